@@ -36,6 +36,7 @@ from gsencoder.models.grid.neighbors import _append_zero_row, _gather_neighborho
 from gsencoder.models.grid.plan import plan_cloud
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.train import samples
+from gsencoder.train.batch import Batch, join_samples
 from gsencoder.train.distill import Distillation
 from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.samples import SampleDataset, SampleRecipe
@@ -204,8 +205,8 @@ def step_parts(config: TrainCommandConfig, prepared: Path, steps: int) -> dict[s
         start = time.perf_counter()
         sample = dataset.make(step - first)
         made = time.perf_counter()
-        batch = samples.join_samples([sample], config.model.transformer.patch)
-        assert isinstance(batch, samples.Batch)
+        batch = join_samples([sample], config.model.transformer.patch)
+        assert isinstance(batch, Batch)
         gaussians += len(batch.attributes)
         marks = [time.perf_counter()]
         with torch.autocast("cpu", dtype, enabled=dtype is not None):

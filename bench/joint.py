@@ -42,7 +42,8 @@ from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.memory.attention import MemoryAttention
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import camera_of, gaussians_of, parameters_from, rows_in_view
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
@@ -176,25 +177,25 @@ def run(setting: Setting, gaussians: Gaussians, loop: QueryLoop | None, weight: 
     for step in range(setting.optimize.steps):
         view = optimizer.view_at(step)
         if loop is not None:
-            rows, shapes, of_queries = loop.slopes(optimizer.raw, view)
+            rows, shapes, of_queries = loop.slopes(optimizer.parameters, view)
             loop.advance(rows, of_queries, step)
         if loop is not None and weight is None:
             continue
-        look = optimizer.slopes(view, 1)
-        grads = {name: torch.zeros_like(value) for name, value in optimizer.raw.items()}
-        for name, value in look.grads.items():
-            grads[name].index_add_(0, look.rows, value)
-        touched = look.rows
+        photo = optimizer.gradients(view, 1)
+        grads = {name: torch.zeros_like(value) for name, value in optimizer.parameters.items()}
+        for name, value in photo.grads.items():
+            grads[name].index_add_(0, photo.rows, value)
+        touched = photo.rows
         if loop is not None:
             for name, value in shapes.items():
                 grads[name].index_add_(0, rows, weight * value)
-            touched = torch.unique(torch.cat([look.rows, rows]))
+            touched = torch.unique(torch.cat([photo.rows, rows]))
         step_grads = {name: value[touched] for name, value in grads.items()}
         optimizer.adam.step(touched, step_grads, setting.optimize.rates_at(step, optimizer.extent))
-        if optimizer.exposures is not None and look.colors is not None:
-            optimizer.exposures.set(view, look.colors)
+        if optimizer.exposures is not None and photo.colors is not None:
+            optimizer.exposures.set(view, photo.colors)
         optimizer.step += 1
-    return gaussians_of(optimizer.raw)
+    return gaussians_of(optimizer.parameters)
 
 
 @torch.no_grad()

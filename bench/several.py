@@ -19,9 +19,10 @@ from gsencoder.app.settings.compose import compose
 from gsencoder.core.runtime.device import autocast_dtype
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.train.batch import Batch, join_samples
 from gsencoder.train.distill import Distillation
 from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.samples import Batch, SampleDataset, SampleRecipe, TeacherRecipe, join_samples
+from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
 from gsencoder.train.training_scene import TrainingScene
 
 

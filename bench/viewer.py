@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from json_option import add_json_option, write_figures
 
-from gsencoder.app.commands.query_words import asked_scene
+from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.viewer.bundle import load_bundle
@@ -51,7 +51,7 @@ SCRIPT = """async (words) => {
 
 def enlarged(folder: Path, count: int) -> SceneSearch:
     """The scene of a folder with so many Gaussians."""
-    scene, words = asked_scene(load_features(folder), folder)
+    scene, words = queried_scene(load_features(folder), folder)
     assert scene.gaussians is not None
     ((name, features),) = scene.features.items()
     rng = np.random.default_rng(0)

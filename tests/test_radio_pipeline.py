@@ -17,7 +17,7 @@ from radios import change_weights, small_joint_model, small_radio
 from symbolic import symbolic_sizes
 
 from gsencoder.app import cli
-from gsencoder.app.commands.query_words import asked_scene
+from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.app.commands.through_head import words_of_head
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.files.archive import open_archive
@@ -163,7 +163,7 @@ def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(
     outputs = head_outputs(head.head, features.decode()) - head.mean
     cosines = outputs @ vectors / (np.linalg.norm(outputs, axis=1) * np.linalg.norm(vectors))
     config = TransformersTextConfig(model=str(world.siglip))
-    asked, table = asked_scene(scene, fused, head="siglip", text=config)
+    asked, table = queried_scene(scene, fused, head="siglip", text=config)
     made = localize(
         asked,
         ["mug"],

@@ -18,7 +18,7 @@ from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PrepareConfig
 from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
-from gsencoder.train.trainer import TrainerConfig
+from gsencoder.train.trainer_config import TrainerConfig
 from gsencoder.train.training_scene import TrainingScene
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
 

@@ -56,7 +56,7 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
     assert not isinstance(settings, type)
     names = {item.name for item in fields(settings)}
     sections: dict[str, dict[str, Any]] = {}
-    own: dict[str, Any] = {}
+    direct: dict[str, Any] = {}
     for key, value in values.items():
         name, _, rest = key.partition(".")
         if name not in names:
@@ -64,10 +64,10 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
         if rest:
             sections.setdefault(name, {})[rest] = value
         else:
-            own[name] = value
+            direct[name] = value
     for name, inner in sections.items():
-        own[name] = with_values(own.get(name, getattr(settings, name)), inner)
-    return typing.cast(Settings, replace(settings, **own))
+        direct[name] = with_values(direct.get(name, getattr(settings, name)), inner)
+    return typing.cast(Settings, replace(settings, **direct))
 
 
 def with_knobs(settings: Settings, knobs: Sequence[Knob], values: Mapping[str, Any]) -> Settings:

@@ -37,13 +37,13 @@ def open_session(path: Path, what: str, *, threads: int = 0) -> Any:
         raise InputError(f"{what}: {path} is no model that onnxruntime reads: {message}") from error
 
 
-def choose_tensors(session: Any, given_input: str, given_output: str, what: str, advice: str = "") -> tuple[str, str]:
+def choose_tensors(session: Any, input_name: str, output_name: str, what: str, advice: str = "") -> tuple[str, str]:
     """The names of an input and an output of a session: those given, else the first ones.
 
     Args:
         session: of a file.
-        given_input: empty = the first.
-        given_output: empty = the first.
+        input_name: empty = the first.
+        output_name: empty = the first.
         what: who asks, and which file, for the message.
         advice: ends the message.
 
@@ -51,8 +51,8 @@ def choose_tensors(session: Any, given_input: str, given_output: str, what: str,
         InputError: the file has no tensors of these names.
     """
     inputs, outputs = ([tensor.name for tensor in side()] for side in (session.get_inputs, session.get_outputs))
-    chosen_input = given_input or (inputs[0] if inputs else "")
-    chosen_output = given_output or (outputs[0] if outputs else "")
+    chosen_input = input_name or (inputs[0] if inputs else "")
+    chosen_output = output_name or (outputs[0] if outputs else "")
     if chosen_input not in inputs or chosen_output not in outputs:
         raise InputError(
             f"{what} has inputs {inputs} and outputs {outputs}, not {chosen_input!r} and {chosen_output!r}{advice}"

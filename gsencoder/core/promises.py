@@ -30,7 +30,7 @@ class Budget:
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        for name in self.given:
+        for name in self.promised:
             value = self.promise(name)
             if name == "error" and not 0 < value < 1:
                 raise InputError(f"error: expected a number between 0 and 1, got {value}")
@@ -40,7 +40,7 @@ class Budget:
             raise InputError(f"seed: expected 0 or more, got {seed}")
 
     @property
-    def given(self) -> tuple[str, ...]:
+    def promised(self) -> tuple[str, ...]:
         """The promises that are made, the one that wins first."""
         return tuple(name for name in PROMISES if getattr(self, name, None) is not None)
 
@@ -51,7 +51,7 @@ class Budget:
     @property
     def names(self) -> str:
         """The options of the promises that are made, for messages."""
-        return " and ".join(f"budget.{name}" for name in self.given)
+        return " and ".join(f"budget.{name}" for name in self.promised)
 
     def shown(self, name: str) -> str:
         """A promise as it is written on the command line."""
@@ -84,7 +84,7 @@ def check_governed(budget: Budget, settings: object, default: object, keys: Iter
     Raises:
         InputError: an option has another value than its default.
     """
-    if not budget.given:
+    if not budget.promised:
         return
     for key in keys:
         if (value := value_at(settings, key)) != value_at(default, key):

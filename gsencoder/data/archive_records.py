@@ -7,7 +7,7 @@ from jaxtyping import Float16, Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import Archive
-from gsencoder.data.readers.images import PIXEL_LIMIT
+from gsencoder.data.readers.image_file import PIXEL_LIMIT
 from gsencoder.data.splats import fingerprint
 from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, Gaussians, MemoryBank, Scene, Views
 

@@ -11,17 +11,9 @@ from jaxtyping import Float64
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.even_indices import even_indices
 from gsencoder.data.readers.background import find_background
-from gsencoder.data.readers.images import (
-    DepthFiles,
-    DepthSensor,
-    ImageFiles,
-    InstanceFiles,
-    PixelGrid,
-    is_deep_grey,
-    picture_info,
-    picture_size,
-    read_integers,
-)
+from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
+from gsencoder.data.readers.image_file import is_deep_grey, picture_info, picture_size, read_integers
+from gsencoder.data.readers.images import ImageFiles, InstanceFiles, PixelGrid
 from gsencoder.data.readers.masks import EmptyFiles, MaskFiles
 from gsencoder.data.readers.posed import PosedImage, PosedImages, choose_origin
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for

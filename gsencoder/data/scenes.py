@@ -1,7 +1,6 @@
 """Loading of scenes in any supported layout, or of a splat alone."""
 
 import math
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -11,21 +10,19 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.posed_views import make_views
+from gsencoder.data.readers.depth_images import DepthMeasure
 from gsencoder.data.readers.frames import pinhole_of
-from gsencoder.data.readers.images import (
-    DepthMeasure,
-)
-from gsencoder.data.readers.layouts import ReadOptions, describe_layouts, layout_of, read_transforms_file
+from gsencoder.data.readers.layouts import ReadOptions, layout_of, read_transforms_file
 from gsencoder.data.readers.objects_json import read_objects
 from gsencoder.data.readers.posed import PosedImage, PosedImages, rigid_pose
 from gsencoder.data.readers.scene_splat import (
-    SPLAT_SUFFIXES,
     file_of_scene,
     find_splat,
     read_bare_splat,
     warn_of_unused_splat,
 )
 from gsencoder.data.readers.transforms_json import TRANSFORMS
+from gsencoder.data.scene_paths import is_transforms_file, name_of_folder
 from gsencoder.data.splats import load_splat
 from gsencoder.data.truth.scene_labels import (
     labels_of_layout,
@@ -122,9 +119,8 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     Returns:
         A scene with views, or with Gaussians only, or both. A ScanNet or ScanNet++ scene whose label files lie beside
         it has objects, and where there are no pictures of instances, maps that are drawn from the labeled mesh on
-        access.
-        `views.masks` exists if there are mask files,
-        transparency, a background of one color, or pinhole pixels that the distorted picture does not cover.
+        access. `views.masks` exists if there are mask files, transparency, a background of one color, or pinhole
+        pixels that the distorted picture does not cover.
 
     Raises:
         InputError: no scene is recognized, no view is left, or a file is wrong.
@@ -132,19 +128,19 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     Warns:
         SceneWarning: a background of one color is masked.
     """
-    given = Path(path)
+    path = Path(path)
     try:
-        root = given.absolute()
+        root = path.absolute()
         exists = root.exists()
     except (OSError, ValueError) as error:
-        raise InputError(f"{str(given)[:200]!r} is not a path ({type(error).__name__})") from error
+        raise InputError(f"{str(path)[:200]!r} is not a path ({type(error).__name__})") from error
     if not exists:
-        raise InputError(f"{given}: no such file or folder")
+        raise InputError(f"{path}: no such file or folder")
     posed, folder, layout = read_posed(root, options)
     if posed is None:
         if splat is not None:
-            raise InputError(f"{given}: splat= is for scenes with views, and here there are none; give one splat only")
-        name = _name_of(root) if root.is_dir() else root.stem
+            raise InputError(f"{path}: splat= is for scenes with views, and here there are none; give one splat only")
+        name = name_of_folder(root) if root.is_dir() else root.stem
         bare, origin = read_bare_splat(find_splat(root))
         return Scene(
             name=name,
@@ -163,23 +159,24 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     gaussians = load_splat(file_of_scene("splat", splat, folder), origin=origin) if splat is not None else None
     if splat is None:
         warn_of_unused_splat(folder)
-    objects = folder / "objects.json"
+    objects_file = folder / "objects.json"
     beside_transforms = root.suffix.lower() == ".json" or any((folder / file).is_file() for file in TRANSFORMS)
+    objects = read_objects(objects_file) if beside_transforms and objects_file.is_file() else ()
     labels = labels_of_layout(folder, layout)
     if labels is not None:
         if layout == "ScanNet":
             views = with_archived_instances(views, folder)
         views = with_mesh_instances(views, labels, origin)
-    found = read_objects(objects) if beside_transforms and objects.is_file() else ()
+        objects = objects_of_labels(labels)
     points = posed.points
     return Scene(
-        name=_name_of(folder),
+        name=name_of_folder(folder),
         gaussians=gaussians,
         views=views,
         origin=origin,
         metres_per_unit=options.metres_per_unit or posed.metres_per_unit,
         up=posed.up if options.up is None else _unit(options.up),
-        objects=found if labels is None else objects_of_labels(labels),
+        objects=objects,
         sfm_points=(points - origin).astype(np.float32) if len(points) else None,
         sfm_colors=posed.colors if len(points) else None,
         folder=folder,
@@ -188,117 +185,6 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
 
 def _unit(direction: tuple[float, float, float] | None) -> Float64[np.ndarray, "3"] | None:
     return None if direction is None else np.array(direction) / math.hypot(*direction)
-
-
-def scene_name(path: Path) -> str:
-    """The name that `load_scene` gives the scene at an existing path."""
-    if path.is_file():
-        return _name_of(path.absolute().parent) if _is_transforms(path) else path.stem
-    return _name_of(path)
-
-
-def check_names(paths: Sequence[Path]) -> None:
-    """Checks that no two scenes have the same name, since their results would be in one folder.
-
-    Raises:
-        InputError: two have.
-    """
-    first: dict[str, Path] = {}
-    for path in paths:
-        name = scene_name(path)
-        if name in first:
-            raise InputError(
-                f"{path} and {first[name]} are both called {name!r}, so their results would be in one folder; "
-                "rename one, or run them with different out="
-            )
-        first[name] = path
-
-
-FEATURES_MARK = "scene.safetensors"
-"""A folder with this file was written by a command, as features or a memory of a scene."""
-
-
-def _is_transforms(path: Path) -> bool:
-    return path.suffix.lower() == ".json" and path.name != "meta.json"
-
-
-def _name_of(folder: Path) -> str:
-    """The name of a scene and of its output folder; "." and ".." are resolved."""
-    return (folder if folder.name not in ("", "..") else folder.resolve()).name or "scene"
-
-
-def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
-    """The scenes at paths: a path is a scene, a folder of scenes, which are sorted by name, or a list of paths (.txt).
-
-    A folder is a scene if `load_scene` recognizes it; of any other folder the direct subfolders are searched. A scene
-    that is named twice, also by different paths, is returned once.
-
-    Raises:
-        InputError: a path does not exist, or a folder holds no scene.
-    """
-    scenes: dict[Path, Path] = {}
-    for given in listed_paths(paths):
-        try:
-            if not given.exists():
-                raise InputError(f"{given}: no such file or folder")
-            inside = [given] if is_scene(given) else sorted(entry for entry in given.iterdir() if _is_listed(entry))
-        except (OSError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
-            raise InputError(f"{str(given)[:200]!r} cannot be read ({type(error).__name__})") from error
-        if not inside and (given / FEATURES_MARK).is_file():
-            raise InputError(
-                f"{given}: a folder of features, not a scene; localize, views, ask, pack and evaluate features= take it"
-            )
-        if not inside:
-            raise InputError(
-                f"{given}: neither a scene nor a folder of scenes; a scene holds one of: {describe_layouts()}; a splat"
-            )
-        for path in inside:
-            scenes.setdefault(path.resolve(), path)
-    return tuple(scenes.values())
-
-
-def listed_paths(paths: Iterable[str | Path]) -> list[Path]:
-    """Paths, with those in list files in place of the files: text files (.txt) with one path a line, relative to the
-    file; blank lines and those that begin with # are left out.
-
-    Raises:
-        InputError: a list cannot be read, or is empty.
-    """
-    result: list[Path] = []
-    for given in map(Path, paths):
-        try:
-            is_list = given.suffix.lower() == ".txt" and given.is_file()
-        except (OSError, ValueError):
-            is_list = False
-        if not is_list:
-            result.append(given)
-            continue
-        try:
-            lines = given.read_text(encoding="utf-8-sig").splitlines()
-        except (OSError, ValueError) as error:
-            raise InputError(f"{given}: not a readable list of scenes ({type(error).__name__})") from error
-        names = [line.strip() for line in lines if line.strip() and not line.strip().startswith("#")]
-        if not names:
-            raise InputError(f"{given}: lists no scene; expected one path a line")
-        result += [given.parent / name for name in names]
-    return result
-
-
-def is_scene(path: Path) -> bool:
-    """Whether `load_scene` recognizes a folder itself as a scene; True for any file."""
-    if path.is_file():
-        return True
-    return (
-        (path / "meta.json").is_file()
-        or layout_of(path) is not None
-        or any(entry.suffix.lower() in SPLAT_SUFFIXES and entry.is_file() for entry in path.iterdir())
-    )
-
-
-def _is_listed(entry: Path) -> bool:
-    return entry.is_dir() and not entry.name.startswith(".") and is_scene(entry)
 
 
 def read_posed(root: Path, options: SceneConfig = SceneConfig()) -> tuple[PosedImages | None, Path, str]:
@@ -315,7 +201,7 @@ def read_posed(root: Path, options: SceneConfig = SceneConfig()) -> tuple[PosedI
         intrinsics=options.intrinsics,
     )
     if root.is_file():
-        if not _is_transforms(root):
+        if not is_transforms_file(root):
             return None, root.parent, "splat"
         name = "transforms.json"
         posed, folder = read_transforms_file(root, read)
@@ -327,11 +213,6 @@ def read_posed(root: Path, options: SceneConfig = SceneConfig()) -> tuple[PosedI
         posed, folder = layout.read(root, read)
     images = tuple(_with_stated_sensors(image, options) for image in posed.images)
     return replace(posed, images=images), folder, name
-
-
-def has_views(path: Path) -> bool:
-    """Whether a path is a scene with posed views, as opposed to a splat, judged by names of files alone."""
-    return _is_transforms(path) if path.is_file() else layout_of(path) is not None
 
 
 def _with_stated_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:

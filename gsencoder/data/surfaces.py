@@ -101,13 +101,13 @@ def surfaces_of_depth(views: Views, *, limit: int = 16, seed: int = 0) -> Surfac
     from gsencoder.data.seeding.depth import surface_pixels
 
     depth = depth_views(views, even_indices(len(views), limit), seed=seed)
-    made = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     world_from_cam = invert_rigid(depth.cam_from_world)
     parts = []
     for view in range(len(depth)):
         pixels = surface_pixels(depth.depths[view], depth.Ks[view].astype(np.float32))
         rows, columns = np.nonzero(pixels.use)
-        picked = made.permutation(len(rows))[:SAMPLES]
+        picked = rng.permutation(len(rows))[:SAMPLES]
         rows, columns = rows[picked], columns[picked]
         z, normals = pixels.depth[rows, columns].astype(np.float64), pixels.normals[rows, columns].astype(np.float64)
         local = unproject_points(np.stack((columns, rows), axis=1) + 0.5, z, depth.Ks[view])

@@ -106,20 +106,20 @@ def write_predictions(
     names: list[RankedNames] = []
     sentences: list[Expression] = []
     boxes: list[PredictedBoxes] = []
-    given: tuple[Expression, ...] = ()
+    all_expressions: tuple[Expression, ...] = ()
     if isinstance(protocol, ReferringProtocol) and protocol.expressions:
-        given = read_expressions(Path(protocol.expressions))
+        all_expressions = read_expressions(Path(protocol.expressions))
     for loaded, load_seconds in scenes:
         scene, features, seconds = with_features(loaded, source, seeds)
         start = time.perf_counter()
         mesh = None if scene.folder is None else find_labels(scene.folder, names=labeled)
         if isinstance(protocol, ReferringProtocol):
-            asked = _expressions(scene, mesh, given, raw_ids)
+            expressions = _expressions(scene, mesh, all_expressions, raw_ids)
             # Boxes of a file are in the aligned frame of its scans, those of a scene's objects in its world.
-            aligned = mesh.aligned_from_world if mesh is not None and given else None
-            sentences += asked
+            aligned = mesh.aligned_from_world if mesh is not None and all_expressions else None
+            sentences += expressions
             boxes += predict_referring(
-                scene, features, asked, words, protocol, localization, aligned_from_world=aligned
+                scene, features, expressions, words, protocol, localization, aligned_from_world=aligned
             )
         else:
             points = labeled_points(scene, mesh)
@@ -186,17 +186,17 @@ def score_written(folder: Path, protocol: BenchmarkProtocol, classes: ClassTable
 
 
 def _expressions(
-    scene: Scene, mesh: MeshLabels | None, given: Sequence[Expression], raw_ids: Mapping[str, int] | None
+    scene: Scene, mesh: MeshLabels | None, sentences: Sequence[Expression], raw_ids: Mapping[str, int] | None
 ) -> tuple[Expression, ...]:
     """The sentences about a scene, with the boxes of a ScanNet scan's labels where they have none, and with what is
     known of their kinds: by ScanNet's label map, or by the names themselves where the names are what is asked."""
-    if not given:
-        asked = expressions_of_objects(scene)
-        return with_kinds(asked, {each.object_name: each.object_name for each in asked})
-    asked = tuple(each for each in given if each.scene == scene.name)
-    lacking = any(each.aabb is None for each in asked)
+    if not sentences:
+        expressions = expressions_of_objects(scene)
+        return with_kinds(expressions, {each.object_name: each.object_name for each in expressions})
+    expressions = tuple(each for each in sentences if each.scene == scene.name)
+    lacking = any(each.aabb is None for each in expressions)
     if lacking and mesh is not None and scene.folder is not None and find_scannet_files(scene.folder) is not None:
-        asked = boxes_from_labels(asked, mesh)
+        expressions = boxes_from_labels(expressions, mesh)
     if raw_ids is None:
-        return asked
-    return with_kinds(asked, named_classes((each.object_name for each in asked), raw_ids))
+        return expressions
+    return with_kinds(expressions, named_classes((each.object_name for each in expressions), raw_ids))

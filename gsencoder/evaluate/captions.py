@@ -101,9 +101,9 @@ def generate_from_features(
     def replace(_: Any, given: tuple[Any, ...]) -> tuple[Any, ...]:
         nonlocal replaced
         if not given or given[0].shape != tokens.shape:
-            wanted = "none" if not given else str(tuple(given[0].shape))
+            expected = "none" if not given else str(tuple(given[0].shape))
             raise InputError(
-                f"{WHAT}: {type(model).__name__} takes features [pictures, patches, channels] of {wanted}, got "
+                f"{WHAT}: {type(model).__name__} takes features [pictures, patches, channels] of {expected}, got "
                 f"{tuple(tokens.shape)}; render them on the grid of its tower"
             )
         replaced += 1

@@ -93,13 +93,13 @@ class PictureTruth:
         assert gaussians is not None
         means = gaussians.means + self.scene.origin
         inside: Bool[np.ndarray, " N"] = ((means >= np.array(lower)) & (means <= np.array(upper))).all(axis=1)
-        best, found = 0.0, 0
+        best, instance = 0.0, 0
         for value in np.unique(self.gaussian_instances[inside]):
             same = self.gaussian_instances == value
             overlap = (inside & same).sum() / (inside | same).sum()
             if value and overlap > best:
-                best, found = float(overlap), int(value)
-        return found
+                best, instance = float(overlap), int(value)
+        return instance
 
     def _camera(self, row: Mapping[str, Any]) -> Cameras:
         pose = move_origin(np.array(row["cam_from_world"], np.float64), self.scene.origin)

@@ -222,10 +222,10 @@ def text_to_image(
     others = np.stack([view_scores(cells, texts, pooling) for cells in pictures]) if len(pictures) and names else None
     ranks, not_finite = [], 0
     for number, (name, text, cells) in enumerate(zip(names, texts, views, strict=True)):
-        own = view_scores(cells, text[None], pooling)
+        scores = view_scores(cells, text[None], pooling)
         drawn = draw(name, len(pictures), count, seed)
-        ranks.append(rank_of_first(own if others is None else np.concatenate([own, others[drawn, number]])))
-        not_finite += not np.isfinite(own[0])
+        ranks.append(rank_of_first(scores if others is None else np.concatenate([scores, others[drawn, number]])))
+        not_finite += not np.isfinite(scores[0])
     return Retrieval(ranks=np.array(ranks, np.int64), distractors=count, not_finite=not_finite)
 
 

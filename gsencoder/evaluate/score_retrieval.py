@@ -68,13 +68,15 @@ def score_retrieval(
     ]
     by_scene = []
     for scene in dict.fromkeys(each.scene for each in captions):
-        own = np.array([each.scene == scene for each in captions])
-        recalls = {f"{name}_{k}": float((side.ranks[own] <= k).mean()) for name, side in sides.items() for k in RECALLS}
-        by_scene.append({"scene": scene, "views": int(own.sum()), **recalls})
-    given = {"i2t": pairs.scores.shape[1] - number, "t2i": len(pairs.distractors)}
+        of_scene = np.array([each.scene == scene for each in captions])
+        recalls = {
+            f"{name}_{k}": float((side.ranks[of_scene] <= k).mean()) for name, side in sides.items() for k in RECALLS
+        }
+        by_scene.append({"scene": scene, "views": int(of_scene.sum()), **recalls})
+    candidates = {"i2t": pairs.scores.shape[1] - number, "t2i": len(pairs.distractors)}
     same = number - len({each.caption for each in captions})
-    notes = [_pool(name, side, given[name]) for name, side in sides.items()]
-    if same and not all(given.values()):
+    notes = [_pool(name, side, candidates[name]) for name, side in sides.items()]
+    if same and not all(candidates.values()):
         notes.append("Views with the same text are no rivals of each other.")
     broken = sum(side.not_finite for side in sides.values())
     if broken:
@@ -84,7 +86,7 @@ def score_retrieval(
             "protocol": "retrieval",
             "views": number,
             "pools": {
-                name: {"distractors": side.distractors, "of": "distractors" if given[name] else "queries"}
+                name: {"distractors": side.distractors, "of": "distractors" if candidates[name] else "queries"}
                 for name, side in sides.items()
             },
             "not_finite": broken,

@@ -118,8 +118,8 @@ def score_caption_files(
         scores = score_box_captions(objects, boxes, min_iou=min_iou, tools=tools)
     else:
         named = [each for each in captions if isinstance(each, NamedCaption)]
-        known = {(each.scene, each.object_id) for each in named}
-        missing = [f"{o.object_id} of {o.scene}" for o in objects if (o.scene, o.object_id) not in known]
+        named_keys = {(each.scene, each.object_id) for each in named}
+        missing = [f"{o.object_id} of {o.scene}" for o in objects if (o.scene, o.object_id) not in named_keys]
         _refuse_missing(missing, "object", predictions, allow_missing)
         scores = score_named_captions(objects, named, tools=tools)
     ending = f"_{round(100 * min_iou)}" if boxes else ""
@@ -137,10 +137,10 @@ def score_caption_files(
         for row, each in enumerate(scores.objects)
     ]
     by_scene = [
-        {"scene": scene, "objects": len(own)}
-        | {name: float(np.mean([row[name] for row in own])) for name in ("cider", "rouge_l", "bleu_4")}
+        {"scene": scene, "objects": len(of_scene)}
+        | {name: float(np.mean([row[name] for row in of_scene])) for name in ("cider", "rouge_l", "bleu_4")}
         for scene in dict.fromkeys(row["scene"] for row in rows)
-        for own in ([row for row in rows if row["scene"] == scene],)
+        for of_scene in ([row for row in rows if row["scene"] == scene],)
     ]
     return ScoreReport(
         results={

@@ -63,14 +63,14 @@ class ProjectionSums:
     ) -> None:
         """Adds vectors of the space, each `counts` times; vectors that are the mean itself have no direction and are
         left out."""
-        kept = np.square(to_coordinates(basis, vectors), dtype=np.float64).sum(axis=1)
+        explained = np.square(to_coordinates(basis, vectors), dtype=np.float64).sum(axis=1)
         total = np.square(vectors - basis.mean, dtype=np.float64).sum(axis=1)
         count = np.where(total > 0, np.ones(len(vectors)) if counts is None else counts, 0)
         # Rounding may make a projection longer than its vector.
-        cosines = np.sqrt(np.minimum(kept / np.where(total > 0, total, 1), 1))
+        cosines = np.sqrt(np.minimum(explained / np.where(total > 0, total, 1), 1))
         bins = np.minimum((cosines * BINS).astype(np.int64), BINS - 1)
         self.histogram += np.bincount(bins, weights=count, minlength=BINS)
-        self.sums += [(kept * count).sum(), (total * count).sum(), (cosines * count).sum()]
+        self.sums += [(explained * count).sum(), (total * count).sum(), (cosines * count).sum()]
 
     def add_map(self, basis: FeatureBasis, feature_map: FeatureMap) -> None:
         """Adds the cells of a map that have a vector."""
@@ -89,14 +89,16 @@ class ProjectionSums:
             InputError: there are none.
         """
         vectors = float(self.histogram.sum())
-        kept, total, cosines = self.sums.tolist()
+        explained, total, cosines = self.sums.tolist()
         if not vectors:
             raise InputError("basis: no view has a cell whose vector differs from the mean; nothing to compare")
         cumulative, rank = self.histogram.cumsum(), WORST * vectors
         bin_ = int(np.searchsorted(cumulative, rank))
         within = 1 - (cumulative[bin_] - rank) / self.histogram[bin_]
         worst = float((bin_ + within) / BINS)
-        return BasisFit(energy=min(kept / total, 1.0), cosine=cosines / vectors, worst=worst, vectors=round(vectors))
+        return BasisFit(
+            energy=min(explained / total, 1.0), cosine=cosines / vectors, worst=worst, vectors=round(vectors)
+        )
 
 
 def total_fit(sums: Iterable[ProjectionSums]) -> BasisFit:

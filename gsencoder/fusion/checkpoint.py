@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import first_difference, open_archive, write_archive
+from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.first_difference import first_difference
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher

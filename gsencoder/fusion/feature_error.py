@@ -58,12 +58,11 @@ def field_error(
             f"field_error: expected {len(reference)} Gaussians in ({reference.space.describe()}), "
             f"got {len(features)} in ({features.space.describe()})"
         )
-    given = rows is not None
-    rows = np.flatnonzero(reference.seen) if rows is None else rows
+    if rows is None:
+        rows = np.flatnonzero(reference.seen)
+        rows = rows[even_indices(len(rows), sample)] if sample else rows
     if not len(rows):
         raise InputError("field_error: the reference saw no Gaussian")
-    if sample and not given:
-        rows = rows[even_indices(len(rows), sample)]
     both = rows[features.seen[rows]]
     centered = raw = 0.0
     for start in range(0, len(both), CHUNK):

@@ -78,7 +78,7 @@ class FuseConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fusion:
-    """What `fuse` made, and what it chose.
+    """The result of `fuse`, and the choices that it made.
 
     Attributes:
         features: on the scene's Gaussians.
@@ -89,8 +89,8 @@ class Fusion:
             cells of all views with each cell weighted by its distance from the mean; 0 without a basis.
         projections: how well a basis that was given represents the teacher's vectors in the views that this call added;
             None if the scene has a basis of its own, or none.
-        sample: cells of the teacher's maps of all views; None if they were not asked for.
-        config: that was asked for.
+        sample: cells of the teacher's maps of all views; None without `sample_cells`.
+        config: the settings as they were given, before `visibility` was resolved.
     """
 
     features: GaussianFeatures
@@ -124,7 +124,7 @@ def fuse(
     Args:
         scene: with Gaussians and views.
         teacher: whose maps are lifted.
-        config: see there.
+        config: settings.
         basis: fuse in the coordinates of this basis, which scenes that are trained on together share; None = one of the
             scene's own, where `config` asks for one.
         rows: numbers of the views that are lifted, in this order; None = those that `config` chooses.
@@ -138,8 +138,8 @@ def fuse(
         InputError: nothing to lift or to lift onto, a basis of another space, no view sees anything, no such device, or
             `work` holds another run.
     """
-    stated = config
-    chosen = device if isinstance(device, torch.device) else choose_device(device)
+    requested = config
+    chosen_device = device if isinstance(device, torch.device) else choose_device(device)
     gaussians, views = checked_scene(scene, teacher, basis)
     config = replace(config, visibility=resolve(config.visibility, views, config.lift))
     if rows is None and config.view_choice == "coverage":
@@ -156,12 +156,13 @@ def fuse(
             subspace = Subspace.of_basis(basis)
         else:
             subspace = find_subspace(teacher, maps, rows, config, track, one_pass=checkpoint is None)
-        # Where the mean alone is unknown, it is computed along the way; never in a run that may start in the middle.
+        # Where only the mean is unknown, it is computed while views are lifted. A run with a checkpoint, which may
+        # start with a later view, has computed it before.
         moments = Moments(teacher.space.channels, second=False) if subspace.mean is None else None
         sample = CellSample(len(rows))
         projections = ProjectionSums() if basis is not None else None
         columns = subspace.basis.rank if subspace.basis is not None else teacher.space.channels
-        sums = FeatureSums(len(gaussians), columns, subspace.basis, teacher.table, chosen)
+        sums = FeatureSums(len(gaussians), columns, subspace.basis, teacher.table, chosen_device)
         if checkpoint is not None:
             checkpoint.resume(sums)
         remaining = rows[sums.views :]
@@ -177,13 +178,13 @@ def fuse(
                     lift=config.lift,
                     visibility=config.visibility,
                     config=config.blend,
-                    device=chosen,
+                    device=chosen_device,
                 )
             return feature_map, matrix, of_view.seconds
 
-        # A costly teacher has threads of its own, and its maps may be large: one view after the other, as on a GPU.
+        # A costly teacher has threads of its own and may have large maps: its views are prepared one after the other.
         workers = min(thread_count(), VIEWS_AT_ONCE)
-        side_by_side = teacher.cheap and chosen.type == "cpu"
+        side_by_side = teacher.cheap and chosen_device.type == "cpu"
         prepared = ahead(prepare, remaining, workers) if side_by_side else map(prepare, remaining)
         start, parts = time.perf_counter(), []
         with Clock().running() as of_sums:
@@ -213,7 +214,7 @@ def fuse(
         features=GaussianFeatures(
             features=features, weights=weights, mean=mean, space=teacher.space, basis=subspace.basis
         ),
-        config=stated,
+        config=requested,
         views=rows,
         tested=config.visibility.against,
         seconds=clock.seconds,
@@ -253,11 +254,11 @@ def checked_scene(scene: Scene, teacher: Teacher, basis: FeatureBasis | None = N
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Subspace:
-    """Where features are summed.
+    """The coordinates in which features are summed.
 
     Attributes:
-        basis: whose coordinates are summed; None = all channels.
-        mean: of the teacher's vectors; None where only a pass over all views tells.
+        basis: features are summed as coordinates in it; None = in all channels.
+        mean: of the teacher's vectors; None where it is known only after a pass over all views.
         truncation: see `Fusion`.
     """
 
@@ -286,9 +287,9 @@ def find_subspace(
         teacher: whose table, if it has one, makes a pass over the maps unnecessary.
         maps: the map of a view.
         rows: of the views.
-        config: see there.
+        config: settings.
         track: progress.
-        one_pass: whether the mean may be left to the pass that lifts, where nothing else is missing.
+        one_pass: whether the mean, where nothing else is needed, may be computed while views are lifted.
     """
     space = teacher.space
     needs_basis = config.basis and space.channels > config.narrow

@@ -196,7 +196,8 @@ class FeatureSums:
 
 
 def _few_codes(codes: int, columns: int) -> bool:
-    """Whether sums by code are no wider than is worth it: one product at the end instead of one for each view."""
+    """Whether to sum by code, which takes one product with the table at the end instead of one for each view: only
+    where the table has few rows, so that the sums are not much wider than sums of vectors."""
     return codes <= max(MAX_CODES, 2 * columns)
 
 

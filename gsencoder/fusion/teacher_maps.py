@@ -118,7 +118,7 @@ class CachedTeacher(WrappedTeacher):
     ) -> None:
         """Args:
         teacher: whose maps.
-        folder: of one scene's maps of this teacher and no other; whoever gives it sees to that.
+        folder: must hold the maps of one scene by this teacher alone, which is not checked.
         before_write: called before a file is written.
         advice: what to do about a damaged file, for the error.
         """
@@ -135,10 +135,10 @@ class CachedTeacher(WrappedTeacher):
             return self.teacher.feature_map(views, view)
         path = self._folder / f"map_{view:05d}.safetensors"
         if not path.is_file():
-            made = self.teacher.feature_map(views, view)
-            if made.codes is not None and self.table is not None:
-                return made
+            feature_map = self.teacher.feature_map(views, view)
+            if feature_map.codes is not None and self.table is not None:
+                return feature_map
             self._before_write()
-            write_map(path, made, with_table=made.table is not None and self.table is None)
+            write_map(path, feature_map, with_table=feature_map.table is not None and self.table is None)
         with advised(self._advice or f"remove {path}, and it is made again"):
             return read_map(path, self.space, self.table)

@@ -207,11 +207,11 @@ class _Builder:
     def _sample(self) -> Float32[np.ndarray, "n D"]:
         """Features with a direction, evenly from all views."""
         counts = [int(directed.sum()) for _, _, directed in self._rows()]
-        wanted = even_indices(sum(counts), SAMPLE)
+        sampled = even_indices(sum(counts), SAMPLE)
         parts, start = [np.zeros((0, self._space.channels), np.float32)], 0
         for rows, _, directed in self._rows():
             count = int(directed.sum())
-            chosen = wanted[(wanted >= start) & (wanted < start + count)] - start
+            chosen = sampled[(sampled >= start) & (sampled < start + count)] - start
             parts.append(rows[directed][chosen])
             start += count
         return np.concatenate(parts)

@@ -125,18 +125,18 @@ def _leaders(
     """
 
     def cover(threshold: float, limit: int) -> CoverReduction:
-        made = CoverReduction(centered.shape[1], threshold)
-        made.add(centered, "features", limit=limit)
-        return made
+        reduction = CoverReduction(centered.shape[1], threshold)
+        reduction.add(centered, "features", limit=limit)
+        return reduction
 
     threshold = config.threshold or largest_threshold(lambda each: len(cover(each, limit)) <= limit)
-    made = cover(threshold, limit)
-    if len(made) > limit and config.rows:
+    leaders = cover(threshold, limit)
+    if len(leaders) > limit and config.rows:
         raise InputError(
             f"index: rows={config.rows}: the features point in more directions than that even at a threshold of "
             f"{threshold:.4f}; give more rows"
         )
-    if len(made) > limit:
+    if len(leaders) > limit:
         if not search:
             raise TooManyRowsError(f"index: a table of threshold {threshold:g} has more than {limit:,} rows")
         fits = largest_threshold(lambda each: len(cover(each, limit)) <= limit)
@@ -144,7 +144,7 @@ def _leaders(
             f"index: a table with a row within {threshold:g} of every feature has more than {limit:,} rows; give "
             f"threshold={fits:.3g}, or rows="
         )
-    return threshold, made.rows
+    return threshold, leaders.rows
 
 
 def _nearest(centered: Float32[np.ndarray, "n C"], table: Float32[np.ndarray, "M C"]) -> Int32[np.ndarray, " n"]:

@@ -53,8 +53,8 @@ def index_within(
     if budget.error is not None:
         return _smallest(features, sample, budget.error)
     assert budget.megabytes is not None
-    made = _largest(features, sample, budget.megabytes, bytes_of)
-    return made, _KindsError(features)(made)
+    indexed = _largest(features, sample, budget.megabytes, bytes_of)
+    return indexed, _KindsError(features)(indexed)
 
 
 class _KindsError:
@@ -68,11 +68,11 @@ class _KindsError:
         self._rows, self._centered = rows[norms > 0], self._centered[norms > 0]
         self._rarity = rarity_of(self._centered, norms[norms > 0])
 
-    def __call__(self, made: IndexMemory) -> float:
+    def __call__(self, indexed: IndexMemory) -> float:
         if not len(self._rows):
-            return made.error
-        each = 1 - row_cosines(self._centered, self._about_mean(made.features, self._rows))
-        return max(made.error, float(self._rarity @ each / self._rarity.sum()), 0.0)
+            return indexed.error
+        each = 1 - row_cosines(self._centered, self._about_mean(indexed.features, self._rows))
+        return max(indexed.error, float(self._rarity @ each / self._rarity.sum()), 0.0)
 
     @staticmethod
     def _about_mean(features: GaussianFeatures, rows: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n R"]:
@@ -88,12 +88,12 @@ def _smallest(features: GaussianFeatures, sample: GaussianFeatures, error: float
     reached: float | None = None
     for number in range(first, len(THRESHOLDS)):
         try:
-            made = _indexed(features, number, MAX_ROWS)
+            indexed = _indexed(features, number, MAX_ROWS)
         except TooManyRowsError:
             break
-        reached = of_all(made)
+        reached = of_all(indexed)
         if reached <= error:
-            return made, reached
+            return indexed, reached
     least = "does not reach it" if reached is None else f"reaches {reached:.2g}"
     raise InputError(
         f"budget.error={error:g}: a table of up to {MAX_ROWS:,} rows {least}; give a larger budget, or form=compact"

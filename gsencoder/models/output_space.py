@@ -189,14 +189,14 @@ def teacher_of_space(spaces: Mapping[str, FeatureSpace], name: str | None = None
         InputError: there is no such space, or there are several and none is named.
     """
     names = [each.name for each in spaces.values()]
-    known = {each.name: teacher for teacher, each in spaces.items() if names.count(each.name) == 1}
-    known |= {teacher: teacher for teacher in spaces}
+    teachers = {each.name: teacher for teacher, each in spaces.items() if names.count(each.name) == 1}
+    teachers |= {teacher: teacher for teacher in spaces}
     if name is None and len(spaces) == 1:
         return next(iter(spaces))
-    if name not in known:
-        wanted = "name one of them" if name is None else f"got {name!r}"
-        raise InputError(f"{option}: the encoder gives features of {', '.join(spaces)}; {wanted}")
-    return known[name]
+    if name not in teachers:
+        hint = "name one of them" if name is None else f"got {name!r}"
+        raise InputError(f"{option}: the encoder gives features of {', '.join(spaces)}; {hint}")
+    return teachers[name]
 
 
 def name_of_space(spaces: Mapping[str, FeatureSpace], space: FeatureSpace, encoder: str) -> str:
@@ -246,8 +246,8 @@ def output_spaces_parts(outputs: OutputSpaces) -> tuple[dict[str, np.ndarray], d
         return arrays, {**header, "teacher": name}
     arrays, headers = {}, []
     for number, name in enumerate(outputs):
-        own_arrays, header = output_space_parts(outputs[name])
-        arrays |= {f"{number}.{key}": value for key, value in own_arrays.items()}
+        space_arrays, header = output_space_parts(outputs[name])
+        arrays |= {f"{number}.{key}": value for key, value in space_arrays.items()}
         headers.append({**header, "teacher": name})
     return arrays, {"outputs": headers}
 

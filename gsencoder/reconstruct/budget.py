@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from gsencoder.core.errors import InputError
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.types import Cameras
 
 FIXED_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 0.03, 7e-7, 1.25e-6
@@ -69,7 +70,7 @@ def step_seconds(pixels: float, gaussians: float, device: torch.device, config: 
     return seconds * (2 / min(torch.get_num_threads(), os.cpu_count() or 1)) ** CORE_GAIN
 
 
-def wanted_steps(minutes: float, config: OptimizeConfig) -> int:
+def steps_for_minutes(minutes: float, config: OptimizeConfig) -> int:
     """Steps that a budget is worth: more time goes into steps by its third root, and into pixels by the rest."""
     return max(LEAST_STEPS, round(config.steps * (minutes / DEFAULT_MINUTES) ** (1 / 3)))
 
@@ -79,7 +80,7 @@ def choose_scale(cameras: Cameras, budget: BudgetConfig, device: torch.device, c
     pixels = float(np.median(cameras.widths.astype(np.float64) * cameras.heights))
     if not budget.minutes:
         return 1.0
-    seconds = (1 - SEED_SHARE) * 60 * budget.minutes / wanted_steps(budget.minutes, config)
+    seconds = (1 - SEED_SHARE) * 60 * budget.minutes / steps_for_minutes(budget.minutes, config)
     none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
     affordable = max(LEAST_PIXELS, (seconds - none) / (one - none))
     scale = math.sqrt(affordable / pixels)
@@ -96,7 +97,7 @@ def plan_steps(optimizer: Optimizer, budget: BudgetConfig) -> int:
     pixels = float(np.mean([optimizer.photographs.at_scale(view).image[..., 0].numel() for view in views]))
     seconds = step_seconds(pixels, gaussians, optimizer.device, config)
     affordable = (1 - SEED_SHARE) * 60 * budget.minutes / seconds
-    return int(min(max(LEAST_STEPS, affordable), wanted_steps(budget.minutes, config)))
+    return int(min(max(LEAST_STEPS, affordable), steps_for_minutes(budget.minutes, config)))
 
 
 def trial_views(training: Sequence[int]) -> list[int]:

@@ -11,7 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import first_difference, open_archive, write_archive
+from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.first_difference import first_difference
 from gsencoder.core.removed_options import without_removed_options
 from gsencoder.reconstruct.anchor import Anchor
 from gsencoder.reconstruct.parameters import shapes_of

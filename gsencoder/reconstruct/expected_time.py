@@ -39,12 +39,12 @@ def expected_seconds(optimizer: Optimizer, held_out: Sequence[int], validations:
         if pruned and state is optimizer:
             began = time.perf_counter()
             state = _pruned(optimizer)
-            left = len(state.raw["means"]) / len(optimizer.raw["means"])
+            left = len(state.parameters["means"]) / len(optimizer.parameters["means"])
             seconds += (1 + (len(prunings) - 1) * left) * (time.perf_counter() - began)
         seconds += len([*group]) * _mean_seconds(trial_views(optimizer.training), partial(_step, state, shrink))
     if held_out and validations:
-        looks = validations * len(held_out)
-        seconds += looks * _mean_seconds(trial_views(held_out), lambda view: score(state, [view]))
+        renders = validations * len(held_out)
+        seconds += renders * _mean_seconds(trial_views(held_out), lambda view: score(state, [view]))
     return seconds
 
 
@@ -58,17 +58,17 @@ def _pruned(optimizer: Optimizer) -> Optimizer:
 
 def _step(optimizer: Optimizer, shrink: int, view: int) -> None:
     """What a step does, on a copy of the rows that it changes."""
-    _, rows, grads, _ = optimizer.slopes(view, shrink)
+    _, rows, grads, _ = optimizer.gradients(view, shrink)
     if len(rows):
-        seen = RowAdam({name: value[rows] for name, value in optimizer.raw.items()})
+        seen = RowAdam({name: value[rows] for name, value in optimizer.parameters.items()})
         seen.step(torch.arange(len(rows), device=rows.device), grads, dict.fromkeys(grads, 0.0))
 
 
-def _mean_seconds(views: Sequence[int], look: Callable[[int], object]) -> float:
+def _mean_seconds(views: Sequence[int], work: Callable[[int], object]) -> float:
     """Of looks at some views; the first look compiles and warms caches, and is not counted."""
     seconds = []
     for view in (views[0], *views):
         began = time.perf_counter()
-        look(view)
+        work(view)
         seconds.append(time.perf_counter() - began)
     return float(np.mean(seconds[1:]))

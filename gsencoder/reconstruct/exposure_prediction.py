@@ -43,23 +43,23 @@ class ExposurePrediction(NamedTuple):
     errors: Mapping[str, float]
 
 
-def predict_exposures(exposures: Exposures | None, cameras: Cameras, wanted: Sequence[int]) -> ExposurePrediction:
+def predict_exposures(exposures: Exposures | None, cameras: Cameras, queries: Sequence[int]) -> ExposurePrediction:
     """Predicts the maps of photographs that were not fitted.
 
     Args:
         exposures: maps of the fitted photographs; None = all are taken as they are.
         cameras: of all views, in the order of the recording.
-        wanted: row numbers of views that were not fitted.
+        queries: row numbers of views that were not fitted.
     """
     if exposures is None or len(exposures.training) < 2:
-        return ExposurePrediction("mean", IDENTITY.repeat(len(wanted), 1, 1), {})
+        return ExposurePrediction("mean", IDENTITY.repeat(len(queries), 1, 1), {})
     relative = exposures.maps - exposures.maps.mean(0)
-    fitted, asked = np.array(exposures.training), np.array(wanted, np.int64)
+    fitted, query_rows = np.array(exposures.training), np.array(queries, np.int64)
     centers = cameras.centers
     tables = {
-        "mean": (mean_weights(fitted, fitted), mean_weights(asked, fitted)),
-        "order": (order_weights(fitted, fitted), order_weights(asked, fitted)),
-        "cameras": (camera_weights(fitted, fitted, centers), camera_weights(asked, fitted, centers)),
+        "mean": (mean_weights(fitted, fitted), mean_weights(query_rows, fitted)),
+        "order": (order_weights(fitted, fitted), order_weights(query_rows, fitted)),
+        "cameras": (camera_weights(fitted, fitted, centers), camera_weights(query_rows, fitted, centers)),
     }
     errors = {source: map_error(_mixed(left_out, relative) - relative) for source, (left_out, _) in tables.items()}
     source = "mean"
@@ -69,36 +69,36 @@ def predict_exposures(exposures: Exposures | None, cameras: Cameras, wanted: Seq
     return ExposurePrediction(source, _mixed(tables[source][1], relative) + IDENTITY, errors)
 
 
-def mean_weights(wanted: Int64[np.ndarray, " Q"], fitted: Int64[np.ndarray, " V"]) -> Float64[np.ndarray, "Q V"]:
+def mean_weights(queries: Int64[np.ndarray, " Q"], fitted: Int64[np.ndarray, " V"]) -> Float64[np.ndarray, "Q V"]:
     """The mean of all other photographs."""
-    others = (wanted[:, None] != fitted).astype(np.float64)
+    others = (queries[:, None] != fitted).astype(np.float64)
     return others / others.sum(axis=1, keepdims=True)
 
 
-def order_weights(wanted: Int64[np.ndarray, " Q"], fitted: Int64[np.ndarray, " V"]) -> Float64[np.ndarray, "Q V"]:
+def order_weights(queries: Int64[np.ndarray, " Q"], fitted: Int64[np.ndarray, " V"]) -> Float64[np.ndarray, "Q V"]:
     """Linear interpolation between the fitted photographs before and after; the nearest one at either end.
 
     Args:
-        wanted: positions in the recording; one that was fitted is interpolated as if it had not been.
+        queries: positions in the recording; one that was fitted is interpolated as if it had not been.
         fitted: positions of the fitted photographs, rising.
     """
-    before = np.searchsorted(fitted, wanted, side="left") - 1
-    after = np.searchsorted(fitted, wanted, side="right")
+    before = np.searchsorted(fitted, queries, side="left") - 1
+    after = np.searchsorted(fitted, queries, side="right")
     before, after = np.where(before < 0, after, before), np.where(after == len(fitted), before, after)
     span = fitted[after] - fitted[before]
-    share = (wanted - fitted[before]) / np.where(span, span, 1)
-    weights, rows = np.zeros((len(wanted), len(fitted))), np.arange(len(wanted))
+    share = (queries - fitted[before]) / np.where(span, span, 1)
+    weights, rows = np.zeros((len(queries), len(fitted))), np.arange(len(queries))
     weights[rows, after] = np.where(span, share, 1)
     weights[rows, before] += np.where(span, 1 - share, 0)
     return weights
 
 
 def camera_weights(
-    wanted: Int64[np.ndarray, " Q"], fitted: Int64[np.ndarray, " V"], centers: Float[np.ndarray, "N 3"]
+    queries: Int64[np.ndarray, " Q"], fitted: Int64[np.ndarray, " V"], centers: Float[np.ndarray, "N 3"]
 ) -> Float64[np.ndarray, "Q V"]:
     """The mean of the photographs whose cameras stand nearest, a camera itself left out."""
-    distances = np.linalg.norm(centers[wanted][:, None] - centers[fitted], axis=2)
-    distances[wanted[:, None] == fitted] = np.inf
+    distances = np.linalg.norm(centers[queries][:, None] - centers[fitted], axis=2)
+    distances[queries[:, None] == fitted] = np.inf
     nearest = min(NEAREST, len(fitted) - 1)
     rows = np.argsort(distances, axis=1, kind="stable")[:, :nearest]
     weights = np.zeros(distances.shape)

@@ -44,10 +44,10 @@ def losses_of(
         losses["empty"] = empty_weight * torch.where(empty, raster.alpha, 0).mean() / share
     if depth_weight and photo.depth is not None:
         depth = photo.depth.to(rgb.device)
-        known = (depth > 0) & (raster.alpha.detach() > 0.5)
+        measured = (depth > 0) & (raster.alpha.detach() > 0.5)
         if photo.mask is not None:
-            known &= photo.mask.to(rgb.device)
+            measured &= photo.mask.to(rgb.device)
         expected = raster.depth / raster.alpha.clamp(min=1e-3)
         error = ((expected - depth).abs() / depth.clamp(min=1e-6)).clamp(max=1)
-        losses["depth"] = depth_weight * torch.where(known, error, 0).mean()
+        losses["depth"] = depth_weight * torch.where(measured, error, 0).mean()
     return losses

@@ -9,11 +9,19 @@ from pathlib import Path
 from gsencoder.core.errors import InputError, SceneWarning, advised, listed
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.data.scenes import SceneConfig, find_scenes, is_scene, listed_paths, load_scene
+from gsencoder.data.scene_paths import find_scenes, is_scene, listed_paths
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.video.decode import is_video
 from gsencoder.data.video.frames import VideoConfig, take_frames
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
-from gsencoder.reconstruct.sfm import PLACED_FILE, Placed, SfmConfig, load_placement, photographs_in, place_photographs
+from gsencoder.reconstruct.sfm import (
+    PLACED_FILE,
+    Placed,
+    SfmConfig,
+    load_placement,
+    photographs_in,
+    register_photographs,
+)
 from gsencoder.types import Scene
 
 START_AGAIN = "give resume=false to begin anew"
@@ -49,14 +57,14 @@ def find_photographed(paths: Sequence[str]) -> tuple[Path, ...]:
         InputError: a path does not exist, or holds nothing of the kind.
     """
     chosen: dict[Path, Path] = {}
-    for given in listed_paths(paths):
-        inside = [given]
-        if given.is_dir() and not is_scene(given) and _pictures_of(given) is None:
-            entries = sorted(entry for entry in given.iterdir() if not entry.name.startswith("."))
+    for path in listed_paths(paths):
+        inside = [path]
+        if path.is_dir() and not is_scene(path) and _pictures_of(path) is None:
+            entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
             inside = [entry for entry in entries if is_video(entry) or (entry.is_dir() and _is_photographed(entry))]
         # Of a path that holds nothing `find_scenes` says what was expected.
-        for path in inside or find_scenes([given]):
-            chosen.setdefault(path.resolve(), path)
+        for scene in inside or find_scenes([path]):
+            chosen.setdefault(scene.resolve(), scene)
     return tuple(chosen.values())
 
 
@@ -127,7 +135,7 @@ def open_scene(
         )
     if placed is None:
         with clock("place"):
-            placed = place_photographs(pictures, work, sfm, single_camera=is_video(path))
+            placed = register_photographs(pictures, work, sfm, single_camera=is_video(path))
     if placed.missing:
         warnings.warn(
             f"{len(placed.missing)} of {len(placed.placed) + len(placed.missing)} photographs could not be placed "

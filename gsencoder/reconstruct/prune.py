@@ -57,7 +57,7 @@ def rows_to_keep(
         raw: parameters.
         cameras: of all views.
         views: photographs that count, at any size, gone through once.
-        config: see there.
+        config: settings.
         raster: accuracy of rendering.
 
     Raises:

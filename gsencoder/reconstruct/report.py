@@ -50,7 +50,7 @@ def describe_plan(optimizer: Optimizer, usual: int, seconds: float) -> str:
     expected = f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} s"
     return (
         f"{len(optimizer.training)} photographs of {int(np.median(widths))}×{int(np.median(heights))}, "
-        f"{len(optimizer.raw['means']):,} Gaussians, {steps - optimizer.step:,} steps{fewer}: about {expected}"
+        f"{len(optimizer.parameters['means']):,} Gaussians, {steps - optimizer.step:,} steps{fewer}: about {expected}"
     )
 
 

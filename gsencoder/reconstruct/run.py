@@ -23,11 +23,12 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.dense import DenseConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.anchor import anchor_at
-from gsencoder.reconstruct.budget import BudgetConfig, plan_steps, wanted_steps
+from gsencoder.reconstruct.budget import BudgetConfig, plan_steps, steps_for_minutes
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
 from gsencoder.reconstruct.expected_time import expected_seconds
 from gsencoder.reconstruct.exposure_prediction import predict_exposures
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.report import Comparison, LogRow, compare, describe, describe_exposure, describe_plan
@@ -120,7 +121,7 @@ def reconstruct(
 
     Args:
         scene: with photographs and poses; depth and masks are used where it has them.
-        config: see there.
+        config: settings.
         device: where to compute; on CUDA gsplat renders.
         work: an existing folder for the checkpoint and the log. A run that was interrupted is continued from the
             checkpoint in it, with the same result; None = a temporary folder.
@@ -149,7 +150,7 @@ def reconstruct(
         identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
         chosen_device, checkpoint = choose_device(device), folder / CHECKPOINT_FILE
         if continued := os.path.lexists(checkpoint):
-            most = max(config.optimize.steps, wanted_steps(config.budget.minutes, config.optimize))
+            most = max(config.optimize.steps, steps_for_minutes(config.budget.minutes, config.optimize))
             shape = {"steps": most, "sh_degree": config.optimize.sh_degree}
             state = load_state(checkpoint, identity, **shape, device=chosen_device)
         else:
@@ -259,7 +260,7 @@ def optimize(
         scores = {
             name: value for name, value in score(optimizer, held_out, seen)._asdict().items() if value is not None
         }
-        row: LogRow = {"seconds": time.monotonic() - start, "gaussians": len(optimizer.raw["means"]), **scores}
+        row: LogRow = {"seconds": time.monotonic() - start, "gaussians": len(optimizer.parameters["means"]), **scores}
         log.add(optimizer.step, row)
         rows.append({"step": optimizer.step, **row})
         report(

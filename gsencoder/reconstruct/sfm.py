@@ -14,7 +14,7 @@ from typing import Any, Literal
 from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.written_files import sha256_of
-from gsencoder.data.readers.images import check_picture
+from gsencoder.data.readers.image_file import check_picture
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.data.video.decode import SUFFIXES as VIDEO_SUFFIXES
 
@@ -83,7 +83,7 @@ def _names_with(folder: Path, suffixes: tuple[str, ...]) -> list[str]:
     return sorted(entry.name for entry in entries if entry.suffix.lower() in suffixes)
 
 
-def place_photographs(
+def register_photographs(
     folder: Path, work: Path, config: SfmConfig = SfmConfig(), *, single_camera: bool = False
 ) -> Placed:
     """Finds poses and intrinsics. Every photograph is decoded before. Few photographs that do not fit together are
@@ -92,7 +92,7 @@ def place_photographs(
     Args:
         folder: of the photographs.
         work: an existing folder for COLMAP's database; the model is written to `sparse/0` in it.
-        config: see there.
+        config: settings.
         single_camera: whether one camera took them all with one focal length, as the frames of a video.
 
     Raises:
@@ -110,9 +110,9 @@ def place_photographs(
     inputs = _inputs(folder, names, config)
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
-    known = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
-    if config.camera not in known:
-        raise InputError(f"sfm.camera: expected one of {', '.join(known)}, got {config.camera!r}")
+    camera_models = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
+    if config.camera not in camera_models:
+        raise InputError(f"sfm.camera: expected one of {', '.join(camera_models)}, got {config.camera!r}")
     attempts, model = work / "attempts", work / "sparse" / "0"
     for stale in (work / PLACED_FILE, work / "database.db", attempts, model.parent):
         shutil.rmtree(stale, ignore_errors=True)
@@ -125,8 +125,8 @@ def place_photographs(
         try:
             models += _map(pycolmap, attempt, folder, names, config, single_camera, thorough)
         except (RuntimeError, ValueError) as error:
-            said = " ".join(str(error).split())[:160]
-            raise InputError(f"{folder}: pycolmap cannot place these photographs: {said}") from error
+            message = " ".join(str(error).split())[:160]
+            raise InputError(f"{folder}: pycolmap cannot place these photographs: {message}") from error
         most = max((each.num_reg_images() for each in models), default=0)
         if len(names) > MAX_THOROUGH or most >= ENOUGH_PLACED * len(names):
             break

@@ -189,8 +189,8 @@ class Blend:
             from gsencoder.render import sparse_cpu as products
 
             arrays = (self.crow, self.col, self.weight, self.depths, least, most)
-            arrays_kept = products.keep_between(*(array.numpy() for array in arrays))
-            crow, col, weight = (torch.from_numpy(array) for array in arrays_kept)
+            selected = products.keep_between(*(array.numpy() for array in arrays))
+            crow, col, weight = (torch.from_numpy(array) for array in selected)
             return Blend(crow, col, weight, self.depths, self.lattice, self.config)
         row = torch.repeat_interleave(torch.arange(self.rows, device=self.crow.device), self.crow.diff())
         z = self.depths[self.col.long()]

@@ -109,13 +109,13 @@ def rasterize(
     return Raster(out[..., :3], out[..., 4], out[..., 3], projected.means2d, radii)
 
 
-def _backend(wanted: RasterBackend, tensor: Tensor) -> RasterBackend:
+def _backend(requested: RasterBackend, tensor: Tensor) -> RasterBackend:
     device = tensor.device.type
-    if wanted == "auto":
+    if requested == "auto":
         return "cpu" if device == "cpu" else "gsplat" if device == "cuda" else "reference"
-    if (wanted == "cpu") != (device == "cpu") and wanted != "reference":
-        raise InputError(f"backend: {wanted} cannot render tensors on {device}; use auto or reference")
-    return wanted
+    if (requested == "cpu") != (device == "cpu") and requested != "reference":
+        raise InputError(f"backend: {requested} cannot render tensors on {device}; use auto or reference")
+    return requested
 
 
 def _composite_reference(

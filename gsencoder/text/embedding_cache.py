@@ -52,14 +52,14 @@ def cached_vectors(
         SceneWarning: the file of the cache is damaged, or cannot be written.
     """
     path = _file_of(identity, templates)
-    known = _read(path) if path is not None else {}
-    missing = list(dict.fromkeys(phrase for phrase in phrases if phrase not in known))
+    cached = _read(path) if path is not None else {}
+    missing = list(dict.fromkeys(phrase for phrase in phrases if phrase not in cached))
     if missing:
-        made = dict(zip(missing, compute(missing), strict=True))
+        computed = dict(zip(missing, compute(missing), strict=True))
         if path is not None:
-            _write(path, made if len(known) + len(made) > MAX_PHRASES else known | made)
-        known = known | made
-    return np.stack([known[phrase] for phrase in phrases])
+            _write(path, computed if len(cached) + len(computed) > MAX_PHRASES else cached | computed)
+        cached = cached | computed
+    return np.stack([cached[phrase] for phrase in phrases])
 
 
 def _file_of(identity: str, templates: Sequence[str]) -> Path | None:
@@ -85,10 +85,10 @@ def _read(path: Path) -> dict[str, Float32[np.ndarray, " D"]]:
     return dict(zip(phrases, vectors, strict=True))
 
 
-def _write(path: Path, known: dict[str, Float32[np.ndarray, " D"]]) -> None:
+def _write(path: Path, cached: dict[str, Float32[np.ndarray, " D"]]) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_archive(path, {"vectors": np.stack(list(known.values()))}, {"phrases": list(known)})
+        write_archive(path, {"vectors": np.stack(list(cached.values()))}, {"phrases": list(cached)})
     except (OSError, InputError) as error:
         warnings.warn(
             f"text vectors are not cached: {error} ({CACHE_VARIABLE}={OFF} turns the cache off)",

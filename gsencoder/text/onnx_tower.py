@@ -144,9 +144,9 @@ class OnnxTower:
     def _pool(self, output: np.ndarray, count: int) -> Float32[np.ndarray, " D"]:
         axes = 2 if self.pooling == "output" else 3
         if output.ndim != axes or len(output) != 1:
-            wanted = "[1, channels]" if axes == 2 else "[1, tokens, channels]"
+            expected = "[1, channels]" if axes == 2 else "[1, tokens, channels]"
             raise InputError(
-                f"its output {self._output!r} has shape {list(output.shape)}, expected {wanted} for pooling="
+                f"its output {self._output!r} has shape {list(output.shape)}, expected {expected} for pooling="
                 f"{self.pooling}"
             )
         if self.pooling == "output":

@@ -328,8 +328,8 @@ def _table(
 
 
 def _read_npz(file: Path, encoder: str) -> TextTable:
-    wanted = {"names": ("U", 1), "embeddings": ("f", 2)}
-    arrays = read_npz(file, wanted, {"encoder": ("U", 0)}, max_text=MAX_NAME)
+    expected = {"names": ("U", 1), "embeddings": ("f", 2)}
+    arrays = read_npz(file, expected, {"encoder": ("U", 0)}, max_text=MAX_NAME)
     made_by = encoder or str(arrays.get("encoder", "")) or file.stem.removesuffix("_names")
     try:
         return make_text_table([str(name) for name in arrays["names"]], arrays["embeddings"], made_by)

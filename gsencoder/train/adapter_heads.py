@@ -73,7 +73,7 @@ def teacher_of_heads(teachers: Mapping[str, TeacherConfig], heads: Sequence[str]
     return with_heads[0] if with_heads else next(iter(teachers))
 
 
-def asked_heads(loss_heads: Sequence[str], teachers: Mapping[str, TeacherConfig]) -> tuple[str, ...]:
+def required_heads(loss_heads: Sequence[str], teachers: Mapping[str, TeacherConfig]) -> tuple[str, ...]:
     """The names of the heads that a training needs: those of the render loss, and those that are stored beside the
     weights besides."""
     stored = [name for config in teachers.values() for name in stored_heads(config)]
@@ -90,8 +90,8 @@ def missing_heads(dataset: PreparedDataset, names: Sequence[str], teacher: Teach
     stored = load_heads(path) if path.is_file() else None
     if stored is not None and all(has_head(stored, name) for name in names):
         return []
-    known = stored.names if stored is not None else ()
-    return [head for head in heads_of(teacher, names) if head.name not in known]
+    stored_names = stored.names if stored is not None else ()
+    return [head for head in heads_of(teacher, names) if head.name not in stored_names]
 
 
 def measure_dataset_heads(

@@ -14,7 +14,8 @@ import torch
 
 from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import Archive, first_difference, open_archive, write_archive
+from gsencoder.core.files.archive import Archive, open_archive, write_archive
+from gsencoder.core.first_difference import first_difference
 
 TRAINING_CHECKPOINT_FILE = "checkpoint.safetensors"
 
@@ -123,9 +124,9 @@ def check_same_teachers(path: Path, teachers: Sequence[str]) -> None:
     if not path.is_file():
         return
     with advised(_begin_anew(path)), open_archive(path) as file:
-        stored, asked = file.value("settings", dict), {"teachers": list(teachers)} if len(teachers) > 1 else {}
-        if stored.get("teachers") != asked.get("teachers"):
-            raise InputError(f"{path}: {_describe_difference(stored, asked)}")
+        stored, requested = file.value("settings", dict), {"teachers": list(teachers)} if len(teachers) > 1 else {}
+        if stored.get("teachers") != requested.get("teachers"):
+            raise InputError(f"{path}: {_describe_difference(stored, requested)}")
 
 
 def _begin_anew(path: Path) -> str:
@@ -135,11 +136,11 @@ def _begin_anew(path: Path) -> str:
 def _describe_difference(stored: dict[str, Any], settings: dict[str, Any]) -> str:
     """The first difference between the settings of a checkpoint and of this run, and what to do about it."""
     # Stated by runs with several teachers alone.
-    made_with, asked = stored.get("teachers"), settings.get("teachers")
-    if made_with != asked:
+    saved, requested = stored.get("teachers"), settings.get("teachers")
+    if saved != requested:
         one = "one teacher"
-        made_with, asked = (one if each is None else f"teachers={each}" for each in (made_with, asked))
-        return f"was made with {made_with}, and this run asks {asked}; give the same settings or another out="
+        saved, requested = (one if each is None else f"teachers={each}" for each in (saved, requested))
+        return f"was made with {saved}, and this run asks {requested}; give the same settings or another out="
     if any(stored.get(name) != settings.get(name) for name in ("space", "spaces", "scenes")):
         return "the prepared scenes have changed since; give the former prepared=, or another out="
     before, now = stored.get("samples_per_step"), settings.get("samples_per_step")

@@ -61,9 +61,9 @@ def lost_workers() -> Iterator[None]:
     except RuntimeError as error:
         if not str(error).startswith("DataLoader worker (pid"):
             raise
-        said = " ".join(str(error).split()).partition(". ")[0]
+        message = " ".join(str(error).split()).partition(". ")[0]
         raise InputError(
-            f"training: a process that makes samples was ended by the system ({said}): memory or {SHARED_MEMORY} is "
+            f"training: a process that makes samples was ended by the system ({message}): memory or {SHARED_MEMORY} is "
             "full, or a prepared scene was cut off; make room and give the same command again, which continues from "
             "the last checkpoint, with fewer train.workers if it happens again"
         ) from error

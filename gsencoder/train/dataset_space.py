@@ -138,9 +138,9 @@ def dataset_space(
     if not scenes:
         raise InputError("training: no scenes to train on")
     with fail_together():
-        own = _share_of_teachers(scenes, open_scene, process, optional=optional)
-    check_agreement("the teacher's weights", own.space.weights if own.space is not None else "")
-    shares = values_of_all(own)
+        own_share = _share_of_teachers(scenes, open_scene, process, optional=optional)
+    check_agreement("the teacher's weights", own_share.space.weights if own_share.space is not None else "")
+    shares = values_of_all(own_share)
     space = _common_space(scenes, shares)
     tables = [share.table for share in shares if share.table is not None]
     if tables:

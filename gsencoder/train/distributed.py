@@ -42,13 +42,13 @@ def gpu_index(process: ProcessRank, init_method: str) -> int:
 
 @contextmanager
 def join_processes(
-    device: Device = "auto", *, asked: Mapping[str, Any] | None = None
+    device: Device = "auto", *, settings: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[ProcessRank, torch.device]]:
     """Joins the process group for the block.
 
     Args:
         device: "auto" (one GPU per process if torch sees any, else the CPU), "cpu" or "cuda".
-        asked: the settings of the run, in which all processes must agree; None = they are not compared.
+        settings: the settings of the run, in which all processes must agree; None = they are not compared.
 
     Yields:
         The rank and the device of this process.
@@ -82,8 +82,8 @@ def join_processes(
         ranks = f"process {process.rank} of {process.world_size}"
         raise InputError(f"training: {ranks} cannot reach the others: {message}") from error
     with lost_processes(process):
-        if asked is not None:
-            shared = {name: value for name, value in asked.items() if name not in ("quiet", "device")}
+        if settings is not None:
+            shared = {name: value for name, value in settings.items() if name not in ("quiet", "device")}
             check_agreement("the settings", digest_of(shared), advice="give all processes the same command")
         yield process, chosen
     # Not after an error: other processes may be waiting in a reduction, and leaving the group would wait for them.
@@ -112,10 +112,10 @@ def lost_processes(process: ProcessRank, minutes: float | None = None) -> Iterat
     except InputError:
         raise
     except RuntimeError as error:
-        said = " ".join(str(error).split())
-        if process.world_size == 1 or not any(words in said.lower() for words in LOST):
+        message = " ".join(str(error).split())
+        if process.world_size == 1 or not any(words in message.lower() for words in LOST):
             raise
-        hung = "timed out" in said.lower() or "timeout" in said.lower()
+        hung = "timed out" in message.lower() or "timeout" in message.lower()
         waited = f"has not answered for {minutes:g} minutes" if hung and minutes is not None else "has not answered"
         raise InputError(
             f"training: process {process.rank} of {process.world_size}: another process "
@@ -217,11 +217,11 @@ def check_agreement(what: str, value: str, advice: str = "give all processes the
     Raises:
         InputError: in every process: two processes have different values; both are named.
     """
-    known = [(rank, each) for rank, each in enumerate(values_of_all(value)) if each]
-    for rank, each in known:
-        if each != known[0][1]:
+    stated = [(rank, each) for rank, each in enumerate(values_of_all(value)) if each]
+    for rank, each in stated:
+        if each != stated[0][1]:
             raise InputError(
-                f"training: {what} differ: their digest is {known[0][1]} in process {known[0][0]} and {each} in "
+                f"training: {what} differ: their digest is {stated[0][1]} in process {stated[0][0]} and {each} in "
                 f"process {rank}; {advice}"
             )
 

@@ -22,7 +22,8 @@ from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.memory_network import MemoryConfig, MemoryNetwork, MemoryObjective, ViewSamples, join_views
 from gsencoder.train.memory_scene import MemoryScene
 from gsencoder.train.render_rows import sample_rows
-from gsencoder.train.trainer import CHANGEABLE_ON_RESUME, Trainer, TrainerConfig
+from gsencoder.train.trainer import Trainer
+from gsencoder.train.trainer_config import CHANGEABLE_ON_RESUME, TrainerConfig
 from gsencoder.types import MemoryBank, QueryMemory
 
 

@@ -18,8 +18,9 @@ from jaxtyping import Float32
 
 from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import first_difference, open_archive, write_archive
+from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.json_values import plain, write_json
+from gsencoder.core.first_difference import first_difference
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.archive_records import bank_parts, read_bank
 from gsencoder.data.splats import fingerprint
@@ -112,13 +113,13 @@ def prepare_memory(
             f"memory: the predicted features are of ({predicted.space.describe()}), and the teacher's of "
             f"({teacher.space.describe()})"
         )
-    made_with = _made_with(scene, teacher, bank, prepare, predicted)
+    settings = _preparation_settings(scene, teacher, bank, prepare, predicted)
     stream = _map_stream(scene, teacher, folder)
     if (folder / BANK_FILE).is_file():
-        made = open_memory_scene(folder, made_with)
-        _sample_raw(folder, stream, made.outputs.space, sample)
-        return made
-    _begin(folder, made_with)
+        prepared = open_memory_scene(folder, settings)
+        _sample_raw(folder, stream, prepared.outputs.space, sample)
+        return prepared
+    _begin(folder, settings)
     maps = folder / MAPS_FOLDER
     work = None if teacher.cheap else maps
     features = predicted or fuse(scene, teacher, prepare.fusion, work=work, device=device, track=track).features
@@ -130,24 +131,24 @@ def prepare_memory(
     rows = view_rows(scene, source, outputs, prepare, np.arange(len(scene.views)), device)
     _sample_raw(folder, stream, features.space, sample)
     write_prepared(folder / SCENE_FILE, scene, features, outputs, rows, source=scene.folder or Path())
-    _write_bank(folder / BANK_FILE, components, outputs, made_with)
-    return open_memory_scene(folder, made_with)
+    _write_bank(folder / BANK_FILE, components, outputs, settings)
+    return open_memory_scene(folder, settings)
 
 
-def open_memory_scene(folder: Path, made_with: Mapping[str, Any] | None = None) -> MemoryScene:
+def open_memory_scene(folder: Path, settings: Mapping[str, Any] | None = None) -> MemoryScene:
     """Opens a prepared scene.
 
     Args:
         folder: of `prepare_memory`.
-        made_with: what the preparation depends on; None = anything.
+        settings: what the preparation depends on; None = anything.
 
     Raises:
         InputError: missing, damaged, or prepared with other settings.
     """
     with _advice(folder), open_archive(folder / BANK_FILE) as file:
         stored = with_added_options(file.value("made_with", dict))
-        if made_with is not None and stored != made_with:
-            raise InputError(f"was prepared with {first_difference(stored, dict(made_with))}")
+        if settings is not None and stored != settings:
+            raise InputError(f"was prepared with {first_difference(stored, dict(settings))}")
         outputs = read_output_space(file)
         bank = read_bank(file, file.array("bank", "float32", ("M", outputs.space.channels)), outputs.space)
     return MemoryScene(prepared=PreparedScene(folder / SCENE_FILE), outputs=outputs, bank=bank)
@@ -157,7 +158,7 @@ def _advice(folder: Path) -> AbstractContextManager[None]:
     return advised(f"give resume=false, or remove {folder}, to prepare the scene again")
 
 
-def _begin(folder: Path, made_with: Mapping[str, Any]) -> None:
+def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
     """Writes what a preparation depends on before its first map and its sample, which do not say so themselves.
 
     Raises:
@@ -172,14 +173,14 @@ def _begin(folder: Path, made_with: Mapping[str, Any]) -> None:
                 folder.mkdir(parents=True, exist_ok=True)
             except OSError as error:
                 raise InputError(f"{folder}: cannot be made: {error.strerror or error}") from error
-            write_json(path, made_with)
+            write_json(path, settings)
             return
         try:
             stored = with_added_options(json.loads(path.read_bytes()))
         except (OSError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: cannot be read ({type(error).__name__})") from error
-        if stored != made_with:
-            raise InputError(f"{folder}: was begun with {first_difference(stored, made_with)}")
+        if stored != settings:
+            raise InputError(f"{folder}: was begun with {first_difference(stored, settings)}")
 
 
 def open_raw_sample(folder: Path) -> RawSample:
@@ -221,20 +222,20 @@ def _map_stream(scene: Scene, teacher: Teacher, folder: Path) -> MapStream:
     return stream
 
 
-def _write_bank(path: Path, bank: MemoryBank, outputs: OutputSpace, made_with: Mapping[str, Any]) -> None:
+def _write_bank(path: Path, bank: MemoryBank, outputs: OutputSpace, settings: Mapping[str, Any]) -> None:
     arrays, header = output_space_parts(outputs)
     of_bank, figures = bank_parts(bank)
     arrays |= {"bank": bank.components, **of_bank}
-    write_archive(path, arrays, {**header, **figures, "made_with": dict(made_with)})
+    write_archive(path, arrays, {**header, **figures, "made_with": dict(settings)})
 
 
-def _made_with(
+def _preparation_settings(
     scene: Scene, teacher: Teacher, bank: BankConfig, prepare: PrepareConfig, predicted: GaussianFeatures | None
 ) -> dict[str, Any]:
     """What a preparation depends on, as JSON values."""
     assert scene.gaussians is not None
     assert scene.views is not None
-    made_with = {
+    settings = {
         "gaussians": fingerprint(scene.gaussians)[:16],
         "views": list(scene.views.names),
         "teacher": teacher.settings(),
@@ -242,7 +243,7 @@ def _made_with(
         "prepare": plain(prepare),
         "predicted": None if predicted is None else sha256(predicted.features.tobytes()).hexdigest()[:16],
     }
-    return dict(json.loads(json.dumps(made_with, default=str)))
+    return dict(json.loads(json.dumps(settings, default=str)))
 
 
 def _spread(features: GaussianFeatures) -> float:

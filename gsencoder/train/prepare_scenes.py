@@ -69,8 +69,9 @@ def prepare_scenes(
     """
     teachers = config.teachers_by_name
     folders = teacher_folders(folder, list(teachers))
-    made_with = {
-        name: _made_with(training, words.get(name), teacher, config, voxel) for name, teacher in teachers.items()
+    settings = {
+        name: _preparation_settings(training, words.get(name), teacher, config, voxel)
+        for name, teacher in teachers.items()
     }
     reader = SceneReader(config, words, voxel)
     several = len(teachers) > 1
@@ -79,12 +80,12 @@ def prepare_scenes(
         if process.is_first:
             with_heads = teacher_of_heads(teachers, heads)
             for name, path in folders.items():
-                dataset = PreparedDataset(path, made_with[name])
+                dataset = PreparedDataset(path, settings[name])
                 dataset.remove_stale_maps()
                 # Read first, since a head that is not there is an error before the teacher has made a map.
                 with _about_teacher(config, name):
                     unmeasured[name] = missing_heads(dataset, heads, teachers[name]) if name == with_heads else []
-    datasets = {name: PreparedDataset(path, made_with[name]) for name, path in folders.items()}
+    datasets = {name: PreparedDataset(path, settings[name]) for name, path in folders.items()}
     for name, dataset in datasets.items():
         open_scene, views = partial(reader.with_views, name), config.prepare.basis_views
         with _about_teacher(config, name):
@@ -140,10 +141,10 @@ def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     if len(names) == 1:
         prepared = sorted(path.parent.name for path in folder.glob(f"*/{DATASET_SETTINGS_FILE}"))
         if prepared and not (folder / DATASET_SETTINGS_FILE).is_file():
-            own = names[0] if names[0] in prepared else prepared[0]
+            teacher = names[0] if names[0] in prepared else prepared[0]
             raise InputError(
                 f"{folder}: was prepared for several teachers ({listed(prepared, 3)}), and this run has one; give "
-                f"another prepared=, or the folder of one of them ({folder / own})"
+                f"another prepared=, or the folder of one of them ({folder / teacher})"
             )
         return {names[0]: folder}
     if (folder / DATASET_SETTINGS_FILE).is_file():
@@ -154,7 +155,7 @@ def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     return {name: folder / name for name in names}
 
 
-def _made_with(
+def _preparation_settings(
     training: Sequence[Path], words: Words | None, teacher: TeacherConfig, config: SourceConfig, voxel: float
 ) -> dict[str, Any]:
     """Everything that the preparation for a teacher depends on, as JSON values."""

@@ -15,8 +15,9 @@ from jaxtyping import Float32
 
 from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised, listed
-from gsencoder.core.files.archive import first_difference, open_archive, write_archive
+from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file, locked
+from gsencoder.core.first_difference import first_difference
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.fusion.teacher_maps import CachedTeacher
@@ -146,15 +147,15 @@ class PreparedDataset:
         if not path.is_file():
             return False
         with advised("remove the file to prepare the scene again"), open_archive(path) as file:
-            made_from = file.value("source", str)
+            stored_source = file.value("source", str)
             files = file.value("source_files", str) if "source_files" in file else ""
             if (got := stored_precision(file)) != self.precision:
                 raise InputError(f"expected targets of {self.precision}, as the settings of its folder say, got {got}")
         # A data set that was moved, or is mounted elsewhere on another machine, holds the same files.
-        if made_from != str(source.resolve()) and not (files and files == digest_of_files(source)):
+        if stored_source != str(source.resolve()) and not (files and files == digest_of_files(source)):
             raise InputError(
-                f"{path}: was prepared from {made_from}, but this run uses {source.resolve()}; prepared scenes need "
-                "distinct names: rename one, or give another folder as prepared="
+                f"{path}: was prepared from {stored_source}, but this run uses {source.resolve()}; prepared scenes "
+                "need distinct names: rename one, or give another folder as prepared="
             )
         return True
 
@@ -195,9 +196,9 @@ class PreparedDataset:
         """
         if teacher.table is None:
             return
-        known = self.load_kinds()
-        new = [kind for kind in getattr(teacher, "kinds", ()) if kind not in known]
-        if known and new:
+        kinds = self.load_kinds()
+        new = [kind for kind in getattr(teacher, "kinds", ()) if kind not in kinds]
+        if kinds and new:
             raise InputError(
                 f"{self.folder}: the classes of this dataset lack {listed(new, 3)}, since the scene has changed; give "
                 "another folder as prepared="
@@ -217,8 +218,8 @@ class PreparedDataset:
         """Removes caches of teacher maps that killed runs left; where folders cannot be locked, none."""
         with locked(self.folder, wait=True):
             for path in self.folder.glob(f"{MAPS_PREFIX}*"):
-                with suppress(OSError), locked(path) as known:
-                    if known:
+                with suppress(OSError), locked(path) as is_stale:
+                    if is_stale:
                         shutil.rmtree(path, ignore_errors=True)
 
     def count_classes(self, names: Sequence[str], track: Track, process: ProcessRank = ProcessRank()) -> None:

@@ -184,8 +184,8 @@ def digest_of_files(source: Path) -> str:
     Contents are not read: thousands of scenes are looked at before a training begins.
     """
     if source.is_dir():
-        found = (Path(folder) / name for folder, _, names in os.walk(source) for name in names)
-        rows = sorted(f"{path.relative_to(source).as_posix()} {path.stat().st_size}" for path in found)
+        files = (Path(folder) / name for folder, _, names in os.walk(source) for name in names)
+        rows = sorted(f"{path.relative_to(source).as_posix()} {path.stat().st_size}" for path in files)
     else:
         rows = [str(source.stat().st_size)] if source.exists() else []
     return hashlib.sha256("\n".join(rows).encode()).hexdigest()[:16] if rows else ""

@@ -180,8 +180,8 @@ def _as_float16(
 ) -> Float16[np.ndarray, "n channels"]:
     """Integers times the scales of their columns. In torch, which converts to float16 several times faster than numpy,
     and in blocks that stay in the cache."""
-    result, given, factors = np.empty(integers.shape, np.float16), torch.from_numpy(integers), torch.from_numpy(scales)
+    result, values, factors = np.empty(integers.shape, np.float16), torch.from_numpy(integers), torch.from_numpy(scales)
     rows = torch.from_numpy(result)
     for start in range(0, len(integers), BLOCK_ROWS):
-        rows[start : start + BLOCK_ROWS] = given[start : start + BLOCK_ROWS].float().mul_(factors)
+        rows[start : start + BLOCK_ROWS] = values[start : start + BLOCK_ROWS].float().mul_(factors)
     return result

@@ -22,7 +22,7 @@ from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.text.build import Words, closed_table
 from gsencoder.text.table import TextTable
-from gsencoder.train.adapter_heads import asked_heads, dataset_heads, render_heads, teacher_of_heads
+from gsencoder.train.adapter_heads import dataset_heads, render_heads, required_heads, teacher_of_heads
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, check_same_teachers
 from gsencoder.train.crops import SamplingConfig
@@ -34,7 +34,8 @@ from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
 from gsencoder.train.source import SourceConfig
-from gsencoder.train.trainer import CHANGEABLE_ON_RESUME, TrainerConfig, ValidationResult
+from gsencoder.train.trainer import ValidationResult
+from gsencoder.train.trainer_config import CHANGEABLE_ON_RESUME, TrainerConfig
 from gsencoder.train.training_scene import TrainingScene
 
 SceneValidator = Callable[
@@ -160,7 +161,7 @@ def train(
                 config,
                 prepared_folder,
                 voxel=voxel,
-                heads=asked_heads(config.heads, config.teachers_by_name),
+                heads=required_heads(config.heads, config.teachers_by_name),
                 process=process,
                 device=chosen_device,
                 track=track,
@@ -283,12 +284,12 @@ def _check_trained(losses: LossConfig, weights: Sequence[float], with_contrast: 
     ]
     if not untrained:
         return
-    given = f"loss.teacher_weights={list(weights)}"
+    option = f"loss.teacher_weights={list(weights)}"
     if len(untrained) == len(weights):
-        raise InputError(f"loss: the losses of every teacher have the weight 0 ({given}); give one of them a weight")
+        raise InputError(f"loss: the losses of every teacher have the weight 0 ({option}); give one of them a weight")
     names = f"teacher {untrained[0]}" if len(untrained) == 1 else f"teachers {', '.join(untrained)}"
     warnings.warn(
-        f"{names}: no loss is computed with a weight above 0 ({given}), so that the encoder gives features that were "
+        f"{names}: no loss is computed with a weight above 0 ({option}), so that the encoder gives features that were "
         "never trained; give a weight above 0, or leave the teacher out",
         SceneWarning,
         stacklevel=3,
@@ -324,8 +325,8 @@ def resume_settings(
     prepared = {name: dataset.settings for name, dataset in datasets.items()}
     if len(datasets) == 1:
         # The form of runs of earlier versions, which had one teacher and can be resumed.
-        (space,), (made_with,) = spaces.values(), prepared.values()
-        of_teachers: dict[str, Any] = {"space": space, "prepared": made_with}
+        (space,), (of_preparation,) = spaces.values(), prepared.values()
+        of_teachers: dict[str, Any] = {"space": space, "prepared": of_preparation}
     else:
         # The order, which a mapping does not state when it is compared, is that of the columns.
         scenes = {name: [each.name for each in dataset.scenes(training)] for name, dataset in datasets.items()}

@@ -90,8 +90,8 @@ def sampled_moments(
                 number: _block(blocks[number], open_scene, space, files[number], optional=optional)
                 for number in track(share, "fitting the basis")
             }
-        made = {number: block for of_process in values_of_all(computed) for number, block in of_process.items()}
-        in_order = [made[number] for number in range(len(blocks))]
+        by_number = {number: block for of_process in values_of_all(computed) for number, block in of_process.items()}
+        in_order = [by_number[number] for number in range(len(blocks))]
         every += zip(files, blocks, in_order, strict=True)
         for block in in_order:
             kinds |= dict.fromkeys(block.kinds)
@@ -108,10 +108,10 @@ def _block(
     requests: list[MapRequest], open_scene: OpenScene, space: FeatureSpace, file: Path | None, *, optional: bool
 ) -> Block:
     """Computes a block and writes its file, unless the file is there."""
-    made_of = {"requests": plain(requests), "space": plain(space)}
+    key = {"requests": plain(requests), "space": plain(space)}
     if file is not None and file.is_file():
         with advised(f"remove {file.parent} to compute them again"), open_archive(file) as archive:
-            if all(archive.value(name, list, dict) == value for name, value in made_of.items()):
+            if all(archive.value(name, list, dict) == value for name, value in key.items()):
                 answers = [
                     MapAnswer(views=tuple(views), missing=missing) for views, missing in archive.value("answers", list)
                 ]
@@ -127,7 +127,7 @@ def _block(
     if file is None:
         return Block(answers=answers, kinds=tuple(kinds), moments=moments)
     header: dict[str, Any] = {
-        **made_of,
+        **key,
         "answers": [[list(answer.views), answer.missing] for answer in answers],
         "kinds": list(kinds),
     }

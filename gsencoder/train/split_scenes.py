@@ -52,12 +52,12 @@ def split_scenes(
     return training, [path for path in paths if path.name in held_out]
 
 
-def _names_of(option: str, file: Path | None, given: Sequence[str]) -> tuple[str, ...]:
+def _names_of(option: str, file: Path | None, scenes: Sequence[str]) -> tuple[str, ...]:
     """The names in a split file, none without a file; all must be among those given."""
     if file is None:
         return ()
-    chosen, known = read_split(file), frozenset(given)
-    missing = [name for name in chosen if name not in known]
+    chosen, possible = read_split(file), frozenset(scenes)
+    missing = [name for name in chosen if name not in possible]
     if missing:
         raise InputError(
             f"{option}={file}: {len(missing)} of its {len(chosen)} scenes are not among those given, such as "

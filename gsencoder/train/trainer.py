@@ -2,22 +2,20 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float64
-from torch import Tensor, nn
+from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import Log
 from gsencoder.core.runtime.device import autocast_dtype
-from gsencoder.core.runtime.device_names import Precision
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.signals import defer_signals, stop_of
 from gsencoder.core.runtime.threads import threads_of_torch
@@ -26,87 +24,18 @@ from gsencoder.train import distributed
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.data_workers import automatic_workers, lost_workers, start_worker
 from gsencoder.train.distributed import (
-    STOPPED_ELSEWHERE,
     check_agreement,
     digest_of,
     digest_of_weights,
     fail_together,
     lost_processes,
-    sum_over_processes,
 )
+from gsencoder.train.objective import NO_WEIGHT, Objective, TrainingBatch, finite_terms, sum_divisors
 from gsencoder.train.samples import StepSampler
+from gsencoder.train.trainer_config import TrainerConfig
 
-CHANGEABLE_ON_RESUME = (
-    "workers",
-    "prefetch",
-    "log_every",
-    "validate_every",
-    "checkpoint_every",
-    "compile",
-    "accumulate",
-)
-"""Settings of the loop that a resumed run may change, since they do not change the result of a step."""
 SAMPLE_THREADS = 4
 """Threads while a sample is made in the training process: its arrays are small, and sixteen take 3 times as long."""
-NO_WEIGHT = 1e-12
-"""Divisor of a term that nothing in a step has a weight for."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrainerConfig:
-    """Settings of the training loop."""
-
-    steps: int = field(default=2000, metadata={"help": "optimizer steps"})
-    batch: int = field(default=1, metadata={"help": "samples per micro-batch"})
-    accumulate: int = field(
-        default=1, metadata={"help": "micro-batches per process and step, whose gradients are accumulated"}
-    )
-    learning_rate: float = field(default=2e-3, metadata={"help": "highest learning rate"})
-    final_rate: float = field(default=0.01, metadata={"help": "learning rate at the end, as a fraction of the highest"})
-    warmup: int = field(default=100, metadata={"help": "steps of linear warm-up of the learning rate"})
-    weight_decay: float = field(default=0.05, metadata={"help": "weight decay of matrices; norms and biases have none"})
-    clip: float = field(default=1.0, metadata={"help": "norm to which the gradient is clipped; 0 = no clipping"})
-    precision: Precision = field(
-        default="auto",
-        metadata={
-            "help": "floating-point type of the network; auto = bfloat16 on a CPU with AMX, else float32 (on a GPU "
-            "bfloat16 suits model=base)"
-        },
-    )
-    workers: int | None = field(
-        default=None,
-        metadata={
-            "help": "number of processes that make samples; 0 = make them in the training process, null = that "
-            "without a GPU, else one a core, at most 8, as far as /dev/shm has 1 GiB for each"
-        },
-    )
-    prefetch: int = field(
-        default=2,
-        metadata={"help": "batches that each of these processes makes ahead; each is held in shared memory (/dev/shm)"},
-    )
-    seed: int = field(default=0, metadata={"help": "seed of all random numbers"})
-    log_every: int = field(default=10, metadata={"help": "steps per row of the log, over which losses are averaged"})
-    validate_every: int = field(default=500, metadata={"help": "steps between validations; 0 = only at the end"})
-    checkpoint_every: float = field(default=300.0, metadata={"help": "seconds between checkpoints"})
-    compile: bool = field(default=False, metadata={"help": "compile the network with torch.compile"})
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch", "accumulate", "log_every", "prefetch"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
-        for name in ("warmup", "weight_decay", "clip", "workers", "seed", "validate_every", "checkpoint_every"):
-            if not 0 <= (getattr(self, name) or 0) < math.inf:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        if self.seed >= 1 << 63:
-            raise InputError(f"seed: expected a number below 2⁶³, got {self.seed}")
-        if not 0 < self.learning_rate < math.inf:
-            raise InputError(f"learning_rate: expected a positive number, got {self.learning_rate}")
-        if not 0 <= self.final_rate <= 1:
-            raise InputError(f"final_rate: expected a number in [0, 1], got {self.final_rate}")
-
-    def samples_per_step(self, processes: int) -> int:
-        """The number of samples of one optimizer step over all processes."""
-        return self.batch * self.accumulate * processes
 
 
 class ValidationResult(NamedTuple):
@@ -119,48 +48,6 @@ class ValidationResult(NamedTuple):
 
     scores: Mapping[str, float]
     pictures: Mapping[str, np.ndarray] = {}
-
-
-@runtime_checkable
-class TrainingBatch(Protocol):
-    """A batch of samples.
-
-    Attributes:
-        names: of the samples, for messages.
-    """
-
-    @property
-    def names(self) -> Sequence[str]: ...
-
-    def to(self, device: torch.device) -> "TrainingBatch": ...
-
-
-@runtime_checkable
-class Objective(Protocol):
-    """The loss of a network as weighted terms. Each is, in a step, Σ total / Σ divisor over all micro-batches of all
-    processes.
-
-    Attributes:
-        network: that is called, possibly compiled or wrapped for several processes.
-        lambdas: the weights of the terms that are not 0, by name.
-        advice: what to check where no term has a divisor above 0, for the error.
-    """
-
-    network: nn.Module
-
-    @property
-    def lambdas(self) -> dict[str, float]: ...
-
-    @property
-    def advice(self) -> str: ...
-
-    def divisors(self, batch: Any) -> dict[str, float]:
-        """The sum of the weights of a batch's rows, for each term."""
-        ...
-
-    def __call__(self, batch: Any) -> dict[str, Tensor]:
-        """The totals of the terms whose weight is not 0."""
-        ...
 
 
 class Trainer:
@@ -336,13 +223,13 @@ class Trainer:
             items: micro-batches of this process, or the errors of their samples.
         """
         self.optimizer.zero_grad(set_to_none=True)
-        rate = self.rate_at(step)
+        rate = self.config.rate_at(step)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.network.train()
-        batches, divisors = self._sum_divisors(items)
+        batches, divisors = sum_divisors(self.objective, items, self.device)
         lambdas = self.objective.lambdas
-        micro_losses = []
+        micro_terms = []
         for micro, batch in enumerate(batches):
             self._seed((step * len(batches) + micro) * self.process.world_size + self.process.rank)
             if self._parallel is not None:
@@ -353,38 +240,14 @@ class Trainer:
             loss = (shares * shares.new_tensor(list(lambdas.values()))).sum()
             # DistributedDataParallel averages gradients over processes; the step needs their sum.
             (loss * self.process.world_size).backward()
-            micro_losses.append(shares.detach().double())
+            micro_terms.append(shares.detach().double())
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), self.config.clip or math.inf).item()
-        totals = self._finite_totals(step, batches, torch.stack(micro_losses), norm)
-        losses = dict(zip(lambdas, totals, strict=True))
+        losses = finite_terms(
+            step, batches, list(lambdas), torch.stack(micro_terms), norm, processes=self.process.world_size
+        )
         total = sum(lambdas[name] * loss for name, loss in losses.items())
         losses = {name: loss for name, loss in losses.items() if divisors[name] > NO_WEIGHT}
         return {"loss": total, **losses, "gradient": norm, "learning_rate": rate}
-
-    def _sum_divisors(self, items: list[Any]) -> tuple[list[TrainingBatch], dict[str, float]]:
-        """Separates the batches of a step from errors, and sums the divisors of its loss terms over all processes.
-
-        Raises:
-            InputError: a sample could not be made, here or on another process, or no term has a weight.
-        """
-        batches = [item for item in items if not isinstance(item, InputError)]
-        lambdas = self.objective.lambdas
-        batch_divisors = [self.objective.divisors(batch) for batch in batches]
-        sums = [sum(divisors[name] for divisors in batch_divisors) for name in lambdas]
-        failed = len(items) - len(batches)
-        totals = sum_over_processes(torch.tensor([*sums, failed], dtype=torch.float64, device=self.device)).tolist()
-        for item in items:
-            if isinstance(item, InputError):
-                raise item
-        if totals[-1]:
-            raise InputError(STOPPED_ELSEWHERE)
-        if not any(totals[:-1]):
-            names = "; ".join(name for batch in batches for name in batch.names)
-            raise InputError(
-                f"training: there is nothing to compare in {names}: no Gaussian has a target with a weight, and no "
-                f"cell of the teacher passes the thresholds; check {self.objective.advice}, and these scenes"
-            )
-        return batches, {name: max(total, NO_WEIGHT) for name, total in zip(lambdas, totals, strict=False)}
 
     def _seed(self, number: int) -> None:
         """Seeds the network's random numbers by the number of the micro-batch in the run, so that a resumed run repeats
@@ -396,45 +259,6 @@ class Trainer:
             torch.default_generator.manual_seed(seed)
         else:
             torch.manual_seed(seed)
-
-    def _finite_totals(
-        self, step: int, batches: list[TrainingBatch], micro_losses: Float64[Tensor, "micro terms"], norm: float
-    ) -> list[float]:
-        """The loss terms of the step over all processes.
-
-        Raises:
-            InputError: a loss of any process, or the gradient, is not finite.
-        """
-        bad_loss = bad_gradient = ""
-        for batch, row in zip(batches, micro_losses.tolist(), strict=True):
-            for name, value in zip(self.objective.lambdas, row, strict=True):
-                if not math.isfinite(value):
-                    bad_loss = bad_loss or f"the {name} loss of {'; '.join(batch.names)}"
-        if not bad_loss and not math.isfinite(norm):
-            # Gradients are already summed over processes, so samples of any of them may be the cause.
-            names = "; ".join(name for batch in batches for name in batch.names)
-            bad_gradient = (
-                f"the gradient of {names}{' or of samples of other processes' if self.process.world_size > 1 else ''}"
-            )
-        flags = micro_losses.new_tensor([float(bool(bad_loss)), float(bool(bad_gradient))])
-        *totals, bad_losses, bad_gradients = sum_over_processes(torch.cat((micro_losses.sum(dim=0), flags))).tolist()
-        if bad_losses or bad_gradients:
-            # A loss identifies the samples that cause it; the gradient is named only if all losses are finite.
-            where = bad_loss or ("a loss of another process" if bad_losses else bad_gradient)
-            raise InputError(
-                f"training: {where} is not finite at step {step}; parameters were not changed. Use a lower "
-                "learning_rate, or check these scenes (`gsencoder inspect`)"
-            )
-        return totals
-
-    def rate_at(self, step: int) -> float:
-        """The learning rate of a step: linear warm-up, then a half cosine down to `final_rate`."""
-        config = self.config
-        if step < config.warmup:
-            return config.learning_rate * (step + 1) / config.warmup
-        progress = (step - config.warmup) / max(config.steps - config.warmup, 1)
-        final = config.final_rate
-        return config.learning_rate * (final + (1 - final) * 0.5 * (1 + math.cos(math.pi * progress)))
 
     def _run_validation(self, step: int) -> dict[str, float]:
         """Validates in all processes; returns the columns of the log, which are empty on all but the first."""

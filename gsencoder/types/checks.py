@@ -10,27 +10,27 @@ UNIT_TOLERANCE = 1e-3
 """How far from 1 the norm of a quaternion, and from 0 an entry of RᵀR − I, may be."""
 
 
-def fail(owner: str, name: str, wanted: str, got: str) -> None:
-    raise InputError(f"{owner}.{name}: expected {wanted}, got {got}")
+def fail(owner: str, name: str, expected: str, got: str) -> None:
+    raise InputError(f"{owner}.{name}: expected {expected}, got {got}")
 
 
 def check_array(owner: str, name: str, array: object, dtype: str, shape: tuple[int | str, ...]) -> None:
-    wanted = f"{dtype}[{', '.join(map(str, shape))}]"
+    expected = f"{dtype}[{', '.join(map(str, shape))}]"
     if not isinstance(array, np.ndarray):
-        fail(owner, name, wanted, type(array).__name__)
+        fail(owner, name, expected, type(array).__name__)
         return
     same = array.ndim == len(shape) and all(
         isinstance(want, str) or want == got for want, got in zip(shape, array.shape, strict=True)
     )
     if array.dtype != np.dtype(dtype) or not same:
-        fail(owner, name, wanted, f"{array.dtype}[{', '.join(map(str, array.shape))}]")
+        fail(owner, name, expected, f"{array.dtype}[{', '.join(map(str, array.shape))}]")
 
 
-def check_rows(owner: str, name: str, good: np.ndarray, wanted: str, values: np.ndarray) -> None:
+def check_rows(owner: str, name: str, good: np.ndarray, expected: str, values: np.ndarray) -> None:
     """Fails naming the first bad row and how many there are."""
     if not good.all():
         bad = np.flatnonzero(~good)
-        fail(owner, name, wanted, f"{values[bad[0]].tolist()} in row {bad[0]} ({bad.size} bad of {good.size} rows)")
+        fail(owner, name, expected, f"{values[bad[0]].tolist()} in row {bad[0]} ({bad.size} bad of {good.size} rows)")
 
 
 def check_finite(owner: str, name: str, array: np.ndarray) -> None:

@@ -13,10 +13,11 @@ from safetensors.numpy import save
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic
-from gsencoder.core.files.archive import _write_safetensors, write_archive
+from gsencoder.core.files.archive import write_archive
 from gsencoder.core.files.atomic import atomic_file, locked
 from gsencoder.core.files.json_values import write_bytes
 from gsencoder.core.files.picture_file import write_picture
+from gsencoder.core.files.safetensors_bytes import write_safetensors
 
 KILLED = """
 import os, signal, sys
@@ -122,7 +123,7 @@ def test_archives_are_the_bytes_that_safetensors_writes(tmp_path: Path, rng: np.
     }
     for each in ({}, arrays, dict(list(arrays.items())[5:6])):
         text = {"gsencoder": '{"é": "\\n\u2028"}'}
-        _write_safetensors(tmp_path / "a", each, text)
+        write_safetensors(tmp_path / "a", each, text)
         assert (tmp_path / "a").read_bytes() == save(each, text)
     write_archive(tmp_path / "b", {"a": np.arange(12).reshape(3, 4).T}, {})
     assert names(tmp_path) == ["a", "b"]

@@ -46,9 +46,9 @@ def test_a_negative_seed_is_refused_with_a_promise_and_without() -> None:
 
 
 def test_the_order_of_promises_is_that_of_all_commands_and_not_that_of_the_fields() -> None:
-    assert SmallBudget(megabytes=1, error=0.1).given == ("error", "megabytes")
-    assert SmallBudget(megabytes=1).given == ("megabytes",)
-    assert SmallBudget().given == ()
+    assert SmallBudget(megabytes=1, error=0.1).promised == ("error", "megabytes")
+    assert SmallBudget(megabytes=1).promised == ("megabytes",)
+    assert SmallBudget().promised == ()
 
 
 def test_a_conflict_names_both_promises_what_is_needed_and_which_one_wins() -> None:

@@ -9,17 +9,9 @@ from PIL import Image
 from scene_files import photograph, save
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.images import (
-    DepthFiles,
-    DepthSensor,
-    ImageFiles,
-    InstanceFiles,
-    PixelGrid,
-    picture_info,
-    picture_size,
-    read_integers,
-    read_rgba,
-)
+from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
+from gsencoder.data.readers.image_file import picture_info, picture_size, read_integers, read_rgba
+from gsencoder.data.readers.images import ImageFiles, InstanceFiles, PixelGrid
 from gsencoder.data.readers.masks import MaskFiles
 from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
 

@@ -11,7 +11,8 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.layouts import LAYOUTS, layout_of
 from gsencoder.data.readers.registration import register_depth
 from gsencoder.data.readers.tum import nearest_within
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.types import Scene, Views
 

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from scene_files import save
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.images import DepthFiles, DepthSensor, ImageFiles, PixelGrid
+from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
+from gsencoder.data.readers.images import ImageFiles, PixelGrid
 from gsencoder.data.readers.masks import MaskFiles
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, build_remap, check_camera, pinhole_for
 

@@ -15,8 +15,10 @@ import torch
 from gsencoder.core.errors import InputError
 from gsencoder.train import distributed
 from gsencoder.train.distill import encoder_trainer
+from gsencoder.train.trainer_config import TrainerConfig
 
 torch.set_num_threads(1)
+rate_at = TrainerConfig.rate_at
 folder, rank, began = Path(sys.argv[1]), int(os.environ["RANK"]), 0.0
 
 def train(how, process, device):
@@ -31,15 +33,13 @@ def train(how, process, device):
     trainer = encoder_trainer(
         network, samples(dataset, names), LOSSES, SHORT, folder=work, settings=settings, process=process, device=device
     )
-    rate_at = trainer.rate_at
-
-    def lost(step):
+    def lost(config, step):
         if step == 2 and rank and how in ("dies", "hangs"):
             (folder / "lost").touch()
             os._exit(9) if how == "dies" else time.sleep(60)
-        return rate_at(step)
+        return rate_at(config, step)
 
-    trainer.rate_at = lost
+    TrainerConfig.rate_at = lost
     trainer.run()
 
 distributed.STEP_MINUTES = 1 / 30
@@ -47,10 +47,10 @@ for how in sys.argv[2:]:
     said = "ended"
     try:
         if how == "settings":
-            with distributed.join_processes("cpu", asked={"steps": rank, "quiet": bool(rank)}):
+            with distributed.join_processes("cpu", settings={"steps": rank, "quiet": bool(rank)}):
                 pass
         elif not torch.distributed.is_initialized():
-            with distributed.join_processes("cpu", asked={"steps": 3, "quiet": bool(rank)}) as (process, device):
+            with distributed.join_processes("cpu", settings={"steps": 3, "quiet": bool(rank)}) as (process, device):
                 train(how, process, device)
         else:
             with distributed.lost_processes(process := distributed.rank_from_environment(os.environ)[0]):

@@ -8,7 +8,7 @@ from fixed_teachers import EXACT, FixedTeacher, make_scene
 
 from gsencoder.fusion.coverage.covering import covering_views
 from gsencoder.fusion.coverage.order import view_order
-from gsencoder.fusion.coverage.sight import look, pixels_of
+from gsencoder.fusion.coverage.sight import pixels_of, trace_sight
 from gsencoder.fusion.fuse import chosen_views, fuse
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
 from gsencoder.render import BlendConfig, blend
@@ -24,7 +24,7 @@ def test_rays_that_are_followed_have_the_weights_of_b(depth: bool, rng: np.rando
     assert scene.views is not None
     config = BlendConfig(stop_transmittance=1e-6)
     visibility = VisibilityConfig(against=("sensor",), relative=0.2) if depth else OPEN
-    sight = look(scene.gaussians, scene.views, pixels_of(scene.views), visibility, config)
+    sight = trace_sight(scene.gaussians, scene.views, pixels_of(scene.views), visibility, config)
     assert sight.followed > 50
     for view, rays in enumerate(sight.rays):
         b = blend(scene.gaussians, scene.views.cameras, view, config=config)
@@ -75,7 +75,7 @@ def test_views_are_judged_by_gaussians_that_they_were_not_chosen_by() -> None:
     splat, views = scene.gaussians, scene.views
     assert splat is not None
     assert views is not None
-    sight = look(splat, views, pixels_of(views), OPEN, BlendConfig(), size=100)
+    sight = trace_sight(splat, views, pixels_of(views), OPEN, BlendConfig(), size=100)
     choosing, judging = sight.halves()
     first, second = (set(each.sample[: each.singles].tolist()) for each in (choosing, judging))
     assert (len(first), len(second), first & second) == (50, 50, set())
@@ -85,6 +85,6 @@ def test_views_are_judged_by_gaussians_that_they_were_not_chosen_by() -> None:
         columns = [sight.sample[:100].tolist().index(row) for row in each.sample[: each.singles]]
         np.testing.assert_array_equal(each.weights[:, : each.singles], sight.weights[:, columns])
         np.testing.assert_array_equal(each.areas[:, each.singles :], sight.areas[:, 100:])
-    whole = look(splat, views, pixels_of(views), OPEN, BlendConfig())
+    whole = trace_sight(splat, views, pixels_of(views), OPEN, BlendConfig())
     assert whole.complete
     assert whole.halves() == (whole, whole)

@@ -15,7 +15,7 @@ from scene_files import save
 from text_towers import save_graph, save_tokenizer
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.images import read_integers
+from gsencoder.data.readers.image_file import read_integers
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teachers import MissingInput, Teacher

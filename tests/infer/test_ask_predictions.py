@@ -10,7 +10,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.truth.caption_text import wrapped_caption
 from gsencoder.data.truth.entries import box_corners
 from gsencoder.infer.ask.ask import Question
-from gsencoder.infer.ask.predictions import predictions, said, short_answer, target_corners
+from gsencoder.infer.ask.predictions import answer_text, predictions, short_answer, target_corners
 from gsencoder.infer.ask.question_sets import QuestionSet, caption_question, is_question_set, read_question_set
 
 
@@ -35,7 +35,7 @@ def read(folder: Path, content: Any, **settings: Any) -> QuestionSet:
 
 def test_the_meant_box_comes_first_and_the_others_in_their_order(tmp_path: Path) -> None:
     (question,) = read(tmp_path, [described(4)]).questions
-    assert question.asked.id == "a/4/0"
+    assert question.question.id == "a/4/0"
     targets = [target(0), target(5), target(9)]
     for mark, order in ((1, (0, 5, 9)), (2, (5, 0, 9)), (3, (9, 0, 5))):
         (row,) = predictions("scanrefer", [(question, {"mark": mark, "targets": targets})])
@@ -55,7 +55,7 @@ def test_answers_have_the_box_of_the_best_target_and_unanswered_descriptions_com
 def test_captions_of_scenes_keep_their_boxes_and_the_even_probabilities_of_eighteen_classes() -> None:
     keyed = caption_question("b", "7", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {"obj_prob": [0.5, 0.5]})
     bare = caption_question("a", "0", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {})
-    assert (keyed.scene, keyed.asked.id, keyed.asked.question.task) == ("b", "b/7", "caption")
+    assert (keyed.scene, keyed.question.id, keyed.question.question.task) == ("b", "b/7", "caption")
     rows = predictions(
         "scan2cap",
         [
@@ -83,17 +83,17 @@ def test_each_object_is_captioned_once_in_its_own_box_and_only_in_scenes_that_ar
         described(4, "b", bbox=corners(9)),
     ]
     asked = read(tmp_path, rows, task="caption")
-    assert [(each.scene, each.asked.id, each.asked.question.aabb) for each in asked.questions] == [
+    assert [(each.scene, each.question.id, each.question.question.aabb) for each in asked.questions] == [
         ("a", "a/4", (4.0, 0.0, -1.0, 5.0, 2.0, 3.0)),
         ("a", "a/2", (2.0, 0.0, -1.0, 3.0, 2.0, 3.0)),
         ("b", "b/4", (9.0, 0.0, -1.0, 10.0, 2.0, 3.0)),
     ]
     assert asked.scenes() == {"a": 2, "b": 1}
-    assert [each.asked.id for each in asked.of_scene("a")] == ["a/4", "a/2"]
+    assert [each.question.id for each in asked.of_scene("a")] == ["a/4", "a/2"]
     boxes = tmp_path / "boxes.json"
     boxes.write_text(json.dumps({"c": [{"box": corners(1)}], "b": [{"box": corners(3)}, {"box": corners(8)}]}))
     proposed = read(tmp_path, rows, task="caption", proposals=str(boxes))
-    assert [(each.asked.id, each.asked.question.aabb) for each in proposed.questions] == [
+    assert [(each.question.id, each.question.question.aabb) for each in proposed.questions] == [
         ("b/0", (3.0, 0.0, -1.0, 4.0, 2.0, 3.0)),
         ("b/1", (8.0, 0.0, -1.0, 9.0, 2.0, 3.0)),
     ]
@@ -112,11 +112,11 @@ def test_questions_without_a_situation_are_named_by_their_id_alone(tmp_path: Pat
     content = {"questions": [{"scene_id": "a", "situation": "I sit.", "question": "Left?", "question_id": 3}]}
     (question,) = read(tmp_path, content).questions
     assert question.keys == {"scene_id": "a", "question_id": "3", "situation": "I sit.", "question": "Left?"}
-    assert (question.scene, question.asked.id) == ("a", "3")
+    assert (question.scene, question.question.id) == ("a", "3")
     (question,) = read(tmp_path, [{"scene_id": "b", "question_id": "q", "question": "Left?"}]).questions
     assert question.keys == {"scene_id": "b", "question_id": "q"}
-    assert question.asked.question == Question(text="Left?")
-    assert [each.task for each in (read(tmp_path, [described(1)]).questions[0].asked.question,)] == ["ground"]
+    assert question.question.question == Question(text="Left?")
+    assert [each.task for each in (read(tmp_path, [described(1)]).questions[0].question.question,)] == ["ground"]
     with pytest.raises(InputError, match="task=answer or ground or caption|expected task="):
         read(tmp_path, content, task="ground")
 
@@ -140,7 +140,7 @@ def test_a_set_is_one_value_that_is_no_question(tmp_path: Path, text: str, one: 
 
 
 def test_what_was_said_is_on_one_line_and_loses_thoughts_and_the_last_stops() -> None:
-    assert said("<think>no</think>  A\n b. ") == "A b."
+    assert answer_text("<think>no</think>  A\n b. ") == "A b."
     assert short_answer("It is 3.5. ..") == "it is 3.5."
     assert short_answer("...") == ""
     assert wrapped_caption("it is. it is.") == "sos it is . it is . eos"

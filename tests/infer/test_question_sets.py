@@ -58,7 +58,7 @@ def test_questions_of_scanqa_are_answered(tmp_path: Path) -> None:
     assert asked.benchmark == "scanqa"
     assert asked.scenes() == {"a": 1, "b": 1}
     (first,) = asked.of_scene("a")
-    assert first.asked.question == Question(text="What is on the table?")
+    assert first.question.question == Question(text="What is on the table?")
     assert answers(asked, answer="<think>Hm.</think> A red Mug. ")[0] == {
         "scene_id": "a",
         "question_id": "q1",
@@ -71,7 +71,7 @@ def test_questions_of_scanqa_are_answered(tmp_path: Path) -> None:
 def test_situations_of_sqa3d_are_said_before_the_question(tmp_path: Path) -> None:
     asked = read(tmp_path, SQA3D)
     assert asked.benchmark == "sqa3d"
-    assert asked.questions[0].asked.question.text == "I sit. What is left?"
+    assert asked.questions[0].question.question.text == "I sit. What is left?"
     assert answers(asked, answer="Chair") == [
         {"scene_id": "a", "question_id": "220602000002", "situation": "I sit.", "question": "What is left?"}
         | {"answer": "chair"}
@@ -81,7 +81,7 @@ def test_situations_of_sqa3d_are_said_before_the_question(tmp_path: Path) -> Non
 def test_descriptions_of_scanrefer_are_grounded(tmp_path: Path) -> None:
     asked = read(tmp_path, SCANREFER)
     assert asked.benchmark == "scanrefer"
-    assert asked.questions[1].asked.question == Question(text="the cabinet 1", task="ground")
+    assert asked.questions[1].question.question == Question(text="the cabinet 1", task="ground")
     other = {"aabb_min": (5, 5, 5), "aabb_max": (6, 6, 6)}
     targets = [other, {"aabb_min": LOW, "aabb_max": HIGH}]
     keys = {"scene_id": "a", "object_id": "8", "ann_id": "1"}
@@ -98,7 +98,7 @@ def test_objects_of_scanrefer_are_captioned_once_each_in_the_boxes_of_the_file(t
     asked = read(tmp_path, SCANREFER, task="caption")
     assert asked.benchmark == "scan2cap"
     (question,) = asked.questions
-    assert question.asked.question == Question(task="caption", aabb=(*LOW, *HIGH))
+    assert question.question.question == Question(task="caption", aabb=(*LOW, *HIGH))
     (caption,) = answers(asked, answer="A cabinet. It is gray.")["a"]
     assert caption["caption"] == "sos a cabinet . it is gray . eos"
     np.testing.assert_allclose(caption["box"], box_corners(LOW, HIGH))
@@ -118,8 +118,8 @@ def test_boxes_of_another_file_stand_in_for_those_of_the_set(tmp_path: Path) -> 
     boxes.write_text(json.dumps({"a": [other, other], "c": [other]}))
     bare = [{key: value for key, value in row.items() if key != "bbox"} for row in SCANREFER]
     asked = read(tmp_path, bare, task="caption", proposals=str(boxes))
-    assert [each.asked.question.aabb for each in asked.questions] == [(5.0, 5.0, 5.0, 6.0, 6.0, 6.0)] * 2
-    assert len({each.asked.id for each in asked.questions}) == 2
+    assert [each.question.question.aabb for each in asked.questions] == [(5.0, 5.0, 5.0, 6.0, 6.0, 6.0)] * 2
+    assert len({each.question.id for each in asked.questions}) == 2
     localized = read(tmp_path, bare, task="caption", proposals="localize")
     assert localized.names == {"a": ("file cabinet",)}
     assert localized.scenes() == {"a": 1}

@@ -11,7 +11,8 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.anchor import Anchor, anchor_at
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
@@ -28,7 +29,7 @@ def held(length: float, config: OptimizeConfig = ALL) -> Optimizer:
 
 
 def strayed(one: Optimizer, anchor: Anchor) -> torch.Tensor:
-    return (one.raw["means"] - anchor.means).norm(dim=1) / anchor.reach
+    return (one.parameters["means"] - anchor.means).norm(dim=1) / anchor.reach
 
 
 @pytest.mark.usefixtures("no_jaxtyping")
@@ -62,7 +63,7 @@ def test_only_rows_in_view_are_pulled() -> None:
 @pytest.mark.slow
 def test_a_fitted_splat_stays_within_its_anchor_and_strays_without() -> None:
     free, bound = held(0), held(0.3)
-    anchor = anchor_at(free.raw, 0.3)
+    anchor = anchor_at(free.parameters, 0.3)
     kept = replace(PRUNED, at=())
     free.pruning = bound.pruning = kept
     for _ in range(30):
@@ -82,7 +83,7 @@ def test_a_anchor_is_pruned_with_its_gaussians_and_taken_up_with_them(tmp_path: 
     for _ in range(12):
         cut.advance()
     assert cut.anchor is not None
-    assert len(cut.raw["means"]) == len(cut.anchor.means) < len(held(0.3).raw["means"])
+    assert len(cut.parameters["means"]) == len(cut.anchor.means) < len(held(0.3).parameters["means"])
     assert strayed(cut, cut.anchor).max() < 3**0.5
     exposures = None if cut.exposures is None else cut.exposures.maps
     state = State(adam=cut.adam, anchor=cut.anchor, exposures=exposures, step=12, seconds=0.0, facts={})
@@ -92,5 +93,5 @@ def test_a_anchor_is_pruned_with_its_gaussians_and_taken_up_with_them(tmp_path: 
     again = Optimizer(found.adam, cut.photographs, cut.training, ALL, prune=PRUNED, step=12, **held_back)
     for _ in range(8):
         again.advance()
-    for name, value in whole.raw.items():
-        assert torch.equal(value, again.raw[name]), name
+    for name, value in whole.parameters.items():
+        assert torch.equal(value, again.parameters[name]), name

@@ -17,10 +17,11 @@ from gsencoder.reconstruct.budget import (
     choose_scale,
     plan_steps,
     step_seconds,
+    steps_for_minutes,
     trial_views,
-    wanted_steps,
 )
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
@@ -49,7 +50,7 @@ def test_small_photographs_stay_and_phone_photographs_are_made_smaller(monkeypat
     assert choose_scale(pictures(4000, 3000), ten, torch.device("cuda"), USUAL) > phone
     # What is chosen costs no more than there is time for.
     pixels = 4000 * 3000 * phone**2
-    assert wanted_steps(10.0, USUAL) * step_seconds(pixels, 60_000.0, CPU, USUAL) <= 600 * 0.81
+    assert steps_for_minutes(10.0, USUAL) * step_seconds(pixels, 60_000.0, CPU, USUAL) <= 600 * 0.81
 
 
 def test_cores_and_stages_count(monkeypatch: pytest.MonkeyPatch) -> None:

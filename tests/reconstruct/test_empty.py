@@ -12,7 +12,8 @@ from gsencoder.data.seeding.dense import DenseConfig, covered_share, densify
 from gsencoder.data.seeding.hull import outside_hull
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.losses import losses_of
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.report import describe
@@ -75,8 +76,8 @@ def test_what_floats_in_empty_space_fades_and_the_wall_stays(weight: float) -> N
     assert after.floating is not None
     assert before.floating > 0.8
     assert (after.floating < 0.3) == (weight > 0)
-    low = one.raw["means"][:, 1] > 0.3
-    assert float(one.raw["logit_opacities"][low].sigmoid().median()) > 0.5
+    low = one.parameters["means"][:, 1] > 0.3
+    assert float(one.parameters["logit_opacities"][low].sigmoid().median()) > 0.5
     line = describe({name: value for name, value in after._asdict().items() if value is not None})
     assert f"opacity {after.floating:.3f} in empty space" in line
 

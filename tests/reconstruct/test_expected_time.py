@@ -12,7 +12,8 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct import expected_time
 from gsencoder.reconstruct.expected_time import expected_seconds
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, Slopes
+from gsencoder.reconstruct.optimize import Optimizer, PhotographGradients
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
@@ -44,22 +45,22 @@ class Work:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
-        slopes, contributing = Optimizer.slopes, Optimizer.contributing
+        gradients, contributing = Optimizer.gradients, Optimizer.contributing
 
-        def timed_slopes(one: Optimizer, view: int, shrink: int) -> Slopes:
-            found = slopes(one, view, shrink)
+        def timed_gradients(one: Optimizer, view: int, shrink: int) -> PhotographGradients:
+            found = gradients(one, view, shrink)
             self.now += len(found.rows) / shrink**2
             return found
 
         def timed_contributing(one: Optimizer) -> torch.Tensor:
-            self.now += 3 * len(one.raw["means"])
+            self.now += 3 * len(one.parameters["means"])
             return contributing(one)
 
         def timed_score(one: Optimizer, views: list[int]) -> Score:
             self.now += 500 * len(views)
             return score(one, views)
 
-        monkeypatch.setattr(Optimizer, "slopes", timed_slopes)
+        monkeypatch.setattr(Optimizer, "gradients", timed_gradients)
         monkeypatch.setattr(Optimizer, "contributing", timed_contributing)
         monkeypatch.setattr(expected_time, "score", timed_score)
         monkeypatch.setattr(expected_time.time, "perf_counter", lambda: self.now)
@@ -68,10 +69,10 @@ class Work:
 def test_what_is_announced_is_the_work_that_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
     work, one = Work(monkeypatch), optimizer(splat())
     announced = expected_seconds(one, HELD_OUT, 3)
-    begun, before = work.now, len(one.raw["means"])
+    begun, before = work.now, len(one.parameters["means"])
     while one.step < CONFIG.steps:
         one.advance()
-    assert len(one.raw["means"]) < 0.7 * before
+    assert len(one.parameters["means"]) < 0.7 * before
     assert announced == pytest.approx(work.now - begun + 3 * 500, rel=0.15)
 
 
@@ -81,12 +82,12 @@ def test_every_pruning_is_announced_and_steps_after_the_first_are_of_what_it_lea
 ) -> None:
     """A step costs as many units as there are Gaussians, a quarter of it at half the size, and a pruning three."""
     work, one = Work(monkeypatch), optimizer(splat(), at=at)
-    before, left = len(one.raw["means"]), len(one.contributing())
+    before, left = len(one.parameters["means"]), len(one.contributing())
     assert left < 0.7 * before
 
     def step(one: Optimizer, shrink: int, view: int) -> None:
         assert view in TRAINING
-        work.now += len(one.raw["means"]) / shrink**2
+        work.now += len(one.parameters["means"]) / shrink**2
 
     monkeypatch.setattr(expected_time, "_step", step)
     steps = sum((before if step < at_step else left) / (4 if step < 6 else 1) for step in range(20))
@@ -98,7 +99,7 @@ def test_each_kind_of_work_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     work = Work(monkeypatch)
     one = optimizer(splat(), at=())
     steps = expected_seconds(one, [], 0)
-    rows = [len(one.slopes(view, 1).rows) for view in TRAINING[:4]]
+    rows = [len(one.gradients(view, 1).rows) for view in TRAINING[:4]]
     # Two stages: 6 steps of photographs of half the size, and 14 of the full size.
     assert steps == pytest.approx(np.mean(rows) * (6 / 4 + 14), rel=0.1)
     assert expected_seconds(one, HELD_OUT, 2) == pytest.approx(steps + 2 * 500)
@@ -123,8 +124,8 @@ def test_the_trial_changes_nothing() -> None:
     for _ in range(3):
         one.advance()
         other.advance()
-    for name, value in one.raw.items():
-        assert torch.equal(value, other.raw[name]), name
+    for name, value in one.parameters.items():
+        assert torch.equal(value, other.parameters[name]), name
     assert one.exposures is not None
     assert other.exposures is not None
     assert torch.equal(one.exposures.maps, other.exposures.maps)

@@ -12,8 +12,17 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
-from gsencoder.reconstruct.exposure import IDENTITY, ROUNDS, SAME, Exposures, apply_colors, fitted_colors, known_pixels
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.exposure import (
+    IDENTITY,
+    ROUNDS,
+    SAME,
+    Exposures,
+    apply_colors,
+    compared_pixels,
+    fitted_colors,
+)
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.report import describe_exposure
@@ -68,10 +77,10 @@ def test_pixels_that_are_masked_or_not_covered_do_not_count() -> None:
     spoiled = image.clone()
     spoiled[:6] = 0
     spoiled[:, :9] = 1
-    known = known_pixels(alpha, mask)
+    known = compared_pixels(alpha, mask)
     assert int(known.sum()) == 18 * 23
     torch.testing.assert_close(fitted_colors(render, spoiled, known), fitted_colors(render, image, known))
-    assert bool(known_pixels(alpha, None)[6:].all())
+    assert bool(compared_pixels(alpha, None)[6:].all())
 
 
 @pytest.mark.parametrize("value", [0.0, 0.3, 1.0])

@@ -44,7 +44,7 @@ class Placing:
         self.images = ""
         self.earlier: Placed | None = None
         self.placed = Placed(model=Path("model"), placed=("a.jpg", "b.jpg"), missing=missing, points=9, error=0.5)
-        monkeypatch.setattr(opening, "place_photographs", self.place)
+        monkeypatch.setattr(opening, "register_photographs", self.place)
         monkeypatch.setattr(opening, "load_placement", lambda *_: self.earlier)
         monkeypatch.setattr(opening, "load_scene", self.load)
 
@@ -58,7 +58,7 @@ class Placing:
 
 
 def test_poses_of_a_scene_are_taken_as_they_are(posed: Path, work: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opening, "place_photographs", None)
+    monkeypatch.setattr(opening, "register_photographs", None)
     opened = open_scene(posed, work)
     assert (opened.sfm, opened.photographs, opened.is_video) == (None, None, False)
     assert opened.scene.views is not None

@@ -16,7 +16,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import camera_of, gaussians_of, parameters_from, rows_in_view
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.reconstruct.row_adam import RowAdam
@@ -101,8 +102,8 @@ def test_a_signal_within_a_step_is_heard_after_it() -> None:
         cut.advance()
     whole.advance()
     assert (cut.step, cut.is_consistent) == (1, True)
-    for name, value in whole.raw.items():
-        assert torch.equal(value, cut.raw[name]), name
+    for name, value in whole.parameters.items():
+        assert torch.equal(value, cut.parameters[name]), name
 
 
 @pytest.mark.slow
@@ -124,8 +125,8 @@ def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None
     again = Optimizer(found.adam, cut.photographs, cut.training, QUICK, prune=NEVER, **carried_on)
     for _ in range(12):
         again.advance()
-    for name, value in whole.raw.items():
-        assert torch.equal(value, again.raw[name]), name
+    for name, value in whole.parameters.items():
+        assert torch.equal(value, again.parameters[name]), name
     with pytest.raises(InputError, match=r"run=1, and this run asks run=2; give resume=false"):
         load_state(tmp_path / "state", {"run": 2}, **asked)
     with pytest.raises(InputError, match=r"a state that no run was in \(step 8 of 7\)"):
@@ -159,7 +160,7 @@ def test_pruning_happens_when_it_is_due() -> None:
     counts = []
     for _ in range(40):
         one.advance()
-        counts.append(len(one.raw["means"]))
+        counts.append(len(one.parameters["means"]))
     assert counts[18] == len(start)
     assert counts[20] < len(start)
     assert all(len(moments["means"]) == counts[-1] for moments in (one.adam.averages, one.adam.squares))
@@ -186,17 +187,17 @@ def test_nothing_becomes_infinite_from_the_worst_of_starts() -> None:
     one = Optimizer(adam_of(start, config), photographs, range(4), config, prune=PruneConfig(at=(0.5,)))
     for _ in range(600):
         one.advance()
-    assert all(bool(torch.isfinite(value).all()) for value in one.raw.values())
+    assert all(bool(torch.isfinite(value).all()) for value in one.parameters.values())
     assert len(one.gaussians()) > 0
 
 
 def test_a_gradient_that_is_not_finite_stops_before_the_step() -> None:
     one = optimizer()
     one.photographs._images[one.view_at(0)] = torch.full((72, 96, 3), torch.nan)
-    before = {name: value.clone() for name, value in one.raw.items()}
+    before = {name: value.clone() for name, value in one.parameters.items()}
     with pytest.raises(InputError, match=r"the loss l1 is not finite at step 0, photograph 'view_\d.png'"):
         one.advance()
-    assert all(torch.equal(value, before[name]) for name, value in one.raw.items())
+    assert all(torch.equal(value, before[name]) for name, value in one.parameters.items())
 
 
 def test_masked_pixels_do_not_count() -> None:
@@ -211,7 +212,7 @@ def test_masked_pixels_do_not_count() -> None:
         one = Optimizer(adam_of(seeds(), config), photographs, range(4), config, prune=NEVER)
         for _ in range(4):
             one.advance()
-        raws.append(one.raw)
+        raws.append(one.parameters)
     for name, value in raws[0].items():
         torch.testing.assert_close(value, raws[1][name], rtol=1e-4, atol=1e-5)
 

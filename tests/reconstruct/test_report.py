@@ -6,7 +6,8 @@ from walls import wall_views
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.exposure import IDENTITY
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.report import MATCHED_GAIN, compare, describe, describe_plan
@@ -23,7 +24,7 @@ def optimizer() -> Optimizer:
 
 
 def test_a_plan_names_what_is_left_and_the_time_in_the_unit_that_is_read_most_easily(optimizer: Optimizer) -> None:
-    size = f"2 photographs of 96×72, {len(optimizer.raw['means']):,} Gaussians"
+    size = f"2 photographs of 96×72, {len(optimizer.parameters['means']):,} Gaussians"
     assert describe_plan(optimizer, 2000, 89.4) == f"{size}, 1,600 steps: about 89 s"
     assert describe_plan(optimizer, 2000, 90.0) == f"{size}, 1,600 steps: about 1.5 minutes"
     fewer = describe_plan(optimizer, 3000, 630.0)

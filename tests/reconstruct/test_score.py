@@ -9,7 +9,8 @@ from walls import wall_views
 
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam

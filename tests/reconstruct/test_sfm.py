@@ -19,7 +19,7 @@ def test_photographs_far_aside_are_placed_by_features_that_follow_slants(shared:
     work.mkdir()
     for path in sorted((plush / "images").iterdir())[:44:4]:
         shutil.copy(path, photographs)
-    found = sfm.place_photographs(photographs, work)
+    found = sfm.register_photographs(photographs, work)
     assert len(found.placed) >= 8
     assert not set(found.placed) & set(found.missing)
     truth = {
@@ -56,5 +56,5 @@ def test_a_second_look_is_taken_where_few_of_few_are_placed(tmp_path: Path, monk
         sizes.append(placed)
         # The models have nothing to be written with.
         with pytest.raises(AttributeError):
-            sfm.place_photographs(tmp_path / "photographs", tmp_path)
+            sfm.register_photographs(tmp_path / "photographs", tmp_path)
         assert looks == expected

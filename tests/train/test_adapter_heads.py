@@ -21,11 +21,11 @@ from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.train.adapter_heads import (
     FeatureDecoder,
-    asked_heads,
     dataset_heads,
     measure_dataset_heads,
     missing_heads,
     render_heads,
+    required_heads,
     teacher_of_heads,
 )
 from gsencoder.train.prepared_dataset import PreparedDataset
@@ -81,9 +81,9 @@ def test_heads_of_another_backbone_are_refused() -> None:
 
 def test_a_training_asks_for_the_heads_of_its_loss_and_for_those_that_are_stored_besides() -> None:
     teacher = RadioConfig(heads=("siglip", "clip"))
-    assert asked_heads(("sam", "siglip"), {"radio": teacher}) == ("sam", "siglip", "clip")
-    assert asked_heads((), {"palette": PaletteConfig()}) == ()
-    assert asked_heads((), {"palette": PaletteConfig(), "radio": teacher}) == ("siglip", "clip")
+    assert required_heads(("sam", "siglip"), {"radio": teacher}) == ("sam", "siglip", "clip")
+    assert required_heads((), {"palette": PaletteConfig()}) == ()
+    assert required_heads((), {"palette": PaletteConfig(), "radio": teacher}) == ("siglip", "clip")
 
 
 def test_heads_belong_to_the_one_teacher_that_has_some() -> None:

@@ -20,8 +20,8 @@ from training_scenes import (
 )
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.archive import first_difference
 from gsencoder.core.files.step_log import LOG_FILE, read_log
+from gsencoder.core.first_difference import first_difference
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import untracked
 from gsencoder.fusion.teachers import MissingInput

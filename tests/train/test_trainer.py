@@ -30,12 +30,8 @@ from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.trainer import (
-    Trainer,
-    TrainerConfig,
-    ValidationResult,
-    _parameter_groups,
-)
+from gsencoder.train.trainer import Trainer, ValidationResult, _parameter_groups
+from gsencoder.train.trainer_config import TrainerConfig
 
 pytestmark = pytest.mark.slow
 
@@ -358,9 +354,9 @@ def test_a_compiled_encoder_learns_the_same(
     np.testing.assert_allclose(losses(tmp_path / "compiled"), losses(tmp_path / "plain"), rtol=1e-4)
 
 
-def test_the_learning_rate_rises_and_falls(dataset: Prepared, tmp_path: Path) -> None:
-    one = trainer(dataset, tmp_path, replace(SHORT, steps=100, warmup=10, learning_rate=1.0, final_rate=0.1))
-    rates = [one.rate_at(step) for step in range(100)]
+def test_the_learning_rate_rises_and_falls() -> None:
+    config = TrainerConfig(steps=100, warmup=10, learning_rate=1.0, final_rate=0.1)
+    rates = [config.rate_at(step) for step in range(100)]
     assert rates[0] == pytest.approx(0.1)
     assert max(rates) == pytest.approx(1.0, abs=1e-2)
     assert rates[99] == pytest.approx(0.1, abs=1e-2)

@@ -11,7 +11,7 @@ from torch import nn
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.prompt_store import StoredPrompt
-from gsencoder.train.trainer import TrainerConfig
+from gsencoder.train.trainer_config import TrainerConfig
 from gsencoder.train.tuning import run, vlm
 from gsencoder.train.tuning.network import TERM, AnswerObjective
 from gsencoder.train.tuning.run import TuneConfig, check_pairs, open_processor, pairs_digest, tuning_training

@@ -142,8 +142,8 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
 
 def made_from(config: AskCommandConfig) -> dict[str, Any]:
     """Settings that answers depend on and the asker does not know."""
-    given = settings(config)
-    return {name: given[name] for name in ("space", "photos", "data")}
+    values = settings(config)
+    return {name: values[name] for name in ("space", "photos", "data")}
 
 
 def ask_file(
@@ -169,19 +169,19 @@ def ask_file(
     console(config.quiet).print(f"{out}: {counted(len(questions), 'question')}, {ANSWERS}")
 
 
-def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | None, summary: Summary) -> None:
+def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServer | None, summary: Summary) -> None:
     """Asks the questions of a benchmark about each scene that there are features of, and writes predictions.
 
     The features of one scene are in memory at a time. Questions that have no answer are counted and named, and so are
     scenes without features.
     """
-    out = config.out or Path("outputs") / asked.benchmark
-    wanted = asked.scenes()
-    folders = scene_folders(config.paths, wanted)
+    out = config.out or Path("outputs") / question_set.benchmark
+    question_counts = question_set.scenes()
+    folders = scene_folders(config.paths, question_counts)
     if not folders:
         raise InputError(
-            f"questions: {config.questions} asks about {counted(len(wanted), 'scene')} "
-            f"({listed(sorted(wanted), 3)}), and none of "
+            f"questions: {config.questions} asks about {counted(len(question_counts), 'scene')} "
+            f"({listed(sorted(question_counts), 3)}), and none of "
             f"them has features in {', '.join(config.paths)}"
         )
     target, clock, screen = Path(os.path.realpath(out)), Clock(), console(config.quiet)
@@ -200,14 +200,18 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
             name = asker.scene.name
             if name in counts:
                 raise InputError(f"{path}: holds features of scene {name}, and so does another folder; give one")
-            if name not in wanted:
+            if name not in question_counts:
                 counts[name] = 0
                 continue
-            questions = localized_captions(asker, asked.names[name]) if asked.names else asked.of_scene(name)
+            questions = (
+                localized_captions(asker, question_set.names[name])
+                if question_set.names
+                else question_set.of_scene(name)
+            )
             state = work.path / name
             state.mkdir(exist_ok=True)
             rows = ask_questions(
-                [each.asked for each in questions],
+                [each.question for each in questions],
                 asker,
                 server,
                 state,
@@ -219,20 +223,20 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
             (folder / name).mkdir()
             write_answers(folder / name, state, rows)
             by_id = {row["id"]: row for row in rows}
-            answered += [(each, by_id[each.asked.id]) for each in questions if each.asked.id in by_id]
-            silent += [each for each in questions if each.asked.id not in by_id]
+            answered += [(each, by_id[each.question.id]) for each in questions if each.question.id in by_id]
+            silent += [each for each in questions if each.question.id not in by_id]
             counts[name] = len(questions)
             screen.print(f"{name}: {len(rows)} of {len(questions)} questions")
         summary.add_seconds(clock.seconds)
         if not any(counts.values()):
             raise InputError(
-                f"questions: {config.questions} asks about {counted(len(wanted), 'scene')} "
-                f"({listed(sorted(wanted), 3)}), and "
+                f"questions: {config.questions} asks about {counted(len(question_counts), 'scene')} "
+                f"({listed(sorted(question_counts), 3)}), and "
                 f"there are features of others ({listed(sorted(counts), 3) or 'none'})"
             )
-        others = {name: count for name, count in wanted.items() if name not in counts}
+        others = {name: count for name, count in question_counts.items() if name not in counts}
         summary.results.update(
-            benchmark=asked.benchmark,
+            benchmark=question_set.benchmark,
             questions=sum(counts.values()),
             answered=len(answered),
             unanswered=unanswered,
@@ -241,7 +245,7 @@ def ask_set(config: AskCommandConfig, asked: QuestionSet, server: VlmServer | No
             other_scenes=others,
         )
         if server is not None:
-            entries = predictions(asked.benchmark, answered, silent)
+            entries = predictions(question_set.benchmark, answered, silent)
             write_json(folder / PREDICTIONS, entries)
             written = sum(map(len, entries.values())) if isinstance(entries, dict) else len(entries)
             summary.results.update(predictions=PREDICTIONS, predicted=written)

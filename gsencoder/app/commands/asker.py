@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from gsencoder.app.commands.query_words import asked_scene, load_words
+from gsencoder.app.commands.query_words import load_words, queried_scene
 from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.store.words import table_path
@@ -43,7 +43,7 @@ def load_asker(settings: AskerSettings, folder: Path, photos: str) -> Asker:
     """The scene of a folder of features, and what is asked about it is looked up with.
 
     Args:
-        settings: see there.
+        settings: settings.
         folder: of the features.
         photos: the scene that was fused, whose photographs are shown; empty = renders are.
     """
@@ -54,14 +54,14 @@ def asker_of(settings: AskerSettings, scene: Scene, folder: Path) -> Asker:
     """The asker of a scene that was loaded from a folder of features. A box can be asked about without words."""
     words: Words | None
     if settings.head:
-        scene, words = asked_scene(
-            scene, folder, head=settings.head, space=settings.space, given=settings.words, text=settings.text
+        scene, words = queried_scene(
+            scene, folder, head=settings.head, space=settings.space, words_file=settings.words, text=settings.text
         )
     else:
         space = select_features(scene, settings.space or None)[1].space
         stated = settings.words or not isinstance(settings.text, TableTextConfig)
-        known = stated or table_path(folder, space.text_encoder) is not None
-        words = load_words(folder, space, settings.words, settings.text) if known else None
+        has_words = stated or table_path(folder, space.text_encoder) is not None
+        words = load_words(folder, space, settings.words, settings.text) if has_words else None
     return Asker(
         scene,
         words,

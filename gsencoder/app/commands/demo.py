@@ -109,7 +109,7 @@ def write_page(path: Path, scene: Scene, one: TeacherResult, words: TextTable, c
     except InputError as error:
         return str(error)
     shown = replace(scene, features={one.features.space.name: one.features})
-    made = fitting_page(
+    page = fitting_page(
         bundle,
         [(shown, one.title, words)],
         config,
@@ -119,7 +119,7 @@ def write_page(path: Path, scene: Scene, one: TeacherResult, words: TextTable, c
         max_bytes=25 * 10**6,
     )
     with atomic_file(path) as stream:
-        stream.write(made.page)
+        stream.write(page.page)
     return ""
 
 

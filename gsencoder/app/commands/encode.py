@@ -17,7 +17,8 @@ from gsencoder.app.settings.config import CommonConfig, settings, typed
 from gsencoder.core.errors import InputError, SceneWarning, about
 from gsencoder.core.files.model_files import digest_files
 from gsencoder.core.runtime.heap import retain_freed_memory
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
@@ -150,10 +151,10 @@ def _encode_into(
     assert scene.gaussians is not None
     unit = unit_of(scene, encoder.voxel)
     teachers = requested_teachers(encoder, config.spaces)
-    made: BudgetEncoding | None = None
-    if config.budget.given:
-        made = encode_in_budget(scene, encoder, teachers, config, made_with, summary, metres_per_unit=unit)
-        by_teacher, encoding = made.features, made.setting.config
+    budgeted: BudgetEncoding | None = None
+    if config.budget.promised:
+        budgeted = encode_in_budget(scene, encoder, teachers, config, made_with, summary, metres_per_unit=unit)
+        by_teacher, encoding = budgeted.features, budgeted.setting.config
     else:
         with summary.step("encode"):
             by_teacher = encoder.encode_spaces(
@@ -177,9 +178,9 @@ def _encode_into(
         save_features(folder, scene, by_teacher, {"encode": settings(encoding), **made_with})
         save_tables(folder, {name: encoder.tables[name] for name in by_teacher if name in encoder.tables}, by_teacher)
     lines = []
-    if made is not None:
+    if budgeted is not None:
         files = [folder / str(each["features"]) for each in figures.values()]
-        lines = check_promises(made, scene, encoder, files, config, summary, metres_per_unit=unit)
+        lines = check_promises(budgeted, scene, encoder, files, config, summary, metres_per_unit=unit)
     first = next(iter(by_teacher.values()))
     summary.results.update(
         gaussians=len(first),
@@ -228,10 +229,10 @@ def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Enc
 
     if scene.views is None:
         raise InputError("basis_views: the scene has no views in which the teacher could be run; leave it out")
-    made_with = encoder.made_by.get("settings", {})
-    if not (made_with.get("teachers") or made_with.get("teacher")):
+    training = encoder.made_by.get("settings", {})
+    if not (training.get("teachers") or training.get("teacher")):
         raise InputError("basis_views: the weights do not say which teacher they were made with; leave it out")
-    stored = {key: made_with[key] for key in ("teacher", "teachers", "text") if made_with.get(key)}
+    stored = {key: training[key] for key in ("teacher", "teachers", "text") if training.get(key)}
     source = typed(SourceConfig, stored)
     teachers = source.teachers_by_name
     only = next(iter(teachers)) if len(teachers) == 1 else name

@@ -43,7 +43,7 @@ def encode_in_budget(
     assert scene.gaussians is not None
     # Of the settings, those that take the most bytes in the files.
     longest = replace(exact_encoding(config.encode), precision="bfloat16")
-    made = encode_within(
+    encoding = encode_within(
         scene.gaussians,
         encoder,
         teachers,
@@ -53,25 +53,25 @@ def encode_in_budget(
         header={"encode": settings(longest), **made_with},
         track=Progress(quiet=config.quiet),
     )
-    summary.add_seconds({"choose": made.choosing, "encode": made.seconds - made.choosing})
-    ranks = {"rank" if len(made.ranks) == 1 else f"rank of {name}": rank for name, rank in made.ranks.items()}
+    summary.add_seconds({"choose": encoding.choosing, "encode": encoding.seconds - encoding.choosing})
+    ranks = {"rank" if len(encoding.ranks) == 1 else f"rank of {name}": rank for name, rank in encoding.ranks.items()}
     report_choice(
         summary,
         scene.name,
-        {**made.setting.knobs, **ranks},
+        {**encoding.setting.knobs, **ranks},
         predicted={
-            "error": made.predicted,
-            "seconds": made.choosing + made.setting.seconds if config.budget.seconds is not None else None,
+            "error": encoding.predicted,
+            "seconds": encoding.choosing + encoding.setting.seconds if config.budget.seconds is not None else None,
         },
-        notes=made.notes,
+        notes=encoding.notes,
         quiet=config.quiet,
-        gaussians_sampled=made.sampled,
+        gaussians_sampled=encoding.sampled,
     )
-    return made
+    return encoding
 
 
 def check_promises(
-    made: BudgetEncoding,
+    encoding: BudgetEncoding,
     scene: Scene,
     encoder: Encoder,
     files: Sequence[Path],
@@ -86,7 +86,7 @@ def check_promises(
     if budget.error is not None and budget.check:
         with summary.step("check"):
             errors = realised_error(
-                made,
+                encoding,
                 scene.gaussians,
                 encoder,
                 metres_per_unit=metres_per_unit,
@@ -95,7 +95,7 @@ def check_promises(
             )
         realised["error"] = max(error.total for error in errors.values())
     if budget.seconds is not None:
-        realised["seconds"] = made.seconds
+        realised["seconds"] = encoding.seconds
     if budget.megabytes is not None:
         realised["megabytes"] = sum(file.stat().st_size for file in files) / MEGABYTE
     return report_promises(summary, budget, realised)

@@ -15,7 +15,7 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import settings
 from gsencoder.core.errors import InputError, SceneWarning, about, advised, listed
-from gsencoder.data.scenes import find_scenes, scene_name
+from gsencoder.data.scene_paths import find_scenes, scene_name
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
 from gsencoder.data.truth.scannetpp_classes import ids_of_benchmark
@@ -48,7 +48,7 @@ def run_benchmark(
     summary: Summary,
 ) -> None:
     """Predicts the scenes of this process, and in the first process scores those of all and prints the scores."""
-    with join_processes("cpu", asked=settings(config)) as (process, _), ExitStack() as results:
+    with join_processes("cpu", settings=settings(config)) as (process, _), ExitStack() as results:
         folder = None
         with fail_together():
             if process.is_first:
@@ -116,17 +116,17 @@ def _other_sentences(protocol: BenchmarkProtocol, scenes: Collection[str], *, wa
     """
     if not isinstance(protocol, ReferringProtocol) or not protocol.expressions:
         return 0
-    asked = read_expressions(Path(protocol.expressions))
-    others = [each.scene for each in asked if each.scene not in scenes]
-    if len(others) == len(asked):
+    sentences = read_expressions(Path(protocol.expressions))
+    others = [each.scene for each in sentences if each.scene not in scenes]
+    if len(others) == len(sentences):
         raise InputError(
-            f"protocol.expressions: none of the {len(asked)} sentences of {protocol.expressions} is about a scene that "
-            f"is evaluated ({listed(sorted(scenes), 3)}); first {listed(others, 1)}"
+            f"protocol.expressions: none of the {len(sentences)} sentences of {protocol.expressions} is about a scene "
+            f"that is evaluated ({listed(sorted(scenes), 3)}); first {listed(others, 1)}"
         )
     if others and warn:
         warnings.warn(
-            f"{len(others)} of {len(asked)} sentences do not count: they are about {len(set(others))} scenes that are "
-            f"not evaluated (first: {others[0]})",
+            f"{len(others)} of {len(sentences)} sentences do not count: they are about {len(set(others))} scenes that "
+            f"are not evaluated (first: {others[0]})",
             SceneWarning,
             stacklevel=2,
         )

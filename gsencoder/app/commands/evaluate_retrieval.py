@@ -12,7 +12,8 @@ from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError, SceneWarning, advised, counted, listed
-from gsencoder.data.scenes import find_scenes, load_scene, scene_name
+from gsencoder.data.scene_paths import find_scenes, scene_name
+from gsencoder.data.scenes import load_scene
 from gsencoder.data.truth.view_captions import read_texts, read_view_captions, write_view_captions
 from gsencoder.evaluate.files.retrieval import write_scored_pairs
 from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol, evaluate_retrieval, views_of
@@ -36,18 +37,18 @@ def run_retrieval(
     """Compares the views of all scenes with all texts, and scores what it wrote."""
     if not protocol.captions:
         raise InputError("protocol.captions= is missing: a JSON list of {scene_id, view, caption}")
-    given = read_view_captions(Path(protocol.captions))
+    provided = read_view_captions(Path(protocol.captions))
     names = [scene_name(path) for path in find_scenes(config.paths)]
-    captions = [each for name in names for each in given if each.scene == name]
+    captions = [each for name in names for each in provided if each.scene == name]
     if not captions:
         raise InputError(
             f"protocol.captions: none of the captions in {protocol.captions} is about a scene "
-            f"that is evaluated ({listed(names, 3)}); first {given[0].scene}"
+            f"that is evaluated ({listed(names, 3)}); first {provided[0].scene}"
         )
-    if len(captions) < len(given):
+    if len(captions) < len(provided):
         warnings.warn(
-            f"{len(given) - len(captions)} of {counted(len(given), 'caption')} do not count: they are about scenes "
-            "that are not evaluated",
+            f"{len(provided) - len(captions)} of {counted(len(provided), 'caption')} do not count: they are about "
+            "scenes that are not evaluated",
             SceneWarning,
             stacklevel=2,
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.app.commands.from_poses import memory_of
-from gsencoder.app.commands.query_words import asked_scene
+from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.text.build import TableTextConfig, TextConfig, Words
@@ -36,7 +36,7 @@ def stored_words(
         InputError: there are no such features or words.
     """
     folder = folder_of(features, scene)
-    return asked_scene(load_features(folder), folder, head=head, space=space, text=text)[1]
+    return queried_scene(load_features(folder), folder, head=head, space=space, text=text)[1]
 
 
 def with_stored_features(
@@ -63,11 +63,11 @@ def with_stored_features(
                 f"features: {folder} holds those of scene {stored.name}, and {scene.name} is evaluated; give a folder "
                 f"that has the features of each scene in a folder of its name"
             )
-        asked, _ = asked_scene(stored, folder, head=head, space=space, text=text)
-        assert asked.gaussians is not None
-        means = (asked.gaussians.means + (stored.origin - scene.origin)).astype(np.float32)
-        gaussians = replace(asked.gaussians, means=means)
-        yield replace(scene, gaussians=gaussians, features=asked.features), seconds
+        queried, _ = queried_scene(stored, folder, head=head, space=space, text=text)
+        assert queried.gaussians is not None
+        means = (queried.gaussians.means + (stored.origin - scene.origin)).astype(np.float32)
+        gaussians = replace(queried.gaussians, means=means)
+        yield replace(scene, gaussians=gaussians, features=queried.features), seconds
 
 
 def stored_source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:

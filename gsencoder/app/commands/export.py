@@ -12,7 +12,8 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.runtime.device_names import Stored
-from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
@@ -214,8 +215,8 @@ def _memory_of(memories: Mapping[str | None, QueryMemory], space: str) -> QueryM
         by_name.setdefault(memory.space.name, memory)
     if space not in by_name:
         names = ", ".join(name or memory.space.name for name, memory in memories.items())
-        wanted = f"expected one of them, got {space!r}" if space else "name one of them"
-        raise InputError(f"space: the folder has memories of {names}; {wanted}")
+        hint = f"expected one of them, got {space!r}" if space else "name one of them"
+        raise InputError(f"space: the folder has memories of {names}; {hint}")
     return by_name[space]
 
 

@@ -21,7 +21,7 @@ FROM_POSE = "from_pose.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AskedCameras:
+class RequestedCameras:
     """Cameras that words are searched from.
 
     Attributes:
@@ -33,7 +33,7 @@ class AskedCameras:
     views: tuple[str | None, ...]
 
 
-def asked_cameras(scene: Scene, pose: str, views: Sequence[str]) -> AskedCameras | None:
+def requested_cameras(scene: Scene, pose: str, views: Sequence[str]) -> RequestedCameras | None:
     """The cameras of a file, followed by those of views of the scene; None where neither is asked for.
 
     Args:
@@ -50,13 +50,13 @@ def asked_cameras(scene: Scene, pose: str, views: Sequence[str]) -> AskedCameras
         parts.append(read_cameras(Path(pose), scene.origin))
         in_file = len(parts[0])
     if names:
-        known = {} if scene.views is None else {name: row for row, name in enumerate(scene.views.names)}
+        row_of = {} if scene.views is None else {name: row for row, name in enumerate(scene.views.names)}
         for name in names:
-            if name not in known:
-                some = f"its views are {listed(list(known))}" if known else "it has no views"
+            if name not in row_of:
+                some = f"its views are {listed(list(row_of))}" if row_of else "it has no views"
                 raise InputError(f"view: scene {scene.name} has no view {name[:80]!r}; {some}")
         assert scene.views is not None
-        parts.append(scene.views.cameras.select([known[name] for name in names]))
+        parts.append(scene.views.cameras.select([row_of[name] for name in names]))
     if not parts:
         return None
     cameras = Cameras(
@@ -65,20 +65,20 @@ def asked_cameras(scene: Scene, pose: str, views: Sequence[str]) -> AskedCameras
         widths=np.concatenate([part.widths for part in parts]),
         heights=np.concatenate([part.heights for part in parts]),
     )
-    return AskedCameras(cameras=cameras, views=(*(None,) * in_file, *names))
+    return RequestedCameras(cameras=cameras, views=(*(None,) * in_file, *names))
 
 
-def memory_of(folder: Path, asked: Scene) -> QueryMemory | None:
+def memory_of(folder: Path, scene: Scene) -> QueryMemory | None:
     """The memory that the one feature set of a scene was decoded from; None where features are stored themselves."""
     if not (folder / MEMORY_FILE).is_file() and not teachers_in(folder, MEMORY_FILE):
         return None
-    (features,) = asked.features.values()
+    (features,) = scene.features.values()
     return next((memory for memory in load_memories(folder).values() if memory.space == features.space), None)
 
 
 def search_from_poses(
-    asked: Scene,
-    cameras: AskedCameras,
+    scene: Scene,
+    cameras: RequestedCameras,
     words: Sequence[str],
     text: TextEncoder,
     config: LocalizeConfig,
@@ -90,7 +90,7 @@ def search_from_poses(
     """What each camera sees of the words.
 
     Args:
-        asked: the scene with one feature set.
+        scene: the scene with one feature set.
         cameras: relative to its origin.
         words: that `text` knows.
         text: turns words into the features' space.
@@ -107,7 +107,7 @@ def search_from_poses(
     from gsencoder.infer.draw.pose_pictures import pose_picture, view_picture
     from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig
 
-    field = FeatureField(asked, memory=memory, config=FromPoseConfig(mode=config.mode, threshold=config.threshold))
+    field = FeatureField(scene, memory=memory, config=FromPoseConfig(mode=config.mode, threshold=config.threshold))
     for view, name in enumerate(cameras.views):
         seen = field.at(cameras.cameras, view)
         points = [

@@ -20,7 +20,8 @@ from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
-from gsencoder.data.scenes import SceneConfig, find_scenes
+from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats import READABLE
 from gsencoder.fusion.budget.config import BudgetConfig, check_budget
@@ -116,7 +117,7 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
                 teacher = build_teacher(config.teacher, scene, words)
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
             in_budget: BudgetFusion | None = None
-            if config.budget.given:
+            if config.budget.promised:
                 in_budget = fuse_in_budget(scene, teacher, config, one, work_folder(out), sample_cells=bool(heads))
                 fusion = in_budget.fusion
             else:

@@ -34,7 +34,7 @@ def fuse_in_budget(
     scene: Scene, teacher: Teacher, config: BudgetOptions, summary: Summary, work: Path, *, sample_cells: bool
 ) -> BudgetFusion:
     """Chooses a setting and fuses; says which setting that is, and what is predicted of it."""
-    made = fuse_within(
+    fused = fuse_within(
         scene,
         teacher,
         config.fusion,
@@ -44,26 +44,26 @@ def fuse_in_budget(
         device=config.device,
         track=Progress(quiet=config.quiet),
     )
-    choice = made.choice
-    summary.add_seconds({"choose": made.choosing, **made.fusion.seconds})
+    choice = fused.choice
+    summary.add_seconds({"choose": fused.choosing, **fused.fusion.seconds})
     report_choice(
         summary,
         scene.name,
         choice.knobs,
-        predicted=_predicted(made),
+        predicted=_predicted(fused),
         notes=choice.notes,
         quiet=config.quiet,
-        of=f", of {len(made.scene.views or ())} views",
+        of=f", of {len(fused.scene.views or ())} views",
         of_views=len(scene.views) if scene.views is not None else 0,
         scatter=choice.scatter,
         rays_followed=choice.followed,
         rays_exact=choice.all_rays,
     )
-    return made
+    return fused
 
 
-def _predicted(made: BudgetFusion) -> Mapping[str, float | None]:
-    choice = made.choice
+def _predicted(fused: BudgetFusion) -> Mapping[str, float | None]:
+    choice = fused.choice
     size = None if choice.bytes is None else choice.bytes / MEGABYTE
     return {
         "error": choice.predicted.error,
@@ -73,17 +73,17 @@ def _predicted(made: BudgetFusion) -> Mapping[str, float | None]:
     }
 
 
-def check_promises(made: BudgetFusion, file: Path, config: BudgetOptions, summary: Summary) -> list[str]:
+def check_promises(fused: BudgetFusion, file: Path, config: BudgetOptions, summary: Summary) -> list[str]:
     """Measures what was promised; returns a line for each promise, and warns of those that are broken."""
     budget, realised = config.budget, dict[str, float]()
     if budget.error is not None and budget.check:
         with summary.step("check"):
             track = Progress(quiet=config.quiet)
-            error = realised_error(made, config.fusion, seed=budget.seed, device=config.device, track=track)
+            error = realised_error(fused, config.fusion, seed=budget.seed, device=config.device, track=track)
         realised["error"] = error.total
         summary.results["budget"]["covered"] = error.covered
     if budget.seconds is not None:
-        realised["seconds"] = made.seconds
+        realised["seconds"] = fused.seconds
     if budget.megabytes is not None:
         realised["megabytes"] = file.stat().st_size / MEGABYTE
     return report_promises(summary, budget, realised)

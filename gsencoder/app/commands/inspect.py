@@ -12,7 +12,8 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.scene_splat import find_splat
-from gsencoder.data.scenes import SceneConfig, find_scenes, has_views, load_scene, read_posed, scene_name
+from gsencoder.data.scene_paths import find_scenes, has_views, scene_name
+from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.splat_formats.repair import SplatReport, inspect_splat
 from gsencoder.data.splats import READABLE, read_raw
 from gsencoder.data.video.decode import refuse_video

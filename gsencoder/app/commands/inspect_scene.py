@@ -68,24 +68,24 @@ def check_lines(facts: SceneFacts, depth: DepthCheck | None, matches: EpipolarCh
     """The figures of the checks, a line each."""
     lines = []
     if depth is not None:
-        given = depth.given
+        stated = depth.stated
         if depth.comparable:
             near, far = depth.offsets
             lines.append(
-                f"depth of {len(depth.views)} of {facts.views:,} views carried into each other: {given.share:.0%} "
+                f"depth of {len(depth.views)} of {facts.views:,} views carried into each other: {stated.share:.0%} "
                 "agree "
-                f"within 2 % where seen ({given.compared:,} comparisons); median offset "
-                f"{_percent(given.offset, sign=True)}"
+                f"within 2 % where seen ({stated.compared:,} comparisons); median offset "
+                f"{_percent(stated.offset, sign=True)}"
             )
             lines.append(f"median offset of neighbors {_percent(near)}, of views far apart {_percent(far)}")
         else:
             lines.append("depth: by their poses no two views see the same place, so it cannot be compared")
         if np.isfinite(depth.color):
             lines.append(f"colors at the same places correlate by {depth.color:.2f}")
-        if depth.registration is not None and np.isfinite(depth.registration.given):
+        if depth.registration is not None and np.isfinite(depth.registration.stated):
             fit = depth.registration
             lines.append(
-                f"details of the photographs correlate by {fit.given:.2f} with the stated camera, best by "
+                f"details of the photographs correlate by {fit.stated:.2f} with the stated camera, best by "
                 f"{fit.best:.2f} with a focal length of {fit.focal_factor * facts.focal[0]:.0f} pixels"
             )
     if matches is not None:
@@ -119,9 +119,9 @@ def check_results(depth: DepthCheck | None, matches: EpipolarCheck | None) -> di
     if depth is not None:
         results["depth"] = {
             "views": len(depth.views),
-            "comparisons": depth.given.compared,
-            "share": depth.given.share,
-            "offset": depth.given.offset,
+            "comparisons": depth.stated.compared,
+            "share": depth.stated.share,
+            "offset": depth.stated.offset,
             "offset_near": depth.offsets[0],
             "offset_far": depth.offsets[1],
             "best_share": depth.best.share,
@@ -131,7 +131,7 @@ def check_results(depth: DepthCheck | None, matches: EpipolarCheck | None) -> di
             results["registration"] = {
                 "focal_factor": depth.registration.focal_factor,
                 "shift": depth.registration.shift.tolist(),
-                "given": depth.registration.given,
+                "given": depth.registration.stated,
                 "best": depth.registration.best,
             }
     if matches is not None:

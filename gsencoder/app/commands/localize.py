@@ -8,12 +8,12 @@ import numpy as np
 
 from gsencoder.app.commands.from_poses import (
     FROM_POSE,
-    asked_cameras,
     describe_point,
     memory_of,
+    requested_cameras,
     search_from_poses,
 )
-from gsencoder.app.commands.query_words import asked_scene, query_words
+from gsencoder.app.commands.query_words import queried_scene, query_words
 from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import output_folder
@@ -83,14 +83,14 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         scene = shown_scene(folder, config.photos, config.data)
         # Features of earlier versions may lie in a scene whose up nobody estimated.
         scene, _ = with_up(scene)
-        asked, table = asked_scene(
-            scene, folder, head=config.head, space=config.space, given=config.words, text=config.text
+        queried, table = queried_scene(
+            scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
         )
-        cameras = asked_cameras(scene, config.pose, config.view)
+        cameras = requested_cameras(scene, config.pose, config.view)
     with summary.step("localize"):
-        localization = localize(asked, words, table, config.localize)
+        localization = localize(queried, words, table, config.localize)
     out = config.out or Path("outputs") / scene.name / "boxes"
-    summary.results["space"] = next(iter(asked.features.values())).space.describe()
+    summary.results["space"] = next(iter(queried.features.values())).space.describe()
     boxes = localization_to_json(localization)
     summary.results.update(boxes=boxes, thresholds=dict(zip(words, localization.thresholds.tolist(), strict=True)))
     summary.results.update(words=words_to_json(localization))
@@ -109,9 +109,9 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         if cameras is not None:
             with summary.step("from_pose"):
                 # Heads lead into other spaces than the one in which a memory attends.
-                memory = None if config.head else memory_of(folder, asked)
-                for found, drawn in search_from_poses(
-                    asked,
+                memory = None if config.head else memory_of(folder, queried)
+                for pose_points, drawn in search_from_poses(
+                    queried,
                     cameras,
                     words,
                     table,
@@ -120,7 +120,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
                     memory=memory,
                     pictures=config.pictures > 0,
                 ):
-                    points += found
+                    points += pose_points
                     for name, picture in drawn:
                         write_picture(target / f"{name}.png", picture)
             write_json(target / FROM_POSE, points)

@@ -20,7 +20,7 @@ from gsencoder.core.files.picture_file import write_picture
 from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
-from gsencoder.data.scenes import find_scenes
+from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
 from gsencoder.fusion.store.folder import file_of_teacher, save_memories
@@ -40,7 +40,7 @@ from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.train.memory_scene import MemoryScene, open_memory_scene, open_raw_sample, prepare_memory
 from gsencoder.train.render_rows import sample_rows
 from gsencoder.train.source import SourceConfig
-from gsencoder.train.trainer import TrainerConfig
+from gsencoder.train.trainer_config import TrainerConfig
 from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
 
 DRAWN_FEATURES = 20_000
@@ -108,7 +108,7 @@ def run(config: MemoryCommandConfig, summary: Summary) -> None:
     words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
     with (
         WorkFolder(out.with_name(f"{out.name}.training")) as state,
-        join_processes(config.device, asked=settings(config)) as (process, device),
+        join_processes(config.device, settings=settings(config)) as (process, device),
         ExitStack() as results,
     ):
         track = Progress(quiet=config.quiet or not process.is_first)

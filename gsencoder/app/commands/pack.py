@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from shutil import copyfile
 
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
@@ -12,6 +11,7 @@ from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.copied_file import copy_checked
 from gsencoder.core.promises import MEGABYTE, check_governed
 from gsencoder.fusion.store.budget import PackBudget
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features
@@ -77,7 +77,7 @@ class PackConfig(CommonConfig):
     def __post_init__(self) -> None:
         if len(self.paths) > 1:
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
-        if self.budget.given and self.form not in CODED:
+        if self.budget.promised and self.form not in CODED:
             raise InputError(
                 f"{self.budget.names}: form={self.form} writes features as they are; take form=compact or index, or "
                 "leave the budget out"
@@ -122,12 +122,7 @@ def _write_beside(folder: Path, source: Path, scene: Scene, features: GaussianFe
     if words is not None and form in CODED:
         save_text_table(folder / WORDS_FILE, load_text_table(words), dtype="float16")
     elif words is not None:
-        copyfile(words, folder / WORDS_FILE)
-        try:
-            # What was copied is looked at: the file may have been cut off meanwhile.
-            load_text_table(folder / WORDS_FILE)
-        except InputError as error:
-            raise InputError(str(error).replace(str(folder / WORDS_FILE), str(words))) from error
+        copy_checked(words, folder / WORDS_FILE, load_text_table)
     if (source / HEADS_FILE).is_file():
         others = [each.space for each in scene.features.values() if each is not features]
         copy_heads(source / HEADS_FILE, folder / HEADS_FILE, [features.space], left_out=others)
@@ -150,50 +145,52 @@ def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackC
 def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
     budget = config.budget
     if budget.error is None and budget.megabytes is not None:
-        made = save_package_within(folder, scene, features, megabytes=budget.megabytes)
+        compacted = save_package_within(folder, scene, features, megabytes=budget.megabytes)
     else:
-        made = save_package(folder, scene, features, error=budget.error or DEFAULT_ERROR)
+        compacted = save_package(folder, scene, features, error=budget.error or DEFAULT_ERROR)
     size = (folder / PACKAGE_FILE).stat().st_size
     share = size / (2 * features.space.channels * len(features))
     summary.results.update(
         bytes=size,
-        row_bytes=made.row_bytes,
-        rank=made.basis.rank,
-        error=made.error,
-        lowest=made.lowest,
-        weight_error=(made.heaviest / made.lightest) ** (1 / 510) - 1,
+        row_bytes=compacted.row_bytes,
+        rank=compacted.basis.rank,
+        error=compacted.error,
+        lowest=compacted.lowest,
+        weight_error=(compacted.heaviest / compacted.lightest) ** (1 / 510) - 1,
         share_of_float16=share,
     )
-    _report(scene, {"rank": made.basis.rank, "row_bytes": made.row_bytes}, made.error, size, config, summary)
+    _report(
+        scene, {"rank": compacted.basis.rank, "row_bytes": compacted.row_bytes}, compacted.error, size, config, summary
+    )
     return (
         f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / MEGABYTE:.3g} MB, "
-        f"{_ratio(share)} of float16 vectors: {made.basis.rank} coordinates in {made.row_bytes} bytes a row; centered "
-        f"cosines lose {made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
+        f"{_ratio(share)} of float16 vectors: {compacted.basis.rank} coordinates in {compacted.row_bytes} bytes a row; "
+        f"centered cosines lose {compacted.error:.4f}, one in a thousand is below {compacted.lowest:.3f}"
     )
 
 
 def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
-    if config.budget.given:
-        made, error = index_within(features, config.budget, partial(index_bytes, scene, features))
+    if config.budget.promised:
+        indexed, error = index_within(features, config.budget, partial(index_bytes, scene, features))
     else:
-        made = index_features(features, config.index)
-        error = made.error
-    save_index_package(folder, scene, made.features, error=made.error)
-    rows, size = len(made.features.features), (folder / PACKAGE_FILE).stat().st_size
+        indexed = index_features(features, config.index)
+        error = indexed.error
+    save_index_package(folder, scene, indexed.features, error=indexed.error)
+    rows, size = len(indexed.features.features), (folder / PACKAGE_FILE).stat().st_size
     summary.results.update(
         bytes=size,
         rows=rows,
         row_bytes=1 if rows < 256 else 2,
-        threshold=made.threshold,
-        error=made.error,
-        lowest=made.lowest,
+        threshold=indexed.threshold,
+        error=indexed.error,
+        lowest=indexed.lowest,
         share_of_float16=size / (2 * features.space.channels * len(features)),
     )
-    _report(scene, {"rows": rows, "threshold": made.threshold}, error, size, config, summary)
+    _report(scene, {"rows": rows, "threshold": indexed.threshold}, error, size, config, summary)
     return (
         f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / MEGABYTE:.3g} MB: the "
         f"number of one of {rows:,} rows in {'one byte' if rows < 256 else 'two bytes'}; centered cosines lose "
-        f"{made.error:.4f}, one in a thousand is below {made.lowest:.3f}"
+        f"{indexed.error:.4f}, one in a thousand is below {indexed.lowest:.3f}"
     )
 
 
@@ -202,12 +199,12 @@ def _report(
 ) -> None:
     """Says what a budget chose and what became of it: both are measured over all Gaussians, of the file as it is."""
     budget, megabytes = config.budget, size / MEGABYTE
-    if not budget.given:
+    if not budget.promised:
         return
     broken = budget.error is not None and budget.megabytes is not None and megabytes > budget.megabytes
     notes = [budget.conflict("error", "megabytes", megabytes)] if broken else []
     report_choice(summary, scene.name, chosen, predicted={}, notes=notes, quiet=config.quiet)
-    realised = {name: value for name, value in (("error", error), ("megabytes", megabytes)) if name in budget.given}
+    realised = {name: value for name, value in (("error", error), ("megabytes", megabytes)) if name in budget.promised}
     for line in report_promises(summary, budget, realised):
         console(config.quiet).print(f"{scene.name}: {line}")
 

@@ -46,13 +46,13 @@ def _lines_of(file: Path) -> list[str]:
         raise InputError(f"queries: {file} cannot be read as text: {error}") from error
 
 
-def asked_scene(
+def queried_scene(
     scene: Scene,
     folder: Path,
     *,
     head: str = "",
     space: str = "",
-    given: str = "",
+    words_file: str = "",
     text: TextConfig = TableTextConfig(),
 ) -> tuple[Scene, Words]:
     """A scene with the one feature set that words are compared with, and the words.
@@ -62,7 +62,7 @@ def asked_scene(
         folder: of the features.
         head: name of an adapter head; empty = the features themselves are asked.
         space: name of the feature set; empty where there is only one.
-        given: a file of words; empty = those beside the features, or for a head those of `text`.
+        words_file: a file of words; empty = those beside the features, or for a head those of `text`.
         text: a text tower.
 
     Raises:
@@ -70,28 +70,28 @@ def asked_scene(
     """
     if head:
         # Heads need torch, which finding boxes does without.
-        from gsencoder.app.commands.through_head import asked_through_head
+        from gsencoder.app.commands.through_head import queried_through_head
 
-        return asked_through_head(scene, folder, head, space=space, given=given, text=text)
+        return queried_through_head(scene, folder, head, space=space, words_file=words_file, text=text)
     _, features = select_features(scene, space or None)
-    words = load_words(folder, features.space, given, text)
+    words = load_words(folder, features.space, words_file, text)
     return replace(scene, features={features.space.name: features}), words
 
 
-def load_words(folder: Path, space: FeatureSpace, given: str, text: TextConfig = TableTextConfig()) -> Words:
+def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextConfig = TableTextConfig()) -> Words:
     """The text table that was given, or the one in the folder of the features, with the tower that made it.
 
     Args:
         folder: of the features.
         space: of the features that are asked; folders with several may hold words for each.
-        given: a file of words; empty = the one in the folder.
+        words_file: a file of words; empty = the one in the folder.
         text: a tower that is given; otherwise it is searched for when a phrase needs it.
 
     Raises:
         InputError: there are no words, or the tower is another than the one that made them.
     """
-    if given:
-        words = words_of_table(load_text_table(find_file(given, "words")), text)
+    if words_file:
+        words = words_of_table(load_text_table(find_file(words_file, "words")), text)
         return stating_trained(words, _table_beside(folder, space))
     if not isinstance(text, TableTextConfig):
         table = _table_beside(folder, space)

@@ -19,22 +19,21 @@ def holds_features(folder: Path) -> bool:
     return (folder / SCENE_FILE).is_file() or (folder / PACKAGE_FILE).is_file()
 
 
-def scene_folders(paths: Sequence[str], wanted: Collection[str]) -> list[Path]:
-    """The folders of features at paths: each path, or the folders in it that are called like a scene that is wanted.
+def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:
+    """The folders of features at paths: each path, or the folders in it that are called like one of the scenes.
 
     Raises:
         InputError: a path that is no folder, or that holds neither features nor any such folder.
     """
     folders: dict[Path, Path] = {}
-    for given in paths:
-        path = Path(given)
+    for path in map(Path, paths):
         if not path.is_dir():
             raise InputError(f"{path}: no such folder of features")
         inner = [path] if holds_features(path) else sorted(each for each in path.iterdir() if holds_features(each))
         if not inner:
             raise InputError(f"{path}: holds no features, nor folders of features; expected what fuse or encode wrote")
         for folder in inner:
-            if folder is path or folder.name in wanted:
+            if folder is path or folder.name in scenes:
                 folders.setdefault(folder.resolve(), folder)
     return list(folders.values())
 
@@ -53,12 +52,12 @@ def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[SetQuestion,
     if asker.words is None:
         raise InputError(f"proposals=localize: no words lead into the features of {asker.scene.name}; give words=")
     table = closed_table(asker.words)
-    known = [name for name in names if table is None or table.find(name) is not None]
-    if not known:
+    known_names = [name for name in names if table is None or table.find(name) is not None]
+    if not known_names:
         return ()
-    found = localize(asker.scene, known, asker.words, asker.localization, space=asker.space)
+    localization = localize(asker.scene, known_names, asker.words, asker.localization, space=asker.space)
     questions = []
-    for number, box in enumerate(best_boxes(found, asker.config.boxes)):
+    for number, box in enumerate(best_boxes(localization, asker.config.boxes)):
         low, high = box.aabb_min.tolist(), box.aabb_max.tolist()
         aabb = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
         keys = {"obj_prob": [1 - float(box.probability), float(box.probability)]}

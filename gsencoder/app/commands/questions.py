@@ -11,7 +11,8 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.runtime.tracking import Track
-from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
+from gsencoder.data.scene_paths import check_names, find_scenes
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.truth.expressions import write_scanrefer
 from gsencoder.data.truth.made_expressions import make_expressions
 from gsencoder.data.truth.made_questions import KINDS, QuestionsConfig, kind_of, make_questions

@@ -16,7 +16,8 @@ from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.json_values import write_json
-from gsencoder.data.scenes import SceneConfig, has_views, load_scene, read_posed
+from gsencoder.data.scene_paths import has_views
+from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.splat_formats.repair import repair_splat
 from gsencoder.data.splats import READABLE, WRITABLE, RawSplat, gaussians_from_raw, read_raw, save_splat
 from gsencoder.types import Scene

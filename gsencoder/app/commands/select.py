@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from gsencoder.app.commands.query_words import asked_scene, query_words
+from gsencoder.app.commands.query_words import queried_scene, query_words
 from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import one_line
@@ -90,13 +90,13 @@ def run(config: SelectCommandConfig, summary: Summary) -> None:
         scene = load_features(folder)
         # Features of earlier versions may lie in a scene whose up nobody estimated.
         scene, _ = with_up(scene)
-        asked, table = asked_scene(
-            scene, folder, head=config.head, space=config.space, given=config.words, text=config.text
+        queried, table = queried_scene(
+            scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
         )
     track = Progress(quiet=config.quiet)
     with summary.step("select"):
         selection, localization = select(
-            asked,
+            queried,
             words,
             table,
             config.select,
@@ -108,7 +108,7 @@ def run(config: SelectCommandConfig, summary: Summary) -> None:
     out = config.out or Path("outputs") / scene.name / "selection"
     files = _files(selection, config)
     summary.results.update(
-        space=next(iter(asked.features.values())).space.describe(),
+        space=next(iter(queried.features.values())).space.describe(),
         metres_per_unit=scene.metres_per_unit,
         words=words_to_json(localization),
         seeds=[int((selection.seeds == number + 1).sum()) for number in range(len(words))],

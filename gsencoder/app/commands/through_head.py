@@ -20,14 +20,14 @@ from gsencoder.text.transformers_tower import TransformersTower
 from gsencoder.types import GaussianFeatures, Scene
 
 
-def asked_through_head(
-    scene: Scene, folder: Path, head: str, *, space: str, given: str, text: TextConfig
+def queried_through_head(
+    scene: Scene, folder: Path, head: str, *, space: str, words_file: str, text: TextConfig
 ) -> tuple[Scene, Words]:
     """A scene with the outputs of a head as its only features, and the words that they are compared with; arguments and
-    errors are those of `gsencoder.app.commands.query_words.asked_scene`."""
+    errors are those of `gsencoder.app.commands.query_words.queried_scene`."""
     heads = heads_of_folder(folder, head)
     chosen = find_head(heads, head)
-    words = words_of_head(chosen.head, given, text)
+    words = words_of_head(chosen.head, words_file, text)
     return scene_through_head(scene, heads, chosen, space=space, text_encoder=words.space.text_encoder), words
 
 
@@ -37,7 +37,7 @@ def packed_through_head(
     """A scene with the outputs of a head as its only features, and the words to store beside them, if a tower is given.
 
     Raises:
-        InputError: see `asked_through_head`.
+        InputError: see `queried_through_head`.
     """
     heads = heads_of_folder(folder, head)
     chosen = find_head(heads, head)
@@ -87,18 +87,18 @@ def features_for_heads(scene: Scene, heads: HeadSet, space: str = "") -> Gaussia
         InputError: there are no such features.
     """
     if not space and len(scene.features) > 1:
-        own = [features for features in scene.features.values() if features.space == heads.space]
-        if own:
-            return own[0]
+        of_backbone = [features for features in scene.features.values() if features.space == heads.space]
+        if of_backbone:
+            return of_backbone[0]
     return select_features(scene, space or None)[1]
 
 
-def words_of_head(head: Head, given: str, text: TextConfig) -> Words:
+def words_of_head(head: Head, words_file: str, text: TextConfig) -> Words:
     """The words that a head's outputs are compared with.
 
     Args:
         head: a summary head, whose outputs lie in the space of a model with a text side.
-        given: a file of words; empty = the vocabulary of `text`.
+        words_file: a file of words; empty = the vocabulary of `text`.
         text: the text tower of that model.
 
     Raises:
@@ -115,8 +115,8 @@ def words_of_head(head: Head, given: str, text: TextConfig) -> Words:
             f"head={head.name}: words are compared with summary heads, since outputs of feature heads are not aligned "
             f"with text; give head={head.name.rpartition('.')[0]}.summary"
         )
-    if given:
-        words = words_of_table(load_text_table(given), text)
+    if words_file:
+        words = words_of_table(load_text_table(words_file), text)
     elif isinstance(text, TableTextConfig):
         raise InputError(
             f"head={head.name}: no words lead into its space; give text=transformers text.model=FOLDER, the text side "

@@ -16,7 +16,8 @@ from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files.csv_text import csv_text
 from gsencoder.core.files.json_values import json_bytes, write_bytes
-from gsencoder.data.scenes import SceneConfig, find_scenes
+from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol
 from gsencoder.evaluate.tradeoff.halving import HalvingConfig
@@ -143,7 +144,7 @@ def run(config: TradeoffConfig, summary: Summary) -> None:
         screen.print(_table(each))
         screen.print(f"knobs that matter: {', '.join(each.matter) or 'none'}")
         for rung in each.rungs:
-            more = "" if rung is each.rungs[-1] else f"; the best {len(rung.kept)} went on"
+            more = "" if rung is each.rungs[-1] else f"; the best {len(rung.survivors)} went on"
             screen.print(f"{counted(len(rung.settings), 'setting')} on {counted(rung.scenes, 'scene')}{more}")
     for scaled in exponents:
         value, low, high, *_ = scaled.exponent

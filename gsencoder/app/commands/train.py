@@ -22,7 +22,7 @@ from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.core.runtime.threads import threads_of_torch
-from gsencoder.data.scenes import find_scenes
+from gsencoder.data.scene_paths import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.basis_fit import total_fit
 from gsencoder.fusion.heads.measure import HeadSet
@@ -33,7 +33,7 @@ from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
-from gsencoder.train.adapter_heads import asked_heads, dataset_heads, teacher_of_heads
+from gsencoder.train.adapter_heads import dataset_heads, required_heads, teacher_of_heads
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, check_same_teachers
 from gsencoder.train.distributed import cpu_share, fail_together, join_processes
 from gsencoder.train.prepare_scenes import prepare_scenes
@@ -96,7 +96,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
     words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
     with (
         WorkFolder(work) as state,
-        join_processes(config.device, asked=settings(config)) as (process, device),
+        join_processes(config.device, settings=settings(config)) as (process, device),
         ExitStack() as results,
     ):
         track = Progress(quiet=config.quiet or not process.is_first)
@@ -108,7 +108,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
                 if config.resume:
                     check_same_teachers(state.path / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
         with summary.step("prepare"), threads_of_torch(cpu_share(process, config.prepare_threads)):
-            heads_asked = asked_heads(config.heads, config.teachers_by_name)
+            heads_asked = required_heads(config.heads, config.teachers_by_name)
             datasets = prepare_scenes(
                 training,
                 held_out,

@@ -138,7 +138,7 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
     )
     with (
         WorkFolder(work) as state,
-        join_processes(config.device, asked=settings(config)) as (process, device),
+        join_processes(config.device, settings=settings(config)) as (process, device),
         ExitStack() as results,
     ):
         track = Progress(quiet=config.quiet or not process.is_first)

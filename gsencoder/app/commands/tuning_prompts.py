@@ -164,16 +164,16 @@ def prepare_prompts(
         store = PromptStore(folder)
         keys = prompt_keys(questions, features, photos, recipe)
         opened: tuple[str, Asker, GaussianFeatures | None] | None = None
-        said: list[str] = []
+        messages: list[str] = []
         for each, key in track(list(zip(questions, keys, strict=True)), "preparing prompts"):
             if key in store.prompts:
                 continue
             with about(f"question {each.id}"):
                 if opened is None or opened[0] != each.scene:
                     opened = (each.scene, *_asker(folders[each.scene], str(shown.get(each.scene, "")), recipe))
-                said += _store(store, key, opened[1], each, opened[2], recipe)
-        if said:
-            warnings.warn(f"{len(said)} of {len(questions)} questions: {said[0]}", SceneWarning, stacklevel=2)
+                messages += _store(store, key, opened[1], each, opened[2], recipe)
+        if messages:
+            warnings.warn(f"{len(messages)} of {len(questions)} questions: {messages[0]}", SceneWarning, stacklevel=2)
     finally:
         if lock is not None:
             os.close(lock)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gsencoder.app.commands.query_words import asked_scene
+from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_file import refuse_existing, sole_writer
 from gsencoder.app.runs.progress import console
@@ -135,7 +135,7 @@ def _load(folder: Path, config: ViewConfig, photographed: Scene | None) -> tuple
         if not features.space.text_encoder:
             # Features such as DINOv2's can be looked at.
             return replace(scene, features={features.space.name: features}), None
-    return asked_scene(scene, folder, head=config.head, space=config.space, given=config.words, text=config.text)
+    return queried_scene(scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text)
 
 
 def _titles(folders: Sequence[Path]) -> list[str]:
@@ -183,7 +183,7 @@ def _write(
 ) -> None:
     options = FileOptions(error=config.error, sh_degree=3, photographs=config.photographs, photograph_side=640)
     with summary.step("page"):
-        made = fitting_page(
+        page = fitting_page(
             bundle,
             [(scene, title, words) for (scene, words), title in zip(loaded, titles, strict=True)],
             config.localize,
@@ -194,22 +194,22 @@ def _write(
         )
     with sole_writer(out, overwrite=config.overwrite):
         with summary.step("write"), atomic_file(out) as stream:
-            stream.write(made.page)
+            stream.write(page.page)
         summary.results.update(
             page=str(out),
-            bytes=len(made.page),
-            gaussians=made.gaussians,
-            sh_degree=made.sh_degree,
-            photographs=made.photographs,
-            feature_error=made.feature_error,
-            left_out=list(made.notes),
+            bytes=len(page.page),
+            gaussians=page.gaussians,
+            sh_degree=page.sh_degree,
+            photographs=page.photographs,
+            feature_error=page.feature_error,
+            left_out=list(page.notes),
         )
         write_beside(out, summary)
     screen = console(config.quiet)
-    for note in made.notes:
+    for note in page.notes:
         screen.print(note)
-    counts = " and ".join(f"{count:,}" for count in made.gaussians)
+    counts = " and ".join(f"{count:,}" for count in page.gaussians)
     screen.print(
-        f"{out}: {len(made.page) / 1e6:.1f} MB; {counts} Gaussians, spherical harmonics of degree "
-        f"{max(made.sh_degree)}; opens in a browser without a network"
+        f"{out}: {len(page.page) / 1e6:.1f} MB; {counts} Gaussians, spherical harmonics of degree "
+        f"{max(page.sh_degree)}; opens in a browser without a network"
     )

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsencoder.app.commands.query_words import asked_scene, query_words
+from gsencoder.app.commands.query_words import queried_scene, query_words
 from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.app.commands.through_head import features_for_heads, heads_of_folder
 from gsencoder.app.commands.words_options import WordsOptions
@@ -95,10 +95,10 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
     if config.query or config.queries or config.choose.method == "greedy":
         with summary.step("localize"):
             words = query_words(config.query, config.queries)
-            asked, table = asked_scene(
-                scene, folder, head=config.head, space=config.space, given=config.words, text=config.text
+            queried, table = queried_scene(
+                scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
             )
-            localization = localize(asked, words, table, config.localize)
+            localization = localize(queried, words, table, config.localize)
             assert scene.gaussians is not None
             targets = targets_of(scene.gaussians, localization, config.boxes)
         absent = {word: describe_absent(value) for word, value in localization.absent.items()}
@@ -109,18 +109,18 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
         summary.results.update(boxes=[box_to_json(box) for box in boxes], words=words_to_json(localization))
     promises: list[str] = []
     with summary.step("choose"):
-        if config.budget.given:
-            made = choose_views_within(scene, targets, config.choose, config.budget)
-            views = made.views
+        if config.budget.promised:
+            result = choose_views_within(scene, targets, config.choose, config.budget)
+            views = result.views
             report_choice(
                 summary,
                 scene.name,
-                {"candidates": made.candidates},
-                predicted={"seconds": made.predicted},
-                notes=made.notes,
+                {"candidates": result.candidates},
+                predicted={"seconds": result.predicted},
+                notes=result.notes,
                 quiet=config.quiet,
             )
-            promises = report_promises(summary, config.budget, {"seconds": made.seconds})
+            promises = report_promises(summary, config.budget, {"seconds": result.seconds})
         else:
             views = choose_views(scene, targets, config.choose)
     out = config.out or Path("outputs") / scene.name / "views"

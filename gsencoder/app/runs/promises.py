@@ -53,7 +53,7 @@ def report_promises(summary: Summary, budget: Budget, realised: Mapping[str, flo
         budget: its promises.
         realised: what was measured, by promise; one that is missing was not.
     """
-    promised = {name: budget.promise(name) for name in budget.given}
+    promised = {name: budget.promise(name) for name in budget.promised}
     summary.results["budget"].update(promised=promised, realised=dict(realised))
     predicted = "; the summary says what was predicted" if summary.results["budget"]["predicted"] else ""
     lines = []

@@ -15,7 +15,7 @@ from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.files.written_files import SUMMARY_NAME
 from gsencoder.core.runtime.process_rank import refuse_several
-from gsencoder.data.scenes import check_names, scene_name
+from gsencoder.data.scene_paths import check_names, scene_name
 
 NOT_COMPARED = ("paths", "out", "overwrite", "quiet", "worker", "resume", "device", "preset")
 """Settings in which two runs with the same results may differ; what a preset sets is compared."""

@@ -2,7 +2,7 @@
 
 Files are not trusted: an array of another size would otherwise be broadcast, or fail far from the cause. Against
 damage, files of version 2 carry checksums (`checksums.py`) of the header and the arrays, and each array is verified
-when it is read. Files of version 1 have none, and are read with a warning.
+when it is read. Files of version 1 have none, and are read with a warning. `safetensors_bytes.py` has the bytes.
 """
 
 import hashlib
@@ -17,7 +17,6 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning, about
-from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.checksums import (
     BLOCK_BYTES,
     DIGITS,
@@ -27,7 +26,15 @@ from gsencoder.core.files.checksums import (
     file_digest,
 )
 from gsencoder.core.files.model_files import check_fetched
-from gsencoder.core.files.safetensors_bytes import array_offsets, read_bytes
+from gsencoder.core.files.safetensors_bytes import (
+    DTYPES,
+    Entries,
+    array_offsets,
+    entries_of,
+    read_bytes,
+    safetensors_header,
+    write_safetensors,
+)
 
 VERSION = 2
 WITHOUT_CHECKSUMS = 1
@@ -38,34 +45,9 @@ RESERVED_KEYS = ("version", "checksums", "digest")
 LARGEST_NUMBER = 2.0**63
 LONGEST_NUMBER = -2.2250738585072014e-308
 """JSON writes no number in more characters: it stands for numbers of a header that are not known yet."""
-DTYPES = {
-    "F16": "float16",
-    "F32": "float32",
-    "F64": "float64",
-    "I8": "int8",
-    "I32": "int32",
-    "I64": "int64",
-    "U8": "uint8",
-    "U16": "uint16",
-}
-"""The types of arrays that archives may hold, by their names in safetensors."""
-ORDER = ("I64", "F64", "F32", "I32", "F16", "U16", "I8", "U8")
-"""The types in the order in which safetensors writes arrays: those first that are aligned to more bytes."""
+LONGEST_SHARE = abs(LONGEST_NUMBER)
+"""The same for numbers that cannot be negative."""
 DAMAGED = "the file is damaged"
-
-Entries = Mapping[str, tuple[str, tuple[int, ...]]]
-"""Type and shape of each array of a file."""
-
-
-def first_difference(saved: Mapping[str, Any], current: Mapping[str, Any], prefix: str = "") -> str:
-    """Describes the first setting in which a saved run and the current one differ."""
-    for key in sorted({*saved, *current}):
-        old, new = saved.get(key), current.get(key)
-        if isinstance(old, dict) and isinstance(new, dict) and old != new:
-            return first_difference(old, new, f"{prefix}{key}.")
-        if old != new:
-            return f"{prefix}{key}={old}, and this run asks {prefix}{key}={new}"
-    return "other settings"
 
 
 class Archive:
@@ -265,61 +247,31 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
     assert not set(RESERVED_KEYS) & set(header)
     assert all(array.dtype.name in DTYPES.values() for array in pieces.values()), "a type that cannot be read back"
     checksums = {name: block_checksums(array) for name, array in pieces.items()}
-    _write_safetensors(path, pieces, _metadata(_entries(pieces), checksums, header))
+    write_safetensors(path, pieces, _metadata(entries_of(pieces), checksums, header))
 
 
-def _write_safetensors(path: Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
-    """Writes the bytes that `safetensors.numpy.save` gives, without a second copy of the arrays in memory.
-
-    The library's `save_file` writes a file of a random name first, which a kill leaves in the folder for good.
-    """
-    entries = _entries(arrays)
-    with atomic_file(path) as stream:
-        stream.write(_table(entries, metadata))
-        for name in _file_order(entries):
-            stream.write(bytes_of(arrays[name]).data)
-
-
-def archive_bytes(entries: Entries, header: Mapping[str, Any]) -> int:
+def archive_bytes(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> int:
     """The size of the file that `write_archive` would write.
 
     Args:
-        entries: type and shape of each array.
+        arrays: by name; values do not matter, so that arrays of `shape_only` will do.
         header: as it would be written; numbers of other lengths change the size by as many bytes.
     """
+    entries = entries_of(arrays)
     sizes = {name: math.prod(shape) * np.dtype(dtype).itemsize for name, (dtype, shape) in entries.items()}
     checksums = {name: "0" * (DIGITS * -(-size // BLOCK_BYTES)) for name, size in sizes.items()}
-    return len(_table(entries, _metadata(entries, checksums, header))) + sum(sizes.values())
+    return len(safetensors_header(entries, _metadata(entries, checksums, header))) + sum(sizes.values())
 
 
-def _entries(arrays: Mapping[str, np.ndarray]) -> Entries:
-    return {name: (array.dtype.name, array.shape) for name, array in arrays.items()}
-
-
-def _file_order(entries: Entries) -> list[str]:
-    letters = {name: letter for letter, name in DTYPES.items()}
-    return sorted(entries, key=lambda name: (ORDER.index(letters[entries[name][0]]), name))
+def shape_only(dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    """An array of zeros that takes no memory: it stands for one of its type and shape in `archive_bytes`."""
+    return np.broadcast_to(np.zeros((), dtype), shape)
 
 
 def _metadata(entries: Entries, checksums: Mapping[str, str], header: Mapping[str, Any]) -> dict[str, str]:
     # The digest is of what a reader will see: JSON turns tuples into lists and keys into text.
     covered = json.loads(json.dumps({**header, "version": VERSION, "checksums": checksums}))
     return {"gsencoder": json.dumps({**covered, "digest": file_digest(covered, entries)})}
-
-
-def _table(entries: Entries, metadata: Mapping[str, str]) -> bytes:
-    """What stands before the arrays."""
-    letters = {name: letter for letter, name in DTYPES.items()}
-    table: dict[str, Any] = {"__metadata__": dict(metadata)}
-    end = 0
-    for name in _file_order(entries):
-        dtype, shape = entries[name]
-        begin, end = end, end + math.prod(shape) * np.dtype(dtype).itemsize
-        table[name] = {"dtype": letters[dtype], "shape": list(shape), "data_offsets": [begin, end]}
-    text = json.dumps(table, separators=(",", ":"), ensure_ascii=False).encode("utf-8", "surrogatepass")
-    # Arrays begin at a multiple of eight bytes.
-    text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text
 
 
 def _contiguous(array: np.ndarray) -> np.ndarray:
@@ -351,3 +303,13 @@ def open_archive(path: Path) -> Iterator[Archive]:
         check_fetched(path)
         message = " ".join(str(error).split())[:160]
         raise InputError(f"{path}: damaged or no safetensors file: {message}") from error
+
+
+def verify_archive(path: Path) -> None:
+    """Reads an archive and verifies its checksums.
+
+    Raises:
+        InputError: missing, damaged, of another version, or without checksums.
+    """
+    with open_archive(path) as file:
+        file.verify()

@@ -63,8 +63,8 @@ class EventFile:
         Raises:
             InputError: the disk is full, or the system refuses.
         """
-        made = self._summary.image(name, pixels, dataformats="HWC")
-        self._write(self._event(wall_time=time.time(), step=step, summary=made))
+        summary = self._summary.image(name, pixels, dataformats="HWC")
+        self._write(self._event(wall_time=time.time(), step=step, summary=summary))
 
     def _write(self, event: Any) -> None:
         import io

@@ -25,6 +25,6 @@ def write_picture(path: Path, picture: Image.Image | np.ndarray, **options: Any)
         InputError: the folder is missing, the disk is full, or the system refuses.
     """
     held = io.BytesIO()
-    made = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
-    made.save(held, Image.registered_extensions()[path.suffix.lower()], **options)
+    image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
+    image.save(held, Image.registered_extensions()[path.suffix.lower()], **options)
     write_bytes(path, held.getvalue())

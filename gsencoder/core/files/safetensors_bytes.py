@@ -1,19 +1,40 @@
-"""Bytes of the arrays of a safetensors file, read without a memory map.
+"""The bytes of safetensors files: arrays read without a memory map, and files written without a second copy of them.
 
 A process that touches a page of a map beyond the end of its file is ended by the system (SIGBUS) without a word. Read
 as here, a file that is cut off by another program is shorter than expected, and an error names it.
 """
 
 import json
-from typing import BinaryIO
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import numpy as np
 from jaxtyping import UInt8
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.checksums import bytes_of
 
 HEADER_LIMIT = 100_000_000
 """Bytes of the longest header that the library reads."""
+DTYPES = {
+    "F16": "float16",
+    "F32": "float32",
+    "F64": "float64",
+    "I8": "int8",
+    "I32": "int32",
+    "I64": "int64",
+    "U8": "uint8",
+    "U16": "uint16",
+}
+"""The types of arrays that archives may hold, by their names in safetensors."""
+NAMES_OF_DTYPES = {dtype: name for name, dtype in DTYPES.items()}
+ORDER = ("I64", "F64", "F32", "I32", "F16", "U16", "I8", "U8")
+"""The types in the order in which safetensors writes arrays: those first that are aligned to more bytes."""
+Entries = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Type and shape of each array of a file."""
 
 
 def array_offsets(stream: BinaryIO) -> dict[str, tuple[int, int]]:
@@ -54,3 +75,39 @@ def read_bytes(stream: BinaryIO, span: tuple[int, int]) -> UInt8[np.ndarray, " b
     while done < len(data) and (count := stream.readinto(data[done:].data)):  # type: ignore[attr-defined]
         done += count
     return data[:done]
+
+
+def write_safetensors(path: Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+    """Writes the bytes that `safetensors.numpy.save` gives, without a second copy of the arrays in memory.
+
+    The library's `save_file` writes a file of a random name first, which a kill leaves in the folder for good.
+    """
+    entries = entries_of(arrays)
+    with atomic_file(path) as stream:
+        stream.write(safetensors_header(entries, metadata))
+        for name in _file_order(entries):
+            stream.write(bytes_of(arrays[name]).data)
+
+
+def entries_of(arrays: Mapping[str, np.ndarray]) -> Entries:
+    """Type and shape of each array."""
+    return {name: (array.dtype.name, array.shape) for name, array in arrays.items()}
+
+
+def _file_order(entries: Entries) -> list[str]:
+    """The names of arrays in the order in which they stand in the file."""
+    return sorted(entries, key=lambda name: (ORDER.index(NAMES_OF_DTYPES[entries[name][0]]), name))
+
+
+def safetensors_header(entries: Entries, metadata: Mapping[str, str]) -> bytes:
+    """The bytes before the arrays: the length of the table of names, types, shapes and offsets, and the table."""
+    table: dict[str, Any] = {"__metadata__": dict(metadata)}
+    end = 0
+    for name in _file_order(entries):
+        dtype, shape = entries[name]
+        begin, end = end, end + math.prod(shape) * np.dtype(dtype).itemsize
+        table[name] = {"dtype": NAMES_OF_DTYPES[dtype], "shape": list(shape), "data_offsets": [begin, end]}
+    text = json.dumps(table, separators=(",", ":"), ensure_ascii=False).encode("utf-8", "surrogatepass")
+    # Arrays begin at a multiple of eight bytes.
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text

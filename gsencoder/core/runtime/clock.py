@@ -51,11 +51,11 @@ class Clock:
         """
         of_threads: dict[str, float] = {}
         for each in steps:
-            for step, taken in each.items():
-                of_threads[step] = of_threads.get(step, 0.0) + taken
+            for step, seconds_of_step in each.items():
+                of_threads[step] = of_threads.get(step, 0.0) + seconds_of_step
         total = sum(of_threads.values())
-        for step, taken in of_threads.items():
-            self.seconds[step] = self.seconds.get(step, 0.0) + (seconds * taken / total if total else 0.0)
+        for step, seconds_of_step in of_threads.items():
+            self.seconds[step] = self.seconds.get(step, 0.0) + (seconds * seconds_of_step / total if total else 0.0)
 
 
 def timed(step: str) -> Callable[[Callable[P, R]], Callable[P, R]]:

@@ -42,9 +42,9 @@ def _limit_threads(threads: int) -> None:
 def thread_count() -> int:
     """As many threads as torch uses, or would use if it were loaded."""
     cores = os.cpu_count() or 1
-    asked = getattr(sys.modules.get("torch"), "get_num_threads", None)
-    if asked is not None:
-        return min(int(asked()), cores)
+    torch_threads = getattr(sys.modules.get("torch"), "get_num_threads", None)
+    if torch_threads is not None:
+        return min(int(torch_threads()), cores)
     stated = os.environ.get("OMP_NUM_THREADS", "")
     return min(max(int(stated), 1), cores) if stated.isdecimal() else cores
 

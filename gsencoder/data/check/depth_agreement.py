@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from gsencoder.data.readers.images import ray_lengths
+from gsencoder.data.readers.depth_images import ray_lengths
 from gsencoder.types import Views
 from gsencoder.types.cameras import pixel_centers, project_points
 from gsencoder.types.poses import invert_rigid, transform
@@ -76,7 +76,7 @@ def depth_views(views: Views, chosen: Int64[np.ndarray, " V"], *, seed: int = 0)
         seed: of the choice of samples.
     """
     assert views.depths is not None
-    made = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     cameras = views.cameras.select(chosen)
     shrink = min(1.0, MAX_SIDE / int(max(cameras.widths[0], cameras.heights[0])))
     width, height = (max(3, round(shrink * int(size[0]))) for size in (cameras.widths, cameras.heights))
@@ -90,7 +90,7 @@ def depth_views(views: Views, chosen: Int64[np.ndarray, " V"], *, seed: int = 0)
         depth = full[rows][:, columns]
         maps.append(depth)
         rows, columns = np.nonzero(on_surface(depth))
-        picked = made.permutation(len(rows))[:SAMPLES]
+        picked = rng.permutation(len(rows))[:SAMPLES]
         at, value = np.zeros((SAMPLES, 2)), np.zeros(SAMPLES)
         at[: len(picked)] = np.stack((columns[picked], rows[picked]), axis=1) + 0.5
         value[: len(picked)] = depth[rows[picked], columns[picked]]
@@ -125,9 +125,9 @@ def residuals(views: DepthViews) -> Float64[np.ndarray, "V V n"]:
     diagonal."""
     points = world_samples(views)
     count = len(views)
-    flat, known = points.reshape(-1, 3), (views.values > 0).reshape(-1)
+    flat, measured = points.reshape(-1, 3), (views.values > 0).reshape(-1)
     result = np.stack(
-        [_depth_ratio(views, other, flat, known).reshape(count, -1) - 1 for other in range(count)], axis=1
+        [_depth_ratio(views, other, flat, measured).reshape(count, -1) - 1 for other in range(count)], axis=1
     )
     result[np.arange(count), np.arange(count)] = np.nan
     return result
@@ -153,11 +153,11 @@ def agreement_map(views: DepthViews, view: int) -> Float32[np.ndarray, "h w"]:
         )
     )[0]
     agree, seen = np.zeros(len(points)), np.zeros(len(points))
-    known = views.depths[view].reshape(-1) > 0
+    measured = views.depths[view].reshape(-1) > 0
     for other in range(count):
         if other == view:
             continue
-        ratio = _depth_ratio(views, other, points, known)
+        ratio = _depth_ratio(views, other, points, measured)
         compared = np.isfinite(ratio) & (ratio < 1 + CLIP)
         seen += compared
         agree += compared & (np.abs(ratio - 1) <= TOLERANCE)
@@ -227,16 +227,16 @@ class Agreement:
 
 def agreement(residual: Float64[np.ndarray, "*n"]) -> Agreement:
     """Summary of residuals; NaN where nothing was compared."""
-    known = residual[np.isfinite(residual)]
-    if not len(known):
+    finite = residual[np.isfinite(residual)]
+    if not len(finite):
         return Agreement(share=float("nan"), spread=float("nan"), offset=float("nan"), compared=0)
-    size = np.abs(known)
-    near = known[size <= CLIP]
+    size = np.abs(finite)
+    near = finite[size <= CLIP]
     return Agreement(
-        share=float((size <= TOLERANCE).sum() / max(1, (known <= CLIP).sum())),
+        share=float((size <= TOLERANCE).sum() / max(1, (finite <= CLIP).sum())),
         spread=float(np.minimum(size, CLIP).mean()),
         offset=float(np.median(near)) if len(near) else float("nan"),
-        compared=len(known),
+        compared=len(finite),
     )
 
 
@@ -249,7 +249,7 @@ def pair_offsets(residual: Float64[np.ndarray, "V V n"]) -> tuple[float, float]:
     far: list[float] = []
     for view, other in np.ndindex(count, count):
         distance = abs(view - other)
-        known = residual[view, other][np.abs(residual[view, other]) <= CLIP]
-        if len(known) >= MIN_SAMPLES and (distance <= 3 or distance >= count / 2):
-            (near if distance <= 3 else far).append(abs(float(np.median(known))))
+        inliers = residual[view, other][np.abs(residual[view, other]) <= CLIP]
+        if len(inliers) >= MIN_SAMPLES and (distance <= 3 or distance >= count / 2):
+            (near if distance <= 3 else far).append(abs(float(np.median(inliers))))
     return tuple(float(np.median(each)) if each else float("nan") for each in (near, far))  # type: ignore[return-value]

@@ -107,17 +107,17 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
             cameras=cameras,
         )
     errors = pair_errors(cameras, matches)
-    given = float(np.mean(errors))
+    stated = float(np.mean(errors))
     findings: list[Finding] = []
-    best, best_error = cameras, given
-    if given > BAD:
+    best, best_error = cameras, stated
+    if stated > BAD:
         cause, factor, other, error = _best_reading(cameras, views.cameras, rows, matches)
         # One view astray among few raises the mean of all pairs, and no reading of all poses mends that.
-        if error < BETTER * given:
+        if error < BETTER * stated:
             findings.append(
                 Finding(
                     cause=cause,
-                    message=f"{ADVICE[cause].format(factor=factor)} (matches lie {given:.1f} pixels from their "
+                    message=f"{ADVICE[cause].format(factor=factor)} (matches lie {stated:.1f} pixels from their "
                     f"epipolar lines, {error:.1f} if so read)",
                     factor=factor,
                 )
@@ -138,7 +138,7 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
         views=rows,
         pairs=len(matches),
         matches=len(distances),
-        error=given,
+        error=stated,
         share=float((distances <= TOLERANCE).mean()),
         best_error=best_error,
         findings=tuple(findings),
@@ -217,11 +217,11 @@ def _stray_views(
     while True:
         worst = None
         for view in np.unique(pair_views[left]):
-            own = left & (pair_views == view).any(axis=1)
-            others = left & ~own
-            if own.sum() < 2 or others.sum() < 3:
+            of_view = left & (pair_views == view).any(axis=1)
+            others = left & ~of_view
+            if of_view.sum() < 2 or others.sum() < 3:
                 continue
-            error, usual = float(np.median(errors[own])), float(np.median(errors[others]))
+            error, usual = float(np.median(errors[of_view])), float(np.median(errors[others]))
             if error > max(STRAY_ERROR, STRAY_FACTOR * usual) and (worst is None or error > worst[1]):
                 worst = int(view), error, usual
         if worst is None:

@@ -36,7 +36,7 @@ class Reading:
     factor: float | None = None
 
 
-def as_given(views: DepthViews) -> Reading:
+def stated_reading(views: DepthViews) -> Reading:
     """The files' own reading."""
     return Reading(cause="", views=views, agreement=agreement(residuals(views)))
 

@@ -40,21 +40,21 @@ class RegistrationFit:
     Attributes:
         focal_factor: its focal length, as a multiple of the stated one.
         shift: what is added to x and y in the depth camera's axes to have them in its own, world units.
-        given: mean correlation of details of pairs of views with the stated camera.
+        stated: mean correlation of details of pairs of views with the stated camera.
         best: the same with the best one.
         pairs: pairs of views that were compared.
     """
 
     focal_factor: float
     shift: Float64[np.ndarray, "2"]
-    given: float
+    stated: float
     best: float
     pairs: int
 
     @property
     def differs(self) -> bool:
         """Whether the stated camera is wrong."""
-        return self.pairs > 0 and self.best >= LEAST and self.best >= self.given + BETTER
+        return self.pairs > 0 and self.best >= LEAST and self.best >= self.stated + BETTER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,25 +73,25 @@ def fit_registration(views: Views, chosen: Int64[np.ndarray, " V"], depth: Depth
         chosen: the rows of the views that are compared.
         depth: their depth images, under the reading that fits best.
     """
-    pairs = _shared_places(depth)
+    pairs = _shared_samples(depth)
     nothing = RegistrationFit(
-        focal_factor=1.0, shift=np.zeros(2), given=float("nan"), best=float("nan"), pairs=len(pairs)
+        focal_factor=1.0, shift=np.zeros(2), stated=float("nan"), best=float("nan"), pairs=len(pairs)
     )
     if not pairs:
         return nothing
-    places = [_places_of_view(pairs, view, views, chosen) for view in range(len(chosen))]
-    places = [each for each in places if len(each.points)]
+    samples = [_samples_of_view(pairs, view, views, chosen) for view in range(len(chosen))]
+    samples = [each for each in samples if len(each.points)]
 
     def score(factor: float, shift: Float64[np.ndarray, "2"]) -> float:
         key = (round(factor, 6), *np.round(shift / typical, 6))
-        if key not in known:
-            known[key] = _correlation(places, len(pairs), factor, shift)
-        return known[key]
+        if key not in scores:
+            scores[key] = _correlation(samples, len(pairs), factor, shift)
+        return scores[key]
 
     typical = float(np.median(np.concatenate([pair.points[0][:, 2] for pair in pairs])))
-    known: dict[tuple[float, ...], float] = {}
-    given = score(1.0, np.zeros(2))
-    if not np.isfinite(given):
+    scores: dict[tuple[float, ...], float] = {}
+    stated = score(1.0, np.zeros(2))
+    if not np.isfinite(stated):
         return nothing
     best = max(
         ((factor, np.array((shift * typical, 0.0))) for factor in FOCAL_FACTORS for shift in SHIFTS),
@@ -105,10 +105,10 @@ def fit_registration(views: Views, chosen: Int64[np.ndarray, " V"], depth: Depth
             around += [(factor, shift + sign * steps[1] * axis) for axis in np.eye(2) for sign in (-1, 1)]
             best = max([best, *around], key=lambda candidate: score(*candidate))
         steps = steps[0] ** 0.5, steps[1] / 2
-    return RegistrationFit(focal_factor=best[0], shift=best[1], given=given, best=score(*best), pairs=len(pairs))
+    return RegistrationFit(focal_factor=best[0], shift=best[1], stated=stated, best=score(*best), pairs=len(pairs))
 
 
-def _shared_places(depth: DepthViews) -> list[_Pair]:
+def _shared_samples(depth: DepthViews) -> list[_Pair]:
     """The pairs of views with the most samples on which their depth agrees."""
     pairs = [
         _Pair(views=(view, other), points=(here, there))
@@ -117,7 +117,7 @@ def _shared_places(depth: DepthViews) -> list[_Pair]:
     return sorted(pairs, key=lambda pair: -len(pair.points[0]))[:MAX_PAIRS]
 
 
-class _Places(NamedTuple):
+class _ViewSamples(NamedTuple):
     """What the correlation needs to know about one view.
 
     Attributes:
@@ -135,7 +135,7 @@ class _Places(NamedTuple):
     pairs: Int64[np.ndarray, " n"]
 
 
-def _places_of_view(pairs: list[_Pair], view: int, views: Views, chosen: Int64[np.ndarray, " V"]) -> _Places:
+def _samples_of_view(pairs: list[_Pair], view: int, views: Views, chosen: Int64[np.ndarray, " V"]) -> _ViewSamples:
     sizes = np.array([len(pair.points[0]) for pair in pairs])
     starts = np.concatenate(([0], np.cumsum(sizes)))
     points, entries, numbers = [np.empty((0, 3))], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
@@ -149,7 +149,7 @@ def _places_of_view(pairs: list[_Pair], view: int, views: Views, chosen: Int64[n
     small = views.cameras.select([row]).resized(PICTURE_SIZE, enlarge=False)
     everything = np.concatenate(points)
     details = _details(views, row, int(small.widths[0]), int(small.heights[0])) if len(everything) else np.zeros((1, 1))
-    return _Places(
+    return _ViewSamples(
         details, small.Ks[0].astype(np.float64), everything, np.concatenate(entries), np.concatenate(numbers)
     )
 
@@ -164,13 +164,13 @@ def _details(views: Views, row: int, width: int, height: int) -> Float64[np.ndar
     return np.asarray(gaussian_filter(values, FINE) - gaussian_filter(values, COARSE))
 
 
-def _correlation(places: list[_Places], pairs: int, factor: float, shift: Float64[np.ndarray, "2"]) -> float:
+def _correlation(positions: list[_ViewSamples], pairs: int, factor: float, shift: Float64[np.ndarray, "2"]) -> float:
     """Mean correlation of the details of pairs of views with a color camera."""
     from scipy.ndimage import map_coordinates
 
-    total = sum(len(each.points) for each in places)
+    total = sum(len(each.points) for each in positions)
     values, numbers = np.full(total, np.nan), np.zeros(total, np.int64)
-    for details, K, points, entries, pair in places:
+    for details, K, points, entries, pair in positions:
         focal = K.copy()
         focal[0, 0] *= factor
         focal[1, 1] *= factor

@@ -19,7 +19,7 @@ from gsencoder.data.check.depth_agreement import (
 )
 from gsencoder.data.check.epipolar import EpipolarCheck, check_matches
 from gsencoder.data.check.findings import ADVICE, Finding
-from gsencoder.data.check.readings import Reading, as_given, other_readings
+from gsencoder.data.check.readings import Reading, other_readings, stated_reading
 from gsencoder.data.check.registration_fit import RegistrationFit, fit_registration
 from gsencoder.data.check.stray_views import fit_pose, surface_normals, view_spreads
 from gsencoder.types import Scene, Views
@@ -61,8 +61,8 @@ class DepthCheck:
 
     Attributes:
         views: rows of the views that were looked at.
-        given: agreement of depth as the files have it.
-        best: that of the reading that fits best; `given` unless a finding names another.
+        stated: agreement of depth as the files have it.
+        best: that of the reading that fits best; `stated` unless a finding names another.
         offsets: see `pair_offsets`, under the reading that fits best.
         findings: what is wrong, causes that concern all views first.
         color: median correlation of the photographs' intensities at the same places; NaN without photographs.
@@ -71,7 +71,7 @@ class DepthCheck:
     """
 
     views: Int64[np.ndarray, " V"]
-    given: Agreement
+    stated: Agreement
     best: Agreement
     offsets: tuple[float, float]
     findings: tuple[Finding, ...]
@@ -114,7 +114,7 @@ def findings_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> list
 def fit_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> float:
     """The share of what views share that agrees: of depth if it can be compared, else of matches; NaN of neither."""
     if depth is not None and depth.comparable:
-        return depth.given.share
+        return depth.stated.share
     return matches.share if matches is not None else float("nan")
 
 
@@ -123,10 +123,10 @@ def warn_of_faults(scene: Scene) -> None:
     views = scene.views
     if views is None:
         return
-    plain, looked_at = plain_photographs(views)
+    plain, checked = plain_photographs(views)
     if plain:
         warnings.warn(
-            f"scene {scene.name}: {len(plain)} of {looked_at} photographs that were looked at are of one color all "
+            f"scene {scene.name}: {len(plain)} of {checked} photographs that were looked at are of one color all "
             f"over: {listed(plain)}",
             SceneWarning,
             stacklevel=2,
@@ -162,10 +162,10 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
     chosen = even_indices(len(views), limit)
     names = tuple(views.names[int(view)] for view in chosen)
     small = depth_views(views, chosen)
-    given = as_given(small)
-    best = _best_reading(given, small, chosen, views)
+    stated = stated_reading(small)
+    best = _best_reading(stated, small, chosen, views)
     comparable = best.agreement.compared >= _needed(small)
-    findings = _reading_findings(given, best) if comparable else []
+    findings = _reading_findings(stated, best) if comparable else []
     fits = comparable and best.agreement.share >= UNFIT
     stray = _stray_views(best.views, names) if fits else []
     color, registration = float("nan"), None
@@ -188,7 +188,7 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
             )
     return DepthCheck(
         views=chosen,
-        given=given.agreement,
+        stated=stated.agreement,
         best=best.agreement,
         offsets=pair_offsets(residuals(best.views)),
         findings=(*findings, *stray, *other),
@@ -207,13 +207,13 @@ def suspicious_depth(views: Views, *, limit: int = 10) -> tuple[Agreement, Findi
     """
     chosen = even_indices(len(views), limit)
     small = depth_views(views, chosen)
-    given = as_given(small)
-    if given.agreement.compared >= _needed(small) and given.agreement.share >= SUSPICIOUS:
-        return given.agreement, None
-    best = _best_reading(given, small, chosen, views)
+    stated = stated_reading(small)
+    if stated.agreement.compared >= _needed(small) and stated.agreement.share >= SUSPICIOUS:
+        return stated.agreement, None
+    best = _best_reading(stated, small, chosen, views)
     if best.agreement.compared < _needed(small):
-        return given.agreement, None
-    return given.agreement, next(iter(_reading_findings(given, best)), None)
+        return stated.agreement, None
+    return stated.agreement, next(iter(_reading_findings(stated, best)), None)
 
 
 def _needed(views: DepthViews) -> float:
@@ -221,7 +221,7 @@ def _needed(views: DepthViews) -> float:
     return COMPARABLE * len(views) * (len(views) - 1) * views.values.shape[1]
 
 
-def _best_reading(given: Reading, depth: DepthViews, chosen: Int64[np.ndarray, " V"], views: Views) -> Reading:
+def _best_reading(stated: Reading, depth: DepthViews, chosen: Int64[np.ndarray, " V"], views: Views) -> Reading:
     """The files' own reading, or another one that fits clearly better."""
     candidates = [
         reading
@@ -229,30 +229,30 @@ def _best_reading(given: Reading, depth: DepthViews, chosen: Int64[np.ndarray, "
         if reading.agreement.compared >= _needed(depth)
         and (reading.cause == "order" or reading.factor is None or _differs(reading.factor))
     ]
-    best = min(candidates, key=lambda reading: reading.agreement.spread, default=given)
-    if given.agreement.compared < _needed(depth):
+    best = min(candidates, key=lambda reading: reading.agreement.spread, default=stated)
+    if stated.agreement.compared < _needed(depth):
         # Views that share nothing are no fault; only a reading under which they agree says that they should.
-        return best if best.agreement.share >= CLEAR else given
-    return best if best.agreement.spread < BETTER * given.agreement.spread else given
+        return best if best.agreement.share >= CLEAR else stated
+    return best if best.agreement.spread < BETTER * stated.agreement.spread else stated
 
 
 def _differs(factor: float) -> bool:
     return abs(float(np.log(factor))) >= float(np.log(SMALLEST_FACTOR))
 
 
-def _reading_findings(given: Reading, best: Reading) -> list[Finding]:
+def _reading_findings(stated: Reading, best: Reading) -> list[Finding]:
     """What the reading that fits best says about the files."""
     share = best.agreement.share
     if share < UNFIT:
         message = (
-            f"poses and depth do not belong together: {given.agreement.share:.0%} of the depth agrees across views, "
+            f"poses and depth do not belong together: {stated.agreement.share:.0%} of the depth agrees across views, "
             f"and no other reading of the files has more than {share:.0%}"
         )
         return [Finding(cause="unknown", message=message)]
-    if best is given:
+    if best is stated:
         return []
     message = ADVICE[best.cause].format(factor=best.factor)
-    shares = f"{given.agreement.share:.0%} of the depth agrees across views, {share:.0%} if so read"
+    shares = f"{stated.agreement.share:.0%} of the depth agrees across views, {share:.0%} if so read"
     return [Finding(cause=best.cause, message=f"{message} ({shares})", factor=best.factor)]
 
 
@@ -261,7 +261,7 @@ def _with_registration(findings: list[Finding], fit: RegistrationFit) -> list[Fi
     finding."""
     if not fit.differs:
         return findings
-    correlations = f"details of the photographs correlate by {fit.given:.2f} across views, {fit.best:.2f} if so"
+    correlations = f"details of the photographs correlate by {fit.stated:.2f} across views, {fit.best:.2f} if so"
     focal = next((finding for finding in findings if finding.cause == "depth focal length"), None)
     if focal is not None and focal.factor and abs(np.log(fit.focal_factor / focal.factor)) < SAME_FACTOR:
         message = f"{ADVICE['focal length'].format(factor=focal.factor)}, and so is that of the depth ({correlations})"

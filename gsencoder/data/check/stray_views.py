@@ -86,13 +86,13 @@ def fit_pose(views: DepthViews, view: int, normals: list[Float64[np.ndarray, "h 
             z = local[inside, 2]
             good = (measured > 0) & (np.abs(z - measured) <= reach * measured)
             normal = normals[other][rows[good], columns[good]]
-            known = np.isfinite(normal).all(axis=1)
-            normal, moved = normal[known], here[inside][good][known]
+            finite = np.isfinite(normal).all(axis=1)
+            normal, moved = normal[finite], here[inside][good][finite]
             # Along the ray of the pixel the surface lies at the measured depth.
             eye = invert_rigid(views.cam_from_world[other])[:3, 3]
-            target = eye + (moved - eye) * (measured[good] / z[good])[known, None]
+            target = eye + (moved - eye) * (measured[good] / z[good])[finite, None]
             distance = np.einsum("ni,ni->n", moved - target, normal)
-            scale = HUBER * measured[good][known]
+            scale = HUBER * measured[good][finite]
             weight = np.minimum(1, scale / np.maximum(np.abs(distance), 1e-12)) / np.square(scale)
             jacobian = np.hstack((np.cross(moved - center, normal), normal))
             left += (jacobian * weight[:, None]).T @ jacobian

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from gsencoder.core.even_indices import even_indices
-from gsencoder.data.readers.images import read_rgba, read_small
+from gsencoder.data.readers.image_file import read_rgba, read_small
 
 LOOKED_AT = 16
 """So many photographs, evenly spaced, are looked at."""

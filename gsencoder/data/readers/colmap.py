@@ -142,8 +142,8 @@ def _load(model: Path) -> Any:
         # Names are decoded when they are asked for, so a name that is not UTF-8 shows only here.
         [image.name for image in reconstruction.images.values()]
     except Exception as error:
-        said = " ".join(str(error).split())[:200]
-        raise InputError(f"{model}: pycolmap cannot read this model ({type(error).__name__}: {said})") from error
+        message = " ".join(str(error).split())[:200]
+        raise InputError(f"{model}: pycolmap cannot read this model ({type(error).__name__}: {message})") from error
     if not binary:
         _check_text_counts(model, reconstruction)
     return reconstruction

@@ -62,8 +62,8 @@ def _params_of(model: int, walker: _Walker) -> int:
     names = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items()}
     if model < 0 or model not in names or names[model] == "INVALID":
         walker.fail(f"camera model number {model} is unknown to pycolmap {pycolmap.__version__}")
-    made = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
-    return len(made.params)
+    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
+    return len(camera.params)
 
 
 def _cameras(walker: _Walker) -> None:

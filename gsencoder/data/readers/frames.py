@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.images import picture_size
+from gsencoder.data.readers.image_file import picture_size
 from gsencoder.data.readers.undistort import CameraModel, check_camera
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")

@@ -20,7 +20,7 @@ from jaxtyping import Float64
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
 from gsencoder.data.readers.frames import SkippedFrames, files_by_stem, is_lost, pinhole_of
-from gsencoder.data.readers.images import picture_size
+from gsencoder.data.readers.image_file import picture_size
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.transforms_json import read_json, read_transforms
 from gsencoder.data.readers.undistort import CameraModel

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.images import picture_of, read_integers
+from gsencoder.data.readers.image_file import open_picture, read_integers
 from gsencoder.data.readers.label_images import LabelFiles
 
 MAX_MEMBER_BYTES = 64 << 20
@@ -56,7 +56,7 @@ def archived_size(path: Path) -> tuple[int, int]:
     Raises:
         InputError: damaged or no picture.
     """
-    with picture_of(path, member_bytes(path)) as picture:
+    with open_picture(path, member_bytes(path)) as picture:
         return picture.size
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.images import PictureFiles, PixelGrid, check_picture_size, load_npy, read_integers
+from gsencoder.data.readers.image_file import check_picture_size, load_npy, read_integers
+from gsencoder.data.readers.images import PictureFiles, PixelGrid
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache
 from gsencoder.types import Views
 from gsencoder.types.scene import Selected

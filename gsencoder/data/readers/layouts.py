@@ -94,8 +94,8 @@ def _read_colmap(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
     homes = [root, root.parent, root.parent.parent] if model == root else [root]
     home = next((home for home in homes if (home / "images").is_dir()), None)
     if home is None:
-        looked = ", ".join(str(home / "images") for home in homes)
-        raise InputError(f"{model}: a COLMAP model without photographs; looked for {looked}; say images=FOLDER")
+        searched = ", ".join(str(home / "images") for home in homes)
+        raise InputError(f"{model}: a COLMAP model without photographs; looked for {searched}; say images=FOLDER")
     return read_colmap(model, home / "images", home, allow_outside=options.allow_outside), home
 
 

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Bool
 
 from gsencoder.data.readers.background import Background, outline
-from gsencoder.data.readers.images import PictureFiles, PixelGrid, read_mask
+from gsencoder.data.readers.image_file import read_mask
+from gsencoder.data.readers.images import PictureFiles, PixelGrid
 from gsencoder.data.readers.undistort import RemapCache
 
 
@@ -48,7 +49,7 @@ class _OutlineFiles(PictureFiles[Bool[np.ndarray, "H W"]]):
             return None
         state = path.stat()
         used, empty = _last_outline(path, self._background, state.st_mtime_ns, state.st_size)
-        self.checked(view, used.shape)
+        self.check_size(view, used.shape)
         return used, empty
 
     def _fitted(self, view: int, pixels: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "h w"]:
@@ -84,7 +85,7 @@ class MaskFiles(_OutlineFiles):
         pixels = np.ones((grid.source.height, grid.source.width), bool)
         if path is not None:
             nonzero = read_mask(path)
-            self.checked(view, nonzero.shape)
+            self.check_size(view, nonzero.shape)
             pixels &= nonzero
         outlines = self._outline(view)
         if outlines is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.images import DepthMeasure
+from gsencoder.data.readers.depth_images import DepthMeasure
 from gsencoder.data.readers.undistort import CameraModel
 
 RIGID_TOLERANCE = 1e-3

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.frames import PICTURE_SUFFIXES, SkippedFrames, files_by_stem, is_lost, pinhole_of
-from gsencoder.data.readers.images import picture_size
+from gsencoder.data.readers.image_file import picture_size
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.tables import read_numbers
 from gsencoder.data.readers.undistort import CameraModel

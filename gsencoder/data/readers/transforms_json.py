@@ -22,7 +22,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.written_files import check_written
-from gsencoder.data.readers.images import picture_size
+from gsencoder.data.readers.image_file import picture_size
 from gsencoder.data.readers.posed import (
     PosedImage,
     PosedImages,

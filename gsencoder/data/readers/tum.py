@@ -17,7 +17,7 @@ from jaxtyping import Float64, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.frames import SkippedFrames
-from gsencoder.data.readers.images import picture_size
+from gsencoder.data.readers.image_file import picture_size
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, warn_left_out
 from gsencoder.data.readers.tables import read_numbers, table_lines
 from gsencoder.data.readers.undistort import CameraModel
@@ -192,12 +192,12 @@ def _camera(root: Path, picture: Path, intrinsics: Sequence[float] | None) -> Ca
     width, height = picture_size(picture)
     if intrinsics is not None:
         return CameraModel(model="PINHOLE", width=width, height=height, params=tuple(intrinsics))
-    known = re.search(r"freiburg([123])", str(root.resolve()), re.IGNORECASE)
-    if known is None or (width, height) != (640, 480):
+    sequence = re.search(r"freiburg([123])", str(root.resolve()), re.IGNORECASE)
+    if sequence is None or (width, height) != (640, 480):
         raise InputError(
             f"{root}: the sequence does not say its intrinsics; give data.intrinsics=[fx,fy,cx,cy] in pixels"
         )
-    fx, fy, cx, cy, k1, k2, p1, p2, k3 = KINECTS[known[1]]
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = KINECTS[sequence[1]]
     return CameraModel(
         model="FULL_OPENCV", width=640, height=480, params=(fx, fy, cx, cy, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     )

@@ -146,10 +146,12 @@ def load_pycolmap() -> Any:
 def _colmap_camera(camera: CameraModel, where: str) -> Any:
     pycolmap = load_pycolmap()
     # pycolmap reads past the end of a short parameter list unless it is checked first.
-    made = pycolmap.Camera(model=camera.model, width=camera.width, height=camera.height, params=list(camera.params))
-    if not made.verify_params():
+    converted = pycolmap.Camera(
+        model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
+    )
+    if not converted.verify_params():
         raise InputError(f"{where}: {len(camera.params)} parameters do not fit the camera model {camera.model}")
-    return made
+    return converted
 
 
 def _project(
@@ -161,9 +163,9 @@ def _project(
     if camera.is_pinhole:
         where = np.ascontiguousarray(project_points(rays, intrinsic_matrix(*camera.pinhole_params())))
     else:
-        made = _colmap_camera(camera, camera.model)
-        where = np.asarray(made.img_from_cam(rays), dtype=np.float64)
-        back = np.asarray(made.cam_from_img(np.nan_to_num(where)), dtype=np.float64)
+        converted = _colmap_camera(camera, camera.model)
+        where = np.asarray(converted.img_from_cam(rays), dtype=np.float64)
+        back = np.asarray(converted.cam_from_img(np.nan_to_num(where)), dtype=np.float64)
         with np.errstate(invalid="ignore", over="ignore"):
             used &= (np.abs(back - rays[:, :2]) * (K[0, 0], K[1, 1])).max(axis=1) <= PIXEL_TOLERANCE
     with np.errstate(invalid="ignore"):
@@ -249,9 +251,9 @@ class Remap:
         h, w = picture.shape
         column = np.clip(np.nan_to_num(self.x), 0, w - 1).astype(np.int32)
         row = np.clip(np.nan_to_num(self.y), 0, h - 1).astype(np.int32)
-        taken = picture.reshape(-1)[row * w + column]
-        taken[~self.valid] = 0
-        return taken
+        values = picture.reshape(-1)[row * w + column]
+        values[~self.valid] = 0
+        return values
 
 
 def build_remap(target: Pinhole, source: CameraModel) -> Remap:

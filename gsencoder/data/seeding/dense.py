@@ -17,10 +17,13 @@ from torch import Tensor
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
+from gsencoder.data.seeding.fill_depths import interpolated_depths, supported_depths
 from gsencoder.data.seeding.hull import outside_hull
 from gsencoder.data.seeding.stereo import (
+    DEPTH_TOLERANCE,
     MAX_PLANES,
     DepthMap,
+    back_project,
     confirms,
     count_agreeing,
     depth_range,
@@ -28,11 +31,7 @@ from gsencoder.data.seeding.stereo import (
     sees_through,
     source_views,
     sweep,
-    to_grid,
-    window_mean,
-    world_points,
 )
-from gsencoder.geometry import transform
 from gsencoder.types import Cameras
 
 FILLED_SPACING = 2.0
@@ -42,10 +41,6 @@ MAX_SEE_THROUGH = 1
 MIN_SPACING = 0.1
 MIN_CORRELATION = 0.6
 """Normalized cross-correlation of two windows, −1 to 1, from which they are taken to show the same surface."""
-DEPTH_TOLERANCE = 0.02
-"""Largest relative difference of two depths of one surface."""
-COLOR_TOLERANCE = 0.06
-"""Largest mean difference of the colors (0 to 1) of one surface in two photographs."""
 CELL = 1 / 40
 """Side of the cells in which coverage is counted, as a share of the picture's longer side."""
 
@@ -126,15 +121,15 @@ def densify(
     guide: Float32[np.ndarray, "G 3"] | None = None,
     track: Track = untracked,
 ) -> DenseSeeds | None:
-    """Points for every surface that the training photographs show; None where the given ones cover enough. No point
-    remains where photographs show that nothing is.
+    """Points on every surface that the training photographs show; None where `points` cover enough. Points where
+    photographs show empty space are removed.
 
     Args:
         photographs: of all views.
         training: the views that may be looked at.
         points: from structure from motion.
         colors: beside them.
-        config: see there.
+        config: settings.
         guide: points that tell which views to compare and at which depths, and are no seeds; None = `points`.
         track: progress.
     """
@@ -152,21 +147,21 @@ def densify(
             maps[view] = sweep_neighbors(view, others, photos, poses, *limits)
     consistent = consistent_depths(maps, photos, poses, neighbors)
     swept = back_project(consistent, photos, poses)
-    seen = _fill_depths(consistent, photos, poses, guide)
-    filled = back_project(_supported_depths(seen, consistent, photos, poses, neighbors), photos, poses)
+    interpolated = interpolated_depths(consistent, photos, poses, guide)
+    filled = back_project(supported_depths(interpolated, consistent, photos, poses, neighbors), photos, poses)
     voxel = config.spacing * _pixel_size(cameras, consistent)
     swept = carve(*average_by_voxel(*swept, voxel, config.samples), consistent, photos, poses, DEPTH_TOLERANCE)
     filled = average_by_voxel(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
     filled = carve(*filled, consistent, photos, poses, DEPTH_TOLERANCE)
-    given, swept, filled = (
-        (positions[keep], tints[keep])
-        for positions, tints in ((points, colors), swept, filled)
-        for keep in [~outside_hull(positions, photographs, training)]
+    sparse, swept, filled = (
+        (positions[inside], rgb[inside])
+        for positions, rgb in ((points, colors), swept, filled)
+        for inside in [~outside_hull(positions, photographs, training)]
     )
-    positions, tints = (np.concatenate(arrays) for arrays in zip(given, swept, filled, strict=True))
+    positions, rgb = (np.concatenate(arrays) for arrays in zip(sparse, swept, filled, strict=True))
     after = covered_share(photographs, training, positions)
     return DenseSeeds(
-        points=positions, colors=tints, swept=len(swept[0]), filled=len(filled[0]), coverage=(before, after)
+        points=positions, colors=rgb, swept=len(swept[0]), filled=len(filled[0]), coverage=(before, after)
     )
 
 
@@ -208,8 +203,8 @@ def sweep_neighbors(
 
 def _pixel_size(cameras: Cameras, depths: Mapping[int, Float[Tensor, "h w"]]) -> float:
     """What a pixel of a typical photograph covers of the known surfaces, in world units."""
-    known = [(view, depth[depth > 0]) for view, depth in depths.items()]
-    return float(np.median([float(z.median() / cameras.Ks[view, 0, 0]) for view, z in known if len(z)] or [1.0]))
+    measured = [(view, depth[depth > 0]) for view, depth in depths.items()]
+    return float(np.median([float(z.median() / cameras.Ks[view, 0, 0]) for view, z in measured if len(z)] or [1.0]))
 
 
 def carve(
@@ -277,96 +272,3 @@ def consistent_depths(
         votes = count_agreeing(depth_map.depth, photos[view], poses[view], others, tolerance)
         consistent[view] = torch.where(votes >= 2, depth_map.depth, 0)
     return consistent
-
-
-def back_project(
-    depths: Mapping[int, Float[Tensor, "h w"]], photos: Mapping[int, ScaledPhotograph], poses: Mapping[int, Tensor]
-) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    arrays: list[tuple[np.ndarray, np.ndarray]] = [(np.empty((0, 3), np.float32), np.empty((0, 3), np.uint8))]
-    for view, depth in depths.items():
-        known = depth > 0
-        points_seen = world_points(depth, photos[view], poses[view])[known]
-        arrays.append((points_seen.numpy(), (photos[view].image[known] * 255 + 0.5).to(torch.uint8).numpy()))
-    positions, tints = zip(*arrays, strict=True)
-    return np.concatenate(positions), np.concatenate(tints)
-
-
-def _fill_depths(
-    consistent: Mapping[int, Float[Tensor, "h w"]],
-    photos: Mapping[int, ScaledPhotograph],
-    poses: Mapping[int, Tensor],
-    points: Float32[np.ndarray, "P 3"],
-) -> dict[int, Float[Tensor, "h w"]]:
-    """Depth at every pixel of every view: its own, else that of other views' points, else between its neighbors'."""
-    cloud = torch.cat((torch.from_numpy(points), torch.from_numpy(back_project(consistent, photos, poses)[0])))
-    return {
-        view: interpolate(torch.where(depth > 0, depth, splat_depths(cloud, photos[view], poses[view])))
-        for view, depth in consistent.items()
-    }
-
-
-def splat_depths(
-    cloud: Float[Tensor, "P 3"], photo: ScaledPhotograph, pose: Float[Tensor, "4 4"]
-) -> Float[Tensor, "h w"]:
-    """The nearest point of each pixel: its depth, 0 where there is none."""
-    camera = transform(pose, cloud)
-    grid, inside = to_grid(camera, photo)
-    camera, grid = camera[inside], grid[inside]
-    column, row = ((grid + 1) / 2 * torch.tensor([photo.width, photo.height])).long().unbind(-1)
-    index = row.clamp(max=photo.height - 1) * photo.width + column.clamp(max=photo.width - 1)
-    nearest = torch.full((photo.height * photo.width,), torch.inf)
-    nearest.scatter_reduce_(0, index, camera[:, 2], "amin")
-    return torch.where(nearest.isfinite(), nearest, 0).reshape(photo.height, photo.width)
-
-
-def interpolate(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Fills what is 0 with means of ever larger surroundings, in 1/depth, in which planes are linear (push–pull)."""
-    known = (depth > 0).float()
-    inverse = torch.where(depth > 0, 1 / depth.clamp(min=1e-9), 0)
-    levels: list[tuple[Tensor, Tensor]] = [(inverse, known)]
-    while max(levels[-1][0].shape) > 1:
-        value, weight = (
-            torch.nn.functional.avg_pool2d(part[None], 2, ceil_mode=True)[0]
-            for part in (levels[-1][0] * levels[-1][1], levels[-1][1])
-        )
-        levels.append((value / weight.clamp(min=1e-9), (weight > 0).float()))
-    result = levels[-1][0]
-    for value, weight in reversed(levels[:-1]):
-        coarse = torch.nn.functional.interpolate(result[None, None], size=value.shape, mode="bilinear")[0, 0]
-        result = torch.where(weight > 0, value, coarse)
-    return torch.where(depth > 0, depth, torch.where(result > 0, 1 / result.clamp(min=1e-9), 0))
-
-
-def _supported_depths(
-    seen: Mapping[int, Float[Tensor, "h w"]],
-    consistent: Mapping[int, Float[Tensor, "h w"]],
-    photos: Mapping[int, ScaledPhotograph],
-    poses: Mapping[int, Tensor],
-    neighbors: Mapping[int, Sequence[int]],
-) -> dict[int, Float[Tensor, "h w"]]:
-    """Interpolated depths whose colors two other photographs confirm, and that none sees through; 0 elsewhere."""
-    smooth = {view: window_mean(photos[view].image.permute(2, 0, 1)[None])[0] for view in seen}
-    supported = {}
-    for view, depth in seen.items():
-        candidates = (consistent[view] == 0) & (depth > 0)
-        mask = photos[view].mask
-        if mask is not None:
-            candidates &= mask
-        points_seen = world_points(depth, photos[view], poses[view])[candidates]
-        tints = smooth[view].permute(1, 2, 0)[candidates]
-        votes = torch.zeros(len(points_seen), dtype=torch.int64)
-        against = torch.zeros(len(points_seen), dtype=torch.bool)
-        for other in neighbors[view]:
-            if other not in seen:
-                continue
-            grid, inside = to_grid(transform(poses[other], points_seen), photos[other])
-            other_tints = torch.nn.functional.grid_sample(smooth[other][None], grid[None, None], align_corners=False)[
-                0, :, 0
-            ].T
-            votes += inside & ((other_tints - tints).abs().mean(dim=-1) <= COLOR_TOLERANCE)
-            z, measured = sample_depth(points_seen, consistent[other], photos[other], poses[other])
-            against |= sees_through(z, measured, DEPTH_TOLERANCE)
-        chosen = torch.zeros_like(candidates)
-        chosen[candidates] = (votes >= 2) & ~against
-        supported[view] = torch.where(chosen, depth, 0)
-    return supported

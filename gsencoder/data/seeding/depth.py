@@ -114,8 +114,8 @@ def read_rgbd(views: Views, view: int) -> tuple[Float32[np.ndarray, "H W"], UInt
     size = (int(views.cameras.heights[view]), int(views.cameras.widths[view]))
     for kind, array in (("depth", depth), ("image", image)):
         if array.shape[:2] != size:
-            got, wanted = "×".join(map(str, array.shape[1::-1])), f"{size[1]}×{size[0]}"
-            raise InputError(f"view {views.names[view]!r}: the {kind} is {got}, but its camera says {wanted}")
+            got, expected = "×".join(map(str, array.shape[1::-1])), f"{size[1]}×{size[0]}"
+            raise InputError(f"view {views.names[view]!r}: the {kind} is {got}, but its camera says {expected}")
     bad = np.count_nonzero(~np.isfinite(depth) | (depth < 0))
     if bad:
         raise InputError(

@@ -16,7 +16,6 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.dense import (
     DenseConfig,
     DenseSeeds,
-    back_project,
     consistent_depths,
     covered_share,
     densify,
@@ -24,6 +23,7 @@ from gsencoder.data.seeding.dense import (
     sweep_neighbors,
 )
 from gsencoder.data.seeding.points import seed_from_points
+from gsencoder.data.seeding.stereo import back_project
 from gsencoder.data.seeding.triangulate import Triangulation, triangulate
 from gsencoder.data.seeding.view_pairs import depth_range_of_cameras, overlaps, typical_distance
 from gsencoder.types import Cameras, Gaussians, Views

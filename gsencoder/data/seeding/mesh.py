@@ -164,9 +164,9 @@ def _parts(path: Path) -> list[Any]:
         loaded = trimesh.load_scene(path, process=False)
         return loaded.dump(concatenate=False)
     except Exception as error:  # trimesh's readers raise whatever their parsers do.
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+        message = " ".join(f"{type(error).__name__}: {error}".split())[:160]
         raise InputError(
-            f"{path}: not a mesh that trimesh can read ({said}); expected .ply, .obj, .glb, .stl or .off"
+            f"{path}: not a mesh that trimesh can read ({message}); expected .ply, .obj, .glb, .stl or .off"
         ) from error
 
 

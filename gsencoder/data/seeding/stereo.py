@@ -4,12 +4,12 @@ For every pixel of a reference view, planes z = d of many depths carry it into a
 small windows look most alike there is kept, if they look alike enough.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64, UInt8
 from torch import Tensor
 
 from gsencoder.data.photographs import ScaledPhotograph
@@ -26,6 +26,8 @@ SMALLEST_DEPTH = 1e-6
 """Points nearer to a camera, or behind it, are in no picture, world units."""
 MIN_CONTRAST = 0.01
 """Windows whose colors deviate less (of 1) say nothing."""
+DEPTH_TOLERANCE = 0.02
+"""Largest relative difference of two depths of one surface."""
 BEST_ANGLE = np.deg2rad(8.0)
 """Views whose rays meet at about this angle are compared: further ones look different, nearer ones measure little."""
 
@@ -256,5 +258,17 @@ def count_agreeing(
 def world_points(
     depth: Float[Tensor, "h w"], photo: ScaledPhotograph, pose: Float[Tensor, "4 4"]
 ) -> Float[Tensor, "h w 3"]:
-    """Where the pixels' surfaces lie in the world."""
+    """The world points that the pixels of a view show."""
     return transform(invert_rigid(pose), _points_at(depth, photo))
+
+
+def back_project(
+    depths: Mapping[int, Float[Tensor, "h w"]], photos: Mapping[int, ScaledPhotograph], poses: Mapping[int, Tensor]
+) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
+    """The points and colors (RGB) of the pixels of all views whose depth is known (above 0)."""
+    points, colors = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.uint8)]
+    for view, depth in depths.items():
+        known = depth > 0
+        points.append(world_points(depth, photos[view], poses[view])[known].numpy())
+        colors.append((photos[view].image[known] * 255 + 0.5).to(torch.uint8).numpy())
+    return np.concatenate(points), np.concatenate(colors)

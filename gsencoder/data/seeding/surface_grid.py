@@ -142,8 +142,8 @@ def _add_samples(points, normals, colors, voxel, base, slots, keys, sums, rows):
     for n in range(len(points)):
         key, offset, facing, largest = np.int64(0), np.float32(0), 0, np.float32(-1)
         for axis in range(3):
-            place, normal = points[n, axis] / voxel, normals[n, axis]
-            cell = np.floor(place)
+            position, normal = points[n, axis] / voxel, normals[n, axis]
+            cell = np.floor(position)
             # Numbers that no integer holds are out of reach too, and must not be cast.
             if not abs(cell) < OUT_OF_REACH:
                 return -1
@@ -151,7 +151,7 @@ def _add_samples(points, normals, colors, voxel, base, slots, keys, sums, rows):
             if local < 0 or local >= 1 << AXIS_BITS:
                 return -1
             key = key << AXIS_BITS | local
-            offset += (place - cell - half) * normal
+            offset += (position - cell - half) * normal
             if abs(normal) > largest:
                 largest, facing = abs(normal), 2 * axis + (normal > 0)
         layer = min(max(int(np.rint(offset / layer_height)) + _LAYERS // 2, 0), _LAYERS - 1)

@@ -102,15 +102,15 @@ def _read(path: Path, load: Load, size: int) -> RawSplat:
             raise InputError(
                 f"{path}: meta.json names {str(name)[:60]!r} for {section}; expected a file name without a folder"
             )
-        wanted = rows or count
+        count_wanted = rows or count
         # Pixels beyond the count are padding to whole rows; a lossless WebP is no larger than its pixels.
-        allowed = 2 * wanted + (1 << 16)
+        allowed = 2 * count_wanted + (1 << 16)
         image = _decode_webp(path, name, load(name, 5 * allowed), allowed)
-        if image.shape[0] * image.shape[1] < wanted or (width is not None and image.shape[1] != width):
+        if image.shape[0] * image.shape[1] < count_wanted or (width is not None and image.shape[1] != width):
             raise InputError(
-                f"{path}: {name} has {image.shape[1]}×{image.shape[0]} pixels, too few for {wanted:,} entries"
+                f"{path}: {name} has {image.shape[1]}×{image.shape[0]} pixels, too few for {count_wanted:,} entries"
             )
-        return image.reshape(-1, 4)[:wanted]
+        return image.reshape(-1, 4)[:count_wanted]
 
     low, high = _numbers(path, meta, "means", "mins", 3), _numbers(path, meta, "means", "maxs", 3)
     fixed = texels("means", 0)[:, :3] + (texels("means", 1)[:, :3].astype(np.float64) * 256)

@@ -68,10 +68,10 @@ class ClassTable:
 
     def without(self, names: Collection[str]) -> "ClassTable":
         """The table without some names, of which those that it does not have are passed over."""
-        kept = [row for row, name in enumerate(self.names) if name not in names]
+        rows = [row for row, name in enumerate(self.names) if name not in names]
         return ClassTable(
-            names=tuple(self.names[row] for row in kept),
-            ids=tuple(self.ids[row] for row in kept),
+            names=tuple(self.names[row] for row in rows),
+            ids=tuple(self.ids[row] for row in rows),
             groups={
                 group: tuple(name for name in members if name not in names) for group, members in self.groups.items()
             },
@@ -81,5 +81,5 @@ class ClassTable:
         """The row of each id in the table; -1 for ids that it does not have."""
         order = np.argsort(self.ids)
         ascending = np.array(self.ids, np.int64)[order]
-        places = np.minimum(np.searchsorted(ascending, ids), len(ascending) - 1)
-        return np.where(ascending[places] == ids, order[places], -1)
+        positions = np.minimum(np.searchsorted(ascending, ids), len(ascending) - 1)
+        return np.where(ascending[positions] == ids, order[positions], -1)

@@ -65,10 +65,10 @@ def make_expressions(
     ordered = sorted(scenes, key=lambda scene: scene.name)
     if len({scene.name for scene in ordered}) < len(ordered):
         raise InputError("expressions: two scenes have one name")
-    made = [each for scene in ordered for each in _of_scene(scene, seed, per_object, per_scene)]
-    if not made:
+    expressions = [each for scene in ordered for each in _of_scene(scene, seed, per_object, per_scene)]
+    if not expressions:
         raise InputError(f"expressions: no object of {len(ordered)} scenes is shown well enough and can be described")
-    return tuple(made)
+    return tuple(expressions)
 
 
 def _of_scene(scene: SeenScene, seed: int, per_object: int, per_scene: int) -> list[MadeExpression]:
@@ -78,13 +78,13 @@ def _of_scene(scene: SeenScene, seed: int, per_object: int, per_scene: int) -> l
         (thing, ways) for thing in things if thing.name and scene.shown(thing) and (ways := ways_to_say(scene, thing))
     ]
     shuffled = rng.permutation(len(described)).tolist()
-    made = []
+    expressions = []
     for row in sorted(shuffled[:per_scene] if per_scene else shuffled):
         thing, ways = described[row]
         chosen = [ways[way] for way in rng.permutation(len(ways))[:per_object]]
         for number, (text, others) in enumerate(chosen):
-            made.append(_made(scene, thing, text, others, number))
-    return made
+            expressions.append(_made(scene, thing, text, others, number))
+    return expressions
 
 
 def ways_to_say(scene: SeenScene, thing: SeenObject) -> list[tuple[str, tuple[SeenObject, ...]]]:

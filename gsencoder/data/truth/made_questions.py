@@ -123,9 +123,9 @@ def balanced(units: Mapping[str, Mapping[Kind, Sequence[Unit]]], equal: bool) ->
     most = min(counts, default=0)
     chosen: list[Question] = []
     for kind, ranked in by_kind.items():
-        kept = ranked[: -(-most // len(ranked[0][2]))] if equal and ranked else ranked
+        selected = ranked[: -(-most // len(ranked[0][2]))] if equal and ranked else ranked
         numbers: dict[str, int] = {}
-        for _, name, unit in sorted(kept, key=lambda one: (one[1], one[0])):
+        for _, name, unit in sorted(selected, key=lambda one: (one[1], one[0])):
             for question in unit:
                 numbers[name] = numbers.get(name, -1) + 1
                 chosen.append(replace(question, id=f"{name}-{kind}-{numbers[name]}"))
@@ -219,14 +219,14 @@ def _question(scene: SeenScene, text: str, answers: Sequence[str], needed: Seque
 def _varied(questions: Sequence[Question], count: int) -> list[Unit]:
     """The first so many questions, of which no answer has more than half, rounded up."""
     most = -(-count // 2)
-    taken: dict[str, int] = {}
-    kept: list[Unit] = []
+    counts: dict[str, int] = {}
+    selected: list[Unit] = []
     for question in questions:
         answer = question.answers[0]
-        if taken.get(answer, 0) < most and len(kept) < count:
-            taken[answer] = taken.get(answer, 0) + 1
-            kept.append((question,))
-    return kept
+        if counts.get(answer, 0) < most and len(selected) < count:
+            counts[answer] = counts.get(answer, 0) + 1
+            selected.append((question,))
+    return selected
 
 
 def _paired(questions: Sequence[Question], count: int) -> Sequence[Unit]:

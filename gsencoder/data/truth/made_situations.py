@@ -39,8 +39,8 @@ def make_situations(scenes: Iterable[SeenScene], *, seed: int = 0, per_kind: int
     ordered = sorted(scenes, key=lambda scene: scene.name)
     if len({scene.name for scene in ordered}) < len(ordered):
         raise InputError("situations: two scenes have one name")
-    made = [each for scene in ordered for each in _of_scene(scene, seed, per_kind)]
-    return tuple(made)
+    situations = [each for scene in ordered for each in _of_scene(scene, seed, per_kind)]
+    return tuple(situations)
 
 
 def _of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
@@ -52,19 +52,19 @@ def _of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
     shuffled = [triples[row] for row in rng.permutation(len(triples))]
     sides: dict[str, list[Question]] = {"left": [], "right": []}
     nearer: list[Question] = []
-    asked: set[tuple[int, int]] = set()
+    pairs: set[tuple[int, int]] = set()
     for at, facing, other in shuffled:
         side = side_of(at, facing, other)
-        if side is not None and len(sides[side]) < per_kind // 2 and (at.id, other.id) not in asked:
-            asked.add((at.id, other.id))
+        if side is not None and len(sides[side]) < per_kind // 2 and (at.id, other.id) not in pairs:
+            pairs.add((at.id, other.id))
             text = f"Is the {other.name} on my left or on my right?"
             sides[side].append(_question(scene, at, facing, [other], text, side))
     for number, (at, one, other) in enumerate(shuffled):
         first, second = gap(at, one), gap(at, other)
-        if first > second or (at.id, one.id) in asked or len(nearer) == per_kind:
+        if first > second or (at.id, one.id) in pairs or len(nearer) == per_kind:
             continue
         if clearly_nearer(first, second) and second - first >= CLEAR_DISTANCE:
-            asked.add((at.id, one.id))
+            pairs.add((at.id, one.id))
             named = sorted((one, other), key=lambda thing: str(thing.name))
             text = f"Which is closer to me, the {named[0].name} or the {named[1].name}?"
             # What one faces must not tell which is the nearer one.

@@ -60,7 +60,7 @@ def take_frames(
         path: of the video.
         folder: is replaced; it receives `frame_000000.jpg` and so on, the number being that of the frame in the video,
             and a record of what they were made from.
-        config: see there.
+        config: settings.
         track: progress of decoding.
 
     Returns:
@@ -102,9 +102,9 @@ def take_frames(
             stacklevel=2,
         )
     names: list[str] = []
-    wanted = set(chosen.tolist())
+    selected = set(chosen.tolist())
     for index, frame in track(enumerate(video.frames()), f"taking {len(chosen)} frames"):
-        if index in wanted:
+        if index in selected:
             names.append(f"frame_{index:06d}.jpg")
             _write(folder / names[-1], color_picture(frame, config.pixels, video.pixel_aspect))
         if index == chosen[-1]:

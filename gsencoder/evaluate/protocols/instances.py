@@ -80,8 +80,8 @@ def predict_instances(
     """
     ids = classes.id_of
     if protocol.proposals == "clusters":
-        asked = replace(scene, features={features.space.name: features})
-        boxes = localize(asked, classes.names, text, localization).boxes
+        queried = replace(scene, features={features.space.name: features})
+        boxes = localize(queried, classes.names, text, localization).boxes
         masks = [points.masked(box.rows.astype(np.int64), len(features)) for box in boxes]
         labels, scores = [ids[box.query] for box in boxes], [float(box.probability) for box in boxes]
     else:

@@ -93,8 +93,10 @@ def predict_referring(
         aligned_from_world: rigid transform into the frame in which true boxes are axis-aligned; None = the world.
     """
     table = closed_table(text)
-    asked = {each: (each.text,) if protocol.query == "sentence" else words_in(each.text, table) for each in expressions}
-    words = list(dict.fromkeys(words[0] for words in asked.values() if words))
+    queries_of = {
+        each: (each.text,) if protocol.query == "sentence" else words_in(each.text, table) for each in expressions
+    }
+    words = list(dict.fromkeys(words[0] for words in queries_of.values() if words))
     corners: dict[str, list[Float64[np.ndarray, "2 3"]]] = {}
     if words:
         with_features = replace(scene, features={features.space.name: features})
@@ -103,7 +105,9 @@ def predict_referring(
             warnings.simplefilter("ignore", SceneWarning)
             localized = localize(with_features, words, text, localization)
         corners = corners_of_words(scene, localized, aligned_from_world)
-    boxes = {each: corners.get(asked[each][0], [])[:CANDIDATES] if asked[each] else [] for each in expressions}
+    boxes = {
+        each: corners.get(queries_of[each][0], [])[:CANDIDATES] if queries_of[each] else [] for each in expressions
+    }
     return [
         PredictedBoxes(
             scene=each.scene,

@@ -101,15 +101,15 @@ def evaluate_retrieval(
     directions = word_directions(words.encode(list(texts)), words.mean, protocol.mode)
     results = []
     for loaded, load_seconds in scenes:
-        own = tuple(each for each in captions if each.scene == loaded.name)
-        rows = views_of(loaded, own)
+        of_scene = tuple(each for each in captions if each.scene == loaded.name)
+        rows = views_of(loaded, of_scene)
         scene, features, seconds = with_features(loaded, source, seeds)
         check_space(features.space, words.space)
         start = time.perf_counter()
         scores = score_views(scene, features, rows, directions, protocol, memory=memory_of(scene))
         seconds = {"load": load_seconds, **seconds, "retrieve": time.perf_counter() - start}
         results.append(
-            SceneRetrieval(scene=scene.name, captions=own, scores=scores, gaussians=len(features), seconds=seconds)
+            SceneRetrieval(scene=scene.name, captions=of_scene, scores=scores, gaussians=len(features), seconds=seconds)
         )
     return results
 

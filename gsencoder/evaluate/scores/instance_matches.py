@@ -112,10 +112,10 @@ def match_instances(
     instance_rows = np.where(ids == 0, -1, instance_rows)
     counted = (instance_rows >= 0) & (ids >= IDS_PER_CLASS) & (sizes >= min_region)
     other_classes = int((rows < 0).sum())
-    kept = np.flatnonzero((rows >= 0) & (np.diff(prediction.offsets) >= min_region))
-    rows, scores, areas = rows[kept], prediction.scores[kept], np.diff(prediction.offsets)[kept]
-    common = np.zeros((len(kept), len(ids)), np.int64)
-    for row, index in enumerate(kept.tolist()):
+    large = np.flatnonzero((rows >= 0) & (np.diff(prediction.offsets) >= min_region))
+    rows, scores, areas = rows[large], prediction.scores[large], np.diff(prediction.offsets)[large]
+    common = np.zeros((len(large), len(ids)), np.int64)
+    for row, index in enumerate(large.tolist()):
         common[row] = np.bincount(codes[prediction.mask(index)], minlength=len(ids))
 
     same = rows[:, None] == instance_rows

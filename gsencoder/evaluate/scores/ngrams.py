@@ -196,13 +196,13 @@ def _bleu(correct: np.ndarray, guessed: np.ndarray, lengths: np.ndarray) -> np.n
 
 def _common_subsequence(first: Sequence[str], second: Sequence[str]) -> int:
     """Length of the longest common subsequence, a bit of one integer for each token of `first` (Hyyrö 2004)."""
-    places: dict[str, int] = {}
+    positions: dict[str, int] = {}
     for row, token in enumerate(first):
-        places[token] = places.get(token, 0) | 1 << row
+        positions[token] = positions.get(token, 0) | 1 << row
     every = (1 << len(first)) - 1
     state = every
     for token in second:
-        matches = state & places.get(token, 0)
+        matches = state & positions.get(token, 0)
         state = ((state + matches) | (state - matches)) & every
     return len(first) - state.bit_count()
 

@@ -60,14 +60,14 @@ class RecognizedInstance:
         scene: name of its scene.
         object: its id there.
         name: its class.
-        place: of this class among the predicted names, from 1; 0 if it is not among them.
+        rank: of this class among the predicted names, from 1; 0 if it is not among them.
         first: the name predicted first; None without an answer.
     """
 
     scene: str
     object: str
     name: str
-    place: int
+    rank: int
     first: str | None
 
     @property
@@ -141,7 +141,7 @@ def recognize(
                 scene=instance.scene,
                 object=instance.object,
                 name=instance.name,
-                place=ranked.index(instance.name) + 1 if instance.name in ranked else 0,
+                rank=ranked.index(instance.name) + 1 if instance.name in ranked else 0,
                 first=ranked[0] if ranked else None,
             )
         )
@@ -164,20 +164,20 @@ def recognition_scores(
     _refuse_repeated([item.key for item in instances], "instances")
     if min(ks, default=1) < 1:
         raise InputError(f"recognition: expected k of 1 or more, got {min(ks)}")
-    places: dict[str, list[int]] = {name: [] for name in classes}
+    ranks_of: dict[str, list[int]] = {name: [] for name in classes}
     for item in instances:
-        if item.name not in places:
+        if item.name not in ranks_of:
             raise InputError(f"{described(item.key)} is {item.name[:40]!r}, which is no class")
-        places[item.name].append(item.place)
-    table = {k: {name: _share(ranks, k) for name, ranks in places.items()} for k in ks}
-    everything = [item.place for item in instances]
+        ranks_of[item.name].append(item.rank)
+    table = {k: {name: _share(ranks, k) for name, ranks in ranks_of.items()} for k in ks}
+    everything = [item.rank for item in instances]
     return RecognitionScores(
         instances=len(instances),
         unanswered=sum(item.first is None for item in instances),
         classes=table,
         mean={k: mean_of(list(row.values())) for k, row in table.items()},
         overall={k: _share(everything, k) for k in ks},
-        counts={name: len(ranks) for name, ranks in places.items()},
+        counts={name: len(ranks) for name, ranks in ranks_of.items()},
     )
 
 
@@ -186,8 +186,8 @@ def described(key: tuple[str, str]) -> str:
     return f"object {key[1]} of {key[0]}"
 
 
-def _share(places: list[int], k: int) -> float:
-    return mean_of([float(1 <= place <= k) for place in places])
+def _share(ranks: list[int], k: int) -> float:
+    return mean_of([float(1 <= rank <= k) for rank in ranks])
 
 
 def _refuse_repeated(keys: Sequence[tuple[str, str]], where: str) -> None:

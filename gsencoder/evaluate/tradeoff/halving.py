@@ -44,12 +44,12 @@ class Rung:
     Attributes:
         scenes: of the rung.
         settings: that were measured on them.
-        kept: those of the next rung; after the last rung, all in the order in which they are best.
+        survivors: those of the next rung; after the last rung, all in the order in which they are best.
     """
 
     scenes: int
     settings: tuple[Knobs, ...]
-    kept: tuple[Knobs, ...]
+    survivors: tuple[Knobs, ...]
 
 
 def draw_settings(values: Mapping[str, Sequence[Any]], count: int, seed: int) -> list[dict[str, Any]]:
@@ -84,7 +84,7 @@ def successive_halving(
         settings: to begin with.
         scenes: how many there are.
         evaluate: see there.
-        config: see there.
+        config: settings.
     """
     rungs: list[Rung] = []
     current, used = list(settings), min(config.first, scenes)
@@ -92,9 +92,9 @@ def successive_halving(
         costs = np.asarray(evaluate(current, used), np.float64).reshape(len(current), -1)
         order = [current[index] for index in best_first(costs)]
         last = used == scenes
-        kept = order if last else order[: max(LEAST, math.ceil(config.keep * len(order) - 1e-9))]
-        rungs.append(Rung(scenes=used, settings=tuple(current), kept=tuple(kept)))
+        survivors = order if last else order[: max(LEAST, math.ceil(config.keep * len(order) - 1e-9))]
+        rungs.append(Rung(scenes=used, settings=tuple(current), survivors=tuple(survivors)))
         if last:
             break
-        current, used = kept, min(scenes, max(used + 1, round(used / config.keep)))
+        current, used = survivors, min(scenes, max(used + 1, round(used / config.keep)))
     return rungs

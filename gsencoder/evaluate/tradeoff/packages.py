@@ -34,8 +34,8 @@ class PackageScene:
         if settings.form == "compact":
             save_package(target, self._scene, self._features, error=settings.error)
         elif settings.form == "index":
-            made = index_features(self._features, IndexConfig(threshold=settings.threshold))
-            save_index_package(target, self._scene, made.features, error=made.error)
+            indexed = index_features(self._features, IndexConfig(threshold=settings.threshold))
+            save_index_package(target, self._scene, indexed.features, error=indexed.error)
         elif settings.form == "ply":
             save_ply(target, self._scene, self._features, decoded=False)
         else:

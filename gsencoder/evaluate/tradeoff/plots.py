@@ -36,7 +36,7 @@ def to_json(stages: Sequence[StageResult], scaling: Sequence[ScalingResult] = ()
                 "accuracy": each.stage.accuracy,
                 "matter": list(each.matter),
                 "rungs": [
-                    {"scenes": rung.scenes, "settings": len(rung.settings), "kept": len(rung.kept)}
+                    {"scenes": rung.scenes, "settings": len(rung.settings), "kept": len(rung.survivors)}
                     for rung in each.rungs
                 ],
             }
@@ -138,14 +138,14 @@ def label_points(axes: Any, labels: Sequence[Label]) -> list[Any]:
     """
     renderer = axes.figure.canvas.get_renderer()
     legend = axes.get_legend()
-    taken = [] if legend is None else [legend.get_window_extent(renderer)]
+    occupied = [] if legend is None else [legend.get_window_extent(renderer)]
     notes = []
     for text, point in labels:
         for offset, side in OFFSETS:
             note = axes.annotate(text, point, xytext=offset, textcoords="offset points", fontsize=7, ha=side)
             box = note.get_window_extent(renderer)
-            if box.count_overlaps(taken) == 0:
-                taken.append(box)
+            if box.count_overlaps(occupied) == 0:
+                occupied.append(box)
                 notes.append(note)
                 break
             note.remove()

@@ -94,14 +94,14 @@ def values_of(stage: Stage, sweep: SweepConfig) -> dict[str, tuple[Any, ...]]:
     Raises:
         InputError: a value of another type, or one that the stage refuses.
     """
-    given = dict(_given(text) for text in sweep.values)
+    values = dict(_given(text) for text in sweep.values)
     chosen: dict[str, tuple[Any, ...]] = {}
     for knob in stage.knobs:
         if sweep.knobs and knob.name not in sweep.knobs:
             continue
         tried = knob.values
-        if knob.name in given:
-            tried = tuple(read_value(stage.base, knob, text) for text in given[knob.name])
+        if knob.name in values:
+            tried = tuple(read_value(stage.base, knob, text) for text in values[knob.name])
         chosen[knob.name] = tuple(dict.fromkeys((value_at(stage.base, knob.key), *tried)))
     return chosen
 
@@ -121,16 +121,16 @@ def check_sweep(stages: Sequence[Stage], sweep: SweepConfig) -> None:
         InputError: an unknown knob, one that is given twice or left out by `knobs`, no value, or one that its stage
             refuses.
     """
-    known = [knob.name for stage in stages for knob in stage.knobs]
+    knob_names = [knob.name for stage in stages for knob in stage.knobs]
     names = [_given(text)[0] for text in sweep.values]
     if (repeated := first_repeated(names)) is not None:
         raise InputError(f"sweep.values: {repeated[0]} is given twice; give all of its values at once")
     for option, listed in (("knobs", sweep.knobs), ("values", names)):
         for name in listed:
-            if name not in known:
+            if name not in knob_names:
                 raise InputError(
                     f"sweep.{option}: {name!r} is no knob of {', '.join(stage.name for stage in stages)}; expected "
-                    f"some of {', '.join(known)}"
+                    f"some of {', '.join(knob_names)}"
                 )
     if sweep.knobs and (left_out := [name for name in names if name not in sweep.knobs]):
         raise InputError(
@@ -195,14 +195,14 @@ def sweep_stage(
         last: dict[str, list[Record]] = {}
 
         def costs(settings: Sequence[Knobs], scenes: int) -> list[tuple[float, float]]:
-            found = measured(settings, scenes)
-            summaries = [summarize(row, base, "joint") for row in found]
-            last.update({summary.label: row for summary, row in zip(summaries, found, strict=True)})
+            measurements = measured(settings, scenes)
+            summaries = [summarize(row, base, "joint") for row in measurements]
+            last.update({summary.label: row for summary, row in zip(summaries, measurements, strict=True)})
             return [(summary.cost(cost), summary.loss(stage.accuracy)) for summary in summaries]
 
         rungs = successive_halving(drawn, len(paths), costs, halving)
-        known = {result.label for result in results}
-        results += [summarize(row, base, "joint") for label, row in last.items() if label not in known]
+        measured_labels = {result.label for result in results}
+        results += [summarize(row, base, "joint") for label, row in last.items() if label not in measured_labels]
     results.sort(key=lambda result: result.phase != "base")
     return StageResult(
         stage=stage,

@@ -48,15 +48,15 @@ class ViewsScene:
         self._scene = replace(scene, views=replace(scene.views, images=None))
         assert scene.gaussians is not None
         protocol = taught.inputs.protocol
-        asked = queryable_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
-        names = list(dict.fromkeys(one.name for one in asked if one.name))
+        objects = queryable_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
+        names = list(dict.fromkeys(one.name for one in objects if one.name))
         if not names:
             raise InputError(f"tradeoff: scene {scene.name} has no object to choose views of")
         boxes = localize(scene, names, words, taught.inputs.localize)
         pairs: list[tuple[Target, Target]] = []
         means = scene.gaussians.means + scene.origin
         for target in targets_of(scene.gaussians, boxes):
-            same = [one for one in asked if one.name == target.name]
+            same = [one for one in objects if one.name == target.name]
             away = [np.linalg.norm((one.aabb_min + one.aabb_max) / 2 - scene.origin - target.center) for one in same]
             nearest = same[int(np.argmin(away))]
             rows = np.flatnonzero(((means >= nearest.aabb_min) & (means <= nearest.aabb_max)).all(axis=1))

@@ -6,9 +6,10 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gsencoder.core.setting_choice import best_setting, within_seconds
 from gsencoder.fusion.basis import Moments
 from gsencoder.fusion.budget.config import BudgetConfig, exact_config
-from gsencoder.fusion.budget.limits import Measure, Pace, within_megabytes, within_seconds
+from gsencoder.fusion.budget.limits import Measure, Pace, within_megabytes
 from gsencoder.fusion.budget.model import (
     UNKNOWN_SCATTER,
     Predicted,
@@ -18,9 +19,9 @@ from gsencoder.fusion.budget.model import (
     setting_weights,
 )
 from gsencoder.fusion.budget.rank import RankErrors, rank_errors, with_rank
-from gsencoder.fusion.budget.settings import Setting, all_settings, cheapest, most_exact
+from gsencoder.fusion.budget.settings import Setting, all_settings
 from gsencoder.fusion.coverage.order import view_order
-from gsencoder.fusion.coverage.sight import LatticeOf, Sight, look
+from gsencoder.fusion.coverage.sight import LatticeOf, Sight, trace_sight
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.lift import capped, distinct_rows
 from gsencoder.fusion.teachers import Teacher
@@ -31,9 +32,9 @@ from gsencoder.types import FeatureMap, Gaussians, Views
 FIRST_MAPS, MAPS_SHARE = 4, 8
 """The scatter of the teacher's vectors is first measured on so many views, or on one of so many if that is more."""
 SAFETY = 1.5
-"""ρ counts so many times, since views are not independent of each other."""
+"""Factor by which ρ is multiplied, since views are not independent of each other."""
 MINIMAL_SCATTER = 1e-4
-"""ρ is not taken for less: what a few views show alike, others may not."""
+"""Lower bound of ρ: vectors that agree in a few views may differ in others."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,8 +75,15 @@ class Choice:
 
 
 @dataclass(slots=True, kw_only=True)
-class _Known:
-    """Maps that were made, and what they say about the teacher."""
+class _ProbedTeacher:
+    """The maps of a teacher that were made for the choice, and what they say about it.
+
+    Attributes:
+        maps: by view.
+        scatter: ρ, see `gsencoder.fusion.budget.model`.
+        drift: of the mean of its vectors.
+        ranks: what ranks leave out.
+    """
 
     maps: dict[int, FeatureMap] = field(default_factory=dict)
     scatter: float = UNKNOWN_SCATTER
@@ -110,64 +118,65 @@ def choose(
     # Maps of a costly teacher are all used: the first one, whose cells tell where rays are, is of a view of the middle.
     spread = spread_out(len(views))
     probe = spread[0]
-    known = _Known(maps={probe: map_of(probe)})
-    lattice_of = _lattices(views, known.maps[probe], exact)
+    probed = _ProbedTeacher(maps={probe: map_of(probe)})
+    lattice_of = _lattices(views, probed.maps[probe], exact)
     visibility = resolve(base.visibility, views, base.lift)
-    sight = look(gaussians, views, lattice_of, visibility, exact.blend, seed=budget.seed)
+    sight = trace_sight(gaussians, views, lattice_of, visibility, exact.blend, seed=budget.seed)
     choosing, judging = sight.halves()
-    wanted = min(max(FIRST_MAPS, math.ceil(len(views) / MAPS_SHARE)), len(views))
+    map_count = min(max(FIRST_MAPS, math.ceil(len(views) / MAPS_SHARE)), len(views))
     while True:
-        for view in spread[:wanted]:
-            if view not in known.maps:
-                known.maps[view] = map_of(view)
-        _learn(known, sight, teacher, base, budget)
-        first = () if teacher.cheap else spread[:wanted]
-        order = view_order(choosing.weights, choosing.singles, known.scatter, first)
+        for view in spread[:map_count]:
+            if view not in probed.maps:
+                probed.maps[view] = map_of(view)
+        _measure_teacher(probed, sight, teacher, base, budget)
+        first = () if teacher.cheap else spread[:map_count]
+        order = view_order(choosing.weights, choosing.singles, probed.scatter, first)
         settings = all_settings(
             judging,
             order,
-            known.ranks,
-            scatter=SAFETY * known.scatter,
-            drift=SAFETY * known.drift,
+            probed.ranks,
+            scatter=SAFETY * probed.scatter,
+            drift=SAFETY * probed.drift,
             exact_stop=exact.blend.stop_transmittance,
             cheap=teacher.cheap,
             coded=teacher.table is not None,
             least=max(len(first), 1) if budget.seconds is None else 1,
         )
-        chosen = most_exact(settings) if budget.error is None else cheapest(settings, budget.error)
+        chosen = best_setting(settings, budget.error)
         # More maps are made until they are half of what is needed, and never one that is not.
-        if teacher.cheap or budget.error is None or chosen.views <= 2 * wanted or wanted == len(views):
+        if teacher.cheap or budget.error is None or chosen.views <= 2 * map_count or map_count == len(views):
             break
-        wanted = min(2 * wanted, len(views))
+        map_count = min(2 * map_count, len(views))
     notes: list[str] = []
     seconds = size = None
     if budget.seconds is not None:
         of_map, lift = measure(int(order[0]))
-        passes = 2 if teacher.cheap and known.ranks.fitted else 1
-        pace = Pace(map=of_map, lift=lift, passes=passes, made=len(known.maps), spent=elapsed())
-        chosen, seconds, said = within_seconds(chosen, settings, budget, pace)
-        notes += said
+        passes = 2 if teacher.cheap and probed.ranks.fitted else 1
+        pace = Pace(map=of_map, lift=lift, passes=passes, cached=len(probed.maps), spent=elapsed())
+        chosen, broken = within_seconds(settings, chosen, budget, pace.seconds)
+        seconds = pace.seconds(chosen)
+        notes += broken
     if budget.megabytes is not None:
         weights = setting_weights(sight, chosen.stop, exact.blend.stop_transmittance)
         basis = base.basis and teacher.space.channels > base.narrow
-        chosen, size, said = within_megabytes(
+        chosen, size, broken = within_megabytes(
             chosen,
             _seen_share(weights[order[: chosen.views]]),
             sight,
-            known.ranks,
+            probed.ranks,
             teacher.space.channels,
             budget,
             basis=basis,
         )
-        notes += said
-    return _choice(chosen, base, teacher, known, sight, order, seconds, size, notes)
+        notes += broken
+    return _choice(chosen, base, teacher, probed, sight, order, seconds, size, notes)
 
 
 def _choice(
     chosen: Setting,
     base: FuseConfig,
     teacher: Teacher,
-    known: _Known,
+    probed: _ProbedTeacher,
     sight: Sight,
     order: np.ndarray,
     seconds: float | None,
@@ -176,10 +185,10 @@ def _choice(
 ) -> Choice:
     rays = exact_config(base).blend.rays_per_patch
     blend = replace(base.blend, stop_transmittance=chosen.stop, rays_per_patch=rays)
-    config = with_rank(replace(base, blend=blend), chosen.rank, known.ranks, teacher)
+    config = with_rank(replace(base, blend=blend), chosen.rank, probed.ranks, teacher)
     knobs: dict[str, int | float] = {"views": chosen.views, "stop_transmittance": chosen.stop}
-    if chosen.rank or known.ranks.fitted:
-        knobs["rank"] = chosen.rank or known.ranks.full
+    if chosen.rank or probed.ranks.fitted:
+        knobs["rank"] = chosen.rank or probed.ranks.full
     return Choice(
         config=config,
         rows=tuple(sorted(order[: chosen.views].tolist())),
@@ -189,9 +198,9 @@ def _choice(
         cost=chosen.cost,
         seconds=seconds,
         bytes=size,
-        scatter=known.scatter,
-        drift=known.drift,
-        maps=known.maps,
+        scatter=probed.scatter,
+        drift=probed.drift,
+        maps=probed.maps,
         followed=sight.followed,
         all_rays=sight.all_rays,
         notes=tuple(notes),
@@ -225,24 +234,26 @@ def _lattices(views: Views, probe: FeatureMap, exact: FuseConfig) -> LatticeOf:
     return of
 
 
-def _learn(known: _Known, sight: Sight, teacher: Teacher, base: FuseConfig, budget: BudgetConfig) -> None:
+def _measure_teacher(
+    probed: _ProbedTeacher, sight: Sight, teacher: Teacher, base: FuseConfig, budget: BudgetConfig
+) -> None:
     """Measures ρ, and what ranks leave out, on the maps that were made."""
     fits = teacher.table is None and (budget.megabytes is not None or teacher.space.channels > base.narrow)
     moments = Moments(teacher.space.channels, second=fits)
     means = []
-    for _, feature_map in sorted(known.maps.items()):
+    for _, feature_map in sorted(probed.maps.items()):
         rows = distinct_rows(feature_map)
         moments.add(rows)
         if len(rows):
             means.append(rows.mean(axis=0, dtype=np.float64))
     if moments.count == 0:
         return
-    features = sample_features(sight, known.maps)
-    known_mean = teacher.table.mean(axis=0) if teacher.mean is None and teacher.table is not None else teacher.mean
-    mean = np.asarray(moments.mean if known_mean is None else known_mean, np.float64)
-    known.scatter = max(measure_scatter(features, mean), MINIMAL_SCATTER)
-    known.drift = measure_drift(features, np.stack(means)) if known_mean is None else 0.0
-    known.ranks = rank_errors(teacher, moments, features, mean, base, needed=budget.megabytes is not None)
+    features = sample_features(sight, probed.maps)
+    stated_mean = teacher.table.mean(axis=0) if teacher.mean is None and teacher.table is not None else teacher.mean
+    mean = np.asarray(moments.mean if stated_mean is None else stated_mean, np.float64)
+    probed.scatter = max(measure_scatter(features, mean), MINIMAL_SCATTER)
+    probed.drift = measure_drift(features, np.stack(means)) if stated_mean is None else 0.0
+    probed.ranks = rank_errors(teacher, moments, features, mean, base, needed=budget.megabytes is not None)
 
 
 def _seen_share(weights: np.ndarray) -> float:

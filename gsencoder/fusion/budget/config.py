@@ -60,7 +60,7 @@ def check_budget(budget: BudgetConfig, config: FuseConfig, *, basis: bool = Fals
     Raises:
         InputError: an option that the budget chooses is set, or a fusion that no sample of rays stands for.
     """
-    if not budget.given:
+    if not budget.promised:
         return
     names = budget.names
     check_governed(budget, config, FuseConfig(), GOVERNED, "fusion")

@@ -24,8 +24,8 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import resolve
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 
-REMEMBERED_BYTES = 1 << 28
-"""Depth maps that the choice reads are remembered up to this size, for the fusion."""
+DEPTH_CACHE_BYTES = 1 << 28
+"""Depth maps that the choice reads stay in memory up to this size, for the fusion."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,29 +77,29 @@ def fuse_within(
     Raises:
         InputError: no budget, one that cannot be combined with the options, or what `fuse` refuses.
     """
-    if not budget.given:
+    if not budget.promised:
         raise InputError("budget: expected budget.error=, budget.seconds= or budget.megabytes=, got none of them")
     check_budget(budget, config)
     start = clock()
     gaussians, views = checked_scene(scene, teacher)
     if views.depths is not None:
-        views = replace(views, depths=_Remembered(views.depths))
+        views = replace(views, depths=_CachedDepths(views.depths))
     if work is not None and not teacher.cheap:
         settings = {"budget": "maps", "lift": config.lift}
         teacher = open_checkpoint(work, settings, teacher, gaussians, views, range(len(views)), None).cached(teacher)
-    made: dict[int, FeatureMap] = {}
+    maps: dict[int, FeatureMap] = {}
 
     def map_of(view: int) -> FeatureMap:
-        made[view] = teacher.feature_map(views, view)
-        return made[view]
+        maps[view] = teacher.feature_map(views, view)
+        return maps[view]
 
     def measure(view: int) -> tuple[float, float]:
         visibility = resolve(config.visibility, views, config.lift)
         blend = exact_config(config).blend
         begun = clock()
-        # What a map takes is measured even where it was made before.
+        # The time of a map is measured even where it is in memory.
         maker = teacher.teacher if isinstance(teacher, CachedTeacher) else teacher
-        feature_map = maker.feature_map(views, view) if view in made else map_of(view)
+        feature_map = maker.feature_map(views, view) if view in maps else map_of(view)
         between = clock()
         matrix = view_matrix(gaussians, views, view, feature_map, lift=config.lift, visibility=visibility, config=blend)
         FeatureSums(len(gaussians), 1, None, None).add(matrix, _one_channel(feature_map), None)
@@ -115,12 +115,17 @@ def fuse_within(
         measure=measure,
         elapsed=lambda: clock() - start,
     )
-    chosen = clock()
+    choice_end = clock()
     scene = replace(scene, views=views)
-    ready = _MadeMaps(teacher, made)
-    fusion = fuse(scene, ready, choice.config, rows=choice.rows, sample_cells=sample_cells, device=device, track=track)
+    cached = _CachedMaps(teacher, maps)
+    fusion = fuse(scene, cached, choice.config, rows=choice.rows, sample_cells=sample_cells, device=device, track=track)
     return BudgetFusion(
-        fusion=fusion, choice=choice, choosing=chosen - start, seconds=clock() - start, scene=scene, teacher=ready
+        fusion=fusion,
+        choice=choice,
+        choosing=choice_end - start,
+        seconds=clock() - start,
+        scene=scene,
+        teacher=cached,
     )
 
 
@@ -132,7 +137,7 @@ def _one_channel(feature_map: FeatureMap) -> FeatureMap:
 
 
 def realised_error(
-    made: BudgetFusion,
+    fused: BudgetFusion,
     config: FuseConfig,
     *,
     seed: int = 0,
@@ -140,12 +145,12 @@ def realised_error(
     track: Track = untracked,
 ) -> FieldError:
     """The error of the features against those of the exact settings, on a tenth of the Gaussians that these see, drawn
-    now. All maps that were not made yet are made for it."""
-    exact = fuse(made.scene, made.teacher, exact_config(config), device=device, track=track).features
-    return judge(made.fusion.features, exact, seed=seed)
+    now. Maps of views that the setting left out are made for it."""
+    exact = fuse(fused.scene, fused.teacher, exact_config(config), device=device, track=track).features
+    return judge(fused.fusion.features, exact, seed=seed)
 
 
-class _Remembered(Sequence[Float32[np.ndarray, "_ _"]]):
+class _CachedDepths(Sequence[Float32[np.ndarray, "_ _"]]):
     """Depth maps that are read once, up to a limit of memory."""
 
     def __init__(self, depths: Sequence[Float32[np.ndarray, "_ _"]]) -> None:
@@ -158,19 +163,19 @@ class _Remembered(Sequence[Float32[np.ndarray, "_ _"]]):
         if index in self._read:
             return self._read[index]
         depth = self._depths[index]
-        if self._bytes + depth.nbytes <= REMEMBERED_BYTES:
+        if self._bytes + depth.nbytes <= DEPTH_CACHE_BYTES:
             self._read[index] = depth
             self._bytes += depth.nbytes
         return depth
 
 
-class _MadeMaps(WrappedTeacher):
-    """A teacher some of whose maps have been made."""
+class _CachedMaps(WrappedTeacher):
+    """A teacher some of whose maps are in memory."""
 
-    def __init__(self, teacher: Teacher, made: dict[int, FeatureMap]) -> None:
+    def __init__(self, teacher: Teacher, maps: dict[int, FeatureMap]) -> None:
         super().__init__(teacher)
-        self._made = made
+        self._maps = maps
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The map of a view, made anew where it was not made for the choice."""
-        return self._made[view] if view in self._made else self.teacher.feature_map(views, view)
+        """The map of a view, from memory where the choice made it."""
+        return self._maps[view] if view in self._maps else self.teacher.feature_map(views, view)

@@ -1,13 +1,13 @@
 """Budgets of seconds and of megabytes: what they leave of the settings."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from gsencoder.core.promises import MEGABYTE, PLANNED
+from gsencoder.core.promises import MEGABYTE
 from gsencoder.fusion.budget.config import BudgetConfig
 from gsencoder.fusion.budget.rank import RankErrors, file_bytes, rank_of_bytes
-from gsencoder.fusion.budget.settings import Setting, most_exact
+from gsencoder.fusion.budget.settings import Setting
 from gsencoder.fusion.coverage.sight import Sight
 
 
@@ -16,46 +16,23 @@ class Pace:
     """Seconds of one view, as measured.
 
     Attributes:
-        map: making its map.
-        lift: blending and lifting it at `Setting.lifting` = 1.
-        passes: how often each map is made: twice by cheap teachers whose basis is fitted first.
-        made: maps that have been made and are not made again.
+        map: of making its map.
+        lift: of blending and lifting it at `Setting.lifting` = 1.
+        passes: number of times that each map is made: twice by cheap teachers whose basis is fitted first.
+        cached: number of maps that are made already.
         spent: seconds since the choice began.
     """
 
     map: float
     lift: float
     passes: int
-    made: int
+    cached: int
     spent: float
 
     def seconds(self, setting: Setting) -> float:
-        """From the beginning of the choice to the features."""
-        maps = max(setting.views * self.passes - self.made, 0)
+        """Seconds of a fusion by a setting, from the beginning of the choice to the features."""
+        maps = max(setting.views * self.passes - self.cached, 0)
         return self.spent + maps * self.map + setting.views * setting.lifting * self.lift
-
-
-def within_seconds(
-    chosen: Setting, settings: Sequence[Setting], budget: BudgetConfig, pace: Pace
-) -> tuple[Setting, float, tuple[str, ...]]:
-    """The most exact setting that takes no longer; where an error is promised too, the one that keeps that.
-
-    Returns:
-        The setting, its seconds, and what is to be said.
-    """
-    assert budget.seconds is not None
-    if budget.error is not None:
-        needed = pace.seconds(chosen)
-        note = budget.conflict("error", "seconds", needed)
-        return chosen, needed, (note,) if needed > budget.seconds else ()
-    fitting = [each for each in settings if pace.seconds(each) <= PLANNED * budget.seconds]
-    if fitting:
-        best = most_exact(fitting)
-        return best, pace.seconds(best), ()
-    fastest = min(settings, key=lambda each: (pace.seconds(each), each.error))
-    needed = pace.seconds(fastest)
-    note = f"{budget.shown('seconds')}: the fastest setting takes about {needed:.3g} s; it is used"
-    return fastest, needed, (note,)
 
 
 def within_megabytes(
@@ -73,7 +50,7 @@ def within_megabytes(
         basis: whether the fusion has a basis without a limit of its rank.
 
     Returns:
-        The setting, bytes of its file, and what is to be said.
+        The setting, bytes of its file, and notes about a promise that is not kept.
     """
     assert budget.megabytes is not None
     rows = math.ceil(min(share, 1.0) * sight.gaussians)

@@ -175,11 +175,11 @@ def sample_features(sight: Sight, maps: Mapping[int, FeatureMap]) -> SampleFeatu
     vectors, weights = [], []
     for view, feature_map in sorted(maps.items()):
         rays = sight.rays[view]
-        found = rows_at(feature_map, rays.rows)
-        weight = np.where(np.isfinite(found[:, 0]), rays.weights, 0).astype(np.float64)
+        cells = rows_at(feature_map, rays.rows)
+        weight = np.where(np.isfinite(cells[:, 0]), rays.weights, 0).astype(np.float64)
         total = np.bincount(rays.owners, weight, m)
-        sums = np.zeros((m, found.shape[1]))
-        np.add.at(sums, rays.owners, np.where(weight[:, None] > 0, found, 0) * weight[:, None])
+        sums = np.zeros((m, cells.shape[1]))
+        np.add.at(sums, rays.owners, np.where(weight[:, None] > 0, cells, 0) * weight[:, None])
         vectors.append(sums / np.maximum(total, TINY)[:, None])
         weights.append(np.where(total > 0, sight.weights[view, sight.singles :], 0))
     return SampleFeatures(vectors=np.stack(vectors), weights=np.stack(weights).astype(np.float64))
@@ -195,9 +195,9 @@ def measure_scatter(features: SampleFeatures, mean: Float64[np.ndarray, " D"]) -
         mean: of the teacher's vectors.
     """
     parts = _parts(len(features.weights))
-    known = [_scatter(features, mean, kept, largest) for kept in parts for largest in (SMALL_CHANGE, np.inf)]
-    found = [turned / geometry for turned, geometry in known if geometry > 0]
-    return max(found) if found else UNKNOWN_SCATTER
+    sums = [_scatter(features, mean, subsets, largest) for subsets in parts for largest in (SMALL_CHANGE, np.inf)]
+    ratios = [turned / geometry for turned, geometry in sums if geometry > 0]
+    return max(ratios) if ratios else UNKNOWN_SCATTER
 
 
 def _parts(count: int) -> list[list[Bool[np.ndarray, " M"]]]:
@@ -207,20 +207,20 @@ def _parts(count: int) -> list[list[Bool[np.ndarray, " M"]]]:
 
 
 def _scatter(
-    features: SampleFeatures, mean: Float64[np.ndarray, " D"], kept_views: list[Bool[np.ndarray, " M"]], largest: float
+    features: SampleFeatures, mean: Float64[np.ndarray, " D"], subsets: list[Bool[np.ndarray, " M"]], largest: float
 ) -> tuple[float, float]:
     """Sums of 1 − cosine and of c, where c is at most `largest`, of the means over some views with those over all."""
     weights, vectors = features.weights, features.vectors
     total, squares = weights.sum(axis=0), np.square(weights).sum(axis=0)
     whole, _ = features.fused()
     turned, geometry = 0.0, 0.0
-    for kept in kept_views:
-        part = weights[kept].sum(axis=0)
+    for subset in subsets:
+        part = weights[subset].sum(axis=0)
         rows = np.flatnonzero((part > 1e-6 * total) & (part < (1 - 1e-6) * total))
         if not len(rows):
             continue
-        w, s, all_ = weights[kept][:, rows], part[rows], total[rows]
-        some = np.einsum("vm,vmd->md", w, vectors[kept][:, rows]) / s[:, None]
+        w, s, all_ = weights[subset][:, rows], part[rows], total[rows]
+        some = np.einsum("vm,vmd->md", w, vectors[subset][:, rows]) / s[:, None]
         q = np.square(w).sum(axis=0)
         c = q * (1 / s**2 - 2 / (s * all_)) + squares[rows] / all_**2
         small = c <= largest
@@ -242,11 +242,11 @@ def measure_drift(features: SampleFeatures, means: Float64[np.ndarray, "M D"]) -
     if count < 2 or not seen.any():
         return UNKNOWN_SCATTER
     fused, mean = whole[seen], means.mean(axis=0)
-    found = []
-    for kept_views in _parts(count):
+    ratios = []
+    for subsets in _parts(count):
         turned = [
-            float((1 - row_cosines(fused - means[kept].mean(axis=0), fused - mean)).mean()) for kept in kept_views
+            float((1 - row_cosines(fused - means[subset].mean(axis=0), fused - mean)).mean()) for subset in subsets
         ]
-        geometry = [1 / kept.sum() - 1 / count for kept in kept_views]
-        found.append(sum(turned) / sum(geometry))
-    return max(found)
+        geometry = [1 / subset.sum() - 1 / count for subset in subsets]
+        ratios.append(sum(turned) / sum(geometry))
+    return max(ratios)

@@ -1,6 +1,5 @@
 """The settings that a budget chooses among, with what is predicted of each."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,13 +92,3 @@ def all_settings(
                     total = min(predicted.error + error, 1.0)
                     settings.append(setting(number, stop, rank, total, predicted.deviation))
     return [*settings, setting(len(order), min(STOPS), 0, 0.0, 0.0)]
-
-
-def cheapest(settings: Sequence[Setting], error: float) -> Setting:
-    """The cheapest setting that keeps a promised error; of equal ones the most exact."""
-    return min((each for each in settings if each.bound <= error), key=lambda each: (each.cost, each.error))
-
-
-def most_exact(settings: Sequence[Setting]) -> Setting:
-    """The setting with the smallest error that is predicted; of equal ones the cheapest."""
-    return min(settings, key=lambda each: (each.error, each.cost))

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsencoder.fusion.coverage.order import view_order
-from gsencoder.fusion.coverage.sight import look, pixels_of
+from gsencoder.fusion.coverage.sight import pixels_of, trace_sight
 from gsencoder.fusion.visibility import VisibilityConfig
 from gsencoder.render import BlendConfig
 from gsencoder.types import Gaussians, Views
@@ -32,6 +32,6 @@ def covering_views(
         relative=visibility.relative,
         absolute=visibility.absolute,
     )
-    sight = look(gaussians, views, pixels_of(views), against, config)
+    sight = trace_sight(gaussians, views, pixels_of(views), against, config)
     order = view_order(sight.weights, sight.singles, SCATTER)
     return tuple(int(view) for view in np.sort(order[:count]))

@@ -61,9 +61,9 @@ def list_rays(projected, index, depths, least, most, shape, counts, limit, rays,
         x0, x1 = max(np.ceil(u - hu), 0.0), min(np.floor(u + hu), last_x)
         y0, y1 = max(np.ceil(v - hv), 0.0), min(np.floor(v + hv), last_y)
         step = max(1, int(max(x1 - x0, y1 - y0)) // ACROSS)
-        looked_at = counts[g] // (step * step)
-        wanted = min(limit, looked_at)
-        number, taken = 0, 0
+        candidates = counts[g] // (step * step)
+        sample_size = min(limit, candidates)
+        number, sampled = 0, 0
         for y in range(int(y0) + step // 2, int(y1) + 1, step):
             for x in range(int(x0) + step // 2, int(x1) + 1, step):
                 dx, dy = x - u, y - v
@@ -72,11 +72,11 @@ def list_rays(projected, index, depths, least, most, shape, counts, limit, rays,
                 row = (y // side) * width + x // side
                 if depths[k] < least[row] or depths[k] > most[row]:
                     continue
-                # The middle of each of `wanted` equal parts of the list.
-                if taken < wanted and number == ((2 * taken + 1) * looked_at) // (2 * wanted):
+                # The middle of each of `sample_size` equal parts of the list.
+                if sampled < sample_size and number == ((2 * sampled + 1) * candidates) // (2 * sample_size):
                     rays[total], owners[total] = y * (width * side) + x, g
                     total += 1
-                    taken += 1
+                    sampled += 1
                 number += 1
     return total
 

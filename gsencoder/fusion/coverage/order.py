@@ -56,7 +56,7 @@ def _greedy(weights, importance, scatter, first):
             all_sum[g] += x
             all_squares[g] += x * x
     chosen_sum, chosen_squares = np.zeros(n), np.zeros(n)
-    order, taken, bounds = np.empty(count, np.int64), np.zeros(count, np.bool_), np.full(count, np.inf)
+    order, is_chosen, bounds = np.empty(count, np.int64), np.zeros(count, np.bool_), np.full(count, np.inf)
     for step in range(count):
         best = -1
         if step < len(first):
@@ -67,7 +67,7 @@ def _greedy(weights, importance, scatter, first):
                 # Gains shrink as views are taken, so that an old one is a bound.
                 best = -1
                 for v in range(count):
-                    if not taken[v] and (best < 0 or bounds[v] > bounds[best]):
+                    if not is_chosen[v] and (best < 0 or bounds[v] > bounds[best]):
                         best = v
                 if fresh[best]:
                     break
@@ -75,7 +75,7 @@ def _greedy(weights, importance, scatter, first):
                     weights[best], importance, scatter, all_sum, all_squares, chosen_sum, chosen_squares
                 )
                 fresh[best] = True
-        order[step], taken[best] = best, True
+        order[step], is_chosen[best] = best, True
         for g in range(n):
             x = np.float64(weights[best, g])
             chosen_sum[g] += x

@@ -113,7 +113,7 @@ def pixels_of(views: Views) -> LatticeOf:
     return lambda view: pixel_lattice(int(views.cameras.widths[view]), int(views.cameras.heights[view]))
 
 
-def look(
+def trace_sight(
     gaussians: Gaussians,
     views: Views,
     lattice_of: LatticeOf,

@@ -14,17 +14,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float16, Float32, Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import LONGEST_NUMBER, Archive, archive_bytes, open_archive, write_archive
+from gsencoder.core.files.archive import (
+    LONGEST_SHARE,
+    Archive,
+    archive_bytes,
+    open_archive,
+    shape_only,
+    write_archive,
+)
 from gsencoder.core.row_numbers import rise_within
 from gsencoder.core.runtime.threads import parallel
 from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.splats import FINGERPRINT_DIGITS, fingerprint
 from gsencoder.fusion.store.memory_file import MEMORY_FILE, read_memory, write_memory
 from gsencoder.fusion.store.package import PACKAGE_FILE, load_package
-from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, QueryMemory, Scene
+from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, QueryMemory, Scene
 
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
 BLOCK = 16_384
@@ -78,7 +85,7 @@ def save_features(
         raise InputError(f"save_features: {wrong[0]} features need as many Gaussians in scene {scene.name}")
     _write_scene(folder, scene, gaussians)
     for name, each in by_file.items():
-        _write_rows(folder / name, each, {"settings": dict(settings), "fingerprint": fingerprint(gaussians)})
+        _write_rows(folder / name, each, settings, fingerprint(gaussians))
 
 
 def save_memories(
@@ -114,8 +121,8 @@ def _write_scene(folder: Path, scene: Scene, gaussians: Gaussians) -> None:
     write_archive(folder / SCENE_FILE, arrays | around, header)
 
 
-def _write_rows(path: Path, features: GaussianFeatures, more: Mapping[str, Any]) -> None:
-    """Writes the features of seen rows, with more entries in the header."""
+def _write_rows(path: Path, features: GaussianFeatures, settings: Mapping[str, Any], fingerprint: str) -> None:
+    """Writes the features of seen rows."""
     rows = np.flatnonzero(features.weights > 0)
     # By blocks: a million rows of many channels are gigabytes, and no second copy of them is made.
     blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
@@ -136,14 +143,36 @@ def _write_rows(path: Path, features: GaussianFeatures, more: Mapping[str, Any])
         halves[number * BLOCK : number * BLOCK + len(block)] = features.stored(block) / channel_scale
 
     parallel(convert, range(len(blocks)))
-    arrays, header = space_parts(features.space, features.mean, features.basis)
-    arrays |= {
-        "rows": rows.astype(np.int32),
-        "features": halves,
-        "channel_scale": channel_scale,
-        "weights": features.weights[rows],
-    }
-    write_archive(path, arrays, header | dict(more))
+    arrays, header = _contents(
+        features.space,
+        features.mean,
+        features.basis,
+        rows=rows.astype(np.int32),
+        halves=halves,
+        channel_scale=channel_scale,
+        weights=features.weights[rows],
+        settings=settings,
+        fingerprint=fingerprint,
+    )
+    write_archive(path, arrays, header)
+
+
+def _contents(
+    space: FeatureSpace,
+    mean: Float32[np.ndarray, " D"],
+    basis: FeatureBasis | None,
+    *,
+    rows: Int32[np.ndarray, " n"],
+    halves: Float16[np.ndarray, "n channels"],
+    channel_scale: Float32[np.ndarray, " channels"],
+    weights: Float32[np.ndarray, " n"],
+    settings: Mapping[str, Any],
+    fingerprint: str,
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the header of a file of features of the seen rows."""
+    arrays, header = space_parts(space, mean, basis)
+    arrays |= {"rows": rows, "features": halves, "channel_scale": channel_scale, "weights": weights}
+    return arrays, header | {"settings": dict(settings), "fingerprint": fingerprint}
 
 
 def features_bytes(
@@ -158,19 +187,19 @@ def features_bytes(
         settings: as `save_features` takes them.
         basis: whether the coordinates are in a basis.
     """
-    arrays, header = space_parts(space, np.zeros(space.channels, np.float32), None)
-    entries: dict[str, tuple[str, tuple[int, ...]]] = {
-        "rows": ("int32", (rows,)),
-        "features": ("float16", (rows, rank)),
-        "channel_scale": ("float32", (rank,)),
-        "weights": ("float32", (rows,)),
-        **{name: (array.dtype.name, array.shape) for name, array in arrays.items()},
-    }
-    header |= {"settings": dict(settings), "fingerprint": "0" * FINGERPRINT_DIGITS}
-    if basis:
-        entries["components"] = ("float32", (rank, space.channels))
-        header["energy_kept"] = LONGEST_NUMBER
-    return archive_bytes(entries, header)
+    mean, components = (shape_only("float32", shape) for shape in ((space.channels,), (rank, space.channels)))
+    arrays, header = _contents(
+        space,
+        mean,
+        FeatureBasis(mean=mean, components=components, energy_kept=LONGEST_SHARE, space=space) if basis else None,
+        rows=shape_only("int32", (rows,)),
+        halves=shape_only("float16", (rows, rank)),
+        channel_scale=shape_only("float32", (rank,)),
+        weights=shape_only("float32", (rows,)),
+        settings=settings,
+        fingerprint="0" * FINGERPRINT_DIGITS,
+    )
+    return archive_bytes(arrays, header)
 
 
 def load_features(folder: str | Path) -> Scene:

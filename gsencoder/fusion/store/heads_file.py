@@ -5,10 +5,10 @@ Its layers are read by `gsencoder.fusion.heads.store`, which needs torch.
 
 from collections.abc import Sequence
 from pathlib import Path
-from shutil import copyfile
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive, open_archive
+from gsencoder.core.files.archive import Archive, open_archive, verify_archive
+from gsencoder.core.files.copied_file import copy_checked
 from gsencoder.types import FeatureSpace
 
 HEADS_FILE = "heads.safetensors"
@@ -48,16 +48,7 @@ def copy_heads(
             return
         check_heads_space(heads, next((space for space in spaces if space == heads), spaces[0]))
         file.verify()
-    try:
-        copyfile(source, target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written: {error.strerror or error}") from error
-    try:
-        # What was copied is looked at: the file may have been cut off meanwhile.
-        with open_archive(target) as file:
-            file.verify()
-    except InputError as error:
-        raise InputError(str(error).replace(str(target), str(source))) from error
+    copy_checked(source, target, verify_archive)
 
 
 def read_heads_space(file: Archive) -> FeatureSpace:

@@ -1,11 +1,12 @@
 """Features that share the rows of a table, as a package: one or two bytes a Gaussian, and the table."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import LONGEST_NUMBER, Archive, archive_bytes, write_archive
+from gsencoder.core.files.archive import LONGEST_NUMBER, Archive, archive_bytes, shape_only, write_archive
 from gsencoder.data.archive_records import read_space, scaled_halves, scene_parts, space_parts
 from gsencoder.data.splats import FINGERPRINT_DIGITS
 from gsencoder.types import GaussianFeatures, Scene
@@ -29,21 +30,43 @@ def write_index(path: Path, scene: Scene, features: GaussianFeatures, *, fingerp
     """
     assert features.index is not None
     rows = len(features.features)
-    kind = np.uint8 if rows < 256 else np.uint16
-    unseen = int(np.iinfo(kind).max)
+    dtype = _index_dtype(rows)
+    unseen = int(np.iinfo(dtype).max)
     if rows > unseen:
         raise InputError(f"{path}: expected a table of up to {unseen:,} rows, got {rows:,}")
     table, channel_scale = scaled_halves(features.features)
-    around, header = scene_parts(scene)
-    parts, named = space_parts(features.space, features.mean, features.basis)
-    arrays = {
-        **around,
-        **parts,
-        "index": np.where(features.index < 0, unseen, features.index).astype(kind),
-        "table": table,
-        "channel_scale": channel_scale,
-    }
-    write_archive(path, arrays, header | named | {"form": INDEX_FORM, "fingerprint": fingerprint, "error": error})
+    arrays, header = _contents(
+        scene,
+        features,
+        index=np.where(features.index < 0, unseen, features.index).astype(dtype),
+        table=table,
+        channel_scale=channel_scale,
+        fingerprint=fingerprint,
+        error=error,
+    )
+    write_archive(path, arrays, header)
+
+
+def _index_dtype(rows: int) -> str:
+    """The type of the numbers of a table's rows; its largest value stands for Gaussians that were never seen."""
+    return "uint8" if rows < 256 else "uint16"
+
+
+def _contents(
+    scene: Scene,
+    features: GaussianFeatures,
+    *,
+    index: np.ndarray,
+    table: np.ndarray,
+    channel_scale: np.ndarray,
+    fingerprint: str,
+    error: float,
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the header of a package; of the features it takes the space, the mean and the basis."""
+    arrays, header = scene_parts(scene)
+    space_arrays, space_header = space_parts(features.space, features.mean, features.basis)
+    arrays |= {**space_arrays, "index": index, "table": table, "channel_scale": channel_scale}
+    return arrays, header | space_header | {"form": INDEX_FORM, "fingerprint": fingerprint, "error": error}
 
 
 def index_bytes(scene: Scene, features: GaussianFeatures, rows: int) -> int:
@@ -54,17 +77,17 @@ def index_bytes(scene: Scene, features: GaussianFeatures, rows: int) -> int:
         features: without an index.
         rows: of the table.
     """
-    around, header = scene_parts(scene)
-    parts, named = space_parts(features.space, features.mean, features.basis)
     columns = features.features.shape[1]
-    entries = {name: (array.dtype.name, array.shape) for name, array in {**around, **parts}.items()}
-    entries |= {
-        "index": ("uint8" if rows < 256 else "uint16", (len(features),)),
-        "table": ("float16", (rows, columns)),
-        "channel_scale": ("float32", (columns,)),
-    }
-    unknown = {"form": INDEX_FORM, "fingerprint": "0" * FINGERPRINT_DIGITS, "error": LONGEST_NUMBER}
-    return archive_bytes(entries, header | named | unknown)
+    arrays, header = _contents(
+        scene,
+        features,
+        index=shape_only(_index_dtype(rows), (len(features),)),
+        table=shape_only("float16", (rows, columns)),
+        channel_scale=shape_only("float32", (columns,)),
+        fingerprint="0" * FINGERPRINT_DIGITS,
+        error=LONGEST_NUMBER,
+    )
+    return archive_bytes(arrays, header)
 
 
 def read_index(file: Archive) -> GaussianFeatures:
@@ -77,9 +100,9 @@ def read_index(file: Archive) -> GaussianFeatures:
     columns = space.channels if basis is None else basis.rank
     scale = file.array("channel_scale", "float32", (columns,))
     table = file.array("table", "float16", ("M", columns)).astype(np.float32) * scale
-    kind = "uint8" if len(table) < 256 else "uint16"
-    stored = file.array("index", kind, ("N",))
-    unseen = stored == np.iinfo(kind).max
+    dtype = _index_dtype(len(table))
+    stored = file.array("index", dtype, ("N",))
+    unseen = stored == np.iinfo(dtype).max
     index = np.where(unseen, -1, stored.astype(np.int32)).astype(np.int32)
     return GaussianFeatures(
         features=table,

@@ -12,10 +12,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import LONGEST_NUMBER, archive_bytes, open_archive, write_archive
+from gsencoder.core.files.archive import (
+    LONGEST_NUMBER,
+    LONGEST_SHARE,
+    archive_bytes,
+    open_archive,
+    shape_only,
+    write_archive,
+)
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.mapped_arrays import MappedArrays
 from gsencoder.core.promises import MEGABYTE
@@ -23,12 +30,14 @@ from gsencoder.data.archive_records import check_splat, read_scene, read_space, 
 from gsencoder.data.splats import FINGERPRINT_DIGITS, fingerprint, load_splat, save_splat
 from gsencoder.fusion.store.index_file import INDEX_FORM, read_index, write_index
 from gsencoder.fusion.store.quantize import CompactFeatures, compact, compact_within
-from gsencoder.types import GaussianFeatures, Scene
+from gsencoder.types import FeatureBasis, GaussianFeatures, Scene
 
 Form = Literal["compact", "index", "npz", "safetensors", "ply"]
 SPLAT_FILE, PACKAGE_FILE = "splat.ply", "features.gsf"
 NPZ_FILE, SAFETENSORS_FILE, BASIS_FILE = "features.npz", "features.safetensors", "basis.npz"
 FORMAT = 1
+NUMBERS = ("lightest", "heaviest", "error", "lowest")
+"""Numbers of `CompactFeatures` that stand in the header of a package."""
 
 
 def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, error: float) -> CompactFeatures:
@@ -52,54 +61,58 @@ def save_package_within(folder: Path, scene: Scene, features: GaussianFeatures, 
     Raises:
         InputError: no Gaussians, or nothing is so small.
     """
-    around, header = scene_parts(scene)
-    _, named = space_parts(features.space, features.mean, features.basis)
-    entries = {name: (array.dtype.name, array.shape) for name, array in around.items()}
-    # Numbers of the header that are not known yet are as long as JSON writes any.
-    header |= named | dict.fromkeys(("energy_kept", "lightest", "heaviest", "error", "lowest"), LONGEST_NUMBER)
-    header |= {"form": FORMAT, "fingerprint": "0" * FINGERPRINT_DIGITS, "total": len(features)}
-    seen, channels = int(features.seen.sum()), features.space.channels
+    space, seen = features.space, int(features.seen.sum())
 
     def bytes_of(bits: Int64[np.ndarray, " R"]) -> int:
+        mean, components = (shape_only("float32", shape) for shape in ((space.channels,), (len(bits), space.channels)))
+        basis = FeatureBasis(mean=mean, components=components, energy_kept=LONGEST_SHARE, space=space)
         coded = {
-            "bits": ("uint8", (len(bits),)),
-            "levels": ("float32", (int((1 << bits).sum()),)),
-            "codes": ("uint8", (seen, -(-int(bits.sum()) // 8))),
-            "weight_codes": ("uint8", (seen,)),
-            "seen": ("uint8", (-(-len(features) // 8),)),
-            "mean": ("float32", (channels,)),
-            "components": ("float32", (len(bits), channels)),
+            "bits": shape_only("uint8", (len(bits),)),
+            "levels": shape_only("float32", (int((1 << bits).sum()),)),
+            "codes": shape_only("uint8", (seen, -(-int(bits.sum()) // 8))),
+            "weight_codes": shape_only("uint8", (seen,)),
         }
-        return archive_bytes(entries | coded, header)
+        numbers, unknown = dict.fromkeys(NUMBERS, LONGEST_NUMBER), "0" * FINGERPRINT_DIGITS
+        return archive_bytes(*_contents(scene, features.seen, basis, coded, numbers, fingerprint=unknown))
 
     return _save_compact(folder, scene, compact_within(features, megabytes * MEGABYTE, bytes_of))
 
 
-def _save_compact(folder: Path, scene: Scene, made: CompactFeatures) -> CompactFeatures:
-    written = _save_splat(folder, scene)
+def _save_compact(folder: Path, scene: Scene, compacted: CompactFeatures) -> CompactFeatures:
+    splat = _save_splat(folder, scene)
+    seen = np.zeros(len(compacted), bool)
+    seen[compacted.rows] = True
+    coded = {name: getattr(compacted, name) for name in ("bits", "levels", "codes", "weight_codes")}
+    numbers = {name: getattr(compacted, name) for name in NUMBERS}
+    arrays, header = _contents(scene, seen, compacted.basis, coded, numbers, fingerprint=splat)
+    write_archive(folder / PACKAGE_FILE, arrays, header)
+    return compacted
+
+
+def _contents(
+    scene: Scene,
+    seen: Bool[np.ndarray, " N"],
+    basis: FeatureBasis,
+    coded: Mapping[str, np.ndarray],
+    numbers: Mapping[str, float],
+    *,
+    fingerprint: str,
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the header of a compact package.
+
+    Args:
+        scene: of the features.
+        seen: which Gaussians have features.
+        basis: of the coordinates.
+        coded: the arrays bits, levels, codes and weight_codes of `CompactFeatures`.
+        numbers: its `NUMBERS`.
+        fingerprint: of the splat.
+    """
     arrays, header = scene_parts(scene)
-    parts, named = space_parts(made.space, made.basis.mean, made.basis)
-    seen = np.zeros(len(made), bool)
-    seen[made.rows] = True
-    coded = {
-        "bits": made.bits,
-        "levels": made.levels,
-        "codes": made.codes,
-        "weight_codes": made.weight_codes,
-        "seen": np.packbits(seen),
-        **parts,
-    }
-    header |= named | {
-        "form": FORMAT,
-        "fingerprint": written,
-        "total": len(made),
-        "lightest": made.lightest,
-        "heaviest": made.heaviest,
-        "error": made.error,
-        "lowest": made.lowest,
-    }
-    write_archive(folder / PACKAGE_FILE, arrays | coded, header)
-    return made
+    space_arrays, space_header = space_parts(basis.space, basis.mean, basis)
+    arrays |= {**coded, "seen": np.packbits(seen), **space_arrays}
+    header |= space_header | {"form": FORMAT, "fingerprint": fingerprint, "total": len(seen), **numbers}
+    return arrays, header
 
 
 def save_index_package(folder: Path, scene: Scene, features: GaussianFeatures, *, error: float) -> None:

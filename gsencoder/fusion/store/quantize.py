@@ -277,7 +277,7 @@ def _encode(
     tiny = float(np.finfo(np.float32).tiny)
     lightest, heaviest = max(float(weights.min()), tiny), max(float(weights.max()), tiny)
     shares = np.log(np.maximum(weights, lightest) / lightest) / max(np.log(heaviest / lightest), 1e-12)
-    made = CompactFeatures(
+    compacted = CompactFeatures(
         codes=codes,
         bits=bits.astype(np.uint8),
         levels=np.concatenate(levels),
@@ -295,4 +295,4 @@ def _encode(
         error=max(1 - float(np.nanmean(cosines)), allocation.errors()[1], 0.0),
         lowest=float(np.nanquantile(cosines, 0.001)),
     )
-    return made, cosines
+    return compacted, cosines

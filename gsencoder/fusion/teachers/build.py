@@ -110,15 +110,15 @@ def words_by_teacher(
     Raises:
         InputError: see `words_of`; or a tower is given that is for none of several teachers.
     """
-    several, given = len(teachers) > 1, not isinstance(text, TableTextConfig)
-    if several and given and not any(map(takes_text, teachers.values())):
+    several, has_tower = len(teachers) > 1, not isinstance(text, TableTextConfig)
+    if several and has_tower and not any(map(takes_text, teachers.values())):
         raise InputError(f"text=: the words of none of the teachers {', '.join(teachers)} can be those of a text tower")
     words: dict[str, Words] = {}
     for name, config in teachers.items():
         with options_of_member(name, config) if several or members else nullcontext():
-            own = words_of(config, text if not several or takes_text(config) else TableTextConfig())
-        if own is not None:
-            words[name] = own
+            teacher_words = words_of(config, text if not several or takes_text(config) else TableTextConfig())
+        if teacher_words is not None:
+            words[name] = teacher_words
     return words
 
 

@@ -168,9 +168,9 @@ class OnnxTeacher:
         where = f"teacher onnx: {self._path.name}"
         output = run_on_picture(self._session, (self._input, self._output), tensor, where)
         if not isinstance(output, np.ndarray) or output.ndim != self._axes or len(output) != 1:
-            wanted = "[1, tokens, channels]" if self.config.layout == "tokens" else "[1, channels, rows, columns]"
+            expected = "[1, tokens, channels]" if self.config.layout == "tokens" else "[1, channels, rows, columns]"
             raise InputError(
-                f"{where} gave {self._output!r} of shape {list(np.shape(output))}, expected {wanted}; "
+                f"{where} gave {self._output!r} of shape {list(np.shape(output))}, expected {expected}; "
                 "check teacher.layout and teacher.output"
             )
         return output[0]
@@ -180,9 +180,9 @@ class OnnxTeacher:
         assert self._classes is not None
         if logits.shape[1] != len(self._classes):
             raise InputError(f"teacher onnx: {logits.shape[1]} classes but {len(self._classes)} class vectors")
-        known = np.isfinite(self._classes[:, 0])
-        logits = np.where(known, logits / self.config.temperature, -np.inf)
-        k = min(self.config.top_k, int(known.sum()))
+        has_vector = np.isfinite(self._classes[:, 0])
+        logits = np.where(has_vector, logits / self.config.temperature, -np.inf)
+        k = min(self.config.top_k, int(has_vector.sum()))
         best = np.argpartition(-logits, k - 1, axis=1)[:, :k]
         top = np.take_along_axis(logits, best, axis=1)
         share = np.exp(top - top.max(axis=1, keepdims=True))

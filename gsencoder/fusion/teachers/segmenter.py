@@ -102,7 +102,7 @@ class SegmenterTeacher:
         """Loads the network, and embeds the names of its classes.
 
         Args:
-            config: see there.
+            config: settings.
             words: turns names into vectors.
 
         Raises:

@@ -62,7 +62,7 @@ class OnnxSegmenter:
 
         Args:
             path: the .onnx file.
-            options: see there.
+            options: settings.
 
         Raises:
             InputError: it cannot be read, or does not take one picture of three channels.

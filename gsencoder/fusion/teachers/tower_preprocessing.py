@@ -127,8 +127,8 @@ def _stated(folder: Path, what: str) -> tuple[Path, dict[str, Any]]:
 def _three(value: Any, where: str, *, positive: bool = False) -> tuple[float, ...]:
     numbers = value if isinstance(value, list) else []
     if len(numbers) != 3 or not all(_is_number(number) and (number > 0 or not positive) for number in numbers):
-        wanted = "three numbers above 0" if positive else "three numbers"
-        raise InputError(f"{where}: expected {wanted}, one a channel, got {str(value)[:60]}")
+        expected = "three numbers above 0" if positive else "three numbers"
+        raise InputError(f"{where}: expected {expected}, one a channel, got {str(value)[:60]}")
     return tuple(float(number) for number in numbers)
 
 

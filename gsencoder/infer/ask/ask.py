@@ -96,7 +96,7 @@ class Prompt:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LookedUp:
+class Lookup:
     """What the words of a question, or its box, lead to.
 
     Attributes:
@@ -129,7 +129,7 @@ class Asker:
         scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
         words: what leads into the features; None where nothing does.
         space: which features are asked.
-        config: see there.
+        config: settings.
         localization: how words become boxes.
         views: how views are chosen.
         vlm: how requests are made; pictures are made smaller than its `image_side`.
@@ -140,7 +140,7 @@ class Asker:
         self.config, self.localization, self.views, self.vlm = config, localization, views, vlm
         self.word_rules = word_rules
         self._free: FreeSpace | None = None
-        self._looked_up: dict[Hashable, LookedUp] = {}
+        self._lookups: dict[Hashable, Lookup] = {}
         self._picture_cache: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
 
     def prompt(self, question: Question) -> Prompt:
@@ -158,12 +158,12 @@ class Asker:
         if not words and not question.aabb and self.table is not None:
             words = words_in(question.text, self.table, self.word_rules)
         key = (words, question.aabb, question.task == "caption")
-        if key not in self._looked_up:
-            self._looked_up[key] = self._look_up(words, question)
-        looked_up = self._looked_up[key]
-        targets, boxes, views = looked_up.targets, looked_up.boxes, looked_up.views
+        if key not in self._lookups:
+            self._lookups[key] = self._look_up(words, question)
+        lookup = self._lookups[key]
+        targets, boxes, views = lookup.targets, lookup.boxes, lookup.views
         if not targets and self.views.method == "greedy":
-            message = self._nothing(words, looked_up.absent)
+            message = self._nothing(words, lookup.absent)
             if question.task != "answer":
                 raise InputError(f"task={question.task}: {message}; give query= or aabb=")
             warnings.warn(f"{message}: evenly spread views are shown", SceneWarning, stacklevel=2)
@@ -181,7 +181,7 @@ class Asker:
             marks=marks,
             kinds=kinds,
             probabilities=[box.probability for box in boxes],
-            absent=looked_up.absent,
+            absent=lookup.absent,
         )
         return Prompt(
             text=text,
@@ -190,7 +190,7 @@ class Asker:
             targets=targets,
             boxes=boxes,
             words=words,
-            absent=looked_up.absent,
+            absent=lookup.absent,
             marks=marks,
         )
 
@@ -210,7 +210,7 @@ class Asker:
         listing = (f"{word!r} is {describe_absent(absent[word])}" if word in absent else repr(word) for word in words)
         return f"none of the words has a box: {', '.join(listing)}"
 
-    def _look_up(self, words: Sequence[str], question: Question) -> LookedUp:
+    def _look_up(self, words: Sequence[str], question: Question) -> Lookup:
         targets, boxes, absent = self._targets(words, question)
         config = self.views
         if not targets:
@@ -220,7 +220,7 @@ class Asker:
         views = choose_views(self.scene, targets, config, free=self._free)
         # Marks are drawn on pictures of the size that is sent, or their numbers would shrink.
         small = views.cameras.resized(self.vlm.image_side, enlarge=False)
-        return LookedUp(targets=targets, boxes=boxes, absent=absent, views=replace(views, cameras=small))
+        return Lookup(targets=targets, boxes=boxes, absent=absent, views=replace(views, cameras=small))
 
     def _targets(
         self, words: Sequence[str], question: Question

@@ -39,7 +39,7 @@ def predictions(
         for question, row in answered:
             probabilities = {"obj_prob": [0.0, 1.0], "sem_prob": [1 / CLASSES] * CLASSES} | dict(question.keys)
             entry = {
-                "caption": wrapped_caption(said(row["answer"]).lower()),
+                "caption": wrapped_caption(answer_text(row["answer"]).lower()),
                 "box": target_corners(row["targets"][0]),
                 **probabilities,
             }
@@ -72,11 +72,11 @@ def target_corners(target: Mapping[str, Any]) -> list[list[float]]:
     return box_corners((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
 
-def said(answer: str) -> str:
+def answer_text(answer: str) -> str:
     """An answer without what a model thought before it, on one line."""
     return " ".join(THOUGHT.sub("", answer).split())
 
 
 def short_answer(answer: str) -> str:
-    """An answer as the benchmarks write answers: what was said, in lower case and without a full stop at its end."""
-    return said(answer).lower().rstrip(".").strip()
+    """An answer as the benchmarks write answers: `answer_text` in lower case and without a full stop at its end."""
+    return answer_text(answer).lower().rstrip(".").strip()

@@ -147,12 +147,12 @@ def number_in(text: str, count: int) -> int | None:
 
     Numbers that are called marks come before others; what a model thought before it answered is left out.
     """
-    said = THOUGHT.sub("", text).strip()
-    if NEITHER.match(said):
+    answer = THOUGHT.sub("", text).strip()
+    if NEITHER.match(answer):
         return 0
     for pattern in (CALLED, ALONE):
-        numbers = {number for number in map(int, pattern.findall(said)) if number <= count}
+        numbers = {number for number in map(int, pattern.findall(answer)) if number <= count}
         if numbers:
             return numbers.pop() if len(numbers) == 1 else None
-    word = re.sub(r"\W", "", said).lower()
+    word = re.sub(r"\W", "", answer).lower()
     return NUMBERS.index(word) if word in NUMBERS[: count + 1] else None

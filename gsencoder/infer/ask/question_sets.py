@@ -24,12 +24,12 @@ class SetQuestion:
 
     Attributes:
         scene: that it is about.
-        asked: what is asked, with an id that is unique in the set.
+        question: with an id that is unique in the set.
         keys: by which the benchmark's predictions name it, such as question_id.
     """
 
     scene: str
-    asked: BatchQuestion
+    question: BatchQuestion
     keys: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -122,7 +122,7 @@ def caption_question(scene: str, name: str, aabb: tuple[Corner, Corner], keys: M
         keys: what the prediction says besides caption and box, such as probabilities.
     """
     question = Question(task="caption", aabb=(*aabb[0], *aabb[1]))
-    return SetQuestion(scene=scene, asked=BatchQuestion(id=f"{scene}/{name}", question=question), keys=keys)
+    return SetQuestion(scene=scene, question=BatchQuestion(id=f"{scene}/{name}", question=question), keys=keys)
 
 
 def _refuse_other_object(content: Mapping[str, Any], path: Path) -> None:
@@ -152,7 +152,7 @@ def _answered(question: TruthQuestion) -> SetQuestion:
         keys |= {"situation": question.situation, "question": question.text}
     return SetQuestion(
         scene=question.scene,
-        asked=BatchQuestion(id=question.id, question=Question(text=question.situated_text)),
+        question=BatchQuestion(id=question.id, question=Question(text=question.situated_text)),
         keys=keys,
     )
 
@@ -163,7 +163,7 @@ def _grounded(expressions: Sequence[Expression]) -> QuestionSet:
         questions=tuple(
             SetQuestion(
                 scene=each.scene,
-                asked=BatchQuestion(
+                question=BatchQuestion(
                     id=f"{each.scene}/{each.object_id}/{each.annotation}",
                     question=Question(text=each.text, task="ground"),
                 ),
@@ -182,8 +182,8 @@ def _captioned(expressions: Sequence[Expression], path: Path, proposals: str) ->
             names[each.scene] = tuple(dict.fromkeys((*names.get(each.scene, ()), name)))
         return QuestionSet(benchmark="scan2cap", questions=(), names=names)
     if proposals:
-        given = read_benchmark_json(Path(proposals))
-        boxes = _read_boxes(object_of(given, proposals, "the boxes of each scene"), Path(proposals))
+        proposed = read_benchmark_json(Path(proposals))
+        boxes = _read_boxes(object_of(proposed, proposals, "the boxes of each scene"), Path(proposals))
         scenes = {each.scene for each in expressions}
         return QuestionSet(
             benchmark="scan2cap", questions=_captions({name: rows for name, rows in boxes.items() if name in scenes})

@@ -77,7 +77,7 @@ def request_body(messages: Sequence[Message], config: VlmConfig, *, named: bool 
 
     Args:
         messages: of `prompts.messages`.
-        config: see there.
+        config: settings.
         named: a model must be named; a dry run needs none.
 
     Raises:

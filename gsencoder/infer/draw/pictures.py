@@ -197,17 +197,17 @@ def _draw_labels(
 ) -> None:
     """Labels above their boxes, inside the picture, each moved down until it covers no earlier one."""
     font = label_font(18)
-    taken: list[tuple[float, float, float, float]] = []
+    occupied: list[tuple[float, float, float, float]] = []
     for at, text, color in labels:
         wide, high = draw.textlength(text, font) + 10, 26
         x = float(np.clip(at[0] - wide / 2, 0, max(size[0] - wide, 0)))
         y = float(np.clip(at[1] - high - 4, 0, max(size[1] - high, 0)))
         # Two labels overlap unless one is wholly beside or above the other.
-        for left, top, right, bottom in sorted(taken, key=lambda rectangle: rectangle[1]):
+        for left, top, right, bottom in sorted(occupied, key=lambda rectangle: rectangle[1]):
             if x < right and left < x + wide and y < bottom and top < y + high:
                 y = bottom + 1
         y = min(y, size[1] - high)
-        taken.append((x, y, x + wide, y + high))
+        occupied.append((x, y, x + wide, y + high))
         draw.rectangle([x, y, x + wide, y + high], fill=color)
         draw.text((x + 5, y + high / 2), text, fill=ink_on(color), font=font, anchor="lm")
 

@@ -88,10 +88,10 @@ def relevancy_pictures(
         seen = rgb if images is None else images[view]
         kind = "rendered" if images is None else "photograph"
         pose, K = cameras.cam_from_world[view], cameras.Ks[view]
-        wanted = [index for index, views in enumerate(chosen) if view in views]
-        scores = torch.from_numpy(np.nan_to_num(localization.relevancy[wanted].T, nan=0.0))
+        word_rows = [index for index, views in enumerate(chosen) if view in views]
+        scores = torch.from_numpy(np.nan_to_num(localization.relevancy[word_rows].T, nan=0.0))
         heats = b.render(scores).numpy()
-        for column, index in enumerate(wanted):
+        for column, index in enumerate(word_rows):
             word = localization.queries[index]
             heat = relevancy_overlay(rgb, heats[:, column].reshape(b.shape))
             halves = [draw_boxes(half, boxes_of[word], pose, K, origin=scene.origin) for half in (seen, heat)]

@@ -86,7 +86,7 @@ def encode_by_chunks(
         run: the encoder: features of the first n Gaussians of a subset, given the subset, the curves of the complete
             scene where there are several chunks, and n.
         curves: computes these curves.
-        config: see there.
+        config: settings.
         metres_per_unit: unit of length of the splat.
         columns: of each space in the encoder's output.
         track: wraps the loop over chunks to show progress.

@@ -105,7 +105,7 @@ def encode(
         gaussians: the splat.
         encoder: from `load_weights`; put into evaluation mode here.
         outputs: what its output channels mean.
-        config: see there.
+        config: settings.
         space: name of a teacher or of its feature space; None = the only one.
         metres_per_unit: unit of length of the splat; the encoder's grid is in metres.
         track: wraps the loop over chunks to show progress.

@@ -11,8 +11,9 @@ import numpy as np
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
 from gsencoder.core.knobs import shown_value
-from gsencoder.core.promises import MEGABYTE, PLANNED
+from gsencoder.core.promises import MEGABYTE
 from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.setting_choice import best_setting, within_seconds
 from gsencoder.fusion.feature_error import FieldError, judge
 from gsencoder.fusion.store.folder import features_bytes
 from gsencoder.infer.encode.chunks import EncodeConfig, cut
@@ -33,8 +34,8 @@ SMALL_SCENE = 20_000
 CUT_ROWS = 100_000
 """Chunks of larger scenes are counted on so many of their Gaussians, in chunks that are as much smaller."""
 SAFETY, DEVIATIONS = 5.0, 2.0
-"""A predicted error counts so many times, and with so many of its standard errors: parts said a third to five times of
-what cuts of whole scenes did."""
+"""The bound of an error is `SAFETY` times the predicted one plus `DEVIATIONS` of its standard errors: the error that
+parts of a scene predict was a third to five times that of the whole scene."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,21 +116,23 @@ def encode_within(
     Raises:
         InputError: no budget, megabytes into which not even one coordinate fits, or what encoding refuses.
     """
-    if not budget.given:
+    if not budget.promised:
         raise InputError("budget: expected budget.error=, budget.seconds= or budget.megabytes=, got none of them")
     start = clock()
     exact = replace(exact_encoding(config), precision=encoder.precisions(config.device)[0])
     if budget.megabytes is not None and budget.error is None:
         _check_size(encoder, teachers, len(gaussians), header, budget.megabytes)
     settings, sampled = all_settings(gaussians, encoder, exact, budget, metres_per_unit=metres_per_unit, clock=clock)
-    setting, notes = _chosen(settings, budget, clock() - start)
-    chosen = clock()
-    made = encoder.encode_spaces(gaussians, setting.config, metres_per_unit=metres_per_unit, track=track)
-    encoded = {name: made[name] for name in teachers}
+    setting, notes, spent = best_setting(settings, budget.error), tuple[str, ...](), clock() - start
+    if budget.seconds is not None:
+        setting, notes = within_seconds(settings, setting, budget, lambda each: spent + each.seconds)
+    encoding_start = clock()
+    by_teacher = encoder.encode_spaces(gaussians, setting.config, metres_per_unit=metres_per_unit, track=track)
+    encoded = {name: by_teacher[name] for name in teachers}
     features, ranks, left_out = encoded, dict[str, int](), 0.0
     if budget.megabytes is not None:
-        features, ranks, left_out, said = _within_megabytes(encoded, header, setting, budget)
-        notes += said
+        features, ranks, left_out, broken = _within_megabytes(encoded, header, setting, budget)
+        notes += broken
     return BudgetEncoding(
         features=features,
         encoded=encoded,
@@ -137,7 +140,7 @@ def encode_within(
         exact=exact,
         ranks=ranks,
         sampled=sampled,
-        choosing=chosen - start,
+        choosing=encoding_start - start,
         seconds=clock() - start,
         predicted=min(setting.error + left_out, 1.0),
         notes=notes,
@@ -200,28 +203,6 @@ def all_settings(
     return settings, min(sampled, len(gaussians))
 
 
-def _chosen(settings: Sequence[Setting], budget: EncodeBudget, spent: float) -> tuple[Setting, tuple[str, ...]]:
-    """The setting, and what is to be said."""
-
-    def exactness(each: Setting) -> tuple[float, float]:
-        return each.error, each.cost
-
-    if budget.error is not None:
-        limit = budget.error
-        chosen = min((each for each in settings if each.bound <= limit), key=lambda each: (each.cost, each.error))
-        needed = spent + chosen.seconds
-        conflict = budget.seconds is not None and needed > budget.seconds
-        return chosen, (budget.conflict("error", "seconds", needed),) if conflict else ()
-    if budget.seconds is None:
-        return min(settings, key=exactness), ()
-    fitting = [each for each in settings if spent + each.seconds <= PLANNED * budget.seconds]
-    if fitting:
-        return min(fitting, key=exactness), ()
-    fastest = min(settings, key=lambda each: (each.seconds, each.error))
-    needed = spent + fastest.seconds
-    return fastest, (f"{budget.shown('seconds')}: the fastest setting takes about {needed:.3g} s; it is used",)
-
-
 def _check_size(encoder: Encoder, teachers: Sequence[str], count: int, header: Mapping[str, Any], size: float) -> None:
     """Refuses a size into which not even one coordinate of each teacher fits."""
     least = sum(features_bytes(encoder.spaces[name], count, 1, header) for name in teachers)
@@ -236,7 +217,7 @@ def _within_megabytes(
     encoded: Mapping[str, GaussianFeatures], header: Mapping[str, Any], setting: Setting, budget: EncodeBudget
 ) -> tuple[dict[str, GaussianFeatures], dict[str, int], float, tuple[str, ...]]:
     """Features with as many coordinates as fit, or as a promised error needs; their numbers, the error that this adds,
-    and what is to be said."""
+    and notes about a promise that is not kept."""
     assert budget.megabytes is not None
     limit = budget.megabytes * MEGABYTE
 
@@ -263,13 +244,13 @@ def _within_megabytes(
     }
     left_out = max((axes[name].left_out(ranks[name]) for name in axes), default=0.0)
     size = sum(bytes_of(name, rank) for name, rank in ranks.items())
-    broken = size > limit and budget.error is not None
-    notes = (budget.conflict("error", "megabytes", size / MEGABYTE),) if broken else ()
+    is_broken = size > limit and budget.error is not None
+    notes = (budget.conflict("error", "megabytes", size / MEGABYTE),) if is_broken else ()
     return reduced, ranks, left_out, notes
 
 
 def realised_error(
-    made: BudgetEncoding,
+    encoding: BudgetEncoding,
     gaussians: Gaussians,
     encoder: Encoder,
     *,
@@ -279,7 +260,7 @@ def realised_error(
 ) -> dict[str, FieldError]:
     """The error of each teacher's features against those of the exact setting, on a tenth of the Gaussians, drawn now.
     Where the exact setting was chosen, nothing is encoded again."""
-    exact: Mapping[str, GaussianFeatures] = made.encoded
-    if made.setting.config != made.exact:
-        exact = encoder.encode_spaces(gaussians, made.exact, metres_per_unit=metres_per_unit, track=track)
-    return {name: judge(features, exact[name], seed=seed) for name, features in made.features.items()}
+    exact: Mapping[str, GaussianFeatures] = encoding.encoded
+    if encoding.setting.config != encoding.exact:
+        exact = encoder.encode_spaces(gaussians, encoding.exact, metres_per_unit=metres_per_unit, track=track)
+    return {name: judge(features, exact[name], seed=seed) for name, features in encoding.features.items()}

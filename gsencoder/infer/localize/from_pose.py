@@ -239,9 +239,9 @@ class SeenField:
         pixel = np.array([lattice.x0 + column * lattice.dx, lattice.y0 + row * lattice.dy])
         entries = slice(int(self.b.crow[best]), int(self.b.crow[best + 1]))
         gaussians, weights = self.b.col[entries].numpy(), self.b.weight[entries].numpy().astype(np.float64)
-        own = of_gaussians[gaussians]
-        relevant = own >= least
-        chosen = relevant if relevant.any() else np.isfinite(own)
+        entry_relevancy = of_gaussians[gaussians]
+        relevant = entry_relevancy >= least
+        chosen = relevant if relevant.any() else np.isfinite(entry_relevancy)
         # Entries are in order of depth.
         total = weights[chosen].cumsum()
         middle = int(np.searchsorted(total, total[-1] / 2))

@@ -121,7 +121,7 @@ def localize(
         scene: Gaussians with features.
         queries: words that `text` knows.
         text: turns words into the features' space.
-        config: see there.
+        config: settings.
         space: name of the feature set; None where the scene has only one.
         rivals: words that may fit the Gaussians better than those asked; None = the names that
             `text` knows, if it knows any.
@@ -277,23 +277,23 @@ def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, Gaussia
 
 def _negatives(text: TextEncoder, words: Sequence[str]) -> Float32[np.ndarray, "M D"]:
     """Vectors of the negative words that the encoder knows; the mean of the text side where it knows none."""
-    known, unknown = [], []
+    vectors, unknown = [], []
     for word in words:
         try:
-            known.append(text.encode([word]))
+            vectors.append(text.encode([word]))
         except InputError:
             unknown.append(word)
     if unknown:
-        instead = "" if known else "; the mean of its words stands for them"
+        instead = "" if vectors else "; the mean of its words stands for them"
         warnings.warn(
             f"{len(unknown)} of {len(words)} negative words are unknown to {text.space.text_encoder} "
             f"({', '.join(unknown[:5])}) and left out{instead}",
             SceneWarning,
             stacklevel=3,
         )
-    if unknown and not known:
-        known = [(text.mean / max(float(np.linalg.norm(text.mean)), 1e-12))[None].astype(np.float32)]
-    return np.concatenate(known) if known else np.zeros((0, text.space.channels), np.float32)
+    if unknown and not vectors:
+        vectors = [(text.mean / max(float(np.linalg.norm(text.mean)), 1e-12))[None].astype(np.float32)]
+    return np.concatenate(vectors) if vectors else np.zeros((0, text.space.channels), np.float32)
 
 
 def _warn_about_absent(scene: str, localization: Localization) -> None:

@@ -66,7 +66,7 @@ class OnnxHeader:
     made_by: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        known = set(get_args(Order))
+        possible_orders = set(get_args(Order))
         numbers = type(self.levels) is int and type(self.patch) is int
         if not 0 < self.voxel < math.inf or not numbers or not 1 <= self.levels <= ALIGN.bit_length() or self.patch < 1:
             raise InputError(
@@ -76,8 +76,8 @@ class OnnxHeader:
         readable = (*get_args(Stored), "int8_static")
         if self.precision not in readable:
             raise InputError(f"expected a precision among {', '.join(readable)}, got {str(self.precision)[:40]}")
-        if not self.orders or not set(self.orders) <= known:
-            raise InputError(f"expected orders among {', '.join(sorted(known))}, got {str(self.orders)[:80]}")
+        if not self.orders or not set(self.orders) <= possible_orders:
+            raise InputError(f"expected orders among {', '.join(sorted(possible_orders))}, got {str(self.orders)[:80]}")
 
 
 def to_metadata(header: OnnxHeader) -> dict[str, str]:
@@ -147,8 +147,8 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
         by_teacher: dict[str, OutputSpace] = {}
         tables: dict[str, TextTable] = {}
         for prefix, part in parts:
-            known = {name: values["arrays"][prefix + name] for name in ARRAYS if prefix + name in values["arrays"]}
-            arrays = {name: _array(entries, prefix + name, **form) for name, form in known.items()}
+            forms = {name: values["arrays"][prefix + name] for name in ARRAYS if prefix + name in values["arrays"]}
+            arrays = {name: _array(entries, prefix + name, **form) for name, form in forms.items()}
             outputs = _output_space(part, arrays)
             # Files of earlier versions do not name their teacher otherwise.
             teacher = str(part.get("teacher") or outputs.space.teacher or outputs.space.name)
@@ -237,13 +237,13 @@ def _array(entries: Mapping[str, str], name: str, *, dtype: str, shape: list[int
     if dtype not in ("float32", "float16", "int8"):
         raise InputError(f"expected {name} of float32, float16 or int8, got {dtype[:20]!r}")
     text = entries[f"{KEY}.{name}"]
-    wanted = math.prod(shape) * np.dtype(dtype).itemsize
-    if not 0 <= wanted <= max(1 << 24, MAX_INFLATION * len(text)):
-        raise InputError(f"{name} claims {str(wanted)[:20]} bytes in {len(text)} of text")
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    if not 0 <= size <= max(1 << 24, MAX_INFLATION * len(text)):
+        raise InputError(f"{name} claims {str(size)[:20]} bytes in {len(text)} of text")
     unpacking = zlib.decompressobj()
-    raw = unpacking.decompress(base64.b64decode(text, validate=True), wanted + 1)
-    if len(raw) != wanted or not unpacking.eof:
-        raise InputError(f"expected {wanted} bytes of {name}, got {'more' if len(raw) > wanted else len(raw)}")
+    raw = unpacking.decompress(base64.b64decode(text, validate=True), size + 1)
+    if len(raw) != size or not unpacking.eof:
+        raise InputError(f"expected {size} bytes of {name}, got {'more' if len(raw) > size else len(raw)}")
     values = np.frombuffer(raw, np.dtype(dtype).newbyteorder("<")).reshape(shape).astype(dtype)
     if not np.isfinite(values).all():
         raise InputError(f"{name} holds values that are not finite")

@@ -85,15 +85,15 @@ def products_in_int8(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 def _products(graph: onnx.GraphProto) -> Iterator[Product]:
-    known = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
+    initializers = {each.name: numpy_helper.to_array(each) for each in graph.initializer}
     for node in graph.node:
-        if node.domain == OURS.domain and node.op_type == convolve.name and node.input[2] in known:
-            weight = known[node.input[2]]
+        if node.domain == OURS.domain and node.op_type == convolve.name and node.input[2] in initializers:
+            weight = initializers[node.input[2]]
             yield Product(node, node.input[0], node.input[2], weight.reshape(-1, weight.shape[2]), len(weight))
-        elif node.op_type == "Gemm" and node.input[1] in known:
-            given = {each.name: helper.get_attribute_value(each) for each in node.attribute}
-            if given.get("transB", 0) == 1 and not given.get("transA", 0) and len(node.input) == 3:
-                yield Product(node, node.input[0], node.input[1], known[node.input[1]].T)
+        elif node.op_type == "Gemm" and node.input[1] in initializers:
+            attributes = {each.name: helper.get_attribute_value(each) for each in node.attribute}
+            if attributes.get("transB", 0) == 1 and not attributes.get("transA", 0) and len(node.input) == 3:
+                yield Product(node, node.input[0], node.input[1], initializers[node.input[1]].T)
 
 
 def _store(graph: onnx.GraphProto, weight: str, **arrays: np.ndarray) -> list[str]:

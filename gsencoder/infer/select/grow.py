@@ -21,12 +21,13 @@ surroundings goes with it."""
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Candidates:
-    """What features and places say of each Gaussian.
+    """The label of each Gaussian by its feature, and the label that it could have by its position.
 
     Attributes:
-        labels: by the features.
-        possible: the label that it could have by its place; 0 = out of reach of every word.
-        shares: of the object of that label in its feature; −∞ where no label is possible, `NO_SHARE` without a feature.
+        labels: by the features, 0 = none.
+        possible: by the position; 0 = out of reach of every word.
+        shares: share of the object of the possible label in the feature; −∞ where no label is possible, `NO_SHARE`
+            without a feature.
     """
 
     labels: Labels
@@ -42,11 +43,11 @@ def labels_by_features(
     config: SelectConfig,
     spacing: float,
 ) -> Candidates:
-    """The label of each Gaussian by its feature, and the label that it could have by its place.
+    """The label of each Gaussian by its feature, and the label that it could have by its position.
 
-    A Gaussian has the word of whose objects its feature has the largest share, if that is above `config.share`. By its
-    place it could be of a word of which a part is within reach; of several, that whose share is the largest, or the
-    first where it has no feature.
+    By its position a Gaussian could have a word of which a part is within reach; of several words the one with the
+    largest share in its feature, or the first where it has no feature. It has that word if the share is above
+    `config.share`.
     """
     count = len(gaussians)
     labels, possible = np.zeros(count, np.int32), np.zeros(count, np.int32)
@@ -67,8 +68,8 @@ def labels_by_features(
             better = shares > best[candidates]
             chosen = candidates[better]
             best[chosen], possible[chosen] = shares[better], number + 1
-    taken = best > config.share
-    labels[taken] = possible[taken]
+    above_share = best > config.share
+    labels[above_share] = possible[above_share]
     return Candidates(labels=labels, possible=possible, shares=best)
 
 
@@ -80,25 +81,25 @@ def labels_by_pixels(
     A Gaussian with a good part of an object in its feature (`PARTLY` of `config.share` or more) is taken if the share
     `config.only` of its weight is on pixels that the object dominates. It is also taken if it is a ghost of the object:
     if, were the object taken out, it would have most of its weight on these pixels, and `GHOST_WEIGHT` times as much
-    there as Gaussians of the object usually have. One that was taken is lost if less than 1 − `config.only` of its
+    there as Gaussians of the object usually have. One that has the label loses it if less than 1 − `config.only` of its
     weight is there. A Gaussian without a feature has the label on whose pixels more than half of its weight is, or,
-    where no view shows it, would be if the objects were taken out. What no view would show stays as it is.
+    where no view shows it, would be if the objects were taken out. Gaussians that no view would show keep their label.
     """
     labels, possible = candidates.labels, candidates.possible
     rows = np.flatnonzero(possible > 0)
-    own, total = _own(votes.present, rows, possible)
-    left, total_left = _own(votes.removed, rows, possible)
+    on_label, total = _weight_on_label(votes.present, rows, possible)
+    on_label_removed, total_removed = _weight_on_label(votes.removed, rows, possible)
     usual = _usual_weights(votes.present, labels)[possible[rows]]
-    is_in, known = labels[rows] == possible[rows], seen[rows]
-    partly = known & (candidates.shares[rows] > PARTLY * config.share)
-    ghost = (left > 0.5) & (left * total_left >= GHOST_WEIGHT * usual) & (total_left > 0)
-    shown = (total > 0) & (own >= config.only)
+    is_in, has_feature = labels[rows] == possible[rows], seen[rows]
+    partly = has_feature & (candidates.shares[rows] > PARTLY * config.share)
+    ghost = (on_label_removed > 0.5) & (on_label_removed * total_removed >= GHOST_WEIGHT * usual) & (total_removed > 0)
+    confirmed = (total > 0) & (on_label >= config.only)
     # What is hidden now is judged by the views in which it would appear.
-    featureless = ~known & (np.where(total > 0, own, left) > 0.5)
-    lost = is_in & (total > 0) & np.where(known, own < 1 - config.only, own <= 0.5)
+    featureless = ~has_feature & (np.where(total > 0, on_label, on_label_removed) > 0.5)
+    lost = is_in & (total > 0) & np.where(has_feature, on_label < 1 - config.only, on_label <= 0.5)
     corrected = labels.copy()
-    taken = rows[(partly & (shown | ghost)) | featureless]
-    corrected[taken] = possible[taken]
+    added = rows[(partly & (confirmed | ghost)) | featureless]
+    corrected[added] = possible[added]
     corrected[rows[lost]] = 0
     return corrected
 
@@ -112,17 +113,19 @@ def _usual_weights(present: Float32[np.ndarray, "N labels"], labels: Labels) -> 
     return usual
 
 
-def _own(weights: Float32[np.ndarray, "N labels"], rows: np.ndarray, possible: Labels) -> tuple[np.ndarray, np.ndarray]:
+def _weight_on_label(
+    weights: Float32[np.ndarray, "N labels"], rows: np.ndarray, possible: Labels
+) -> tuple[np.ndarray, np.ndarray]:
     """The share of the weight that is on the pixels of the label that is possible, 0 without weight; and the weight."""
     total = weights[rows].sum(axis=1)
-    own = weights[rows, possible[rows]]
-    return np.divide(own, total, out=np.zeros_like(own), where=total > 0), total
+    on_label = weights[rows, possible[rows]]
+    return np.divide(on_label, total, out=np.zeros_like(on_label), where=total > 0), total
 
 
 def labels_of_hidden(
     gaussians: Gaussians, labels: Labels, possible: Labels, unknown: Bool[np.ndarray, " N"], spacing: float
 ) -> Labels:
-    """Labels in which Gaussians that neither features nor views tell anything of have the label of those around them.
+    """Labels in which Gaussians that have no feature and that no view shows take the label of their neighbors.
 
     A Gaussian of `unknown` within reach of a word gets the word if more than half of its nearest Gaussians that are
     known have it and the nearest of these is within two spacings.
@@ -130,16 +133,16 @@ def labels_of_hidden(
     from scipy.spatial import cKDTree
 
     rows = np.flatnonzero(unknown & (possible > 0))
-    known = np.flatnonzero(~unknown)
-    if not len(rows) or not len(known):
+    labeled = np.flatnonzero(~unknown)
+    if not len(rows) or not len(labeled):
         return labels
     points = gaussians.means.astype(np.float64)
-    distances, nearest = cKDTree(points[known]).query(points[rows], k=min(NEIGHBORS, len(known)))
+    distances, nearest = cKDTree(points[labeled]).query(points[rows], k=min(NEIGHBORS, len(labeled)))
     distances, nearest = distances.reshape(len(rows), -1), nearest.reshape(len(rows), -1)
-    agreeing = (labels[known[nearest]] == possible[rows][:, None]).mean(axis=1)
+    agreeing = (labels[labeled[nearest]] == possible[rows][:, None]).mean(axis=1)
     corrected = labels.copy()
-    taken = (agreeing > 0.5) & (distances[:, 0] <= 2 * spacing)
-    corrected[rows] = np.where(taken, possible[rows], 0)
+    agrees = (agreeing > 0.5) & (distances[:, 0] <= 2 * spacing)
+    corrected[rows] = np.where(agrees, possible[rows], 0)
     return corrected
 
 
@@ -154,22 +157,22 @@ def grow(
     *,
     track: Track = untracked,
 ) -> tuple[Labels, int]:
-    """The labels of all Gaussians, and how many views were looked at.
+    """The labels of all Gaussians, and the number of views that corrected them.
 
     Args:
         gaussians: the splat.
         features: of the space in which the words were asked.
-        cameras: that look at it; None = features and places alone decide.
+        cameras: of the views that correct the labels; None = features and positions alone decide.
         parts: what each word's selection starts with.
         relevancy: of each word.
-        config: see there.
+        config: settings.
         spacing: of the scene, world units.
         track: progress over the views.
     """
     candidates = labels_by_features(gaussians, features, parts, relevancy, config, spacing)
     labels = candidates.labels
     unknown = ~features.seen
-    looked = 0
+    view_count = 0
     if cameras is not None and config.views and len(cameras):
         # The matrix of a view needs torch, which all else does without.
         from gsencoder.infer.select.votes import sampling, votes
@@ -178,5 +181,5 @@ def grow(
         by_pixels = votes(gaussians, cameras, labels, len(parts), chosen, spacing=spacing, track=track)
         labels = labels_by_pixels(candidates, features.seen, by_pixels, config)
         unknown = unknown & (by_pixels.present.sum(axis=1) + by_pixels.removed.sum(axis=1) == 0)
-        looked = len(chosen.views)
-    return labels_of_hidden(gaussians, labels, candidates.possible, unknown, spacing), looked
+        view_count = len(chosen.views)
+    return labels_of_hidden(gaussians, labels, candidates.possible, unknown, spacing), view_count

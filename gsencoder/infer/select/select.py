@@ -75,19 +75,21 @@ def select(
     else:
         parts = threshold_parts(words, localized.relevancy, threshold)
     seeds = labels = labels_of_parts(parts, localized.relevancy)
-    looked, placed = 0, False
+    view_count, placed = 0, False
     if config.grow and labels.any():
         # A part keeps what no other word took from it.
         parts = tuple(
-            tuple(own for rows in groups if len(own := rows[labels[rows] == number + 1]))
+            tuple(remaining for rows in groups if len(remaining := rows[labels[rows] == number + 1]))
             for number, groups in enumerate(parts)
         )
         seen_by, placed = _with_cameras(scene, config)
         cameras = None if seen_by.views is None else seen_by.views.cameras
         spacing = scene_spacing(gaussians.means) or float(np.median(gaussians.scales))
-        labels, looked = grow(gaussians, features, cameras, parts, localized.relevancy, config, spacing, track=track)
+        labels, view_count = grow(
+            gaussians, features, cameras, parts, localized.relevancy, config, spacing, track=track
+        )
     _check_some(scene, localized, labels)
-    return Selection(words=tuple(words), labels=labels, seeds=seeds, views=looked, placed=placed), localized
+    return Selection(words=tuple(words), labels=labels, seeds=seeds, views=view_count, placed=placed), localized
 
 
 def _check_distinct(words: Sequence[str], text: TextEncoder) -> None:

@@ -64,14 +64,14 @@ def object_shares(
     near = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
     distances = np.asarray(cKDTree(points[rows]).query(points[near])[0])
     candidates = near[distances <= reach * spacing]
-    around = (distances > GAP * spacing) & (distances <= margin) & (features.weights[near] > 0)
-    surroundings = np.setdiff1d(near[around], same, assume_unique=True)
+    in_ring = (distances > GAP * spacing) & (distances <= margin) & (features.weights[near] > 0)
+    surroundings = np.setdiff1d(near[in_ring], same, assume_unique=True)
     # What is as relevant as the part, but too small or sparse for a box of its own, does not stand for something else.
     surroundings = surroundings[relevancy[surroundings] < relevancy[core].min()]
     shares = np.full(len(candidates), np.nan)
-    known = np.flatnonzero(features.weights[candidates] > 0)
+    with_features = np.flatnonzero(features.weights[candidates] > 0)
     if not len(surroundings):
-        shares[known] = 1.0
+        shares[with_features] = 1.0
         return candidates, shares
     others = np.setdiff1d(near, same, assume_unique=True)
     depths = np.asarray(cKDTree(points[others]).query(points[rows])[0])
@@ -80,25 +80,25 @@ def object_shares(
     core = np.union1d(pure, np.intersect1d(core, inside))
     trees = [(cKDTree(points[pure]), pure) for pure in (core, surroundings)]
     step = max(1, BLOCK_BYTES // (8 * NEIGHBORS * features.features.shape[1]))
-    for start in range(0, len(known), step):
-        block = known[start : start + step]
-        asked = candidates[block]
-        a, b = (_local_mean(features, points[asked], tree, pure) for tree, pure in trees)
+    for start in range(0, len(with_features), step):
+        block = with_features[start : start + step]
+        batch = candidates[block]
+        a, b = (_local_mean(features, points[batch], tree, pure) for tree, pure in trees)
         between = a - b
         length = (between**2).sum(axis=1)
-        along = ((features.stored(asked) - b) * between).sum(axis=1)
+        along = ((features.stored(batch) - b) * between).sum(axis=1)
         # Where object and surroundings have one feature, a Gaussian is what it started as.
-        alike = np.isin(asked, rows).astype(np.float64)
+        alike = np.isin(batch, rows).astype(np.float64)
         shares[block] = np.divide(along, length, out=alike, where=length > 1e-12 * (a**2 + b**2).sum(axis=1))
     shares[np.isin(candidates, inside)] = 1.0
     return candidates, shares
 
 
 def _local_mean(
-    features: GaussianFeatures, places: Float64[np.ndarray, "c 3"], tree: object, rows: Int64[np.ndarray, " n"]
+    features: GaussianFeatures, positions: Float64[np.ndarray, "c 3"], tree: object, rows: Int64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, "c channels"]:
     """The mean feature of the nearest of some Gaussians to each place."""
-    nearest = tree.query(places, k=min(NEIGHBORS, len(rows)))[1]  # type: ignore[attr-defined]
-    nearest = np.asarray(nearest).reshape(len(places), -1)
+    nearest = tree.query(positions, k=min(NEIGHBORS, len(rows)))[1]  # type: ignore[attr-defined]
+    nearest = np.asarray(nearest).reshape(len(positions), -1)
     values = features.stored(rows[nearest.ravel()]).astype(np.float64)
     return np.asarray(values.reshape(*nearest.shape, -1).mean(axis=1))

@@ -57,8 +57,8 @@ def label_masses(b: Blend, labels: Int32[np.ndarray, " N"], count: int) -> torch
     """How much of each pixel's opacity is of each label from 1 to `count`: [P, count]."""
     # Gaussians of the label 0 are most of a scene, and have no column.
     one_hot = torch.zeros(len(labels), count)
-    taken = np.flatnonzero(labels)
-    one_hot[torch.from_numpy(taken), torch.from_numpy(labels[taken].astype(np.int64) - 1)] = 1
+    labeled = np.flatnonzero(labels)
+    one_hot[torch.from_numpy(labeled), torch.from_numpy(labels[labeled].astype(np.int64) - 1)] = 1
     return b.render(one_hot)
 
 

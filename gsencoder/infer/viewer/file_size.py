@@ -76,18 +76,19 @@ def fitting_page(
                 f"Spherical harmonics above degree {degree} of {highest} are left out: colors depend less on the "
                 f"direction. A file larger than {max_bytes / 1e6:g} MB (megabytes=) keeps them."
             )
-        known = max(0 if words is None else len(closed_table(words)) for _, _, words in scenes)
+        word_count = max(0 if words is None else len(closed_table(words)) for _, _, words in scenes)
         # Other phrases need the tower, which no file holds.
         phrases = any(isinstance(words, OpenVocabulary) for _, _, words in scenes)
         notes.append(
-            f"This file knows {known:,} words" + (", and gsencoder view FEATURES takes any phrase." if phrases else ".")
+            f"This file knows {word_count:,} words"
+            + (", and gsencoder view FEATURES takes any phrase." if phrases else ".")
         )
-        made = [
+        containers = [
             _container(scene, title, words, config, objects, replace(options, sh_degree=degree), limit)
             for scene, title, words in scenes
         ]
-        settings = {"kind": "file", "scenes": len(made), "notes": notes}
-        page = file_page(bundle, f"{scenes[0][0].name} · gsencoder view", settings, made)
+        settings = {"kind": "file", "scenes": len(containers), "notes": notes}
+        page = file_page(bundle, f"{scenes[0][0].name} · gsencoder view", settings, containers)
         if len(page) <= max_bytes:
             break
         if degree > 0:
@@ -99,9 +100,9 @@ def fitting_page(
             raise InputError(
                 f"megabytes={max_bytes / 1e6:g}: not even {FEWEST_GAUSSIANS:,} Gaussians fit beside the page itself, "
                 f"which takes {fixed / 1e6:.1f} MB; give megabytes= a larger number"
-                + (", or photographs=0" if any(each.meta["photographViews"] for each in made) else "")
+                + (", or photographs=0" if any(each.meta["photographViews"] for each in containers) else "")
             )
-    metas = [each.meta for each in made]
+    metas = [each.meta for each in containers]
     return MadePage(
         page=page,
         gaussians=tuple(meta["count"] for meta in metas),

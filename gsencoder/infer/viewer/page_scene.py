@@ -111,15 +111,15 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
     if search.config.threshold.kind == "otsu":
         raise InputError("localize.threshold.kind=otsu: a page does not compute it; use another, or leave out= out")
     base = scene_container(search, objects, sh_degree=options.sh_degree)
-    made = compact(search.shown.features, error=options.error)
+    compacted = compact(search.shown.features, error=options.error)
     table = search.table
-    directions = np.zeros((0, made.space.channels))
+    directions = np.zeros((0, compacted.space.channels))
     if table is not None:
         directions = word_directions(table.embeddings, table.mean)
-    seen = np.zeros(made.total, bool)
-    seen[made.rows] = True
+    seen = np.zeros(compacted.total, bool)
+    seen[compacted.rows] = True
     labels = search.labels()
-    words = directions @ made.basis.components.astype(np.float64).T
+    words = directions @ compacted.basis.components.astype(np.float64).T
     likeness = directions @ directions.T
     near = {
         str(row): np.flatnonzero(likeness[row] >= presence.SYNONYM).tolist()
@@ -129,9 +129,9 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
     photographs, listed = photograph_bytes(views, options)
     meta = {
         **base.meta,
-        "rank": made.basis.rank,
+        "rank": compacted.basis.rank,
         "floor": feature_axes(search.shown.features).floor,
-        "featureError": made.error,
+        "featureError": compacted.error,
         "synonyms": near,
         "trained": None if table is None or table.trained is None else [table.is_trained(name) for name in table.names],
         "presence": {
@@ -147,9 +147,9 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
     }
     arrays = {
         **base.arrays,
-        "codes": made.codes,
-        "bits": made.bits,
-        "levels": made.levels,
+        "codes": compacted.codes,
+        "bits": compacted.bits,
+        "levels": compacted.levels,
         "seen": np.packbits(seen),
         "wordVectors": np.rint(words / WORD_STEP).astype(np.int16),
         "labels": labels.numbers,

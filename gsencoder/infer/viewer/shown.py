@@ -150,7 +150,7 @@ def object_numbers(
         raise InputError(f"expected fewer than {1 << 16:,} objects, got {len(objects):,}")
     numbers = np.full(len(means), NO_OBJECT, np.uint16)
     volumes = [float(np.prod(each.aabb_max - each.aabb_min)) for each in objects]
-    for place in np.argsort(volumes, kind="stable")[::-1]:
-        low, high = objects[place].aabb_min - origin - margin, objects[place].aabb_max - origin + margin
-        numbers[((means >= low) & (means <= high)).all(axis=1)] = place + 1
+    for row in np.argsort(volumes, kind="stable")[::-1]:
+        low, high = objects[row].aabb_min - origin - margin, objects[row].aabb_max - origin + margin
+        numbers[((means >= low) & (means <= high)).all(axis=1)] = row + 1
     return numbers

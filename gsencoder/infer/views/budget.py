@@ -37,7 +37,7 @@ class BudgetViews:
         candidates: among how many.
         predicted: seconds.
         seconds: from the beginning to the choice.
-        notes: what is to be said.
+        notes: for the user, about a promise that is not kept.
     """
 
     views: ViewSet
@@ -54,7 +54,7 @@ def check_views_budget(budget: ViewsBudget, config: ViewsConfig) -> None:
         InputError: `GOVERNED` options are set, or views are not chosen from candidates.
     """
     check_governed(budget, config, ViewsConfig(), GOVERNED, "choose")
-    if budget.given and config.method != "greedy":
+    if budget.promised and config.method != "greedy":
         raise InputError(
             f"choose.method={config.method}: {budget.names} is for method=greedy, which judges candidates; leave one "
             "of the two out"
@@ -93,16 +93,16 @@ def choose_views_within(
         return judge_candidates(scene, gaussians, targets, free, replace(config, candidates=number))
 
     begun = clock()
-    made, number = judged(numbers[0]), numbers[0]
-    each = (clock() - begun) / number
+    judgment, number = judged(numbers[0]), numbers[0]
+    seconds_each = (clock() - begun) / number
     spent = predicted = clock() - start
     notes: tuple[str, ...] = ()
     # Placing candidates takes some of that time whatever their number, so that this is on the safe side.
-    fitting = [more for more in numbers[1:] if spent + more * each <= PLANNED * budget.seconds]
+    fitting = [more for more in numbers[1:] if spent + more * seconds_each <= PLANNED * budget.seconds]
     if fitting:
         number = fitting[-1]
-        predicted, made = spent + number * each, judged(number)
+        predicted, judgment = spent + number * seconds_each, judged(number)
     elif spent > budget.seconds:
         notes = (f"{budget.shown('seconds')}: judging {number} candidates took {spent:.3g} s; they are used",)
-    views = chosen_views(scene, targets, made, free, config)
+    views = chosen_views(scene, targets, judgment, free, config)
     return BudgetViews(views=views, candidates=number, predicted=predicted, seconds=clock() - start, notes=notes)

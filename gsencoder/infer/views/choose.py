@@ -38,8 +38,8 @@ def choose_views(
         scene: Gaussians, and cameras where it has any. Frames of a scene with photographs are judged as these, and
             close-ups cut from them are candidates too.
         targets: what is looked at; all count alike. Evenly spread frames need none.
-        config: see there.
-        free: the free space of the scene's Gaussians, for who chooses more than once; None = it is made.
+        config: settings.
+        free: the free space of the scene's Gaussians, for callers that choose more than once; None = it is made.
 
     Warns:
         SceneWarning: fewer views than were asked for, a target that no view shows, no room around one.
@@ -90,10 +90,10 @@ def judge_candidates(
 
 
 def chosen_views(
-    scene: Scene, targets: Sequence[Target], made: Judged, free: FreeSpace, config: ViewsConfig
+    scene: Scene, targets: Sequence[Target], judgment: Judged, free: FreeSpace, config: ViewsConfig
 ) -> ViewSet:
     """The candidates that show targets best together; see `choose_views`."""
-    candidates, scores, judged = made
+    candidates, scores, judged = judgment
     cameras = candidates.cameras
     values = CoverageObjective(cameras, targets, scores, config)
     if config.method == "uniform":

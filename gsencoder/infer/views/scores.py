@@ -126,7 +126,7 @@ class _TargetProbe:
         # What is half transparent at a target's rim belongs to what is behind it, too.
         solid = alone >= CONSTANTS.solid_share * float(alone.max())
         total = float(alone[solid].sum())
-        mine = weights[self._rows]
+        blended = weights[self._rows]
         depths = b.depths.numpy()[self._rows].astype(np.float64)
         pixels = float(small.Ks[view, 0, 0]) * self._sizes / np.maximum(depths, config.near)
         target, context = (weights[rows].astype(np.float32) for rows in self._samples)
@@ -136,7 +136,7 @@ class _TargetProbe:
             share=float(shown.mean()),
             inside=float(inside.mean()),
             alpha=_around(alone.reshape(b.shape), b.alpha.reshape(b.shape)),
-            blur=float(mine @ pixels / mine.sum()) / max(b.shape) if mine.sum() > 0 else 0.0,
+            blur=float(blended @ pixels / blended.sum()) / max(b.shape) if blended.sum() > 0 else 0.0,
             target=target,
             context=context,
         )

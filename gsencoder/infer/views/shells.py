@@ -49,13 +49,13 @@ def shell_cameras(
     """
     focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
     outward, vertical = spiral_directions(max(CONSTANTS.tried_directions * count, CONSTANTS.min_tried_directions), up)
-    wanted, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height, between)
+    preferred, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height, between)
     # Up to the first surface beyond the target itself and the cells of what it lies on, with room to stand before it.
     begins = reach + 2 * free.cell
     starts = target.center + begins[:, None] * outward
     clearance = CONSTANTS.clearance_share
-    open_until = begins + free.first_hit(starts, outward, np.maximum(wanted * (1 + clearance) - begins, 0))
-    distance = np.minimum(wanted, open_until / (1 + clearance))
+    open_until = begins + free.first_hit(starts, outward, np.maximum(preferred * (1 + clearance) - begins, 0))
+    distance = np.minimum(preferred, open_until / (1 + clearance))
     centers = target.center + distance[:, None] * outward
     good = (distance >= least) & (free.clearance(centers) >= clearance * np.minimum(distance, target.radius))
     if free.observers is not None:
@@ -107,7 +107,7 @@ def _distances(
     margin = CONSTANTS.fill_margin
     shares = np.clip(CONSTANTS.fill_shares, between[0] * margin, between[1] / margin)
     cell = max(target.radius / CONSTANTS.outline_cells, 2 * float(np.median(gaussians.scales[rows].max(axis=1))))
-    wanted, least, reach = (np.empty(len(outward)) for _ in range(3))
+    preferred, least, reach = (np.empty(len(outward)) for _ in range(3))
     for index, (right, down, direction) in enumerate(look_rotation(outward, vertical)):
         plane = np.stack((offsets @ right, offsets @ down), axis=1)
         area = len(np.unique(np.floor(plane / cell).astype(np.int64), axis=0)) * cell**2
@@ -119,14 +119,13 @@ def _distances(
         ]
         wide, high = np.abs(plane).max(axis=0)
         framed = 2 * focal / CONSTANTS.framed_share * max(wide / width, high / height)
-        wanted[index] = reach[index] + max(fills[0], min(framed, fills[2]))
+        preferred[index] = reach[index] + max(fills[0], min(framed, fills[2]))
         least[index] = reach[index] + fills[1]
-    return wanted, least, reach
+    return preferred, least, reach
 
 
 def up_of(scene: Scene) -> Float64[np.ndarray, "3"] | None:
-    """The scene's up, or what its cameras hold for it: the mean of their pictures' upward directions, where these
-    agree; None where nobody knows."""
+    """The scene's up, else the mean of the upward directions of its views where these agree, else None."""
     if scene.up is not None or scene.views is None:
         return scene.up
     mean = -scene.views.cameras.cam_from_world[:, 1, :3].astype(np.float64).mean(axis=0)

@@ -63,10 +63,10 @@ def patches(gaussians: Gaussians, edge: float) -> Patches:
 def _parts(gaussians: Gaussians, edge: float, most: int) -> Int64[np.ndarray, "N 3"]:
     """Into how many parts each axis is cut."""
     length = 2 * CONSTANTS.surface_sigmas * gaussians.scales.astype(np.float64) / edge
-    wanted = np.where(length > CONSTANTS.max_uncut_edges, np.ceil(length), 1)
-    axes = np.maximum((wanted > 1).sum(axis=1), 1)
-    shrink = np.minimum((most / wanted.prod(axis=1)) ** (1 / axes), 1)
-    return np.maximum(wanted * shrink[:, None], 1).astype(np.int64)
+    cuts = np.where(length > CONSTANTS.max_uncut_edges, np.ceil(length), 1)
+    axes = np.maximum((cuts > 1).sum(axis=1), 1)
+    shrink = np.minimum((most / cuts.prod(axis=1)) ** (1 / axes), 1)
+    return np.maximum(cuts * shrink[:, None], 1).astype(np.int64)
 
 
 def _middles(parts: Int64[np.ndarray, "3"]) -> Float64[np.ndarray, "k 3"]:

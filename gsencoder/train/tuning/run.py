@@ -20,7 +20,8 @@ from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.prompt_store import PromptStore
 from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.distributed import check_agreement
-from gsencoder.train.trainer import CHANGEABLE_ON_RESUME, Trainer, TrainerConfig
+from gsencoder.train.trainer import Trainer
+from gsencoder.train.trainer_config import CHANGEABLE_ON_RESUME, TrainerConfig
 from gsencoder.train.tuning.network import AnswerObjective, TunedVlm
 from gsencoder.train.tuning.samples import PairSamples, TuningPair, join_pairs
 from gsencoder.train.tuning.towers import SPLIT, TowerLayout, tower_layout

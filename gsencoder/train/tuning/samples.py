@@ -81,8 +81,10 @@ class TuningBatch(NamedTuple):
 def chat(text: str, pictures: Sequence[Any], answer: str | None = None) -> list[dict[str, Any]]:
     """The messages of a prompt, pictures before words as `ask` sends them, and those of an answer."""
     content = [*({"type": "image", "image": each} for each in pictures), {"type": "text", "text": text}]
-    said: list[dict[str, Any]] = [{"role": "user", "content": content}]
-    return said if answer is None else [*said, {"role": "assistant", "content": [{"type": "text", "text": answer}]}]
+    messages: list[dict[str, Any]] = [{"role": "user", "content": content}]
+    if answer is not None:
+        messages.append({"role": "assistant", "content": [{"type": "text", "text": answer}]})
+    return messages
 
 
 def answer_frame(processor: Any) -> tuple[str, str]:
@@ -92,10 +94,10 @@ def answer_frame(processor: Any) -> tuple[str, str]:
         InputError: neither the chat template nor the tokenizer says what ends an answer.
     """
     tokenizer, probe = processor.tokenizer, "answer"
-    asked = processor.apply_chat_template(chat("question", []), add_generation_prompt=True, tokenize=False)
-    told = processor.apply_chat_template(chat("question", [], probe), add_generation_prompt=False, tokenize=False)
+    prompt = processor.apply_chat_template(chat("question", []), add_generation_prompt=True, tokenize=False)
+    dialog = processor.apply_chat_template(chat("question", [], probe), add_generation_prompt=False, tokenize=False)
     before, after = "", ""
-    if told.startswith(asked) and probe in (rest := told[len(asked) :]):
+    if dialog.startswith(prompt) and probe in (rest := dialog[len(prompt) :]):
         before, _, after = rest.partition(probe)
     if before.strip():
         before = ""

@@ -99,7 +99,7 @@ class TokenHook:
         self._layout = layout
         tower.register_forward_hook(self._replace)
 
-    def _replace(self, tower: nn.Module, given: Any, output: Any) -> Any:  # noqa: ARG002
+    def _replace(self, tower: nn.Module, inputs: Any, output: Any) -> Any:  # noqa: ARG002
         if self.tokens is None:
             return output
         layout, states = self._layout, output.hidden_states

@@ -106,7 +106,7 @@ def test_photographs_are_placed_whatever_lies_in_folders_beside_them(
         asked.append(pictures)
         raise InputError("stop")
 
-    monkeypatch.setattr("gsencoder.reconstruct.open_scene.place_photographs", remembered)
+    monkeypatch.setattr("gsencoder.reconstruct.open_scene.register_photographs", remembered)
     assert "stop" in refusal(capsys, str(folder), f"out={folder / 'result'}", "quiet=true")
     assert asked == [folder]
 

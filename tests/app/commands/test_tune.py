@@ -134,17 +134,17 @@ def test_prepared_prompts_serve_the_next_run_and_what_changed_is_prepared_anew(
 def test_an_interrupted_command_goes_on_as_if_nothing_had_happened(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gsencoder.train.trainer import Trainer
+    from gsencoder.train.trainer_config import TrainerConfig
 
     assert cli.main(words(given, tmp_path / "whole", "train.steps=6")) == 0
-    rate_at = Trainer.rate_at
+    rate_at = TrainerConfig.rate_at
 
-    def stop(self: Trainer, step: int) -> float:
+    def stop(self: TrainerConfig, step: int) -> float:
         if step == 4:
             signal.raise_signal(signal.SIGINT)
         return rate_at(self, step)
 
-    monkeypatch.setattr(Trainer, "rate_at", stop)
+    monkeypatch.setattr(TrainerConfig, "rate_at", stop)
     assert cli.main(words(given, tmp_path / "cut", "train.steps=6")) == 130
     assert (tmp_path / "cut.training" / "checkpoint.safetensors").is_file()
     monkeypatch.undo()

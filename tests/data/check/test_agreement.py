@@ -257,7 +257,7 @@ def test_a_camera_below_and_beside_the_depth_camera_is_fitted_in_both_directions
     assert fit.focal_factor == pytest.approx(1.1, abs=0.01)
     # Half a pixel at 2 m is 9 mm.
     np.testing.assert_allclose(fit.shift, (-0.02, 0.03), atol=0.009)
-    assert fit.best > 0.8 > fit.given
+    assert fit.best > 0.8 > fit.stated
 
 
 def test_registration_says_nothing_without_shared_places_or_details(views: Views, small: DepthViews) -> None:
@@ -265,7 +265,7 @@ def test_registration_says_nothing_without_shared_places_or_details(views: Views
     grey = replace(views, images=[np.full_like(image, 128) for image in views.images])
     fit = fit_registration(grey, np.arange(COUNT), small)
     assert (fit.focal_factor, fit.differs) == (1.0, False)
-    assert np.isnan([fit.given, fit.best]).all()
+    assert np.isnan([fit.stated, fit.best]).all()
     few = replace(small, values=np.where(np.arange(SAMPLES) < MIN_SHARED - 1, small.values, 0))
     assert fit_registration(views, np.arange(COUNT), few).pairs == 0
 

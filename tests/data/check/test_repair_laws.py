@@ -92,7 +92,7 @@ def test_distortion_and_principal_point_stay_when_the_focal_length_changes() -> 
 
 def test_a_color_camera_beside_the_depth_camera_leaves_the_depth_where_it_was() -> None:
     right = posed()
-    fit = RegistrationFit(focal_factor=0.9, shift=np.array([0.02, -0.01]), given=0.1, best=0.9, pairs=9)
+    fit = RegistrationFit(focal_factor=0.9, shift=np.array([0.02, -0.01]), stated=0.1, best=0.9, pairs=9)
     repair = repair_posed(right, [finding("color registration", factor=0.9)], fit)
     for mended, image in zip(repair.posed.images, right.images, strict=True):
         assert mended.depth_from_color is not None

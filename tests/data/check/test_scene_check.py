@@ -94,8 +94,8 @@ FACTORS = {"depth scale": 1 / 1.03, "depth focal length": 1.1, "focal length": 1
 def test_a_scene_without_faults_has_no_findings(box: Views) -> None:
     check = check_depth(box)
     assert check.findings == ()
-    assert check.given.share > 0.99
-    assert abs(check.given.offset) < 1e-4
+    assert check.stated.share > 0.99
+    assert abs(check.stated.offset) < 1e-4
     assert check.color > 0.98
 
 
@@ -106,7 +106,7 @@ def test_a_fault_of_all_views_is_named_with_its_factor(box: Views, fault: str) -
     if fault in FACTORS:
         assert check.findings[0].factor == pytest.approx(FACTORS[fault], rel=0.01)
     assert check.best.share > 0.95
-    assert check.best.spread < 0.6 * check.given.spread
+    assert check.best.spread < 0.6 * check.stated.spread
 
 
 @pytest.mark.parametrize("fault", VIEW_FAULTS)

@@ -271,7 +271,7 @@ def test_names_are_read_back_and_scored(tmp_path: Path) -> None:
     assert read_recognition_truth(tmp_path / "t.json") == tuple(truth)
     assert read_recognition_predictions(tmp_path / "p.json") == tuple(answers)
     results, others = recognize_files(tmp_path / "p.json", tmp_path / "t.json", ("bed", "chair"))
-    assert ([item.place for item in results], others) == ([2], 1)
+    assert ([item.rank for item in results], others) == ([2], 1)
 
 
 def test_null_is_no_answer(tmp_path: Path) -> None:
@@ -318,7 +318,7 @@ def test_an_object_without_a_prediction_is_refused_unless_it_may_be_missing(tmp_
     with pytest.raises(InputError, match=r"p\.json: object 1 of s has no prediction"):
         recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"])
     found, others = recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"], allow_missing=True)
-    assert ([(each.place, each.first) for each in found], others) == ([(0, None)], 0)
+    assert ([(each.rank, each.first) for each in found], others) == ([(0, None)], 0)
 
 
 def test_bbox_is_the_first_of_bboxes_and_no_other_of_them(tmp_path: Path) -> None:

@@ -119,14 +119,14 @@ def test_places_count_from_one_and_other_classes_are_counted_beside() -> None:
     said = [("b", "a"), (), ("a",)]
     ranked = [RankedNames(scene="s", object=str(k), names=names) for k, names in enumerate(said)]
     found, others = recognize(ranked, truth, ["a", "b"])
-    assert [(each.place, each.first) for each in found] == [(2, "b"), (0, None), (1, "a")]
+    assert [(each.rank, each.first) for each in found] == [(2, "b"), (0, None), (1, "a")]
     assert others == 1
     scores = recognition_scores(found, ["b", "a"], ks=(1, 2))
     assert scores.overall == {1: pytest.approx(1 / 3), 2: pytest.approx(2 / 3)}
     assert (scores.classes[2], scores.mean[2], scores.unanswered) == ({"b": 0, "a": 1}, 1 / 2, 1)
     with pytest.raises(InputError, match="object 1 of s has no prediction"):
         recognize(ranked[:1], truth, ["a", "b"])
-    assert recognize(ranked[:1], truth, ["a", "b"], allow_missing=True)[0][1].place == 0
+    assert recognize(ranked[:1], truth, ["a", "b"], allow_missing=True)[0][1].rank == 0
 
 
 def test_the_ceiling_is_of_the_background_and_no_class_is_of_none() -> None:

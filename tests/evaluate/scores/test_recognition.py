@@ -41,14 +41,14 @@ def test_scores_are_those_worked_out_by_hand() -> None:
     assert scores.mean == pytest.approx({1: (1 / 3 + 1) / 2, 2: (2 / 3 + 1) / 2})
     assert scores.overall == pytest.approx({1: 2 / 4, 2: 3 / 4})
     assert scores.counts == {"bed": 3, "chair": 1, "sofa": 0}
-    assert [item.place for item in found] == [1, 2, 0, 1]
+    assert [item.rank for item in found] == [1, 2, 0, 1]
 
 
 def test_the_mean_of_the_papers_row_is_the_mean_of_its_classes() -> None:
     # Table 1, PointCLIP: 0 but for table 0.7, bookshelf 91.8 and curtain 15.0, of 17 classes; the paper prints 6.3.
     shares = {"table": 7, "bookshelf": 918, "curtain": 150} | {f"class {number}": 0 for number in range(14)}
     found = [
-        RecognizedInstance(scene=name, object=str(number), name=name, place=int(number < right), first=name)
+        RecognizedInstance(scene=name, object=str(number), name=name, rank=int(number < right), first=name)
         for name, right in shares.items()
         for number in range(1000)
     ]

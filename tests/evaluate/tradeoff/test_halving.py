@@ -35,7 +35,7 @@ def test_with_one_cost_the_best_wins_from_any_start() -> None:
             lambda some, _, losses=losses: [(float(losses[each["number"]]),) for each in some],  # type: ignore[misc]
             HalvingConfig(settings=30),
         )
-        assert rungs[-1].kept[0] == {"number": int(losses.argmin())}
+        assert rungs[-1].survivors[0] == {"number": int(losses.argmin())}
 
 
 def test_rungs_grow_in_scenes_and_shrink_in_settings() -> None:
@@ -50,7 +50,7 @@ def test_rungs_grow_in_scenes_and_shrink_in_settings() -> None:
     )
     assert asked == [(27, 1), (9, 3), (4, 9), (4, 12)]
     assert [rung.scenes for rung in rungs] == [1, 3, 9, 12]
-    assert rungs[-1].kept == tuple({"n": number} for number in range(4))
+    assert rungs[-1].survivors == tuple({"n": number} for number in range(4))
 
 
 def test_settings_are_all_combinations_or_a_choice_by_the_seed() -> None:

@@ -26,7 +26,7 @@ def build_regions(config: RegionsConfig, scene: Scene, words: Words | None) -> R
     """The teacher of one scene.
 
     Args:
-        config: see there.
+        config: settings.
         scene: whose masks and captions are read.
         words: of the space; they embed captions.
 

@@ -149,7 +149,7 @@ def codes_of(labels: Int32[np.ndarray, "H W"], row_of: dict[int, int]) -> Int32[
     """For each pixel the row of its label, −1 for labels without one."""
     if not row_of:
         return np.full(labels.shape, -1, np.int32)
-    known = np.array(sorted(row_of), np.int32)
-    rows = np.array([row_of[int(label)] for label in known], np.int32)
-    nearest = np.searchsorted(known, labels).clip(max=len(known) - 1)
-    return np.where(known[nearest] == labels, rows[nearest], np.int32(-1))
+    captioned = np.array(sorted(row_of), np.int32)
+    rows = np.array([row_of[int(label)] for label in captioned], np.int32)
+    nearest = np.searchsorted(captioned, labels).clip(max=len(captioned) - 1)
+    return np.where(captioned[nearest] == labels, rows[nearest], np.int32(-1))

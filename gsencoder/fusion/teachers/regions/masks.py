@@ -131,14 +131,16 @@ def scene_path(scene: Scene, name: str, option: str) -> Path:
         InputError: there is none at an absolute path, or the name stands for both.
     """
     beside = scene.folder / name if scene.folder is not None and not Path(name).is_absolute() else None
-    known = [path for path in (beside, Path(name)) if path is not None and path.exists()]
-    if not known:
+    existing = [path for path in (beside, Path(name)) if path is not None and path.exists()]
+    if not existing:
         tried = " or ".join(str(path) for path in (beside, Path(name)) if path is not None)
         absent = InputError if Path(name).is_absolute() else MissingInput
         raise absent(f"{option}: nothing at {tried}")
-    if len(known) == 2 and not known[0].samefile(known[1]):
-        raise InputError(f"{option}={name}: stands for {known[0]} and for {known[1].absolute()}; give a complete path")
-    return known[0]
+    if len(existing) == 2 and not existing[0].samefile(existing[1]):
+        raise InputError(
+            f"{option}={name}: stands for {existing[0]} and for {existing[1].absolute()}; give a complete path"
+        )
+    return existing[0]
 
 
 def view_stem(name: str) -> PurePosixPath:
@@ -160,21 +162,21 @@ def label_paths(folder: Path, names: Sequence[str]) -> list[Path]:
     paths: list[Path] = []
     missing: list[str] = []
     for name, stem in zip(names, stems, strict=True):
-        places = [folder / stem, folder / stem.name] if count[stem.name] == 1 else [folder / stem]
+        bases = [folder / stem, folder / stem.name] if count[stem.name] == 1 else [folder / stem]
         # Not with_suffix, which would cut off the last part of "frame-000012.color".
-        candidates = [place.with_name(place.name + suffix) for place in places for suffix in ENDINGS]
-        known: list[Path] = []
+        candidates = [base.with_name(base.name + suffix) for base in bases for suffix in ENDINGS]
+        existing: list[Path] = []
         for path in dict.fromkeys(candidates):
             # A file system that ignores case has one file under both spellings of an ending.
-            if path.is_file() and not any(path.samefile(other) for other in known):
-                known.append(path)
-        if len(known) > 1:
+            if path.is_file() and not any(path.samefile(other) for other in existing):
+                existing.append(path)
+        if len(existing) > 1:
             raise InputError(
-                f"teacher.folder: view {name!r} has {len(known)} label images, {known[0]} and {known[1]}; remove all "
-                "but one"
+                f"teacher.folder: view {name!r} has {len(existing)} label images, {existing[0]} and {existing[1]}; "
+                "remove all but one"
             )
-        paths += known
-        missing += [] if known else [name]
+        paths += existing
+        missing += [] if existing else [name]
     if missing:
         first = stems[list(names).index(missing[0])]
         raise InputError(

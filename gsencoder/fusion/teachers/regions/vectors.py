@@ -181,7 +181,7 @@ def region_means(
     counts = np.bincount(codes[inside].astype(np.int64) * cells + cell[inside], minlength=len(regions) * cells)
     counts = counts.reshape(len(regions), cells).astype(np.float64)
     rows = map_rows(dense)
-    known = np.isfinite(rows).all(axis=1)
-    counts = counts[:, known]
+    finite = np.isfinite(rows).all(axis=1)
+    counts = counts[:, finite]
     sizes = counts.sum(axis=1, keepdims=True)
-    return ((counts @ rows[known].astype(np.float64)) / np.where(sizes > 0, sizes, np.nan)).astype(np.float32)
+    return ((counts @ rows[finite].astype(np.float64)) / np.where(sizes > 0, sizes, np.nan)).astype(np.float32)

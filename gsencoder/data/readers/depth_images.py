@@ -1,0 +1,112 @@
+"""Depth images of sensors as lazy sequences: z in world units, in the pixels of the photographs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.readers.image_file import load_npy, read_integers
+from gsencoder.data.readers.images import PictureFiles, PixelGrid
+from gsencoder.data.readers.undistort import RemapCache, pinhole_for
+from gsencoder.types.cameras import pixel_centers, unproject_points
+
+DepthMeasure = Literal["z", "ray"]
+"""What the numbers of a depth file are: the coordinate z in the camera, or the distance from its center."""
+
+
+def ray_lengths(K: Float64[np.ndarray, "3 3"], width: int, height: int) -> Float64[np.ndarray, "height width"]:
+    """The distance from the camera of a point of depth z = 1, for each pixel."""
+    rays = unproject_points(pixel_centers(width, height), np.ones((height, width)), K)
+    return np.asarray(np.linalg.norm(rays, axis=2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DepthSensor:
+    """How the numbers of a depth file become depth of the photograph.
+
+    Attributes:
+        scale: world units for each step of the file.
+        no_depth: a step that means none, besides 0.
+        measure: whether a depth is the coordinate z or the length of the ray.
+        color_from_depth: where the sensor stands beside the photograph's camera, world units; None = in one place.
+    """
+
+    scale: float = 1.0
+    no_depth: int | None = None
+    measure: DepthMeasure = "z"
+    color_from_depth: Float64[np.ndarray, "4 4"] | None = None
+
+
+class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
+    """Sensor depth as float32 [H, W], z in world units, 0 = none; a view without a file is all zero.
+
+    PNG holds integers and .npy any number type; both are multiplied by the view's scale. In .npy, NaN and infinity
+    also mean none. Depth of a sensor that stands beside the photograph's camera is carried over (registration.py).
+    """
+
+    def __init__(
+        self,
+        paths: Sequence[Path | None],
+        grids: Sequence[PixelGrid],
+        remaps: RemapCache,
+        sensors: Sequence[DepthSensor],
+    ) -> None:
+        super().__init__(paths, grids, remaps)
+        self._sensors = tuple(sensors)
+
+    def _slice(self, rows: slice) -> "DepthFiles":
+        return DepthFiles(self._paths[rows], self._grids[rows], self._remaps, self._sensors[rows])
+
+    def _load(self, view: int) -> Float32[np.ndarray, "H W"]:
+        path, grid = self._paths[view], self._grids[view]
+        if path is None:
+            return np.zeros((grid.height, grid.width), np.float32)
+        if path.suffix.lower() == ".npy":
+            read = load_npy(path)
+            with np.errstate(over="ignore"):
+                values = np.where(np.isfinite(read), read, 0).astype(np.float64)
+            if values.size and values.min() < 0:
+                raise InputError(f"{path}: depth has negative values")
+        else:
+            values = read_integers(path, "depth", wide=True).astype(np.float64)
+        sensor = self._sensors[view]
+        if sensor.no_depth is not None:
+            values[values == sensor.no_depth] = 0
+        if sensor.color_from_depth is None:
+            depth = self._nearest(view, values) * sensor.scale
+            if sensor.measure == "ray":
+                depth /= ray_lengths(grid.pinhole.matrix(grid.width, grid.height), grid.width, grid.height)
+        else:
+            depth = self._registered(view, values * sensor.scale, sensor)
+        if depth.size and depth.max() > np.finfo(np.float32).max:
+            raise InputError(f"{path}: depth of {depth.max():g} world units; check the depth scale")
+        return depth.astype(np.float32)
+
+    def _registered(self, view: int, depth: np.ndarray, sensor: DepthSensor) -> Float32[np.ndarray, "H W"]:
+        """The depth of a sensor that stands elsewhere, as the photograph's camera sees it."""
+        # The kernel needs numba and torch, which scenes without such sensors do without.
+        from gsencoder.data.readers.registration import register_depth
+
+        grid = self._grids[view]
+        self.check_size(view, depth.shape)
+        source = grid.source
+        pinhole = pinhole_for(source, str(self._paths[view]))
+        remap = self._remaps.get(pinhole, source)
+        if remap is not None:
+            depth = remap.nearest(depth)
+        K = pinhole.matrix(pinhole.width, pinhole.height)
+        if sensor.measure == "ray":
+            depth = depth / ray_lengths(K, pinhole.width, pinhole.height)
+        assert sensor.color_from_depth is not None
+        return register_depth(
+            depth.astype(np.float32),
+            K,
+            sensor.color_from_depth,
+            grid.pinhole.matrix(grid.width, grid.height),
+            grid.width,
+            grid.height,
+        )

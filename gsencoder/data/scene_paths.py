@@ -1,0 +1,127 @@
+"""Paths of scenes: which paths are scenes, the scenes in folders and lists of paths, and their names.
+
+Judged by names of files alone; `scenes.py` reads them.
+"""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.readers.layouts import describe_layouts, layout_of
+from gsencoder.data.readers.scene_splat import SPLAT_SUFFIXES
+
+FEATURES_FILE = "scene.safetensors"
+"""The file by which a folder of features, or of a memory of a scene, is recognized."""
+
+
+def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
+    """The scenes at paths: a path is a scene, a folder of scenes, which are sorted by name, or a list of paths (.txt).
+
+    A folder is a scene if `load_scene` recognizes it; of any other folder the direct subfolders are searched. A scene
+    that is named twice, also by different paths, is returned once.
+
+    Raises:
+        InputError: a path does not exist, or a folder holds no scene.
+    """
+    scenes: dict[Path, Path] = {}
+    for path in listed_paths(paths):
+        try:
+            if not path.exists():
+                raise InputError(f"{path}: no such file or folder")
+            scenes_of_path = [path] if is_scene(path) else sorted(filter(_is_scene_folder, path.iterdir()))
+        except (OSError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{str(path)[:200]!r} cannot be read ({type(error).__name__})") from error
+        if not scenes_of_path and (path / FEATURES_FILE).is_file():
+            raise InputError(
+                f"{path}: a folder of features, not a scene; localize, views, ask, pack and evaluate features= take it"
+            )
+        if not scenes_of_path:
+            raise InputError(
+                f"{path}: neither a scene nor a folder of scenes; a scene holds one of: {describe_layouts()}; a splat"
+            )
+        for scene in scenes_of_path:
+            scenes.setdefault(scene.resolve(), scene)
+    return tuple(scenes.values())
+
+
+def listed_paths(paths: Iterable[str | Path]) -> list[Path]:
+    """Paths, with those in list files in place of the files: text files (.txt) with one path a line, relative to the
+    file; blank lines and those that begin with # are left out.
+
+    Raises:
+        InputError: a list cannot be read, or is empty.
+    """
+    result: list[Path] = []
+    for path in map(Path, paths):
+        try:
+            is_list = path.suffix.lower() == ".txt" and path.is_file()
+        except (OSError, ValueError):
+            is_list = False
+        if not is_list:
+            result.append(path)
+            continue
+        try:
+            lines = path.read_text(encoding="utf-8-sig").splitlines()
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: not a readable list of scenes ({type(error).__name__})") from error
+        names = [line.strip() for line in lines if line.strip() and not line.strip().startswith("#")]
+        if not names:
+            raise InputError(f"{path}: lists no scene; expected one path a line")
+        result += [path.parent / name for name in names]
+    return result
+
+
+def is_scene(path: Path) -> bool:
+    """Whether `load_scene` recognizes a folder itself as a scene; True for any file."""
+    if path.is_file():
+        return True
+    return (
+        (path / "meta.json").is_file()
+        or layout_of(path) is not None
+        or any(entry.suffix.lower() in SPLAT_SUFFIXES and entry.is_file() for entry in path.iterdir())
+    )
+
+
+def _is_scene_folder(entry: Path) -> bool:
+    return entry.is_dir() and not entry.name.startswith(".") and is_scene(entry)
+
+
+def has_views(path: Path) -> bool:
+    """Whether a path is a scene with posed views, as opposed to a splat, judged by names of files alone."""
+    return is_transforms_file(path) if path.is_file() else layout_of(path) is not None
+
+
+def is_transforms_file(path: Path) -> bool:
+    """Whether a file is to be read as transforms.json: any .json but the meta.json of an unpacked .sog."""
+    return path.suffix.lower() == ".json" and path.name != "meta.json"
+
+
+def scene_name(path: Path) -> str:
+    """The name that `load_scene` gives the scene at an existing path."""
+    if path.is_file():
+        return name_of_folder(path.absolute().parent) if is_transforms_file(path) else path.stem
+    return name_of_folder(path)
+
+
+def name_of_folder(folder: Path) -> str:
+    """The name of a scene and of its output folder; "." and ".." are resolved."""
+    return (folder if folder.name not in ("", "..") else folder.resolve()).name or "scene"
+
+
+def check_names(paths: Sequence[Path]) -> None:
+    """Checks that no two scenes have the same name, since their results would be in one folder.
+
+    Raises:
+        InputError: two have.
+    """
+    first: dict[str, Path] = {}
+    for path in paths:
+        name = scene_name(path)
+        if name in first:
+            raise InputError(
+                f"{path} and {first[name]} are both called {name!r}, so their results would be in one folder; "
+                "rename one, or run them with different out="
+            )
+        first[name] = path
