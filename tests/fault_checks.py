@@ -254,7 +254,7 @@ def hidden(files: dict[str, str]) -> dict[str, str]:
 def tidy(files: dict[str, str]) -> dict[str, str]:
     """Digests without those of pictures of time and logs of TensorBoard, which differ in each run."""
     files = {re.sub(r"tfevents[^/]*", "tfevents", name): value for name, value in files.items()}
-    unlike = ("report.html", "tfevents", "tradeoff.csv", "tradeoff.png", "tradeoff.html", "page.html")
+    unlike = ("report.html", "tfevents", "tradeoff.csv", "scenes.csv", "tradeoff.png", "tradeoff.html", "page.html")
     return {name: "" if name.endswith(unlike) else value for name, value in files.items()}
 
 

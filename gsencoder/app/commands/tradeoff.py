@@ -2,9 +2,10 @@
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from rich.table import Table
 
@@ -23,7 +24,7 @@ from gsencoder.evaluate.protocols.localization import LocalizationProtocol
 from gsencoder.evaluate.tradeoff.halving import HalvingConfig
 from gsencoder.evaluate.tradeoff.plots import page, picture, to_json
 from gsencoder.evaluate.tradeoff.records import Records
-from gsencoder.evaluate.tradeoff.results import SettingResult, pick_within
+from gsencoder.evaluate.tradeoff.results import SettingResult, pick_within, scene_row
 from gsencoder.evaluate.tradeoff.scaling import ScalingConfig, ScalingResult, scaling
 from gsencoder.evaluate.tradeoff.stage import HIGHER_IS_BETTER, Inputs, StageName
 from gsencoder.evaluate.tradeoff.sweep import STAGES, StageResult, SweepConfig, check_sweep, sweep_stage
@@ -34,8 +35,9 @@ from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.views.selection import ViewsConfig
 
-TABLE, RESULTS, PAGE, PICTURE, EXPONENTS = (
+TABLE, SCENES, RESULTS, PAGE, PICTURE, EXPONENTS = (
     "tradeoff.csv",
+    "scenes.csv",
     "tradeoff.json",
     "tradeoff.html",
     "tradeoff.png",
@@ -151,7 +153,7 @@ def run(config: TradeoffConfig, summary: Summary) -> None:
         screen.print(f"{scaled.stage}: CPU time grows as {scaled.factor}^{value:.2f} (95 %: {low:.2f} to {high:.2f})")
     if advice:
         screen.print(advice)
-    screen.print(f"{out}: {TABLE}, {RESULTS}, {PAGE} and {PICTURE}")
+    screen.print(f"{out}: {TABLE}, {SCENES}, {RESULTS}, {PAGE} and {PICTURE}")
 
 
 def _check_names(paths: Sequence[Path]) -> None:
@@ -163,9 +165,8 @@ def _check_names(paths: Sequence[Path]) -> None:
 
 def _write(folder: Path, results: Sequence[StageResult], exponents: Sequence[ScalingResult], summary: Summary) -> None:
     rows = [each.row() for result in results for each in result.results]
-    # Stages give different scores; a table has the columns of all.
-    columns = list(dict.fromkeys(name for row in rows for name in row))
-    write_bytes(folder / TABLE, csv_text([{name: row.get(name) for name in columns} for row in rows]).encode())
+    write_bytes(folder / TABLE, _csv_of_stages(rows))
+    write_bytes(folder / SCENES, _csv_of_stages([scene_row(each) for result in results for each in result.records]))
     everything = to_json(results, exponents)
     write_bytes(folder / RESULTS, json_bytes(everything)[0])
     if exponents:
@@ -178,9 +179,16 @@ def _write(folder: Path, results: Sequence[StageResult], exponents: Sequence[Sca
         matter={each.stage.name: list(each.matter) for each in results},
         exponents=[each.row() for each in exponents],
         table=TABLE,
+        scenes=SCENES,
         page=PAGE,
         plot=PICTURE,
     )
+
+
+def _csv_of_stages(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """Rows as CSV with the columns of all stages, which give different scores."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    return csv_text([{name: row.get(name) for name in columns} for row in rows]).encode()
 
 
 def _advice(results: Sequence[StageResult], budget: LimitConfig) -> str:
@@ -214,8 +222,20 @@ def _table(result: StageResult) -> Table:
     for each in result.results:
         figures = [f"{each.scenes}", f"{each.cpu_seconds:.3g}", f"{100 * each.spread:.0f}", f"{each.ratio:.3f}"]
         figures += [f"{each.seconds:.3g}", f"{each.mib:.0f}", f"{each.bytes / 1000:.0f}"]
-        for name in scores:
-            value, error, _ = each.scores.get(name, (float("nan"),) * 3)
-            figures.append(("" if value != value else f"{value:.4g}") + ("" if error != error else f" ± {error:.2g}"))
+        figures += [_score(each, name) for name in scores]
         table.add_row(each.label, *figures, "●" if each.on_front else "")
     return table
+
+
+def _score(result: SettingResult, name: str) -> str:
+    """A score with its standard error, or with its difference from the defaults on the same scenes and that one's."""
+    if name not in result.scores:
+        return ""
+    value, error, _ = result.scores[name]
+    shown = "" if math.isnan(value) else f"{value:.4g}"
+    if name not in result.differences:
+        return shown + ("" if math.isnan(error) else f" ± {error:.2g}")
+    difference, error, _ = result.differences[name]
+    if math.isnan(difference):
+        return shown
+    return f"{shown} ({difference:+.2g}" + (")" if math.isnan(error) else f" ± {error:.2g})")

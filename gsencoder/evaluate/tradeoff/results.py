@@ -183,6 +183,16 @@ def _difference(name: str, records: Sequence[Record], base: Mapping[str, Record]
     return estimate_difference([score for score, _ in both], [score for _, score in both])
 
 
+def scene_row(record: Record) -> dict[str, Any]:
+    """One setting on one scene as a row of a table: medians over rounds, and each score with the things it is of."""
+    row: dict[str, Any] = {"stage": record.stage, "setting": record.label, "scene": record.scene}
+    row |= {name: float(np.median(_column(record, name))) for name in ("seconds", "cpu_seconds", "mib")}
+    row["bytes"] = record.bytes
+    for name, score in record.scores.items():
+        row |= {name: score.total / score.things if score.things else math.nan, f"{name}_things": score.things}
+    return row
+
+
 def _column(record: Record, name: str) -> np.ndarray:
     return np.array([getattr(timing, name) for timing in record.timings])
 

@@ -77,6 +77,7 @@ class StageResult:
         stage: see there.
         cost: what the front is drawn with.
         results: the base first.
+        records: what they are of, by setting and scene.
         matter: the knobs whose effect is no noise.
         rungs: of successive halving; empty where nothing was tried together.
     """
@@ -84,6 +85,7 @@ class StageResult:
     stage: Stage
     cost: Cost
     results: tuple[SettingResult, ...]
+    records: tuple[Record, ...]
     matter: tuple[str, ...]
     rungs: tuple[Rung, ...]
 
@@ -202,12 +204,15 @@ def sweep_stage(
 
         rungs = successive_halving(drawn, len(paths), costs, halving)
         measured_labels = {result.label for result in results}
-        results += [summarize(row, base, "joint") for label, row in last.items() if label not in measured_labels]
+        joint = [row for label, row in last.items() if label not in measured_labels]
+        results += [summarize(row, base, "joint") for row in joint]
+        rows += joint
     results.sort(key=lambda result: result.phase != "base")
     return StageResult(
         stage=stage,
         cost=cost,
         results=tuple(mark_front(results, stage.accuracy, cost)),
+        records=tuple(record for row in rows for record in row),
         matter=matter,
         rungs=tuple(rungs),
     )

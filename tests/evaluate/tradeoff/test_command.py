@@ -61,6 +61,10 @@ def test_fusion_is_measured_against_the_exact_features_and_the_budget_advises(
     assert float(rows["max_rank=1"]["rank"]) == 1
     assert int(rows["max_rank=1"]["bytes"].split(".")[0]) < float(rows["defaults"]["bytes"])
     assert float(rows["defaults"]["acc_25_things"]) == 3  # One of four is hidden from every camera.
+    assert float(rows["max_rank=1"]["error_difference"]) == pytest.approx(errors["max_rank=1"] - errors["defaults"])
+    with open(out / "scenes.csv", newline="") as stream:
+        of_scenes = {row["setting"]: row for row in csv.DictReader(stream)}
+    assert {name: float(of_scenes[name]["error"]) for name in errors} == pytest.approx(errors)
     printed = capsys.readouterr().out
     assert "budget: " in printed
     assert "fusion: CPU time grows as channels^" in printed
