@@ -54,7 +54,8 @@ def split(count: int, every: int) -> tuple[list[int], list[int]]:
     training = [view for view in range(count) if view not in held_out]
     if len(training) < MIN_PHOTOGRAPHS:
         raise InputError(
-            f"reconstruct: expected at least {MIN_PHOTOGRAPHS} photographs to fit, got {len(training)} of {count}"
+            f"reconstruct: expected at least {MIN_PHOTOGRAPHS} photographs to fit, got {len(training)} of {count}; "
+            "give more photographs" + (f", or hold out fewer than every {every}th (holdout=)" if every else "")
         )
     return training, held_out
 

@@ -266,6 +266,11 @@ def test_a_setting_given_twice_is_an_error_also_under_its_short_name(conf: Path)
         toy(conf, "voxel=1", "fusion.voxel=2")
 
 
+def test_an_empty_output_folder_is_an_error_and_not_the_usual_one(conf: Path) -> None:
+    with pytest.raises(InputError, match="out: is empty; name where the results go, or leave it out"):
+        toy(conf, "out=")
+
+
 def test_a_short_name_of_two_options_must_be_written_out(conf: Path) -> None:
     @dataclass(frozen=True, slots=True, kw_only=True)
     class Twice(CommonConfig):

@@ -97,6 +97,23 @@ def test_a_folder_that_no_run_made_is_never_taken_or_removed(tmp_path: Path, *, 
         work.take(anew=anew)
 
 
+@pytest.mark.parametrize(("message", "noted"), [("no labels", True), ("{path} has other settings", False)])
+def test_an_error_that_is_not_about_the_state_says_that_it_can_be_continued(
+    tmp_path: Path, message: str, *, noted: bool
+) -> None:
+    path = tmp_path / "run"
+
+    def fail() -> None:
+        with WorkFolder(path) as work:
+            work.take(anew=False)
+            (path / "half.bin").touch()
+            raise InputError(message.format(path=path))
+
+    with pytest.raises(InputError) as caught:
+        fail()
+    assert any("continues it" in note for note in getattr(caught.value, "__notes__", ())) == noted
+
+
 @pytest.mark.parametrize("anew", [True, False])
 def test_a_run_that_was_killed_in_its_first_moments_does_not_block_the_next(tmp_path: Path, *, anew: bool) -> None:
     path = tmp_path / "run"

@@ -14,7 +14,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings, typed
-from gsencoder.core.errors import InputError, SceneWarning, about
+from gsencoder.core.errors import InputError, SceneWarning, about, counted
 from gsencoder.core.files.model_files import digest_files
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scene_paths import find_scenes
@@ -118,7 +118,8 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
             if heads is not None:
                 others = [space for space in encoder.spaces.values() if space not in spaces]
                 copy_heads(heads, folder / HEADS_FILE, spaces, left_out=others)
-        screen.print(f"{out}: {one.results['gaussians']:,} Gaussians have features in {one.timings['encode']:.1f} s")
+        gaussians = counted(one.results["gaussians"], "Gaussian")
+        screen.print(f"{out}: features of {gaussians} in {one.timings['encode']:.1f} s")
         where = "this scene" if config.basis_views else "the scenes held out of the training"
         for name, figures in one.results.get("teachers", {"": one.results}).items():
             of = f" for {name}" if name else ""

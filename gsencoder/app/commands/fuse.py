@@ -17,7 +17,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, counted
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.data.scene_paths import find_scenes
@@ -133,9 +133,9 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
         shutil.rmtree(work_folder(out), ignore_errors=True)
         seen, total = one.results["seen"], one.results["gaussians"]
         screen.print(
-            f"{out}: {seen:,} of {total:,} Gaussians have features, {one.results['channels']} channels "
+            f"{out}: {seen:,} of {counted(total, 'Gaussian')} have features, {one.results['channels']} channels "
             f"({describe_basis(one.results, 'this scene')}), "
-            f"from {one.results['views']} views"
+            f"from {counted(one.results['views'], 'view')}"
         )
         for line in (*promises, *lines):
             screen.print(f"{out}: {line}")

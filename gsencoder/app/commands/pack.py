@@ -10,7 +10,7 @@ from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files.copied_file import copy_checked
 from gsencoder.core.promises import MEGABYTE, check_governed
 from gsencoder.fusion.store.budget import PackBudget
@@ -164,8 +164,9 @@ def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, confi
     )
     return (
         f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / MEGABYTE:.3g} MB, "
-        f"{_ratio(share)} of float16 vectors: {compacted.basis.rank} coordinates in {compacted.row_bytes} bytes a row; "
-        f"centered cosines lose {compacted.error:.4f}, one in a thousand is below {compacted.lowest:.3f}"
+        f"{_ratio(share)} of float16 vectors: {counted(compacted.basis.rank, 'coordinate')} in "
+        f"{counted(compacted.row_bytes, 'byte')} a row; centered cosines lose {compacted.error:.4f}, one in a "
+        f"thousand is below {compacted.lowest:.3f}"
     )
 
 

@@ -15,7 +15,7 @@ from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import SceneWarning
+from gsencoder.core.errors import SceneWarning, counted
 from gsencoder.core.files.picture_file import write_picture
 from gsencoder.core.files.step_log import LOG_FILE
 from gsencoder.core.runtime.device import choose_device
@@ -134,8 +134,8 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             splat=PLY_FILE,
             log=LOG_FILE,
         )
-    scores = f"; {describe(last)} on {len(result.held_out)} held-out photographs" if last else ""
-    screen.print(f"{out / PLY_FILE}: {len(result.gaussians):,} Gaussians{scores}")
+    scores = f"; {describe(last)} on {counted(len(result.held_out), 'held-out photograph')}" if last else ""
+    screen.print(f"{out / PLY_FILE}: {counted(len(result.gaussians), 'Gaussian')}{scores}")
     if opened.sfm is not None:
         images = "" if opened.is_video else f" data.images={opened.photographs}"
         screen.print(

@@ -46,7 +46,7 @@ def report_choice(
 
 
 def report_promises(summary: Summary, budget: Budget, realised: Mapping[str, float]) -> list[str]:
-    """A line for each promise, with what became of it; warns of those that are broken, and adds both to the summary.
+    """A line for each promise that is not broken; warns of those that are, and adds what became of all to the summary.
 
     Args:
         summary: of the run, after `report_choice`.
@@ -61,8 +61,9 @@ def report_promises(summary: Summary, budget: Budget, realised: Mapping[str, flo
         if name not in realised:
             lines.append(f"budget.{name}: promised {shown_value(promise)}, not measured (budget.check=false)")
             continue
-        lines.append(f"budget.{name}: promised {shown_value(promise)}, realised {realised[name]:.4g}")
-        if realised[name] > promise:
+        if realised[name] <= promise:
+            lines.append(f"budget.{name}: promised {shown_value(promise)}, realised {realised[name]:.4g}")
+        else:
             warnings.warn(
                 f"budget.{name}: promised {shown_value(promise)}, and it became {realised[name]:.4g}{predicted}",
                 SceneWarning,

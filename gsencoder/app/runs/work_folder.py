@@ -93,6 +93,9 @@ class WorkFolder:
             os.close(self._descriptor)
             self._descriptor = None
 
+    def _has_state(self) -> bool:
+        return any(entry.name != MARKER_FILE for entry in self.path.iterdir())
+
     def __enter__(self) -> "WorkFolder":
         return self
 
@@ -104,7 +107,8 @@ class WorkFolder:
                 self._discard()
                 (self.path / DISCARDED_FILE).unlink(missing_ok=True)
                 self.path.rmdir()
-            elif error is not None and self._taken and any(each.name != MARKER_FILE for each in self.path.iterdir()):
+            elif error is not None and self._taken and self._has_state() and str(self.path) not in str(error):
+                # An error that is about the folder says itself what to do with it.
                 error.add_note(
                     f"{self.path} holds what was computed; a run with the same out= and settings continues it"
                 )

@@ -109,6 +109,9 @@ def read_words(
             raise InputError(f"{full}: given twice{values}; give it once")
         elif sweep and full in choices.options and choices.options[full].secret:
             raise InputError(f"{full}: is not accepted with -m, which writes its values to a file")
+        elif full == "out" and not value:
+            # A variable of a script that is not set would write to the usual folder without a word.
+            raise InputError("out: is empty; name where the results go, or leave it out")
         else:
             given[full] = value
     if paths and "paths" not in choices.options:

@@ -157,8 +157,8 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
                 return compacted, cosines
             if not allocation.can_grow:
                 raise InputError(
-                    f"error={error}: {MAX_BITS} bits a coordinate reach {compacted.error:.2g}; give a larger budget, "
-                    "or another form"
+                    f"an error of {error:.3g}: {MAX_BITS} bits a coordinate reach {compacted.error:.2g}; allow a "
+                    "larger one, or take another form"
                 )
 
     return _completed(features, fewest)

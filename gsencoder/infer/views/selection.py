@@ -53,7 +53,10 @@ class ViewsConfig:
         if self.method == "uniform" and self.source == "shells":
             raise InputError("source: expected frames or both with method=uniform, which spreads frames evenly")
         if self.method == "greedy" and self.count > self.candidates:
-            raise InputError(f"count: expected 1 to candidates={self.candidates}, got {self.count}")
+            raise InputError(
+                f"count: expected 1 to candidates={self.candidates}, got {self.count}; judge more candidates, or show "
+                "fewer views"
+            )
         if not (1 <= self.width <= MAX_PIXELS and 1 <= self.height <= MAX_PIXELS and 1 <= self.fov <= MAX_FOV):
             raise InputError(
                 f"width, height, fov: expected at most {MAX_PIXELS} pixels and 1 to {MAX_FOV} degrees, "
