@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files.atomic import is_full_disk
 from gsencoder.core.files.json_values import plain, write_bytes
 from gsencoder.core.knobs import describe_values
@@ -88,14 +88,16 @@ class Records:
         self._path = None if folder is None else folder / RECORDS_FILE
         if folder is None:
             return
-        wanted = json.dumps(plain(dict(identity)), sort_keys=True)
+        wanted = json.dumps(plain(dict(identity)), sort_keys=True).encode()
         written = folder / IDENTITY_FILE
-        if written.is_file() and written.read_text(encoding="utf-8") != wanted:
+        with readable(written):
+            other = written.is_file() and written.read_bytes() != wanted
+        if other:
             raise InputError(
                 f"{folder}: holds measurements of a sweep with other settings; give resume=false to begin anew, or "
                 "another out="
             )
-        write_bytes(written, wanted.encode())
+        write_bytes(written, wanted)
         self._read()
 
     def _read(self) -> None:
@@ -103,7 +105,8 @@ class Records:
         if not self._path.is_file():
             return
         # A kill may have left an incomplete last line, which is measured again.
-        complete = self._path.read_bytes().rpartition(b"\n")
+        with readable(self._path):
+            complete = self._path.read_bytes().rpartition(b"\n")
         lines = complete[0].splitlines()
         for number, line in enumerate(lines, start=1):
             try:
