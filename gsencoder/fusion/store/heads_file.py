@@ -3,12 +3,13 @@
 Its layers are read by `gsencoder.fusion.heads.store`, which needs torch.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from shutil import copyfile
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files.archive import Archive, open_archive
+from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.checksums import BLOCK_BYTES
 from gsencoder.types import FeatureSpace
 
 HEADS_FILE = "heads.safetensors"
@@ -30,7 +31,7 @@ def heads_of_graph(graph: Path) -> Path:
 def copy_heads(
     source: Path, target: Path, spaces: Sequence[FeatureSpace], *, left_out: Sequence[FeatureSpace] = ()
 ) -> None:
-    """Copies a file of adapter heads beside features or weights.
+    """Copies a file of adapter heads beside features or weights; an earlier one is replaced once the copy is whole.
 
     Args:
         source: the file.
@@ -48,16 +49,22 @@ def copy_heads(
             return
         check_heads_space(heads, next((space for space in spaces if space == heads), spaces[0]))
         file.verify()
-    try:
-        copyfile(source, target)
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written: {error.strerror or error}") from error
-    try:
-        # What was copied is looked at: the file may have been cut off meanwhile.
-        with open_archive(target) as file:
-            file.verify()
-    except InputError as error:
-        raise InputError(str(error).replace(str(target), str(source))) from error
+    with atomic_file(target) as stream:
+        for block in _blocks(source):
+            stream.write(block)
+        stream.flush()
+        try:
+            # What was copied is looked at: the file may have been cut off meanwhile.
+            with open_archive(Path(stream.name)) as file:
+                file.verify()
+        except InputError as error:
+            raise InputError(str(error).replace(stream.name, str(source))) from error
+
+
+def _blocks(path: Path) -> Iterator[bytes]:
+    with readable(path), path.open("rb") as stream:
+        while block := stream.read(BLOCK_BYTES):
+            yield block
 
 
 def read_heads_space(file: Archive) -> FeatureSpace:
