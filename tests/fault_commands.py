@@ -91,10 +91,10 @@ CASES: dict[str, Case] = {
         other=("train.seed=1",),
     ),
     "localize": Case(
-        _of_features("localize", "query=cube", "pictures=1", "report=true"), other=("query=crate",)
+        _of_features("localize", "query=cube", "pictures=1", "report=true"), other=("localize.mode=raw",)
     ),
-    "select": Case(_of_features("select", "query=cube"), other=("query=crate",)),
-    "views": Case(_of_features("views", "query=cube", "grid=[3,4]", *VIEWS), other=("query=crate",)),
+    "select": Case(_of_features("select", "query=cube"), other=("write=[objects]",)),
+    "views": Case(_of_features("views", "query=cube", "grid=[3,4]", *VIEWS), other=("choose.method=uniform",)),
     "ask": Case(
         _of_features("ask", f"question={QUESTION}", *VIEWS),
         server=True,
@@ -127,7 +127,7 @@ CASES: dict[str, Case] = {
             "evaluate", str(given / "room"), _words(given), "protocol.min_views=1", "protocol.min_pixels=1",
             "seeds.voxel=0.1",
         ],
-        other=("seeds.voxel=0.2",),
+        other=("fusion.views=2",),
     ),
     "evaluate instances": Case(
         lambda given: ["evaluate", str(given / "room"), _words(given), "protocol=instances", "seeds.voxel=0.1"]
@@ -139,7 +139,7 @@ CASES: dict[str, Case] = {
         ]
     ),
     "questions": Case(
-        _of_room("questions", "min_pixels=10", "per_kind=2", "objects=2", "per_object=1"), other=("per_kind=1",)
+        _of_room("questions", "min_pixels=10", "per_kind=2", "objects=2", "per_object=1"), other=("absent=[ghost]",)
     ),
     "tune": Case(
         lambda given: [
@@ -155,13 +155,13 @@ CASES: dict[str, Case] = {
             "tradeoff", str(given / "room"), _words(given), "sweep.knobs=views", "sweep.values=views:2",
             "sweep.rounds=1", "seeds.voxel=0.15",
         ],
-        other=("sweep.values=views:1",),
+        other=("data.max_views=2",),
     ),
     "view": Case(_of_features("view", "photographs=1"), out="out.html", other=("max_gaussians=50",)),
     "inspect": Case(_of_room("inspect")),
     "repair": Case(lambda given: ["repair", str(given / "bad.ply")], out="out.ply"),
     "demo": Case(
-        lambda given: ["demo", "views=4", "width=80", "objects=2", "seeds.voxel=0.1"], other=("objects=3",)
+        lambda given: ["demo", "views=4", "width=80", "objects=2", "seeds.voxel=0.1"], other=("seed=1",)
     ),
 }  # fmt: skip
 """By name; GIVEN stands for the folder of inputs."""
