@@ -14,7 +14,13 @@ NAMES = ("cube", "crate", "wall", "pen holder")
 ORIGIN = np.array([100.0, -50.0, 7.0])
 
 
-def save_room(folder: Path, names: tuple[str, ...] = (), *, shift: tuple[float, float, float] = (0, 0, 0)) -> None:
+def save_room(
+    folder: Path,
+    names: tuple[str, ...] = (),
+    *,
+    shift: tuple[float, float, float] = (0, 0, 0),
+    scene_name: str = "room",
+) -> None:
     """A cube and two crates in a room, each with features of its name; `names` are those of its frames."""
     scene, rows = room(
         cube((-0.8, -0.6, 0.8)), cube((-0.9, 0.9, 0.8)), center=(0.3 + shift[0], 0.2 + shift[1], 0.8 + shift[2])
@@ -35,5 +41,5 @@ def save_room(folder: Path, names: tuple[str, ...] = (), *, shift: tuple[float, 
         space=space,
     )
     folder.mkdir()
-    save_features(folder, replace(scene, origin=ORIGIN), features, {})
+    save_features(folder, replace(scene, name=scene_name, origin=ORIGIN), features, {})
     save_text_table(folder / WORDS_FILE, make_text_table(NAMES, embeddings, "table"))

@@ -185,7 +185,7 @@ class Checker:
         if call is None:
             wrong.append("the input was not opened again")
         else:
-            lines = [line for line in done.lines if not line.startswith(("warning: ", "note: "))]
+            lines = self.errors(done)
             name = call.path.rpartition("/")[2]
             if done.code == 0:
                 if state(folder) != ref.whole and not any(name in line for line in done.lines):
@@ -214,7 +214,7 @@ class Checker:
 
     def message(self, done: Run, folder: Path, action: int) -> list[str]:
         """What is wrong with the line that a run ended with."""
-        lines = [line for line in done.lines if not line.startswith(("warning: ", "note: "))]
+        lines = self.errors(done)
         if done.code != 2 or len(lines) != 1 or not lines[0].startswith("error: "):
             return [f"code {done.code}: " + " / ".join(lines[-3:])[-400:]]
         wrong = []
@@ -225,6 +225,12 @@ class Checker:
         if ".partial-" in lines[0] or ".tmp" in lines[0]:
             wrong.append(f"a temporary name is shown: {lines[0]}")
         return wrong
+
+    def errors(self, done: Run) -> list[str]:
+        """The lines of an error: without warnings, and of several scenes without a line about each that failed, which
+        the last one repeats."""
+        beside = ("warning: ", "note: ", *(["failed: "] if self.reference.case.several else []))
+        return [line for line in done.lines if not line.startswith(beside)]
 
     def of_out(self, key: str) -> bool:
         """Whether a file is part of the results."""

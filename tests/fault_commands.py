@@ -24,6 +24,7 @@ TRAIN = (
 )
 VIEWS = ("choose.source=frames", "choose.candidates=4", "choose.count=2")
 QUESTION = "Where is the cube?"
+ROOMS = ("room_a", "room_b")
 
 
 @dataclass(frozen=True)
@@ -89,9 +90,11 @@ CASES: dict[str, Case] = {
         ],
         other=("train.seed=1",),
     ),
-    "localize": Case(_of_features("localize", "query=cube", "pictures=1", "report=true")),
-    "select": Case(_of_features("select", "query=cube")),
-    "views": Case(_of_features("views", "query=cube", "grid=[3,4]", *VIEWS)),
+    "localize": Case(
+        _of_features("localize", "query=cube", "pictures=1", "report=true"), other=("localize.mode=raw",)
+    ),
+    "select": Case(_of_features("select", "query=cube"), other=("write=[objects]",)),
+    "views": Case(_of_features("views", "query=cube", "grid=[3,4]", *VIEWS), other=("choose.method=uniform",)),
     "ask": Case(
         _of_features("ask", f"question={QUESTION}", *VIEWS),
         server=True,
@@ -100,6 +103,15 @@ CASES: dict[str, Case] = {
     ),
     "ask of a file": Case(
         _of_features("ask", "questions=GIVEN/questions.jsonl", *VIEWS),
+        server=True,
+        packages=("openai",),
+        other=("vlm.max_tokens=9",),
+    ),
+    "ask of a set": Case(
+        lambda given: [
+            "ask", *(str(given / "asked" / name) for name in ROOMS), f"questions={given / 'ScanQA_v1.0_val.json'}",
+            *VIEWS,
+        ],
         server=True,
         packages=("openai",),
         other=("vlm.max_tokens=9",),
@@ -114,7 +126,8 @@ CASES: dict[str, Case] = {
         lambda given: [
             "evaluate", str(given / "room"), _words(given), "protocol.min_views=1", "protocol.min_pixels=1",
             "seeds.voxel=0.1",
-        ]
+        ],
+        other=("fusion.views=2",),
     ),
     "evaluate instances": Case(
         lambda given: ["evaluate", str(given / "room"), _words(given), "protocol=instances", "seeds.voxel=0.1"]
@@ -125,7 +138,9 @@ CASES: dict[str, Case] = {
             f"truth={given / 'named' / 'truth.json'}", "ks=1",
         ]
     ),
-    "questions": Case(_of_room("questions", "min_pixels=10", "per_kind=2", "objects=2", "per_object=1")),
+    "questions": Case(
+        _of_room("questions", "min_pixels=10", "per_kind=2", "objects=2", "per_object=1"), other=("absent=[ghost]",)
+    ),
     "tune": Case(
         lambda given: [
             "tune", str(given / "ScanQA_v1.0_train.json"), f"model={given / 'model'}",
@@ -139,12 +154,15 @@ CASES: dict[str, Case] = {
         lambda given: [
             "tradeoff", str(given / "room"), _words(given), "sweep.knobs=views", "sweep.values=views:2",
             "sweep.rounds=1", "seeds.voxel=0.15",
-        ]
+        ],
+        other=("data.max_views=2",),
     ),
     "view": Case(_of_features("view", "photographs=1"), out="out.html", other=("max_gaussians=50",)),
     "inspect": Case(_of_room("inspect")),
     "repair": Case(lambda given: ["repair", str(given / "bad.ply")], out="out.ply"),
-    "demo": Case(lambda given: ["demo", "views=4", "width=80", "objects=2", "seeds.voxel=0.1"]),
+    "demo": Case(
+        lambda given: ["demo", "views=4", "width=80", "objects=2", "seeds.voxel=0.1"], other=("seed=1",)
+    ),
 }  # fmt: skip
 """By name; GIVEN stands for the folder of inputs."""
 EXHAUSTIVE: dict[str, Case] = {
@@ -152,6 +170,7 @@ EXHAUSTIVE: dict[str, Case] = {
         lambda given: ["export", f"weights={given / 'trained'}", "sizes=1,50"],
         out="out.onnx",
         packages=("onnx", "onnxscript"),
+        other=("precision=int8_weights",),
     ),
 }
 """Commands that take too long for a test."""
@@ -219,6 +238,19 @@ def _model(given: Path) -> None:
     (given / "ScanQA_v1.0_train.json").write_text(json.dumps(rows))
 
 
+def _asked(given: Path) -> None:
+    from asked_rooms import save_room
+
+    rows = [
+        {"scene_id": name, "question_id": f"val-{name}", "question": QUESTION, "answers": ["on the floor"]}
+        for name in ROOMS
+    ]
+    (given / "asked").mkdir()
+    for name in ROOMS:
+        save_room(given / "asked" / name, scene_name=name)
+    (given / "ScanQA_v1.0_val.json").write_text(json.dumps(rows))
+
+
 def _bad_splat(given: Path) -> None:
     from splat_samples import make_raw, ply_bytes, ply_columns
 
@@ -234,10 +266,11 @@ INPUTS: dict[str, Callable[[Path], None]] = {
     "remembered": _remembered,
     "named": _named,
     "model": _model,
+    "asked": _asked,
     "bad.ply": _bad_splat,
 }
 NEEDED = {"encode": ("trained",), "export": ("trained",), "export of a memory": ("remembered",), "score": ("named",)}
-NEEDED |= {"tune": ("model",), "repair": ("bad.ply",)}
+NEEDED |= {"tune": ("model",), "ask of a set": ("asked",), "repair": ("bad.ply",)}
 
 
 def prepare(given: Path, name: str) -> None:

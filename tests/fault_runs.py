@@ -32,8 +32,9 @@ VOLATILE = (
     "mib",
     "settings",
     "files",
+    "continued",
 )
-"""Keys of JSON values in which two runs differ."""
+"""Keys of JSON values in which two runs differ; `continued` counts what a run took over from an unfinished one."""
 
 
 @dataclass(frozen=True)

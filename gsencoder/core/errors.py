@@ -18,6 +18,10 @@ class BusyError(InputError):
     """Another run is writing what this one was to write."""
 
 
+class WriteError(InputError):
+    """A file cannot be written: the disk is full, or the system refuses."""
+
+
 class SceneWarning(UserWarning):
     """Something in the input was left out or estimated; the message counts it and says how."""
 

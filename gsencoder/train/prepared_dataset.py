@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float32
 
 from gsencoder.core.added_options import with_added_options
-from gsencoder.core.errors import InputError, advised, listed
+from gsencoder.core.errors import InputError, advised, listed, readable
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file, locked
 from gsencoder.core.first_difference import first_difference
@@ -82,8 +82,13 @@ class PreparedDataset:
                 stream.write(json.dumps(expected, indent=1).encode())
 
     def fingerprint(self) -> str:
-        """A hash of the output space, by which a resumed training checks that its targets are the same."""
-        return hashlib.sha256((self.folder / SPACE_FILE).read_bytes()).hexdigest()[:16]
+        """A hash of the output space, by which a resumed training checks that its targets are the same.
+
+        Raises:
+            InputError: its file cannot be read.
+        """
+        with readable(self.folder / SPACE_FILE):
+            return hashlib.sha256((self.folder / SPACE_FILE).read_bytes()).hexdigest()[:16]
 
     def digest_of_scenes(self, names: Sequence[str]) -> str:
         """A hash of the headers of prepared scenes, which hold the checksums of all arrays, by which processes compare

@@ -35,10 +35,12 @@ from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.splats import load_splat, save_splat
 from gsencoder.data.truth.checked_files import read_checked
 from gsencoder.data.video.frames import RECORD_FILE, _taken
+from gsencoder.evaluate.tradeoff.records import IDENTITY_FILE, RECORDS_FILE, Records
 from gsencoder.fusion.checkpoint import SETTINGS_FILE, FusionCheckpoint
 from gsencoder.infer.ask.batch import ANSWERS, _answered
 from gsencoder.infer.ask.questions import read_answers
 from gsencoder.train.prepared_dataset import DATASET_SETTINGS_FILE, PreparedDataset
+from gsencoder.train.prepared_dataset import SPACE_FILE as DATASET_SPACE_FILE
 
 FLIPS = 60
 SETTINGS = {"fuse": {"views": 3, "rays": 1.5}, "teacher": {"name": "palette"}}
@@ -164,6 +166,13 @@ def test_of_the_files_of_a_run_those_without_checksums_of_their_own_are_listed(t
     assert set(checksums_of(tmp_path)) == {"adapter_model.safetensors", "deep/a.json"}
 
 
+def test_settings_of_a_sweep_that_are_no_text_are_those_of_another(tmp_path: Path) -> None:
+    (tmp_path / IDENTITY_FILE).write_bytes(bytes([255, 254]))
+    (tmp_path / RECORDS_FILE).touch()
+    with pytest.raises(InputError, match="a sweep with other settings; give resume=false"):
+        Records(tmp_path, {})
+
+
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"files": 3}', '{"files": {"a": 3}}', "\0"])
 def test_a_summary_without_checksums_says_nothing_of_files(content: str, tmp_path: Path) -> None:
     (tmp_path / "summary.json").write_text(content)
@@ -172,3 +181,19 @@ def test_a_summary_without_checksums_says_nothing_of_files(content: str, tmp_pat
         warnings.simplefilter("error")
         check_written(tmp_path / "a")
         check_written(tmp_path / "missing")
+
+
+def test_a_file_of_a_run_that_the_disk_does_not_give_back_is_named(tmp_path: Path) -> None:
+    # Opens like any file, and gives an I/O error at its first byte.
+    bad = Path("/proc/self/mem")
+    if not bad.exists():
+        pytest.skip("needs /proc, as Linux has it")
+    for name in (RECORDS_FILE, DATASET_SPACE_FILE, "a.txt"):
+        (tmp_path / name).symlink_to(bad)
+    with pytest.raises(InputError, match=r"a\.txt: cannot be read: Input/output error"):
+        checksums_of(tmp_path)
+    with pytest.raises(InputError, match=rf"{RECORDS_FILE}: cannot be read: Input/output error"):
+        Records(tmp_path, {})
+    (tmp_path / DATASET_SETTINGS_FILE).write_text("{}")
+    with pytest.raises(InputError, match=rf"{DATASET_SPACE_FILE}: cannot be read: Input/output error"):
+        PreparedDataset(tmp_path).fingerprint()

@@ -1,6 +1,8 @@
 """Adapter heads: on disk, measured over maps, and applied to features and tokens."""
 
 import copy
+import errno
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -310,6 +312,22 @@ def test_the_file_of_heads_lies_beside_weights_and_graphs_and_is_copied_for_its_
     with pytest.raises(InputError, match="damaged"):
         copy_heads(tmp_path / "heads.safetensors", tmp_path / "x", [SPACE])
     assert not (tmp_path / "x").exists()
+
+
+def test_earlier_heads_beside_a_graph_stand_until_their_copy_is_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_heads(tmp_path / "heads.safetensors", head_set())
+    target = tmp_path / "e.onnx.heads.safetensors"
+    target.write_bytes(b"earlier")
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match=r"e\.onnx\.heads\.safetensors: no space left"):
+        copy_heads(tmp_path / "heads.safetensors", target, [SPACE])
+    assert target.read_bytes() == b"earlier"
 
 
 def test_a_fusion_that_continues_from_its_cache_samples_the_cells_of_all_views(tmp_path: Path) -> None:

@@ -442,6 +442,9 @@ def test_models_that_cannot_be_used_are_refused_in_a_line(model: Path, tmp_path:
     (pickled / "pytorch_model.bin").write_bytes(b"\x80\x04.")
     bare = copied(model, tmp_path / "bare", "processor_config.json")
     silent = copied(model, tmp_path / "silent", "chat_template.jinja")
+    cut = copied(model, tmp_path / "cut", "chat_template.jinja")
+    template = (model / "chat_template.jinja").read_text()
+    (cut / "chat_template.jinja").write_text(template[: len(template) // 2])
     text = tmp_path / "text"
     shape = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2}
     LlamaForCausalLM(LlamaConfig(vocab_size=32, **shape)).save_pretrained(text)
@@ -452,6 +455,7 @@ def test_models_that_cannot_be_used_are_refused_in_a_line(model: Path, tmp_path:
         (pickled, "has no weights as safetensors, and files of pickles are not opened"),
         (bare, "processor"),
         (silent, "no chat template"),
+        (cut, "its chat template cannot be used"),
         (text, "a model of the kind llama takes no pictures with its text"),
         (coded, "Python code of its own"),
     ):

@@ -174,7 +174,7 @@ def test_models_of_transformers_are_not_compiled_and_the_rate_falls_to_nothing()
 )
 def test_a_processor_has_pictures_text_and_a_template(monkeypatch: pytest.MonkeyPatch, lacking: str, said: str) -> None:
     transformers = pytest.importorskip("transformers")
-    parts = {"image_processor": 1, "tokenizer": 2, "chat_template": "x"}
+    parts = {"image_processor": 1, "tokenizer": 2, "chat_template": "x", "apply_chat_template": lambda *_, **__: "x"}
     processor = SimpleNamespace(**{name: value for name, value in parts.items() if name != lacking})
     config = transformers.Idefics3Config()
     monkeypatch.setattr(vlm, "read_config", lambda folder, what: config)

@@ -10,7 +10,7 @@ from hashlib import sha1
 from pathlib import Path
 from typing import BinaryIO
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, WriteError
 
 try:
     import fcntl
@@ -70,9 +70,9 @@ def is_full_disk(error: BaseException) -> bool:
     return bool(short) or os.strerror(errno.ENOSPC) in str(error)
 
 
-def full_disk(path: str | Path) -> InputError:
+def full_disk(path: str | Path) -> WriteError:
     """The error of a file for which there is no room."""
-    return InputError(f"{path}: no space left on the device; make room and give the command again")
+    return WriteError(f"{path}: no space left on the device; make room and give the command again")
 
 
 @contextmanager
@@ -149,7 +149,8 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     leaves an earlier file as it was.
 
     Raises:
-        InputError: the folder is missing, the disk is full, or the system refuses the write.
+        InputError: the folder is missing, or `target` is one.
+        WriteError: the disk is full, or the system refuses the write.
     """
     target = Path(path)
     if target.is_dir():
@@ -166,4 +167,4 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     except OSError as error:
         if is_full_disk(error):
             raise full_disk(target) from error
-        raise InputError(f"{target}: cannot write: {error.strerror or error}") from error
+        raise WriteError(f"{target}: cannot write: {error.strerror or error}") from error

@@ -6,7 +6,7 @@ import json
 import warnings
 from pathlib import Path
 
-from gsencoder.core.errors import SceneWarning
+from gsencoder.core.errors import SceneWarning, readable
 
 SUMMARY_NAME = "summary.json"
 BLOCK_BYTES = 1 << 22
@@ -26,12 +26,18 @@ def sha256_of(path: Path) -> str:
 
 
 def checksums_of(folder: Path) -> dict[str, str]:
-    """The SHA-256 of each file below a folder that has no checksums of its own, by its path in the folder."""
-    return {
-        path.relative_to(folder).as_posix(): sha256_of(path)
-        for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != SUMMARY_NAME and not _is_archive(path)
-    }
+    """The SHA-256 of each file below a folder that has no checksums of its own, by its path in the folder.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    sums = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.name != SUMMARY_NAME:
+            with readable(path):
+                if not _is_archive(path):
+                    sums[path.relative_to(folder).as_posix()] = sha256_of(path)
+    return sums
 
 
 def _is_archive(path: Path) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files.atomic import is_full_disk
 from gsencoder.core.files.json_values import plain, write_bytes
 from gsencoder.core.knobs import describe_values
@@ -89,10 +89,11 @@ class Records:
         self._path = None if folder is None else folder / RECORDS_FILE
         if folder is None:
             return
-        self._identity = json.dumps(plain(dict(identity)), sort_keys=True)
+        self._identity = json.dumps(plain(dict(identity)), sort_keys=True).encode()
         written = folder / IDENTITY_FILE
-        measured = (folder / RECORDS_FILE).is_file()
-        if measured and written.is_file() and written.read_text(encoding="utf-8") != self._identity:
+        with readable(written):
+            other = written.is_file() and written.read_bytes() != self._identity
+        if other and (folder / RECORDS_FILE).is_file():
             raise InputError(
                 f"{folder}: holds measurements of a sweep with other settings; give resume=false to begin anew, or "
                 "another out="
@@ -104,7 +105,8 @@ class Records:
         if not self._path.is_file():
             return
         # A kill may have left an incomplete last line, which is measured again.
-        complete = self._path.read_bytes().rpartition(b"\n")
+        with readable(self._path):
+            complete = self._path.read_bytes().rpartition(b"\n")
         lines = complete[0].splitlines()
         for number, line in enumerate(lines, start=1):
             try:
@@ -162,7 +164,7 @@ class Records:
         if self._path is None:
             return
         if not self._path.is_file():
-            write_bytes(self._path.with_name(IDENTITY_FILE), self._identity.encode())
+            write_bytes(self._path.with_name(IDENTITY_FILE), self._identity)
         try:
             # The file is closed after every line, so that a kill loses none.
             with self._path.open("ab") as stream:

@@ -30,7 +30,7 @@ def heads_of_graph(graph: Path) -> Path:
 def copy_heads(
     source: Path, target: Path, spaces: Sequence[FeatureSpace], *, left_out: Sequence[FeatureSpace] = ()
 ) -> None:
-    """Copies a file of adapter heads beside features or weights.
+    """Copies a file of adapter heads beside features or weights; an earlier one is replaced once the copy is whole.
 
     Args:
         source: the file.

@@ -10,7 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.errors import InputError, SceneWarning, about
+from gsencoder.core.errors import InputError, SceneWarning, WriteError, about
 from gsencoder.core.files.json_values import plain, write_bytes, write_json
 from gsencoder.core.files.sealed_rows import sealed, unsealed
 from gsencoder.core.runtime.clock import Clock
@@ -47,6 +47,7 @@ def ask_question(
     Raises:
         InputError: a question that cannot be asked of this scene.
         ServerError: a fault of the server.
+        WriteError: the disk is full, or the system refuses.
 
     Warns:
         SceneWarning: nothing was found, or the answer was cut off or names no mark.
@@ -130,8 +131,8 @@ def ask_questions(
         One row a question, in their order, each with its digest; none for those in `unanswered`.
 
     Raises:
-        InputError: questions that have no answer, after all others were asked; the first is named.
-        ServerError: a fault of the server; no further question is asked.
+        InputError: questions that have no answer, after all others were asked; the first is named. A fault of the
+            server, or a file that cannot be written: no further question is asked.
     """
     depends_on = _depends_on(asker, server is None, made_from)
     digests = {each.id: each.digest(depends_on) for each in questions}
@@ -154,7 +155,7 @@ def ask_questions(
         try:
             with about(label), warnings_about(label) as messages:
                 row = ask_question(each.question, asker, server, folder, clock)
-        except ServerError as error:
+        except (ServerError, WriteError) as error:
             raise InputError(f"{error}; {len(done)} of {len(questions)} answers are kept in {file}") from error
         except InputError as error:
             failures[each.id] = str(error)

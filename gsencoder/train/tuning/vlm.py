@@ -67,7 +67,8 @@ def load_processor(folder: Path) -> tuple[Any, Any]:
     """Configuration and processor of a vision-language model, without its weights.
 
     Raises:
-        InputError: transformers is missing, the model takes no pictures, or there is no processor or no chat template.
+        InputError: transformers is missing, the model takes no pictures, or there is no processor or no chat
+            template, or a damaged one.
     """
     config = read_config(folder, WHAT)
     from transformers import AutoProcessor
@@ -90,6 +91,15 @@ def load_processor(folder: Path) -> tuple[Any, Any]:
             f"{WHAT}: {folder}: its processor has no chat template, by which `ask` and servers put pictures and "
             "questions together; expected chat_template.jinja beside the model"
         )
+    asked = [{"role": "user", "content": [{"type": "image"}, {"type": "text", "text": "question"}]}]
+    try:
+        processor.apply_chat_template(asked, add_generation_prompt=True, tokenize=False)
+    except Exception as error:  # templates raise whatever they like
+        message = " ".join(str(error).split())[:160]
+        raise InputError(
+            f"{WHAT}: {folder}: its chat template cannot be used: {message}; expected that of the model, in "
+            "chat_template.jinja"
+        ) from error
     return config, processor
 
 

@@ -1,6 +1,7 @@
 """`gsencoder ask`: what is sent, what is kept, and a real server."""
 
 import base64
+import errno
 import io
 import json
 import os
@@ -89,6 +90,27 @@ def test_a_key_of_the_command_line_is_written_nowhere(
     everything = b"".join(path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
     assert b"sk-of-the-line" not in everything
     assert b"(not shown)" in everything
+
+
+def test_a_file_that_cannot_be_written_ends_a_set_and_counts_for_no_question(
+    features: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row = {"scene_id": "room", "question_id": "1", "question": "Where is the cube?", "answers": ["here"]}
+    (tmp_path / "ScanQA_v1.0_val.json").write_text(json.dumps([row]))
+    rename, fault = os.replace, [OSError(errno.EIO, os.strerror(errno.EIO))]
+
+    def fails_once(source: str | Path, target: str | Path) -> None:
+        if str(target).endswith("view_00.png") and fault:
+            raise fault.pop()
+        rename(source, target)
+
+    monkeypatch.setattr(os, "replace", fails_once)
+    words = (features, tmp_path / "out", f"questions={tmp_path / 'ScanQA_v1.0_val.json'}", "dry_run=true")
+    assert ask(*words) == 2
+    assert "view_00.png: cannot write" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert ask(*words) == 0
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["results"]["unanswered"] == {}
 
 
 def test_a_dry_run_writes_prompt_and_pictures_and_asks_nobody(features: Path, tmp_path: Path) -> None:
