@@ -24,6 +24,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from budget_figures import summary_of
+from json_option import add_json_option, write_figures
 
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -144,8 +146,9 @@ def main() -> None:
     parser.add_argument("--grid", action="store_true")
     parser.add_argument("--cold", action="store_true", help="measure the first scene at once, compilation included")
     parser.add_argument("--out", type=Path, default=Path("budgets.csv"))
+    add_json_option(parser)
     chosen = parser.parse_args()
-    config = teacher_config(chosen.teacher, chosen.skip_tokens)
+    config, measurements = teacher_config(chosen.teacher, chosen.skip_tokens), []
     with chosen.out.open("a", newline="") as file:
         writer = None
         for number, path in enumerate(chosen.scenes):
@@ -156,6 +159,7 @@ def main() -> None:
                         scene, teacher, chosen.error, Path(maps)
                     )  # Kernels are compiled, or read from their cache.
                 line, made, exact = measured(scene, teacher, chosen.error, Path(maps))
+                measurements.append(line)
                 lines = [line] if not chosen.grid else grid(made, exact, chosen.error, line["map_seconds"])
                 for each in lines:
                     if writer is None:
@@ -165,6 +169,7 @@ def main() -> None:
                     writer.writerow(shown)
                     file.flush()
                     print(each, flush=True)
+    write_figures(chosen.json, summary_of(measurements))
 
 
 if __name__ == "__main__":

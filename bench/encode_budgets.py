@@ -13,6 +13,8 @@ import time
 from pathlib import Path
 
 import numpy as np
+from budget_figures import summary_of
+from json_option import add_json_option, write_figures
 
 from gsencoder.core.runtime.heap import retain_freed_memory
 from gsencoder.data.scenes import load_scene
@@ -32,6 +34,7 @@ def main() -> None:
     parser.add_argument("--weights", default="house_cpu")
     parser.add_argument("--chunk", type=int, default=EncodeConfig().chunk)
     parser.add_argument("--out", type=Path, default=Path("encode_budgets.csv"))
+    add_json_option(parser)
     given = parser.parse_args()
     retain_freed_memory()
     encoder = load_encoder(given.weights)
@@ -75,6 +78,7 @@ def main() -> None:
         writer.writeheader()
         for line in lines:
             writer.writerow({key: f"{value:.4g}" if isinstance(value, float) else value for key, value in line.items()})
+    write_figures(given.json, summary_of(lines))
 
 
 if __name__ == "__main__":
