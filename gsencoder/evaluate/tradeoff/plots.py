@@ -103,6 +103,8 @@ def _panel(axes: Any, stage: StageResult) -> None:
     axes.set_ylabel(accuracy + (" (more is better)" if HIGHER_IS_BETTER[accuracy] else " (less is better)"))
     axes.set_title(f"{stage.stage.name} (ringed: on the Pareto front)")
     axes.set_xscale("log")
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "235" else "")
     axes.grid(alpha=0.3)
     axes.set_axisbelow(True)
     if shown:
