@@ -174,3 +174,30 @@ def test_what_cannot_be_removed_is_said(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.setattr(Path, "unlink", refused)
     with pytest.raises(InputError, match=told):
         run(tmp_path / "run", anew=anew)
+
+
+@pytest.mark.parametrize("taken", [True, False])
+def test_an_error_before_anything_was_computed_speaks_of_no_state(tmp_path: Path, *, taken: bool) -> None:
+    path = tmp_path / "run"
+    if not taken:
+        cut_off(path, "state of another run")
+
+    def fail() -> None:
+        with WorkFolder(path) as work:
+            if taken:
+                work.take(anew=False)
+            raise InputError("no labels")
+
+    with pytest.raises(InputError) as caught:
+        fail()
+    assert getattr(caught.value, "__notes__", []) == []
+
+
+def test_an_error_is_not_lost_where_the_folder_went_away_before_it(tmp_path: Path) -> None:
+    def fail(path: Path) -> None:
+        (path / MARKER_FILE).unlink()
+        path.rmdir()
+        raise InputError("no labels")
+
+    with pytest.raises(InputError, match="^no labels$"):
+        run(tmp_path / "run", fail)

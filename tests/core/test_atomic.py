@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, WriteError
 from gsencoder.core.files import atomic
 from gsencoder.core.files.archive import write_archive
 from gsencoder.core.files.atomic import atomic_file, locked
+from gsencoder.core.files.copied_file import copy_checked
 from gsencoder.core.files.json_values import write_bytes
 from gsencoder.core.files.picture_file import write_picture
 from gsencoder.core.files.safetensors_bytes import write_safetensors
@@ -141,3 +142,47 @@ def test_pictures_are_written_in_the_format_of_their_suffix(name: str, tmp_path:
     write_picture(tmp_path / "d.png", np.full((2, 3), 40_000, np.uint16))
     with Image.open(tmp_path / "d.png") as read:
         assert np.asarray(read).max() == 40_000
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), "a: no space left on the device"),
+        (OSError(errno.EDQUOT, os.strerror(errno.EDQUOT)), "a: no space left on the device"),
+        (OSError("4096 requested and 100 written"), "a: no space left on the device"),
+        (OSError(errno.EIO, os.strerror(errno.EIO)), "a: cannot write: Input/output error"),
+    ],
+)
+def test_what_the_system_refuses_is_told_from_a_target_that_cannot_be(
+    tmp_path: Path, fault: OSError, message: str
+) -> None:
+    write_bytes(tmp_path / "a", b"earlier")
+    with pytest.raises(WriteError, match=message), atomic_file(tmp_path / "a"):
+        raise fault
+    assert (tmp_path / "a").read_bytes() == b"earlier"
+    for target, wrong in ((tmp_path, "is a folder; give the name of a file"), (tmp_path / "b" / "c", "does not exist")):
+        with pytest.raises(InputError, match=wrong) as refused:
+            write_bytes(target, b"")
+        assert not isinstance(refused.value, WriteError)
+
+
+def test_a_copy_is_checked_whole_before_it_is_seen_and_a_damaged_one_names_its_source(tmp_path: Path) -> None:
+    source, target = tmp_path / "source", tmp_path / "target"
+    source.write_bytes(b"whole")
+    target.write_bytes(b"earlier")
+
+    def check(copy: Path) -> None:
+        assert target.read_bytes() == b"earlier"
+        # What the source becomes after it was read is nothing to the copy.
+        source.write_bytes(b"cut")
+        assert copy.read_bytes() == b"whole"
+
+    def refuse(copy: Path) -> None:
+        raise InputError(f"{copy}: is damaged")
+
+    copy_checked(source, target, check)
+    assert target.read_bytes() == b"whole"
+    with pytest.raises(InputError, match=f"^{source}: is damaged$"):
+        copy_checked(source, target, refuse)
+    assert target.read_bytes() == b"whole"
+    assert names(tmp_path) == ["source", "target"]

@@ -11,12 +11,12 @@ from splats import random_gaussians
 from training_scenes import SMALL
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.encode.chunks import EncodeConfig, cut
+from gsencoder.infer.encode.chunks import EncodeConfig, cut, encode_by_chunks
 from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.point_transformer import TransformerConfig
-from gsencoder.types import FeatureSpace
+from gsencoder.types import FeatureSpace, Gaussians
 
 SPACE = OutputSpace(space=FeatureSpace(name="s", channels=5), mean=np.arange(5, dtype=np.float32), scale=2.0)
 OUTPUTS = OutputSpaces(by_teacher={"s": SPACE})
@@ -136,6 +136,19 @@ def test_the_unit_of_the_scene_is_taken_into_account() -> None:
     network.config = replace(SMALL, voxel=0.125)
     there = encode(in_quarters, network, OUTPUTS, WHOLE, metres_per_unit=0.25)
     np.testing.assert_allclose(there.features, encode(one, network, OUTPUTS, WHOLE).features, atol=1e-4)
+
+
+def test_a_halo_is_as_many_metres_wide_in_every_unit_of_length() -> None:
+    one, seen = random_gaussians(1500), []
+
+    def run(subset: Gaussians, curves: object, count: int) -> np.ndarray:
+        seen.append(len(subset))
+        return np.zeros((count, 1), np.float32)
+
+    for scene, unit in ((one, 1.0), (replace(one, means=one.means * np.float32(4)), 0.25)):
+        config = EncodeConfig(chunk=700, halo=0.1)
+        encode_by_chunks(scene, run, lambda: None, config, metres_per_unit=unit, columns={"s": slice(0, 1)})
+    assert seen[: len(seen) // 2] == seen[len(seen) // 2 :]
 
 
 def test_a_rerun_gives_the_same_bits() -> None:

@@ -94,7 +94,10 @@ class WorkFolder:
             self._descriptor = None
 
     def _has_state(self) -> bool:
-        return any(entry.name != MARKER_FILE for entry in self.path.iterdir())
+        """Whether something was computed; not where the folder cannot be read any more."""
+        with suppress(OSError):
+            return any(entry.name != MARKER_FILE for entry in self.path.iterdir())
+        return False
 
     def __enter__(self) -> "WorkFolder":
         return self

@@ -1,22 +1,38 @@
 """Sweeps: what is run in which order, what an interrupted one does again, and what results say of scenes."""
 
+import errno
+import os
 from collections import Counter
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_stage import Toy, ToySettings
+from scipy.stats import sem
+from toy_stage import Toy, ToyScene, ToySettings
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.runtime.peak_memory import Growth
 from gsencoder.evaluate.tradeoff.halving import HalvingConfig
 from gsencoder.evaluate.tradeoff.measure import interleaved, measure
 from gsencoder.evaluate.tradeoff.records import RECORDS_FILE, Record, Records, Timing
-from gsencoder.evaluate.tradeoff.results import estimate, estimate_difference, mark_front, pick_within, summarize
+from gsencoder.evaluate.tradeoff.results import (
+    estimate,
+    estimate_difference,
+    mark_front,
+    pick_within,
+    scene_row,
+    summarize,
+)
 from gsencoder.evaluate.tradeoff.stage import Judged, Score
-from gsencoder.evaluate.tradeoff.sweep import SweepConfig, check_sweep, settings_of, sweep_stage
+from gsencoder.evaluate.tradeoff.sweep import (
+    SweepConfig,
+    check_sweep,
+    knobs_that_matter,
+    settings_of,
+    sweep_stage,
+)
 
 SCENES = [Path("/rooms/a"), Path("/rooms/b"), Path("/rooms/c")]
 
@@ -112,6 +128,29 @@ def test_numbers_that_are_not_finite_survive_the_file(tmp_path: Path) -> None:
     assert read.bytes == 7
 
 
+def test_the_order_of_knobs_tells_no_records_apart(tmp_path: Path) -> None:
+    records = Records(tmp_path)
+    records.add_timing("fusion", "a", {"x": 1, "y": 2}, Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0))
+    assert len(Records(tmp_path).get("fusion", "a", {"y": 2, "x": 1}).timings) == 1
+
+
+@pytest.mark.parametrize(
+    ("number", "said"), [(errno.ENOSPC, "no space left on the device"), (errno.EIO, "Input/output error")]
+)
+def test_a_measurement_that_cannot_be_written_ends_the_sweep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, said: str
+) -> None:
+    def refused(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    timing = Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0)
+    records = Records(tmp_path)
+    records.add_timing("fusion", "a", {}, timing)
+    monkeypatch.setattr(Path, "open", refused)
+    with pytest.raises(InputError, match=f"{RECORDS_FILE}: cannot write: {said}"):
+        records.add_timing("fusion", "a", {}, timing)
+
+
 def test_one_knob_is_changed_at_a_time_and_the_base_comes_first() -> None:
     stage = Toy().stage()
     assert settings_of(stage, SweepConfig()) == [
@@ -171,6 +210,57 @@ def test_settings_of_the_joint_part_that_were_measured_before_are_not_measured_a
     assert max(Counter(toy.runs).values()) == 2
 
 
+@dataclass(frozen=True)
+class Picky(ToySettings):
+    """Refuses a combination of values that it accepts alone."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.effort == 8 and self.color == 2:
+            raise InputError("color=2: expected another effort than 8")
+
+
+def test_combinations_that_a_stage_refuses_are_left_out_and_every_result_has_its_records(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def judge(self: ToyScene, product: ToySettings, settings: ToySettings) -> Judged:
+        scores = {"error": Score(1 / settings.effort), "acc_25": Score(settings.color, 8)}
+        return Judged(scores=scores, bytes=100 * settings.effort + settings.color)
+
+    monkeypatch.setattr(ToyScene, "judge", judge)
+    stage, sweep = replace(Toy().stage(), base=Picky()), SweepConfig(rounds=1, cost="bytes")
+    result = sweep_stage(stage, SCENES, Records(), sweep, HalvingConfig(settings=50))
+    assert result.matter == ("effort", "color")
+    assert len(result.rungs[0].settings) == 4 * 3 - 1
+    # What others beat on the first scene is not measured on the rest.
+    assert {each.scenes for each in result.results if each.phase == "joint"} == {1}
+    measured = Counter(each.label for each in result.records)
+    assert measured == {each.label: each.scenes for each in result.results}
+
+
+def test_the_cost_that_is_asked_for_is_the_one_that_decides() -> None:
+    result = sweep_stage(Toy().stage(), SCENES[:1], Records(), SweepConfig(rounds=1, knobs=("color",), cost="seconds"))
+    assert result.cost == "seconds"
+    (effort, _), rows = Toy().stage().knobs, []
+    for knobs, seconds in (({}, 2.0), ({"effort": 1}, 1.0)):
+        timing = Timing(seconds=seconds, cpu_seconds=4.0, mib=1.0)
+        rows.append([Record(stage="fusion", scene="a", knobs=knobs, timings=(timing,))])
+    assert knobs_that_matter([effort], rows, rows[0], "seconds") == ["effort"]
+    assert knobs_that_matter([effort], rows, rows[0], "cpu_seconds") == []
+
+
+def test_what_scenes_do_not_agree_on_is_noise_and_a_scene_without_things_says_nothing() -> None:
+    (effort, _) = Toy().stage().knobs
+
+    def row(*hits: int, **knobs: int) -> list[Record]:
+        scenes = [record(name, [1.0], {"acc_25": Score(n, 8)}, **knobs) for name, n in zip("abc", hits, strict=True)]
+        return [*scenes, record("d", [1.0], {"acc_25": Score(0, 0)}, **knobs)]
+
+    base = row(4, 4, 4)
+    assert knobs_that_matter([effort], [base, row(7, 2, 4, effort=1)], base, "bytes") == []
+    assert knobs_that_matter([effort], [base, row(6, 5, 6, effort=1)], base, "bytes") == ["effort"]
+
+
 def record(scene: str, cpu: list[float], scores: dict[str, Score] | None = None, **knobs: int) -> Record:
     timings = tuple(Timing(seconds=2 * value, cpu_seconds=value, mib=10.0) for value in cpu)
     return Record(
@@ -186,6 +276,39 @@ def test_times_are_medians_over_rounds_and_means_over_scenes_and_ratios_are_of_t
     assert result.ratio == pytest.approx(0.5)
     assert result.ratio_error == pytest.approx(0)
     assert result.spread == pytest.approx(1.4826 * 0.5)
+
+
+def test_memory_is_that_of_the_largest_scene_bytes_a_mean_and_spread_a_median_over_scenes() -> None:
+    rows = [
+        record(name, cpu) for name, cpu in (("a", [1.0, 1.0, 1.0]), ("b", [1.0, 2.0, 4.0]), ("c", [1.0, 9.0, 17.0]))
+    ]
+    rows = [
+        replace(
+            row,
+            timings=tuple(replace(timing, mib=mib) for timing in row.timings),
+            judged=Judged(scores={}, bytes=size),
+        )
+        for row, mib, size in zip(rows, (30.0, 50.0, 10.0), (1, 2, 6), strict=True)
+    ]
+    result = summarize(rows, rows, "base")
+    assert (result.mib, result.bytes) == (50.0, 3.0)
+    assert result.spread == pytest.approx(1.4826 * 0.5)
+
+
+def test_ratios_are_of_the_rounds_that_both_have_and_their_error_is_that_of_the_mean_logarithm() -> None:
+    base = [record(name, [1.0, 4.0, 16.0]) for name in "abc"]
+    shares = (0.5, 0.25, 0.7)
+    rows = [record(name, [share, 4 * share], views=1) for name, share in zip("abc", shares, strict=True)]
+    result = summarize(rows, base, "one at a time")
+    assert result.ratio == pytest.approx(np.prod(shares) ** (1 / 3))
+    assert result.ratio_error == pytest.approx(sem(np.log(shares)))
+
+
+def test_the_row_of_a_scene_has_medians_over_rounds_and_shares_of_its_things() -> None:
+    row = scene_row(record("a", [1.0, 2.0, 9.0], {"acc_25": Score(3, 4), "acc_50": Score(0, 0)}, views=1))
+    assert (row["setting"], row["scene"], row["cpu_seconds"], row["seconds"]) == ("views=1", "a", 2.0, 4.0)
+    assert (row["acc_25"], row["acc_25_things"], row["acc_50_things"]) == (0.75, 4, 0)
+    assert np.isnan(row["acc_50"])
 
 
 def test_a_score_counts_things_and_its_error_is_that_of_scenes() -> None:
