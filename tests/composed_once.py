@@ -19,13 +19,13 @@ class Once:
     composed: dict[Hashable, Any] = {}  # noqa: RUF012
 
     def __init__(self, open_hydra: Any, command: str, cls: type) -> None:
-        self._asked = open_hydra, command, cls
+        self._arguments = open_hydra, command, cls
         self._opened: Any = None
 
     def __getattr__(self, name: str) -> Any:
         """Anything else is Hydra's, which is opened then."""
         if self._opened is None:
-            open_hydra, command, cls = self._asked
+            open_hydra, command, cls = self._arguments
             self._opened = open_hydra(command, cls, None)
             self._hydra = self._opened.__enter__()
         return getattr(self._hydra, name)
@@ -47,7 +47,7 @@ class Once:
             return f"${{text_of_line:{len(texts) - 1}}}"
 
         form = [SEALED.sub(numbered, word) for word in written]
-        key = (self._asked[2], command, *form)
+        key = (self._arguments[2], command, *form)
         if key not in self.composed:
             compose = self.__getattr__("compose_config")
             try:

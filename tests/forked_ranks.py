@@ -68,10 +68,10 @@ class RankServer:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True,
         )  # fmt: skip
 
-    def ask(self, **asked: Any) -> dict[str, Any]:
+    def ask(self, **request: Any) -> dict[str, Any]:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        print(json.dumps(asked), file=self._process.stdin, flush=True)
+        print(json.dumps(request), file=self._process.stdin, flush=True)
         answer: dict[str, Any] = json.loads(self._process.stdout.readline())
         return answer
 
@@ -90,8 +90,8 @@ class RankServer:
         shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, **size}
         environments = [shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)} for rank in range(count)]
         logs = tuple(script.with_name(f"{script.name}.{rank}.log") for rank in range(count))
-        asked = {"words": [str(script), *words], "environments": environments, "logs": list(map(str, logs))}
-        return Ranks(tuple(self.ask(**asked)["pids"]), logs, self)
+        request = {"words": [str(script), *words], "environments": environments, "logs": list(map(str, logs))}
+        return Ranks(tuple(self.ask(**request)["pids"]), logs, self)
 
     def close(self) -> None:
         """Ends the server."""
@@ -167,13 +167,13 @@ def _serve() -> None:
     os.dup2(2, 1)
     codes: dict[int, int] = {}
     for line in sys.stdin:
-        asked = json.loads(line)
-        if "wait" in asked:
-            answer: dict[str, Any] = {"code": _code_of(asked["wait"], asked["timeout"], codes)}
+        request = json.loads(line)
+        if "wait" in request:
+            answer: dict[str, Any] = {"code": _code_of(request["wait"], request["timeout"], codes)}
         else:
-            _import_those_of(Path(asked["words"][0]))
-            both = zip(asked["environments"], asked["logs"], strict=True)
-            answer = {"pids": [_forked(asked["words"], environment, log) for environment, log in both]}
+            _import_those_of(Path(request["words"][0]))
+            both = zip(request["environments"], request["logs"], strict=True)
+            answer = {"pids": [_forked(request["words"], environment, log) for environment, log in both]}
         print(json.dumps(answer), file=out, flush=True)
 
 
