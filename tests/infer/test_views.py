@@ -488,7 +488,8 @@ def test_what_cannot_be_looked_at_is_said(rng: np.random.Generator) -> None:
     "wrong",
     [
         {"count": 0},
-        {"count": 9, "candidates": 8},
+        {"count": 4097},
+        {"candidates": 0},
         {"width": 0},
         {"fov": 0.5},
         {"judged_side": 4},

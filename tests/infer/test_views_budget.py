@@ -1,6 +1,7 @@
 """A budget of seconds for views: the first candidates are judged in any case, more seconds never judge fewer."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,27 @@ def test_what_a_budget_chooses_and_what_it_cannot_are_refused() -> None:
     check_views_budget(ViewsBudget(), ViewsConfig(method="uniform", candidates=16))
     with pytest.raises(InputError, match="seconds: expected a number above 0"):
         ViewsBudget(seconds=0.0)
+
+
+def test_as_many_candidates_are_judged_as_views_are_asked_for_with_a_budget_and_without() -> None:
+    scene, rows = room()
+    assert scene.gaussians is not None
+    target = target_of("cube", scene.gaussians, rows)
+    config = ViewsConfig(source="shells", count=12, candidates=8, judged_side=40, width=160, height=120)
+    assert choose_views(scene, [target], config).judged == 12
+    many = replace(config, count=70, candidates=32)
+    made = choose_views_within(scene, [target], many, ViewsBudget(seconds=1e4))
+    assert made.candidates == made.views.judged == choose_views(scene, [target], many).judged == 70
+
+
+def test_frames_that_are_all_judged_are_the_candidates_that_are_reported() -> None:
+    scene, rows = room()
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    target = target_of("cube", scene.gaussians, rows)
+    few = replace(scene, views=scene.views.select([0, 3, 6]))
+    config = ViewsConfig(source="frames", count=2, judged_side=40)
+    assert choose_views_within(few, [target], config, ViewsBudget(seconds=1e4)).candidates == 3
 
 
 def test_the_command_records_the_promise_and_warns_where_it_is_broken(

@@ -34,7 +34,7 @@ class BudgetViews:
 
     Attributes:
         views: these.
-        candidates: among how many.
+        candidates: among how many; fewer than there was time for where the scene has no more.
         predicted: seconds.
         seconds: from the beginning to the choice.
         notes: for the user, about a promise that is not kept.
@@ -105,4 +105,6 @@ def choose_views_within(
     elif spent > budget.seconds:
         notes = (f"{budget.shown('seconds')}: judging {number} candidates took {spent:.3g} s; they are used",)
     views = chosen_views(scene, targets, judgment, free, config)
-    return BudgetViews(views=views, candidates=number, predicted=predicted, seconds=clock() - start, notes=notes)
+    return BudgetViews(
+        views=views, candidates=views.judged, predicted=predicted, seconds=clock() - start, notes=notes
+    )

@@ -183,6 +183,7 @@ def _candidates(
     config: ViewsConfig,
     judged: BlendConfig,
 ) -> _Candidates:
+    number = max(config.candidates, config.count)
     scene_cameras = scene.views.cameras if scene.views is not None and len(scene.views) else None
     if config.source == "frames" and scene_cameras is None:
         raise InputError(f"views: scene {scene.name} has no cameras; use choose.source=shells")
@@ -191,7 +192,7 @@ def _candidates(
     parts: list[Cameras] = []
     spaces = [free.without(target.rows) for target in targets]
     if config.source != "shells" and scene_cameras is not None and scene.views is not None:
-        room = config.candidates if config.source == "frames" else config.candidates // 2
+        room = number if config.source == "frames" else number // 2
         if scene.views.images is not None and room >= 2 * len(targets):
             large = photograph_cameras(scene.views)
             for target, space, part in zip(targets, spaces, _split_evenly(room // 2, len(targets)), strict=True):
@@ -210,7 +211,7 @@ def _candidates(
                 scene_cameras, gaussians, targets, max(CONSTANTS.free_space_cameras, len(targets)), spaces
             )
             free = free.seen_by(scene_cameras.select(observers), judged)
-        for target, room in zip(targets, _split_evenly(config.candidates - len(frames), len(targets)), strict=True):
+        for target, room in zip(targets, _split_evenly(number - len(frames), len(targets)), strict=True):
             around = shell_cameras(
                 gaussians,
                 target,

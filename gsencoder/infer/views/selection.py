@@ -29,7 +29,7 @@ class ViewsConfig:
     count: int = field(default=8, metadata={"help": "views chosen"})
     candidates: int = field(
         default=32,
-        metadata={"help": "views judged (one for each target at least); the paper's table has 16, 32 and 64"},
+        metadata={"help": "views judged (at least count, and one for each target); the paper's table has 16, 32 and 64"},
     )
     width: int = field(default=640, metadata={"help": "of the pictures around targets, pixels"})
     height: int = field(default=480, metadata={"help": "of the pictures around targets, pixels"})
@@ -45,18 +45,11 @@ class ViewsConfig:
     spread_weight: float = field(default=0.2, metadata={"help": "what seeing it from many directions is worth"})
 
     def __post_init__(self) -> None:
-        if self.count < 1 or not 1 <= self.candidates <= MAX_CANDIDATES:
-            raise InputError(
-                f"count, candidates: expected 1 or more, and at most {MAX_CANDIDATES} candidates, "
-                f"got {self.count}, {self.candidates}"
-            )
+        for name in ("count", "candidates"):
+            if not 1 <= getattr(self, name) <= MAX_CANDIDATES:
+                raise InputError(f"{name}: expected 1 to {MAX_CANDIDATES}, got {getattr(self, name)}")
         if self.method == "uniform" and self.source == "shells":
             raise InputError("source: expected frames or both with method=uniform, which spreads frames evenly")
-        if self.method == "greedy" and self.count > self.candidates:
-            raise InputError(
-                f"count: expected 1 to candidates={self.candidates}, got {self.count}; judge more candidates, or show "
-                "fewer views"
-            )
         if not (1 <= self.width <= MAX_PIXELS and 1 <= self.height <= MAX_PIXELS and 1 <= self.fov <= MAX_FOV):
             raise InputError(
                 f"width, height, fov: expected at most {MAX_PIXELS} pixels and 1 to {MAX_FOV} degrees, "
