@@ -160,6 +160,16 @@ def test_fewer_megabytes_are_a_lower_rank(rng: np.random.Generator) -> None:
     assert 1 <= ranks[0] < ranks[-1] == SPACE.channels
 
 
+def test_megabytes_that_no_coordinate_fits_into_are_refused_with_those_that_one_takes(rng: np.random.Generator) -> None:
+    scene, teacher = make_scene(n=2000, count=4), FixedTeacher(alike(4, 0.3, rng))
+    with pytest.raises(InputError, match=r"^budget\.megabytes=0\.001: one coordinate .* takes about .* MB") as refused:
+        fuse_within(scene, teacher, BASE, BudgetConfig(megabytes=0.001))
+    needed = float(str(refused.value).split("about ")[1].split()[0])
+    made = fuse_within(scene, teacher, BASE, BudgetConfig(megabytes=1.01 * needed))
+    assert made.fusion.features.features.shape[1] == 1
+    assert not made.choice.notes
+
+
 @pytest.mark.parametrize(
     ("fusion", "named"),
     [

@@ -75,7 +75,8 @@ def fuse_within(
         clock: seconds.
 
     Raises:
-        InputError: no budget, one that cannot be combined with the options, or what `fuse` refuses.
+        InputError: no budget, one that cannot be combined with the options, megabytes into which not even one
+            coordinate of each Gaussian fits, or what `fuse` refuses.
     """
     if not budget.promised:
         raise InputError("budget: expected budget.error=, budget.seconds= or budget.megabytes=, got none of them")

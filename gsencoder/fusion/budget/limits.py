@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from gsencoder.core.errors import InputError
 from gsencoder.core.promises import MEGABYTE
 from gsencoder.fusion.budget.config import BudgetConfig
 from gsencoder.fusion.budget.rank import RankErrors, file_bytes, rank_of_bytes
@@ -51,6 +52,9 @@ def within_megabytes(
 
     Returns:
         The setting, bytes of its file, and notes about a promise that is not kept.
+
+    Raises:
+        InputError: not even one coordinate of each Gaussian fits, and no error is promised.
     """
     assert budget.megabytes is not None
     rows = math.ceil(min(share, 1.0) * sight.gaussians)
@@ -60,13 +64,16 @@ def within_megabytes(
         return chosen, size, ()
     if budget.error is not None:
         return chosen, size, (budget.conflict("error", "megabytes", size / MEGABYTE),)
-    rank = min(rank_of_bytes(budget.megabytes * MEGABYTE, rows, channels), ranks.full)
-    size = file_bytes(rows, max(rank, 1), channels, basis=True)
-    note = (
-        f"{budget.shown('megabytes')}: one coordinate of each Gaussian takes about {size / MEGABYTE:.3g} MB; it is used"
-    )
-    error = min(chosen.error + ranks.error_of(max(rank, 1)), 1.0)
-    return replace(chosen, rank=max(rank, 1), error=error), size, () if rank else (note,)
+    fitting = rank_of_bytes(budget.megabytes * MEGABYTE, rows, channels)
+    if not fitting:
+        least = file_bytes(rows, 1, channels, basis=True)
+        raise InputError(
+            f"{budget.shown('megabytes')}: one coordinate of each Gaussian takes about {least / MEGABYTE:.3g} MB; give "
+            "more"
+        )
+    rank = max(min(fitting, ranks.full), 1)
+    error = min(chosen.error + ranks.error_of(rank), 1.0)
+    return replace(chosen, rank=rank, error=error), file_bytes(rows, rank, channels, basis=True), ()
 
 
 Measure = Callable[[int], tuple[float, float]]
