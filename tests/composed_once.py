@@ -60,6 +60,7 @@ class Once:
 
 def compose_once() -> None:
     """Lets `compose` take what was composed before, for the commands and the YAML files of the package."""
+    from hydra.core.config_store import ConfigStore
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
@@ -67,11 +68,15 @@ def compose_once() -> None:
     from gsencoder.core.errors import InputError
 
     open_hydra, store_settings = compose.open_hydra, compose.store_settings
+    store = ConfigStore.instance()
+    of_hydra = dict(store.repo)
     stored: list[tuple[str, type]] = []
 
     def store_unless_stored(command: str, cls: type) -> None:
-        # Commands share names of groups, so that what another one stored is in the way.
+        # Commands share names of groups, so that what another one stored is in the way; and Hydra copies all of the
+        # store each time that it composes.
         if stored[-1:] != [(command, cls)]:
+            store.repo = dict(of_hydra)
             store_settings(command, cls)
             stored[:] = [(command, cls)]
 
