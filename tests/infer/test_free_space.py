@@ -1,12 +1,16 @@
 """Where a camera can stand, in a room whose walls are known."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from rooms import HALF, HEIGHT, STEP, corner_cameras, room, sheet, splat
 
+from gsencoder.infer.views import free_space
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.free_space import FreeSpace
-from gsencoder.types import Gaussians
+from gsencoder.render import BlendConfig, blend
+from gsencoder.types import Cameras, Gaussians
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +42,33 @@ def test_nobody_knows_what_is_empty_without_cameras() -> None:
     blind = FreeSpace(scene.gaussians)
     assert blind.observers is None
     assert not blind.seen_empty(np.zeros((3, 3))).any()
+
+
+def test_a_camera_that_was_asked_before_tells_the_same_and_is_not_rendered_again(
+    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    scene, _ = room()
+    assert scene.gaussians is not None
+    cameras, points = corner_cameras(), rng.uniform((-1.5, -1.5, 0), (1.5, 1.5, 2), (500, 3))
+    rendered: list[int] = []
+
+    def counted(gaussians: Gaussians, small: Cameras, view: int, **rest: Any) -> Any:
+        rendered.append(view)
+        return blend(gaussians, small, view, **rest)
+
+    monkeypatch.setattr(free_space, "blend", counted)
+    space = FreeSpace(scene.gaussians)
+    first = space.seen_by(cameras.select([0]))
+    both = space.seen_by(cameras.select([1, 0]))
+    assert sorted(rendered) == [0, 0]
+    alone = FreeSpace(scene.gaussians)
+    np.testing.assert_array_equal(both.seen_empty(points), alone.seen_by(cameras.select([1, 0])).seen_empty(points))
+    np.testing.assert_array_equal(first.seen_empty(points), alone.seen_by(cameras.select([0])).seen_empty(points))
+    assert (first.seen_empty(points) != both.seen_empty(points)).any()
+    # More exact maps are others.
+    rendered.clear()
+    space.seen_by(cameras.select([0]), BlendConfig(stop_transmittance=1e-6))
+    assert rendered == [0]
 
 
 def test_clearance_from_a_wall_is_at_most_the_distance_less_two_standard_deviations() -> None:

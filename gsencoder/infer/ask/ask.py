@@ -13,7 +13,7 @@ from gsencoder.infer.ask.prompts import Task, messages, number_in, prompt_text
 from gsencoder.infer.ask.question_words import ENGLISH, WordRules, words_in
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.draw.pictures import Picture
-from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize
+from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, with_eps
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
@@ -238,6 +238,8 @@ class Asker:
             return (), (), {}
         if self.words is None:
             raise InputError(f"query: no words lead into the features of {self.scene.name}; give words= or aabb=")
+        # The spacing of the scene is computed once, for the first question that has words.
+        self.localization = with_eps(self.localization, gaussians)
         localization = localize(self.scene, words, self.words, self.localization, space=self.space)
         # A caption is of one thing.
         boxes = self.config.boxes if question.task != "caption" else 1

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -221,7 +221,8 @@ def find_candidates(
             mode=config.mode,
         )
     presence = Presence(features, text.mean, rivals)
-    eps = config.eps if config.eps is not None else config.eps_spacings * _spacing(gaussians)
+    eps = with_eps(config, gaussians).eps
+    assert eps is not None
     words = []
     for number in range(len(queries)):
         cutoff = threshold(scores[number], config.threshold)
@@ -237,11 +238,13 @@ def find_candidates(
     return Candidates(relevancy=scores, words=tuple(words))
 
 
-def _spacing(gaussians: Gaussians) -> float:
-    spacing = scene_spacing(gaussians.means)
-    if spacing > 0:
-        return spacing
-    return float(np.median(gaussians.scales)) if len(gaussians) else 1.0
+def with_eps(config: LocalizeConfig, gaussians: Gaussians) -> LocalizeConfig:
+    """The settings with the radius of DBSCAN in world units, which takes the spacing of a scene to compute; for callers
+    that localize in one scene more than once."""
+    if config.eps is not None:
+        return config
+    spacing = scene_spacing(gaussians.means) or (float(np.median(gaussians.scales)) if len(gaussians) else 1.0)
+    return replace(config, eps=config.eps_spacings * spacing)
 
 
 def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, GaussianFeatures]:

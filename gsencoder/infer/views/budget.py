@@ -105,6 +105,4 @@ def choose_views_within(
     elif spent > budget.seconds:
         notes = (f"{budget.shown('seconds')}: judging {number} candidates took {spent:.3g} s; they are used",)
     views = chosen_views(scene, targets, judgment, free, config)
-    return BudgetViews(
-        views=views, candidates=views.judged, predicted=predicted, seconds=clock() - start, notes=notes
-    )
+    return BudgetViews(views=views, candidates=views.judged, predicted=predicted, seconds=clock() - start, notes=notes)

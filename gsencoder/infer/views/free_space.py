@@ -1,5 +1,6 @@
 """Free space for cameras: cells that are known to be empty, distances to surfaces, ray casting."""
 
+from collections.abc import Hashable
 from copy import copy
 
 import numpy as np
@@ -47,12 +48,14 @@ class FreeSpace:
         self._occupied = np.unique(self._cell_of[self._cell_of >= 0])
         self.observers: Cameras | None = None
         self._depths: list[Float32[np.ndarray, "h w"]] = []
+        # Shared by copies of this space: the same cameras tell of it for one target after the other.
+        self._depth_maps: dict[Hashable, Float32[np.ndarray, "h w"]] = {}
 
     def seen_by(self, cameras: Cameras, config: BlendConfig = BlendConfig()) -> "FreeSpace":
         """The same space, of which cameras tell what they looked through.
 
         Args:
-            cameras: in the same world; a depth map is rendered for each. None of them: nobody tells.
+            cameras: in the same world; a depth map is rendered for each, once. None of them: nobody tells.
             config: accuracy of the depth maps.
         """
         if not len(cameras):
@@ -65,7 +68,11 @@ class FreeSpace:
             # Rays that end nowhere have looked through nothing that is known.
             return torch.where(b.alpha >= CONSTANTS.min_depth_alpha, b.depth, 0.0).reshape(b.shape).float().numpy()
 
-        other._depths = parallel(depth_map, range(len(small)))
+        arrays = small.cam_from_world, small.Ks, small.widths, small.heights
+        keys = [(config, *(array[view].tobytes() for array in arrays)) for view in range(len(small))]
+        new = {key: view for view, key in enumerate(keys) if key not in self._depth_maps}
+        self._depth_maps.update(zip(new, parallel(depth_map, new.values()), strict=True))
+        other._depths = [self._depth_maps[key] for key in keys]
         return other
 
     def _codes(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:

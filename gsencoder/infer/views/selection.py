@@ -29,7 +29,9 @@ class ViewsConfig:
     count: int = field(default=8, metadata={"help": "views chosen"})
     candidates: int = field(
         default=32,
-        metadata={"help": "views judged (at least count, and one for each target); the paper's table has 16, 32 and 64"},
+        metadata={
+            "help": "views judged (at least count, and one for each target); the paper's table has 16, 32 and 64"
+        },
     )
     width: int = field(default=640, metadata={"help": "of the pictures around targets, pixels"})
     height: int = field(default=480, metadata={"help": "of the pictures around targets, pixels"})
