@@ -10,7 +10,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import torch
+from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, SceneWarning, advised
 from gsencoder.core.files.json_values import plain
@@ -89,6 +91,8 @@ class Reconstruction:
         exposure: brightness of each fitted photograph, relative to their mean, from the affine maps of colors; None
             where photographs are fitted as they are.
         exposure_source: what those of held-out photographs were predicted from, see `ExposurePrediction`.
+        held_out_colors: color maps to which held-out photographs are expected to be exposed, in their order; identities
+            where `exposure` is None.
         seconds: wall-clock time by step of the stage.
     """
 
@@ -101,6 +105,7 @@ class Reconstruction:
     comparisons: tuple[Comparison, ...]
     exposure: tuple[float, ...] | None
     exposure_source: str | None
+    held_out_colors: Float32[np.ndarray, "Q 3 4"]
     seconds: Mapping[str, float]
 
 
@@ -180,9 +185,9 @@ def reconstruct(
             config = replace(config, optimize=optimizer.config)
             log = optimize(optimizer, state, held_out, config, folder, identity, track, report)
         exposure = differing = source = None
+        predicted = predict_exposures(optimizer.exposures, photographs.cameras, held_out)
         if optimizer.exposures is not None:
-            exposure = tuple(optimizer.exposures.brightness().tolist())
-            source = predict_exposures(optimizer.exposures, photographs.cameras, held_out).source
+            exposure, source = tuple(optimizer.exposures.brightness().tolist()), predicted.source
             differing = describe_exposure(min(exposure), max(exposure), source)
         if differing is not None:
             report(differing)
@@ -196,6 +201,7 @@ def reconstruct(
             comparisons=compare(optimizer, held_out, matched=differing is not None and source == "mean"),
             exposure=exposure,
             exposure_source=source,
+            held_out_colors=predicted.maps.numpy(),
             seconds=clock.seconds,
         )
 
