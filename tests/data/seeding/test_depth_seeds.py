@@ -1,0 +1,302 @@
+"""Seeds from depth images: they lie on the surface, face it, and are as many as the voxel asks for."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from seed_views import TILTED, K, camera, colors_of, frames, normals_of, plane_depth, rays, same, sphere_depth
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.seeding.depth import depth_samples, surface_pixels
+from gsencoder.data.seeding.flat import flat_gaussians, quats_from_normals
+from gsencoder.data.seeding.seed import (
+    SeedConfig,
+    seed,
+    seed_from_depth,
+)
+from gsencoder.data.seeding.surface_grid import LAYER, SurfaceGrid
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.types import Scene, Views
+
+
+class TestDepth:
+    @pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), TILTED, np.array([1, 0, 1]) / np.sqrt(2)])
+    def test_a_plane_becomes_one_sheet_of_flat_gaussians_with_its_normal(self, normal):
+        view = camera()
+        views = frames((view, plane_depth(view, normal, 1.5 * normal[2])))
+        g = seed_from_depth(views, voxel=0.02)
+        assert np.abs(g.means @ normal - 1.5 * normal[2]).max() < 1e-4
+        assert np.abs(normals_of(g) @ normal).min() > np.cos(np.radians(2))
+        assert (g.scales[:, 2] < 0.11 * g.scales[:, 0]).all()
+        assert np.abs(colors_of(g) - np.array([200, 100, 50]) / 255).max() < 1e-5
+        # One Gaussian a voxel that the plane crosses, not one a voxel and facing, also at 45° between two facings.
+        points = depth_samples(views, voxel=0.02)[0].points
+        cells = np.unique(np.floor(points / 0.02), axis=0)
+        assert len(points) < 1.05 * len(cells)
+
+    def test_a_sphere_has_its_normals_and_every_seen_point_has_a_seed_within_a_voxel(self):
+        center = np.array([0.1, -0.05, 1.2])
+        cameras = [camera(p, center) for p in ((0, 0, 0), (1.2, 0.1, 1.1), (-1.1, 0.3, 1.0), (0.1, 0.2, 2.4))]
+        parts = [(view, sphere_depth(view, center, 0.15)) for view in cameras]
+        g = seed_from_depth(frames(*parts), voxel=0.02)
+        outwards = (g.means - center) / np.linalg.norm(g.means - center, axis=1, keepdims=True)
+        assert np.abs(np.linalg.norm(g.means - center, axis=1) - 0.15).max() < 0.002
+        assert np.median(np.abs((outwards * normals_of(g)).sum(1))) > np.cos(np.radians(3))
+        assert np.abs((outwards * normals_of(g)).sum(1)).min() > np.cos(np.radians(20))
+        for view, depth in parts:
+            surface = (rays(view) * depth[..., None] + view.centers[0])[depth > 0]
+            distance, _ = cKDTree(g.means).query(surface)
+            assert np.quantile(distance, 0.99) < 0.02
+            assert distance.max() < 0.03
+
+    def test_the_gaussians_close_the_surface_and_are_sized_by_their_spacing(self):
+        """They cover a plane as a perfect square grid of Gaussians of 0.6 spacings does."""
+        view = camera()
+        # In the middle of a layer of cells; at 1.5 rounding would decide between two.
+        g = seed_from_depth(frames((view, plane_depth(view, (0, 0, 1.0), 1.51))), voxel=0.02)
+        inner = (np.abs(g.means[:, :2]) < 0.4).all(axis=1)
+        assert np.median(g.scales[inner, 0]) == pytest.approx(0.6 * 0.02, rel=0.03)
+        lattice = np.stack(np.meshgrid(np.arange(-30, 30), np.arange(-30, 30)), axis=-1).reshape(-1, 2) * 0.02
+
+        def coverage(means: np.ndarray, scales: np.ndarray | float, opacities: np.ndarray | float) -> np.ndarray:
+            queries = np.random.default_rng(0).uniform(-0.4, 0.4, (600, 2))
+            squares = np.square(queries[:, None] - means).sum(axis=-1)
+            return 1 - np.exp(np.log1p(-opacities * np.exp(-squares / (2 * scales**2))).sum(axis=1))
+
+        covered = coverage(g.means[:, :2], g.scales[:, 0], g.opacities)
+        perfect = coverage(lattice, 0.6 * 0.02, float(np.median(g.opacities)))
+        assert covered.min() > 0.9
+        # The mean of the pixels in a cell is up to a pixel (0.3 spacings) off its center.
+        assert np.median(covered) == pytest.approx(np.median(perfect), abs=0.01)
+
+    def test_a_thin_plate_keeps_its_top_apart_from_the_table_under_it(self):
+        """A plate 16 mm thick inside one 2 cm layer of voxels: the mean of both surfaces would lie between them."""
+        view = camera()
+        depth = plane_depth(view, (0, 0, 1.0), 1.0)
+        points = rays(view)[..., :2] * (1.0 - 0.016)
+        top = (np.abs(points) < [0.1, 0.015]).all(axis=-1)
+        depth[top] = 1.0 - 0.016
+        images = np.full((240, 320, 3), 40, np.uint8)
+        images[top] = 220
+        views = replace(frames((view, depth)), images=[images])
+        g = seed_from_depth(views, voxel=0.02)
+        height = 1.0 - g.means[:, 2]
+        assert ((height < 0.001) | (np.abs(height - 0.016) < 0.001)).all()
+        bright = colors_of(g)[:, 0] > 0.5
+        assert np.array_equal(bright, height > 0.008)
+        plate = g.means[height > 0.008]
+        assert np.abs(plate[:, :2].max(axis=0) - [0.1, 0.015]).max() < 0.013  # Half a voxel and a pixel.
+
+    def test_pixels_between_two_surfaces_are_dropped_and_silhouettes_kept(self):
+        depth = np.full((240, 320), 2.0, np.float32)
+        depth[60:180, 100:200] = 1.0
+        mixed = depth.copy()
+        mixed[60:180, 99] = 1.4  # What a sensor returns across the edge.
+        use = surface_pixels(mixed, K).use
+        assert not use[61:179, 99].any()
+        # Beside it only the ring of background whose color the outline is mixed into is left out.
+        ring = np.zeros_like(use)
+        ring[59:181, 98:201] = True
+        ring[60:180, 100:200] = False
+        assert use[~ring].all()
+        clean = surface_pixels(depth, K).use
+        assert clean[60:180, 100:200].all()
+        assert clean[~ring].all()
+        assert not clean[100, [99, 200]].any()
+
+    def test_a_wire_of_one_pixel_is_kept(self):
+        depth = np.full((240, 320), 2.0, np.float32)
+        depth[:, 150] = 1.0
+        found = surface_pixels(depth, K)
+        assert found.use[:, 150].all()
+        assert np.abs(found.depth[:, 150] - 1).max() < 1e-6
+
+    def test_normals_survive_the_noise_and_the_rounding_of_sensors(self, rng):
+        view = camera()
+        clean = plane_depth(view, TILTED, 1.5 * TILTED[2])
+        for noisy, limit in (
+            (np.round(clean * 1000) / 1000, 6),
+            (clean + 0.003 * rng.standard_normal(clean.shape), 12),
+        ):
+            found = surface_pixels(noisy.astype(np.float32), K)
+            cos = np.abs(found.normals[found.use] @ TILTED)
+            assert np.degrees(np.arccos(np.median(cos))) < limit
+            assert found.use.mean() > 0.95
+            errors = (found.depth - clean)[5:-5, 5:-5]
+            assert errors.std() < 0.6 * max((noisy - clean)[5:-5, 5:-5].std(), 1e-4)
+
+    def test_surfaces_seen_at_a_slant_are_not_taken(self):
+        view = camera()
+        steep = np.array([1.0, 0.0, 0.02]) / np.linalg.norm([1.0, 0.0, 0.02])
+        depth = plane_depth(view, steep, 1.5 * steep[2])
+        depth[depth > 20] = 0
+        cos = np.abs(rays(view) @ steep) / np.linalg.norm(rays(view), axis=-1)
+        use = surface_pixels(depth, K, min_cos=0.1).use
+        assert not use[cos < 0.095].any()
+
+    def test_a_rigid_motion_of_the_scene_moves_the_seeds(self):
+        scene = make_room(1, views=6, width=120, height=90)
+        views = scene.views
+        still = seed_from_depth(views, voxel=0.04)
+        turn, shift = rotation(0.4, -0.7, 0.2), np.array([3.0, -2.0, 1.0])
+        pose = views.cameras.cam_from_world.astype(np.float64).copy()
+        pose[:, :3, 3] -= np.einsum("vij,j->vi", pose[:, :3, :3] @ turn.T, shift)
+        pose[:, :3, :3] = pose[:, :3, :3] @ turn.T
+        moved = seed_from_depth(
+            replace(views, cameras=replace(views.cameras, cam_from_world=pose.astype(np.float32))), voxel=0.04
+        )
+        assert 0.8 < len(moved) / len(still) < 1.25
+        expected = still.means @ turn.T + shift
+        distance, row = cKDTree(moved.means).query(expected)
+        assert distance.max() < 2 * 0.04
+        assert np.median(distance) < 0.03
+        cos = np.abs((normals_of(moved)[row] * (normals_of(still) @ turn.T)).sum(1))
+        assert np.mean(cos > 0.9) > 0.9
+        assert abs(np.median(moved.scales[:, 0]) / np.median(still.scales[:, 0]) - 1) < 0.1
+
+    def test_the_same_views_give_the_same_bits_and_their_order_only_rounding(self):
+        views = make_room(2, views=5, width=100, height=75).views
+        first = seed_from_depth(views, voxel=0.03)
+        assert same(first, seed_from_depth(views, voxel=0.03))
+        back = [4, 2, 0, 3, 1]
+        shuffled = Views(
+            cameras=views.cameras.select(back),
+            names=tuple(views.names[row] for row in back),
+            images=[views.images[row] for row in back],
+            depths=[views.depths[row] for row in back],
+        )
+        again = seed_from_depth(shuffled, voxel=0.03)
+        assert np.abs(again.means - first.means).max() < 1e-5
+
+    def test_a_scale_of_the_scene_scales_the_seeds(self):
+        view = camera()
+        depth = sphere_depth(view, (0, 0, 1.2), 0.2)
+        g = seed_from_depth(frames((view, depth)), voxel=0.02)
+        big = seed_from_depth(frames((view, (1024 * depth).astype(np.float32))), voxel=0.02 * 1024)
+        assert np.abs(big.means / 1024 - g.means).max() < 1e-5
+        assert np.abs(big.scales / 1024 - g.scales).max() < 1e-5
+
+    def test_masked_and_far_pixels_are_not_used(self):
+        view = camera()
+        depth = plane_depth(view, (0, 0, 1.0), 1.5)
+        depth[:, 160:] = 3.0
+        mask = np.zeros((240, 320), bool)
+        mask[:, :80] = True
+        masked = seed_from_depth(replace(frames((view, depth)), masks=[mask]), voxel=0.05)
+        assert masked.means[:, 0].max() < -0.4
+        near = seed_from_depth(frames((view, depth)), voxel=0.05, max_depth=2.0)
+        assert near.means[:, 2].max() < 2
+
+    def test_a_single_pixel_is_a_single_gaussian(self):
+        one = np.array([[100, 0, 0.5], [0, 100, 0.5], [0, 0, 1]], np.float32)
+        view = camera(size=(1, 1), K=one)
+        g = seed_from_depth(frames((view, np.full((1, 1), 2.0, np.float32))), voxel=0.02)
+        assert np.abs(g.means - [[0, 0, 2]]).max() < 1e-6
+        assert g.scales[0, 0] < 0.1
+
+    @pytest.mark.usefixtures("no_jaxtyping")
+    def test_bad_frames_are_errors_that_name_the_view(self):
+        view = camera()
+        good = plane_depth(view, (0, 0, 1.0), 1.5)
+        views = frames((view, good), (view, good.copy()))
+        views.depths[1][3, 4] = np.nan
+        with pytest.raises(InputError, match=r"view 'view 1': 1 of 76800 depths are NaN"):
+            seed_from_depth(views, voxel=0.02)
+        for depths, images, message in (
+            ([np.zeros_like(good)] * 2, views.images, "none of the 2 depth images"),
+            ([good, good[:100]], views.images, "view 'view 1': the depth is 320×100"),
+            ([good, good], [views.images[0], views.images[1][:, :7]], "view 'view 1': the image is 7×240"),
+            (None, views.images, "no depth images"),
+            ([good, good], None, "no images"),
+        ):
+            with pytest.raises(InputError, match=message):
+                seed_from_depth(replace(views, depths=depths, images=images), voxel=0.02)
+        with pytest.raises(InputError, match="voxel must be a positive length"):
+            seed_from_depth(frames((view, good)), voxel=0.0)
+        with pytest.raises(InputError, match="voxels\\) from the cameras"):
+            seed_from_depth(frames((view, good * 1000)), voxel=0.001)
+
+    def test_no_views_is_an_error(self):
+        none = camera().select([])
+        with pytest.raises(InputError, match="no views"):
+            seed_from_depth(Views(cameras=none, names=(), images=[], depths=[]), voxel=0.02)
+
+    def test_views_without_depth_are_counted(self):
+        view = camera()
+        views = frames((view, plane_depth(view, (0, 0, 1.0), 1.5)), (view, np.zeros((240, 320), np.float32)))
+        with pytest.warns(SceneWarning, match=r"1 of 2 views have no usable depth \(first: 'view 1'\)"):
+            seed_from_depth(views, voxel=0.05)
+
+    def test_a_grid_that_has_to_grow_holds_the_sums_of_every_voxel_facing_and_layer(self, rng, monkeypatch):
+        monkeypatch.setattr("gsencoder.data.seeding.surface_grid.MIN_SLOTS", 2)
+        points = rng.uniform(-0.25, 0.25, (3000, 3)).astype(np.float32)
+        normals = rng.standard_normal((3000, 3)).astype(np.float32)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        colors = rng.integers(0, 256, (3000, 3)).astype(np.uint8)
+        grid = SurfaceGrid(0.1, np.zeros(3))
+        for start, stop in ((0, 1), (1, 40), (40, 700), (700, 3000)):
+            grid.add(points[start:stop], normals[start:stop], colors[start:stop])
+        expected = {}
+        for point, normal, color in zip(points, normals, colors, strict=True):
+            place = point / np.float32(0.1)
+            axis = int(np.abs(normal).argmax())
+            layer = np.clip(np.rint(float((place - np.floor(place) - 0.5) @ normal) / LAYER), -4, 3)
+            key = (*np.floor(place).astype(int).tolist(), axis, bool(normal[axis] > 0), int(layer))
+            expected.setdefault(key, []).append([*point, *normal, *color, 1])
+        rows = grid._sums[np.argsort(grid._keys[: grid._rows])]
+        sums = np.array([np.sum(expected[key], axis=0) for key in sorted(expected)])
+        np.testing.assert_allclose(rows, sums, rtol=1e-6, atol=1e-6)
+
+
+def rotation(a: float, b: float, c: float) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_euler("xyz", [a, b, c]).as_matrix()
+
+
+def test_an_empty_grid_gives_no_samples():
+    grid = SurfaceGrid(0.1, np.zeros(3))
+    grid.add(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    assert len(grid.samples().points) == 0
+
+
+def test_quaternions_take_z_to_the_normal_up_to_its_sign(rng):
+    normals = np.concatenate([rng.standard_normal((500, 3)), np.eye(3), -np.eye(3)])
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    quats = quats_from_normals(normals)
+    w, x, y, z = quats.T
+    axis = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], axis=1)
+    assert np.abs(np.abs((axis * normals).sum(1)) - 1).max() < 1e-5
+    assert np.abs(np.linalg.norm(quats, axis=1) - 1).max() < 1e-6
+
+
+def test_coincident_points_get_a_finite_size():
+    n = 40
+    g = flat_gaussians(
+        np.zeros((n, 3), np.float32), np.tile(np.float32([0, 0, 1]), (n, 1)), np.zeros((n, 3), np.float32), largest=0.1
+    )
+    assert (g.scales[:, 0] <= 0.08).all()
+
+
+@pytest.mark.parametrize("depth", [1e-42, 1e-20, 1e20, 3e38])
+def test_depth_that_no_sensor_gives_is_taken_for_a_wrong_scale(depth):
+    view = camera()
+    with pytest.raises(InputError, match="76800 of 76800 depths lie outside .* check the depth scale"):
+        seed_from_depth(frames((view, np.full((240, 320), depth, np.float32))), voxel=0.02)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"voxel_units": 1e-300}, {"voxel_units": 1e300}, {"voxel": 1e300}, {"voxel": 1e-300}]
+)
+def test_a_voxel_that_float32_cannot_count_in_is_refused(wrong):
+    views = frames((camera(), np.ones((240, 320), np.float32)))
+    with pytest.raises(InputError, match="is outside 1e-12 to 1e\\+12; check voxel"):
+        seed(Scene(name="s", views=views, metres_per_unit=1.0), SeedConfig(**wrong))
+
+
+def test_samples_out_of_the_grids_reach_are_told_without_a_cast_that_overflows():
+    grid = SurfaceGrid(1e-12, np.zeros(3))
+    far = np.full((1, 3), 1e12, np.float32)
+    with pytest.raises(InputError, match="a sample lies further than"):
+        grid.add(far, np.array([[0, 0, 1]], np.float32), np.zeros((1, 3), np.uint8))

@@ -1,0 +1,138 @@
+"""Which source a scene is seeded from, and in what unit."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from seed_views import camera, frames, plane_depth, rays, same
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.seed import (
+    SeedConfig,
+    seed,
+    seed_from_depth,
+)
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.types import Scene, Views
+
+
+class TestSeed:
+    def test_auto_takes_depth_where_there_is_some_and_points_else(self):
+        room = make_room(0, views=3, width=80, height=60)
+        by_depth = seed(room, SeedConfig(voxel=0.05))
+        assert same(by_depth, seed_from_depth(room.views, voxel=0.05))
+        points = np.float32([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+        colors = np.full((4, 3), 9, np.uint8)
+        bare = replace(room, views=replace(room.views, depths=None), sfm_points=points, sfm_colors=colors)
+        assert len(seed(bare)) == 4
+
+    def test_the_voxel_is_metric_where_the_unit_is_known(self):
+        view = camera()
+        views = frames((view, plane_depth(view, (0, 0, 1.0), 1.5)))
+        scene = Scene(name="cm", views=views, metres_per_unit=0.5)
+        assert same(seed(scene, SeedConfig(voxel=0.02)), seed_from_depth(views, voxel=0.04))
+        assert same(seed(scene, SeedConfig(voxel_units=0.1)), seed_from_depth(views, voxel=0.1))
+
+    def test_an_unknown_unit_is_estimated_with_a_warning_that_says_how(self, rng):
+        view = camera()
+        views = frames((view, plane_depth(view, (0, 0, 1.0), 150.0)))
+        with pytest.warns(SceneWarning, match=r"voxel is 1\.5 of its units, one hundredth of the median depth"):
+            g = seed(Scene(name="x", views=views))
+        assert same(g, seed_from_depth(views, voxel=1.5))
+        points = rng.uniform(0, 9, (300, 3)).astype(np.float32)
+        cloud = Scene(name="x", sfm_points=points, sfm_colors=np.zeros((300, 3), np.uint8))
+        with pytest.warns(SceneWarning, match="median nearest-neighbor distance"):
+            assert 100 < len(seed(cloud)) <= 300
+
+    def test_a_mesh_without_a_unit_takes_its_voxel_from_the_cameras(self, tmp_path):
+        trimesh = pytest.importorskip("trimesh")
+        trimesh.creation.box((100.0, 100.0, 100.0)).export(tmp_path / "box.ply")
+        config = SeedConfig(source="mesh", mesh=str(tmp_path / "box.ply"))
+        views = Views(cameras=camera((0.0, 0.0, -400.0)), names=("a",))
+        with pytest.warns(SceneWarning, match=r"voxel is 4 of"):
+            g = seed(Scene(name="x", views=views), config)
+        assert 2_000 < len(g) < 8_000
+
+    def test_sources_that_the_scene_does_not_have_are_errors(self):
+        scene = Scene(name="bare")
+        for source, message in (
+            ("auto", "neither photographs"),
+            ("photographs", "no views"),
+            ("points", "no structure"),
+            ("depth", "no views"),
+            ("tsdf", "no views"),
+        ):
+            with pytest.raises(InputError, match=message):
+                seed(scene, SeedConfig(source=source))
+        room = make_room(0, views=1, width=8, height=6)
+        with pytest.raises(InputError, match="no depth images"):
+            seed(replace(room, views=replace(room.views, depths=None)), SeedConfig(source="depth"))
+
+    @pytest.mark.usefixtures("no_jaxtyping")
+    def test_options_out_of_range_are_errors(self):
+        for options in (
+            {"voxel": 0.0},
+            {"voxel": float("nan")},
+            {"source": "sfm"},
+            {"source": "mesh"},
+            {"min_cos": 1.0},
+        ):
+            (name,) = options
+            with pytest.raises(InputError, match=name):
+                SeedConfig(**options)
+
+    @pytest.mark.shared
+    def test_a_house_scene_is_seeded_in_seconds_with_a_seed_at_every_seen_point(self, shared):
+        scene = load_scene(shared / "scenes/house/train_004")
+        start = time.process_time()
+        g = seed(scene)
+        assert time.process_time() - start < 8  # 1.7 s alone on one core.
+        assert 50_000 < len(g) < 300_000
+        depth, pose = scene.views.depths[5], scene.views.cameras.cam_from_world[5]
+        view = scene.views.cameras.select([5])
+        points = (rays(view) * depth[..., None] + view.centers[0])[depth > 0][::7]
+        distance, _ = cKDTree(g.means).query(points)
+        assert np.quantile(distance, 0.99) < 0.02
+        assert np.isfinite(pose).all()
+
+    @pytest.mark.shared
+    @pytest.mark.slow
+    def test_small_objects_keep_their_boxes(self, shared):
+        """Seeds inside an object's box, on its surface by the instance maps, span at least half of its volume."""
+        scene = load_scene(shared / "scenes/house/train_012")
+        g = seed(scene)
+        votes = np.zeros((len(g), max(found.id for found in scene.objects) + 1), np.int32)
+        for view in range(len(scene.views)):
+            pose, M = scene.views.cameras.cam_from_world[view], scene.views.cameras.Ks[view]
+            local = g.means @ pose[:3, :3].T + pose[:3, 3]
+            rows = np.flatnonzero(local[:, 2] > 0.05)
+            x, y = np.floor(local[rows, :2] / local[rows, 2:] * np.diag(M)[:2] + M[:2, 2]).astype(int).T
+            depth, labels = scene.views.depths[view], scene.views.instances[view]
+            inside = (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
+            rows, x, y = rows[inside], x[inside], y[inside]
+            seen = (np.abs(depth[y, x] - local[rows, 2]) < 0.02) & (labels[y, x] < votes.shape[1])
+            np.add.at(votes, (rows[seen], labels[y[seen], x[seen]]), 1)
+        owner = np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), 0)
+        overlaps = []
+        for found in scene.objects:
+            if found.placed and found.views >= 5 and found.max_pixels >= 60:
+                mine = g.means[owner == found.id].astype(np.float64) + scene.origin
+                lower, upper = mine.min(axis=0), mine.max(axis=0)
+                common = np.clip(np.minimum(upper, found.aabb_max) - np.maximum(lower, found.aabb_min), 0, None).prod()
+                both = (upper - lower).prod() + (found.aabb_max - found.aabb_min).prod()
+                overlaps.append(common / (both - common))
+        assert len(overlaps) >= 5
+        assert min(overlaps) > 0.5
+        assert np.mean(overlaps) > 0.8
+
+    @pytest.mark.shared
+    def test_the_plush_is_usable_through_its_sfm_points(self, shared):
+        scene = load_scene(shared / "scenes/plush")
+        with pytest.warns(SceneWarning, match="unit of scene 'plush' is unknown"):
+            g = seed(scene)
+        assert 0.7 * len(scene.sfm_points) < len(g) <= len(scene.sfm_points)
+        spread = np.ptp(np.quantile(g.means, [0.05, 0.95], axis=0), axis=0)
+        assert g.scales.max() < 0.1 * np.linalg.norm(spread)
