@@ -6,12 +6,15 @@ from pathlib import Path
 import numpy as np
 from rooms import cube, room
 
+from gsencoder.app import cli
 from gsencoder.fusion.store.folder import WORDS_FILE, save_features
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures
 
 NAMES = ("cube", "crate", "wall", "pen holder")
 ORIGIN = np.array([100.0, -50.0, 7.0])
+QUICK = ("choose.source=frames", "choose.candidates=4", "choose.count=2", "quiet=true")
+KEY = "sk-never-to-be-written"
 
 
 def save_room(
@@ -43,3 +46,8 @@ def save_room(
     folder.mkdir()
     save_features(folder, replace(scene, name=scene_name, origin=ORIGIN), features, {})
     save_text_table(folder / WORDS_FILE, make_text_table(NAMES, embeddings, "table"))
+
+
+def ask(features: Path, out: Path, *words: str) -> int:
+    """The exit code of `ask` with few and quick views, and no second try of a request."""
+    return cli.main(["ask", str(features), f"out={out}", "vlm.retries=0", *QUICK, *words])

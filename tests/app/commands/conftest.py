@@ -1,9 +1,10 @@
-"""What tests of `reconstruct` look at."""
+"""What tests of `reconstruct` look at, and what tests of `ask` ask of."""
 
 import shutil
 from pathlib import Path
 
 import pytest
+from asked_rooms import KEY, save_room
 from reconstructions import QUICK
 
 from gsencoder.app import cli
@@ -36,3 +37,18 @@ def ten(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(path, folder)
     Image.new("RGB", (720, 540), (90, 90, 90)).save(folder / "grey.jpg")
     return folder
+
+
+@pytest.fixture(scope="module")
+def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("room") / "features"
+    save_room(folder)
+    return folder
+
+
+@pytest.fixture
+def vlm_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A key and a model, as a user's shell has them."""
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    monkeypatch.setenv("GSENCODER_VLM_MODEL", "tiny")
+    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
