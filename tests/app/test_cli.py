@@ -1,22 +1,15 @@
-"""The command line as its users meet it: help, errors in one line, exit codes, interrupts, many runs."""
+"""The command line as its users meet it: help, errors in one line, exit codes, interrupts."""
 
 import json
-import os
-import pickle
-import re
-import signal
-import subprocess
-import sys
-import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from toy_commands import ToyConfig, splat, write_toy
 
 from gsencoder import __version__
 from gsencoder.app import cli
@@ -28,23 +21,6 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.runtime.signals import Stopped
 from gsencoder.data.splat_formats.repair import FIXES
 from gsencoder.data.splats import load_splat, save_splat
-from gsencoder.types import Gaussians
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ToyConfig(CommonConfig):
-    paths: tuple[str, ...] = field(default=(), metadata={"help": "scenes", "metavar": "SCENE"})
-    size: int = field(default=1, metadata={"help": "how large"})
-    word: str = field(default="", metadata={"help": "what to say"})
-
-
-def write_toy(config: Any, summary: Any) -> None:
-    summary.results["size"] = config.size
-    if config.size < 0:
-        raise InputError("size: expected a positive number")
-    if config.out is not None:
-        with output_folder(config.out, overwrite=config.overwrite, summary=summary) as folder:
-            (folder / "word").write_text(config.word)
 
 
 @pytest.fixture
@@ -61,19 +37,6 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Any, Any], None]
 
     install(write_toy)
     return install
-
-
-def splat(path: Path, count: int = 20) -> Path:
-    rng = np.random.default_rng(0)
-    gaussians = Gaussians(
-        means=rng.normal(size=(count, 3)).astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        scales=np.full((count, 3), 0.1, np.float32),
-        opacities=np.full(count, 0.5, np.float32),
-        sh=np.zeros((count, 1, 3), np.float32),
-    )
-    save_splat(path, gaussians)
-    return path
 
 
 def broken_splat(path: Path) -> Path:
@@ -289,205 +252,3 @@ def test_an_input_is_never_replaced_by_the_output(toy: Any, tmp_path: Path, caps
     assert cli.main(["toy", str(tmp_path / "out" / "word"), f"out={tmp_path / 'out'}", "overwrite=true"]) == 2
     assert "holds the input" in capsys.readouterr().err
     assert (tmp_path / "out" / "word").read_text() == "old"
-
-
-def test_many_runs_sweep_numbers_and_keep_text(
-    toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "o=${t},'s"
-    words = ["toy", "-m", "a,b=", "size=1,2", "word=mug,banana", f"out={out}"]
-    (tmp_path / "a,b=").touch()
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(words) == 0
-    assert sorted(os.listdir()) == sorted(["a,b=", out.name])
-    assert sorted(os.listdir(out)) == ["0", "1", "multirun.yaml"]
-    records = [json.loads((out / str(k) / "summary.json").read_text()) for k in range(2)]
-    assert [record["results"]["size"] for record in records] == [1, 2]
-    assert {(out / str(k) / "word").read_text() for k in range(2)} == {"mug,banana"}
-    assert records[1]["settings"]["paths"] == ["a,b="]
-    assert capsys.readouterr().err == "run 0: size=1\nrun 1: size=2\n"
-
-
-def test_text_is_swept_where_it_is_asked_for(toy: Any, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    assert cli.main(["toy", "-m", "word=choice(mug,'red, cup')", "size=range(1,3)", f"out={out}", "quiet=true"]) == 0
-    assert [(out / str(k) / "word").read_text() for k in range(4)] == ["mug", "mug", "red, cup", "red, cup"]
-
-
-def test_a_failed_run_does_not_stop_the_others(toy: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "out"
-    assert cli.main(["toy", "-m", "size=-1,x,3", f"out={out}", "quiet=true"]) == 2
-    assert sorted(os.listdir(out)) == ["2", "multirun.yaml"]
-    assert capsys.readouterr().err.splitlines() == [
-        f"error: {out / '0'}: size: expected a positive number",
-        "error: run 1: size: expected a whole number, got 'x' (how large)",
-        "error: 2 of 3 runs failed",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["toy", "-m", "size=1,2"], "-m: out= is missing"),
-        (["toy", "-m", "size=1,2", "out=choice(a,b)"], "out: cannot be swept"),
-        (["toy", "-m", "size=(", "out=x"], "size: expected a whole number, got '('"),
-        (["toy", "-m", "siez=1", "out=x"], "siez: no such option"),
-        (["toy", "-m", "--cfg", "out=x"], "--cfg: shows one run"),
-        (["repair", "-m", "a.ply", "out=x.ply"], "-m: repair writes a file"),
-    ],
-)
-def test_many_runs_complain_like_one(
-    toy: Any, words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    monkeypatch.chdir(tmp_path)
-    assert cli.main(words) == 2
-    err = capsys.readouterr().err
-    assert said in err
-    assert err.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["hydra/launcher=nowhere"], "no such launcher is installed; .*pip install 'gsencoder\\[slurm\\]'"),
-        (["hydra/launcher=submitit_local", "hydra.launcher.timeout_mim=1"], "timeout_mim: Hydra has no such setting"),
-        (
-            ["hydra/launcher=submitit_slurm", "+hydra.launcher.additional_parameters.account=mine"],
-            "submitit_slurm: .*srun.*the logs of the jobs are in .*submitit",
-        ),
-    ],
-)
-def test_a_launcher_that_cannot_start_jobs_says_so_in_one_line(
-    toy: Any, words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    if "submitit" in words[0]:
-        pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
-    monkeypatch.setenv("PATH", "")
-    assert cli.main(["toy", "-m", "size=1,2", f"out={tmp_path / 'out'}", *words]) == 2
-    err = capsys.readouterr().err
-    assert re.search(said, err)
-    assert err.count("\n") == 1
-
-
-def test_a_launcher_in_another_process_can_take_a_run(tmp_path: Path) -> None:
-    from gsencoder.app.settings.multirun import _job
-
-    run = partial(cli._run_one, COMMANDS["inspect"], debug=False)
-    job = pickle.dumps(partial(_job, cls=COMMANDS["inspect"].load()[0], run=run, swept=()))
-    (tmp_path / "job").write_bytes(job)
-    code = (
-        "import pickle, sys; job = pickle.load(open(sys.argv[1], 'rb'));"
-        "from omegaconf import OmegaConf; print(OmegaConf.create({'a': '${text:x41}'}).a, job.keywords['cls'].__name__)"
-    )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "job")], capture_output=True, text=True)
-    assert done.stdout == "A InspectConfig\n", done.stderr
-
-
-def run_process(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "gsencoder", *words], capture_output=True, text=True, **options)
-
-
-HEAVY = ("torch", "numba", "open3d", "numpy", "hydra", "scipy", "sklearn", "rich")
-
-
-@pytest.mark.alone
-def test_help_comes_at_once_and_imports_nothing_heavy() -> None:
-    code = (
-        "import sys; from gsencoder.app.cli import main; main(['--help']);"
-        f"print('LOADED', *[name for name in {HEAVY} if name in sys.modules])"
-    )
-    best = float("inf")
-    for _ in range(5):
-        start = time.perf_counter()
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-        best = min(best, time.perf_counter() - start)
-        assert done.stdout.splitlines()[-1] == "LOADED"
-        if best < 0.5:
-            break
-    assert best < 0.5
-
-
-def test_exit_codes_and_streams_of_the_real_program(tmp_path: Path) -> None:
-    done = run_process("inspect", "nothing.ply", cwd=tmp_path)
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", "error: nothing.ply: no such file\n")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_file_names_that_are_not_utf8_are_told(tmp_path: Path) -> None:
-    name = os.fsdecode(b"caf\xe9.ply")
-    (tmp_path / name).write_bytes(splat(tmp_path / "a.ply").read_bytes())
-    done = run_process("inspect", name, "out=out", cwd=tmp_path, env={**os.environ, "PYTHONIOENCODING": "utf-8:strict"})
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "caf\\udce9.ply" in done.stdout
-
-
-@pytest.mark.skipif(os.name != "posix", reason="pipes")
-def test_a_reader_that_leaves_early_is_not_an_error(tmp_path: Path) -> None:
-    path = splat(tmp_path / "a.ply")
-    read, write = os.pipe()
-    os.close(read)
-    with subprocess.Popen(
-        [sys.executable, "-m", "gsencoder", "inspect", str(path), f"out={tmp_path / 'out'}"],
-        stdout=write,
-        stderr=subprocess.PIPE,
-    ) as process:
-        os.close(write)
-        assert process.communicate()[1] == b""
-        assert process.returncode == 1
-    assert (tmp_path / "out" / "summary.json").exists()
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full")
-def test_a_full_standard_output_is_one_line(tmp_path: Path) -> None:
-    path = splat(tmp_path / "a.ply")
-    with open("/dev/full", "w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "gsencoder", "inspect", str(path)], stdout=full, stderr=subprocess.PIPE, text=True
-        )
-    assert (done.returncode, done.stderr) == (2, "error: standard output: no space left on the device\n")
-
-
-SLOW = """
-import sys, time
-from gsencoder.app import cli
-from gsencoder.app.commands import inspect
-from gsencoder.app.runs.output_folder import output_folder
-def run(config, summary):
-    with output_folder(config.out) as folder:
-        (folder / "half").write_text("x")
-        print("writing", flush=True)
-        time.sleep(60)
-inspect.run = run
-sys.exit(cli.main())
-"""
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals")
-@pytest.mark.parametrize(
-    ("number", "code", "said"),
-    [
-        (signal.SIGINT, 130, b"interrupted\n"),
-        (signal.SIGTERM, 143, b"stopped: SIGTERM\n"),
-        (signal.SIGHUP, 129, b"stopped: SIGHUP\n"),
-    ],
-)
-def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code: int, said: bytes) -> None:
-    def defaults() -> None:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGHUP, signal.SIG_DFL)
-
-    with subprocess.Popen(
-        [sys.executable, "-c", SLOW, "inspect", "a", f"out={tmp_path / 'out'}"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        preexec_fn=defaults,
-    ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"writing\n"
-        process.send_signal(number)
-        assert process.communicate()[1] == said
-        assert process.returncode == code
-    assert list(tmp_path.iterdir()) == []

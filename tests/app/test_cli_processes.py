@@ -1,0 +1,138 @@
+"""The program in a process of its own: exit codes, streams, signals, and how fast help comes."""
+
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from toy_commands import splat
+
+from gsencoder.app import cli
+from gsencoder.app.commands import COMMANDS
+
+
+def test_a_launcher_in_another_process_can_take_a_run(tmp_path: Path) -> None:
+    from gsencoder.app.settings.multirun import _job
+
+    run = partial(cli._run_one, COMMANDS["inspect"], debug=False)
+    job = pickle.dumps(partial(_job, cls=COMMANDS["inspect"].load()[0], run=run, swept=()))
+    (tmp_path / "job").write_bytes(job)
+    code = (
+        "import pickle, sys; job = pickle.load(open(sys.argv[1], 'rb'));"
+        "from omegaconf import OmegaConf; print(OmegaConf.create({'a': '${text:x41}'}).a, job.keywords['cls'].__name__)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "job")], capture_output=True, text=True)
+    assert done.stdout == "A InspectConfig\n", done.stderr
+
+
+def run_process(*words: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "gsencoder", *words], capture_output=True, text=True, **options)
+
+
+HEAVY = ("torch", "numba", "open3d", "numpy", "hydra", "scipy", "sklearn", "rich")
+
+
+@pytest.mark.alone
+def test_help_comes_at_once_and_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; from gsencoder.app.cli import main; main(['--help']);"
+        f"print('LOADED', *[name for name in {HEAVY} if name in sys.modules])"
+    )
+    best = float("inf")
+    for _ in range(5):
+        start = time.perf_counter()
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        best = min(best, time.perf_counter() - start)
+        assert done.stdout.splitlines()[-1] == "LOADED"
+        if best < 0.5:
+            break
+    assert best < 0.5
+
+
+def test_exit_codes_and_streams_of_the_real_program(tmp_path: Path) -> None:
+    done = run_process("inspect", "nothing.ply", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", "error: nothing.ply: no such file\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_file_names_that_are_not_utf8_are_told(tmp_path: Path) -> None:
+    name = os.fsdecode(b"caf\xe9.ply")
+    (tmp_path / name).write_bytes(splat(tmp_path / "a.ply").read_bytes())
+    done = run_process("inspect", name, "out=out", cwd=tmp_path, env={**os.environ, "PYTHONIOENCODING": "utf-8:strict"})
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "caf\\udce9.ply" in done.stdout
+
+
+@pytest.mark.skipif(os.name != "posix", reason="pipes")
+def test_a_reader_that_leaves_early_is_not_an_error(tmp_path: Path) -> None:
+    path = splat(tmp_path / "a.ply")
+    read, write = os.pipe()
+    os.close(read)
+    with subprocess.Popen(
+        [sys.executable, "-m", "gsencoder", "inspect", str(path), f"out={tmp_path / 'out'}"],
+        stdout=write,
+        stderr=subprocess.PIPE,
+    ) as process:
+        os.close(write)
+        assert process.communicate()[1] == b""
+        assert process.returncode == 1
+    assert (tmp_path / "out" / "summary.json").exists()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full")
+def test_a_full_standard_output_is_one_line(tmp_path: Path) -> None:
+    path = splat(tmp_path / "a.ply")
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "gsencoder", "inspect", str(path)], stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    assert (done.returncode, done.stderr) == (2, "error: standard output: no space left on the device\n")
+
+
+SLOW = """
+import sys, time
+from gsencoder.app import cli
+from gsencoder.app.commands import inspect
+from gsencoder.app.runs.output_folder import output_folder
+def run(config, summary):
+    with output_folder(config.out) as folder:
+        (folder / "half").write_text("x")
+        print("writing", flush=True)
+        time.sleep(60)
+inspect.run = run
+sys.exit(cli.main())
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [
+        (signal.SIGINT, 130, b"interrupted\n"),
+        (signal.SIGTERM, 143, b"stopped: SIGTERM\n"),
+        (signal.SIGHUP, 129, b"stopped: SIGHUP\n"),
+    ],
+)
+def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code: int, said: bytes) -> None:
+    def defaults() -> None:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+    with subprocess.Popen(
+        [sys.executable, "-c", SLOW, "inspect", "a", f"out={tmp_path / 'out'}"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=defaults,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"writing\n"
+        process.send_signal(number)
+        assert process.communicate()[1] == said
+        assert process.returncode == code
+    assert list(tmp_path.iterdir()) == []

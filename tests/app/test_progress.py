@@ -1,0 +1,54 @@
+"""Progress bars, and lines where there is no terminal."""
+
+import io
+
+import pytest
+
+from gsencoder.app.runs.progress import Progress
+
+
+class Stream(io.StringIO):
+    def __init__(self, terminal: bool) -> None:
+        super().__init__()
+        self.terminal = terminal
+
+    def isatty(self) -> bool:
+        return self.terminal
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+@pytest.mark.parametrize("quiet", [False, True])
+def test_progress_passes_every_item_on(terminal: bool, quiet: bool) -> None:
+    stream = Stream(terminal)
+    track = Progress(quiet=quiet, stream=stream, every=0.0)
+    pairs = [(a, b) for a in track(range(3), "outer") for b in track(iter("xy"), "inner", total=2)]
+    assert pairs == [(a, b) for a in range(3) for b in "xy"]
+    assert bool(stream.getvalue()) != quiet
+    assert not terminal or quiet or "\x1b" in stream.getvalue()
+
+
+def test_labels_are_shown_as_they_are() -> None:
+    for terminal in (False, True):
+        stream = Stream(terminal)
+        assert list(Progress(stream=stream, every=0.0)(range(1), "view [red]")) == [0]
+        assert "view [red]" in stream.getvalue()
+
+
+def test_progress_off_a_terminal_is_a_line_now_and_then() -> None:
+    stream = Stream(terminal=False)
+    assert list(Progress(stream=stream, every=0.0)(range(3), "views")) == [0, 1, 2]
+    assert stream.getvalue().splitlines()[0] == "views: 1/3 after 0 s"
+    assert "\x1b" not in stream.getvalue()
+    silent = Stream(terminal=False)
+    assert list(Progress(stream=silent)(range(1000), "views")) == list(range(1000))
+    assert silent.getvalue() == ""
+
+
+def test_a_loop_left_early_puts_the_bar_away() -> None:
+    stream = Stream(terminal=True)
+    track = Progress(stream=stream)
+    for item in track(range(3), "views"):
+        if item == 1:
+            break
+    assert track._depth == 0
+    assert list(track(range(2), "again")) == [0, 1]
