@@ -182,6 +182,8 @@ def _unique(where: str, names: list[str]) -> None:
 def record(file: Path, values: Mapping[tuple[str, str], tuple[float, float]]) -> None:
     """Writes new values and spreads, by entry and figure, into the lines of a registry; all else stays as it is.
 
+    Accuracies and errors get as many decimals as were recorded, which is what the documents state.
+
     Raises:
         RegistryError: a figure has no line of its own with `recorded` and `spread`.
     """
@@ -190,11 +192,17 @@ def record(file: Path, values: Mapping[tuple[str, str], tuple[float, float]]) ->
         if match := re.match(r"- name: (.*)", line):
             entry = yaml.safe_load(match[1])
         elif re.match(r"\s+- \{name: .*\}\s*$", line):
-            key = (entry, yaml.safe_load(line)[0]["name"])
-            if key in left:
+            figure = yaml.safe_load(line)[0]
+            if (key := (entry, figure["name"])) in left:
                 value, spread = left.pop(key)
-                line = re.sub(r"\brecorded: [^,}]+", f"recorded: {_number(value)}", line)
-                lines[number] = re.sub(r"\bspread: [^,}]+", f"spread: {_number(spread)}", line)
+                # A name may hold the words as well, after a space and not after a comma.
+                decimals = re.search(r", recorded: -?\d+\.(\d+)[,}]", line)
+                fixed = decimals is not None and figure["kind"] in ("accuracy", "error")
+                text = f"{value:.{len(decimals[1])}f}" if fixed and decimals else _number(value)
+                line = re.sub(r", recorded: [^,}]+", f", recorded: {text}", line)
+                if spread != figure["spread"]:
+                    line = re.sub(r", spread: [^,}]+", f", spread: {_number(spread)}", line)
+                lines[number] = line
     if left:
         raise RegistryError(f"{file}: no line of its own: {', '.join(map(' / '.join, left))}")
     file.write_text("".join(lines), encoding="utf-8")

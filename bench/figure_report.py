@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from figure_registry import Entry, Figure, Registry
+from figure_registry import REPEATABLE, Entry, Figure, Registry
 
 ENOUGH_FOR_A_SPREAD = 3
 """Runs whose range is recorded as the spread of a figure."""
@@ -107,12 +107,12 @@ def listing(registry: Registry, shared: Path) -> str:
 
 
 def recorded_values(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str], tuple[float, float]]:
-    """What `record` writes: medians, and spreads of figures with enough runs."""
-    return {
-        (row["entry"], row["figure"]): (
-            row["now"],
-            row["now_spread"] if len(row["values"]) >= ENOUGH_FOR_A_SPREAD else row["spread"],
-        )
-        for row in rows
-        if row["values"]
-    }
+    """What `record` writes: medians, and spreads of figures with enough runs; of figures that do not depend on load only
+    those that moved, with the spread that they have, half of the last digit that is stated."""
+    recorded = {}
+    for row in rows:
+        repeatable = row["kind"] in REPEATABLE
+        if row["values"] and (row["state"] == "moved" or not repeatable):
+            several = len(row["values"]) >= ENOUGH_FOR_A_SPREAD and not repeatable
+            recorded[row["entry"], row["figure"]] = row["now"], row["now_spread"] if several else row["spread"]
+    return recorded

@@ -171,8 +171,9 @@ entries:
 - name: good
   section: Blend
   minutes: 1
-  command: echo '{"same":2.0004,"moved":5}' > $OUT/figures.json
+  command: echo '{"same":2.0004,"moved":5,"digits":0.74461}' > $OUT/figures.json
   figures:
+  - {name: "evenly spread: recorded: mean", at: digits, kind: accuracy, recorded: 0.740, spread: 0.0005}
   - {name: same, at: same, kind: accuracy, recorded: 2, spread: 0.0005}
   - {name: moved, at: moved, kind: count, recorded: 4, spread: 0}
   - {name: seconds, at: moved, kind: seconds, recorded: 1, spread: 0}
@@ -265,6 +266,7 @@ def test_recorded_values_are_written_into_their_lines_and_nothing_else_is(bench:
     expected = bench.registry.read_text()
     bench.run("--only", "good", "spread", "--record")
     for old, new in (
+        ("recorded: 0.740, spread", "recorded: 0.745, spread"),
         ("recorded: 4, spread: 0", "recorded: 5, spread: 0"),
         ("kind: seconds, recorded: 1", "kind: seconds, recorded: 5"),
         # Two runs say too little of the spread.
