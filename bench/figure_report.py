@@ -107,8 +107,8 @@ def listing(registry: Registry, shared: Path) -> str:
 
 
 def recorded_values(rows: Sequence[Mapping[str, Any]]) -> dict[tuple[str, str], tuple[float, float]]:
-    """What `record` writes: medians, and spreads of figures with enough runs. Of figures that do not depend on load only
-    those that moved are written, with the spread that they have, half of the last digit that is stated."""
+    """What `record` writes: medians, and spreads of figures with enough runs. Of figures that do not depend on load
+    only those that moved are written, with the spread that they have, half of the last digit that is stated."""
     recorded = {}
     for row in rows:
         repeatable = row["kind"] in REPEATABLE
