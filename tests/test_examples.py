@@ -2,8 +2,10 @@
 
 import os
 import re
+import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -25,14 +27,19 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(number: int, folder: Path, *arguments: object) -> str:
-    """What an example prints, run in a folder."""
-    (script,) = EXAMPLES.glob(f"{number:02d}_*.py")
-    words = [sys.executable, "-W", "error", str(script), *map(str, arguments)]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, check=False, env=environment)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What an example prints, run in the folder of the test."""
+    monkeypatch.chdir(tmp_path)
+
+    def printed(number: int, *arguments: object) -> str:
+        (script,) = EXAMPLES.glob(f"{number:02d}_*.py")
+        monkeypatch.setattr(sys, "argv", [str(script), *map(str, arguments)])
+        capsys.readouterr()
+        runpy.run_path(str(script), run_name="__main__")
+        return capsys.readouterr().out
+
+    return printed
 
 
 def size_of(picture: Path) -> tuple[int, int]:
@@ -41,23 +48,32 @@ def size_of(picture: Path) -> tuple[int, int]:
 
 
 def test_an_example_fuses_and_localizes(room: Path, tmp_path: Path) -> None:
-    out = run(1, tmp_path, room, "red")
+    """In a process of its own, as users run it; it imports nothing that a test has imported before."""
+    words = [sys.executable, "-W", "error", str(EXAMPLES / "01_fuse_and_localize.py"), str(room), "red"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stderr
+    out = done.stdout
     seen, total = (int(number.replace(",", "")) for number in re.findall(r"[\d,]+\d", out.splitlines()[0]))
     assert 0.9 * total < seen <= total
     assert re.search(r"^red at \[.*\], \d\.\d\d × \d\.\d\d × \d\.\d\d m, score 0\.\d\d, \d+ Gaussians$", out, re.M)
     assert size_of(tmp_path / "relevancy.png") == (240, 90)
 
 
-def test_an_example_shows_that_lifting_is_the_transpose_of_rendering(room: Path, tmp_path: Path) -> None:
-    out = run(2, tmp_path, room)
+def test_an_example_shows_that_lifting_is_the_transpose_of_rendering(
+    run: Callable[..., str], room: Path, tmp_path: Path
+) -> None:
+    out = run(2, room)
     left, right = (float(number) for number in re.findall(r"= (-?[\d.]+)", out)[:2])
     assert left == pytest.approx(right, rel=1e-3, abs=0.5)
     assert float(re.findall(r"gradient and lift: (\S+)", out)[0]) < 1e-4
     assert size_of(tmp_path / "patches.png") == (240, 90)
 
 
-def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(room: Path, tmp_path: Path) -> None:
-    out = run(3, tmp_path, room, "table,chair")
+def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(
+    run: Callable[..., str], room: Path, tmp_path: Path
+) -> None:
+    out = run(3, room, "table,chair")
     assert re.search(r"^[\d,]+ features of ", out)
     assert re.findall(r"^(table|chair): \d+ boxes", out, re.MULTILINE) == ["table", "chair"]
     features = gsencoder.load_features(tmp_path / "encoded").features
@@ -65,9 +81,9 @@ def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(room:
     assert size_of(tmp_path / "encoded.png") == (240, 90)
 
 
-def test_an_example_renders_views_of_a_target(room: Path, tmp_path: Path) -> None:
+def test_an_example_renders_views_of_a_target(run: Callable[..., str], room: Path, tmp_path: Path) -> None:
     assert cli.main(["fuse", str(room), "teacher=palette", f"out={tmp_path / 'features'}", "quiet=true"]) == 0
-    out = run(4, tmp_path, "features", "red")
+    out = run(4, "features", "red")
     pictures = sorted(tmp_path.glob("view_*.png"))
     assert len(pictures) == len(out.splitlines()) == 8
     assert {size_of(picture) for picture in pictures} == {(640, 480)}

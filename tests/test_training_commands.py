@@ -263,7 +263,7 @@ def test_the_papers_setting_composes_and_runs_two_steps_with_a_small_teacher(roo
     transformers.RadioModel(transformers.RadioConfig(**shape, max_img_size=64)).save_pretrained(tmp_path / "radio")
     scenes = [str(rooms / f"room_{number}") for number in range(2)]
     asked = ["train", *scenes, "experiment=scannet", f"teacher.model={tmp_path / 'radio'}", "holdout=room_1"]
-    less = ["teacher.size=64", "train.steps=2", "train.warmup=1", "train.workers=0", "sampling.gaussians=1500"]
+    less = ["teacher.size=64", "train.steps=2", "train.warmup=1", "train.workers=0", "sampling.gaussians=300"]
     out = tmp_path / "scannet"
     assert cli.main([*asked, *less, "tensorboard=false", f"out={out}", "quiet=true"]) == 0
     encoder, outputs, _ = load_weights(out / "encoder.safetensors")
