@@ -196,9 +196,9 @@ def record(file: Path, values: Mapping[tuple[str, str], tuple[float, float]]) ->
             if (key := (entry, figure["name"])) in left:
                 value, spread = left.pop(key)
                 # A name may hold the words as well, after a space and not after a comma.
-                decimals = re.search(r", recorded: -?\d+\.(\d+)[,}]", line)
-                fixed = decimals is not None and figure["kind"] in ("accuracy", "error")
-                text = f"{value:.{len(decimals[1])}f}" if fixed and decimals else _number(value)
+                text, decimals = _number(value), re.search(r", recorded: -?\d+\.(\d+)[,}]", line)
+                if decimals and figure["kind"] in ("accuracy", "error"):
+                    text = f"{value:.{len(decimals[1])}f}"
                 line = re.sub(r", recorded: [^,}]+", f", recorded: {text}", line)
                 if spread != figure["spread"]:
                     line = re.sub(r", spread: [^,}]+", f", spread: {_number(spread)}", line)

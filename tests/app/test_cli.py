@@ -2,41 +2,22 @@
 
 import json
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from toy_commands import ToyConfig, splat, write_toy
+from toy_commands import splat, write_toy
 
 from gsencoder import __version__
 from gsencoder.app import cli
-from gsencoder.app.commands import COMMANDS, Command
+from gsencoder.app.commands import COMMANDS
 from gsencoder.app.commands.repair import Fix
 from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.runtime.signals import Stopped
 from gsencoder.data.splat_formats.repair import FIXES
 from gsencoder.data.splats import load_splat, save_splat
-
-
-@pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Any, Any], None]], None]:
-    """Makes `gsencoder toy` run the given function."""
-
-    def install(run: Callable[[Any, Any], None]) -> None:
-        @dataclass(frozen=True, slots=True, kw_only=True)
-        class Toy(Command):
-            def load(self) -> tuple[type[CommonConfig], Callable[[Any, Any], None]]:
-                return ToyConfig, run
-
-        monkeypatch.setitem(COMMANDS, "toy", Toy(name="toy", config="ToyConfig", help="a toy"))
-
-    install(write_toy)
-    return install
 
 
 def broken_splat(path: Path) -> Path:

@@ -3,33 +3,12 @@
 import json
 import os
 import re
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-from toy_commands import ToyConfig, write_toy
 
 from gsencoder.app import cli
-from gsencoder.app.commands import COMMANDS, Command
-from gsencoder.app.settings.config import CommonConfig
-
-
-@pytest.fixture
-def toy(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Any, Any], None]], None]:
-    """Makes `gsencoder toy` run the given function."""
-
-    def install(run: Callable[[Any, Any], None]) -> None:
-        @dataclass(frozen=True, slots=True, kw_only=True)
-        class Toy(Command):
-            def load(self) -> tuple[type[CommonConfig], Callable[[Any, Any], None]]:
-                return ToyConfig, run
-
-        monkeypatch.setitem(COMMANDS, "toy", Toy(name="toy", config="ToyConfig", help="a toy"))
-
-    install(write_toy)
-    return install
 
 
 def test_many_runs_sweep_numbers_and_keep_text(

@@ -15,11 +15,6 @@ from gsencoder.core.errors import InputError
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
 
 
-@pytest.fixture
-def image(rng: np.random.Generator) -> np.ndarray:
-    return rng.integers(0, 4, (8, 12, 3)).astype(np.uint8)
-
-
 def small_segformer() -> Any:
     config = transformers.SegformerConfig(
         hidden_sizes=[8, 8, 8, 8],
@@ -91,6 +86,13 @@ def save_oneformer(folder: Path) -> tuple[Any, Any]:
     return model, transformers.OneFormerProcessor(images, tokenizer, task_seq_length=12)
 
 
+def semantic_shares(outputs: Any) -> np.ndarray:
+    """The shares [rows, columns, classes] that queries with masks stand for, of one picture."""
+    classes = outputs.class_queries_logits[0].softmax(-1)[:, :-1]
+    semantic = torch.einsum("qc,qhw->hwc", classes, outputs.masks_queries_logits[0].sigmoid())
+    return np.asarray(semantic / semantic.sum(-1, keepdim=True).clamp(min=1))
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_gpu")
 @pytest.mark.parametrize("size", [(40, 64), (64, 48)])
@@ -105,10 +107,7 @@ def test_a_oneformer_gives_the_semantic_map_of_its_library_and_fetches_no_list_o
     assert (inputs["task_inputs"] > 0).sum() >= 4
     with torch.inference_mode():
         outputs = model(**inputs)
-    classes = outputs.class_queries_logits[0].softmax(-1)[:, :-1]
-    semantic = torch.einsum("qc,qhw->hwc", classes, outputs.masks_queries_logits[0].sigmoid())
-    expected = semantic / semantic.sum(-1, keepdim=True).clamp(min=1)
-    np.testing.assert_allclose(made.shares, expected.numpy(), atol=1e-5)
+    np.testing.assert_allclose(made.shares, semantic_shares(outputs), atol=1e-5)
 
 
 @pytest.mark.slow
@@ -157,10 +156,7 @@ def test_a_mask2former_gives_the_semantic_map_of_its_library_without_the_padding
     inputs = processor(images=image, return_tensors="pt")
     with torch.inference_mode():
         outputs = model(**inputs)
-    classes = outputs.class_queries_logits[0].softmax(-1)[:, :-1]
-    semantic = torch.einsum("qc,qhw->hwc", classes, outputs.masks_queries_logits[0].sigmoid())
-    expected = semantic / semantic.sum(-1, keepdim=True).clamp(min=1)
-    np.testing.assert_allclose(made.shares, expected.numpy(), atol=1e-5)
+    np.testing.assert_allclose(made.shares, semantic_shares(outputs), atol=1e-5)
     mask = inputs["pixel_mask"][0]
     height, width = int(mask[:, 0].sum()), int(mask[0].sum())
     corner = made.grid_from_image @ [size[1], size[0], 1]

@@ -14,8 +14,6 @@ from gsencoder.infer.views.pictures import PictureKind
 
 pytest.importorskip("openai")
 
-pytest.importorskip("openai")
-
 
 RENDERS: tuple[PictureKind, ...] = ("render",)
 

@@ -19,8 +19,6 @@ from gsencoder.infer.ask.server import KEY_VARIABLE, MODEL_VARIABLE, URL_VARIABL
 
 pytest.importorskip("openai")
 
-pytest.importorskip("openai")
-
 
 KEY = "sk-1234567890"
 BOTH = pytest.mark.parametrize("stream", [True, False])
