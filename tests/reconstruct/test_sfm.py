@@ -13,13 +13,16 @@ from gsencoder.reconstruct import sfm
 
 @pytest.mark.slow
 def test_photographs_far_aside_are_placed_by_features_that_follow_slants(shared: Path, tmp_path: Path) -> None:
-    """11 of the plush's, 5 to 27 degrees from their nearest neighbor; at first sight COLMAP places two or so."""
+    """11 of the plush's, 5 to 27 degrees from their nearest neighbor; at first sight COLMAP places two or so.
+
+    At 400 pixels it takes a third of the time that it takes at their 720.
+    """
     plush, photographs, work = shared / "scenes" / "plush", tmp_path / "photographs", tmp_path / "work"
     photographs.mkdir()
     work.mkdir()
     for path in sorted((plush / "images").iterdir())[:44:4]:
         shutil.copy(path, photographs)
-    found = sfm.register_photographs(photographs, work)
+    found = sfm.register_photographs(photographs, work, sfm.SfmConfig(size=400, features=4096))
     assert len(found.placed) >= 8
     assert not set(found.placed) & set(found.missing)
     truth = {

@@ -44,7 +44,7 @@ def boxes(room: Path, out: Path, *options: str) -> list[dict[str, Any]]:
     words = room / "words.safetensors"
     assert cli.main(["fuse", str(room), f"teacher.words={words}", *options, f"out={out}", "quiet=true"]) == 0
     query = ",".join(load_text_table(words).names)
-    assert cli.main(["localize", str(out), f"query={query}", f"out={out}/boxes", "quiet=true"]) == 0
+    assert cli.main(["localize", str(out), f"query={query}", f"out={out}/boxes", "pictures=0", "quiet=true"]) == 0
     found: list[dict[str, Any]] = json.loads((out / "boxes/boxes.json").read_text())
     return found
 
@@ -116,7 +116,11 @@ def test_the_preset_of_dinov2_means_over_regions() -> None:
 
 
 @pytest.mark.slow
-def test_names_of_objects_through_minilm_are_those_of_labels(shared: Path, tmp_path: Path) -> None:
+def test_names_of_objects_through_minilm_are_those_of_labels(
+    shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Both fusions read the same names with the same tower.
+    monkeypatch.setenv("GSENCODER_CACHE", str(tmp_path / "cache"))
     scene, fields = shared / "scenes/house/train_040", []
     for teacher in (["teacher=labels"], ["teacher=regions", "teacher.masks=instances"]):
         out = tmp_path / teacher[0].partition("=")[2]
