@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import shape_checks  # noqa: F401  # Before any module of the package.
+import shape_checks  # Before any module of the package.
 from composed_once import compose_once
 from forked_ranks import RankServer, rank_server
 from hypothesis import settings
@@ -42,6 +42,10 @@ def pytest_collection_finish(session: pytest.Session) -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 10, 10)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    shape_checks.begin_test()
 
 
 @pytest.fixture(scope="session")

@@ -5,6 +5,9 @@ jaxtyping's import hook decorates each function, those inside functions anew at 
 checks of a function are compiled at its first call and once for all closures of one `def`, and arguments are checked
 once; the names of axes are looked after only where a function has some. What is checked is the same: the arguments
 before the call, what it returns after it, with one meaning of the names of axes for both.
+
+A search calls the same small function ten thousand times with the same shapes. So each test checks the first calls of
+each function, and of the later ones a share.
 """
 
 import inspect
@@ -23,6 +26,17 @@ _jaxtyped = jaxtyping.jaxtyped
 _axes_of_one_call = _jaxtyped("context")
 """Names of axes have new meanings within; it holds nothing, so that one serves all calls."""
 
+FIRST_CALLS, LATER_SHARE = 100, 20
+"""Calls of a function that a test checks at first; of those that follow, one of so many is checked."""
+_test = 0
+"""Number of the test that runs."""
+
+
+def begin_test() -> None:
+    """Lets the first calls of all functions be checked again."""
+    global _test
+    _test += 1
+
 
 class Checks:
     """The checks of the arguments and of the result of functions with one code and the same annotations."""
@@ -33,6 +47,7 @@ class Checks:
         self._function = function
         self._names_axes = any(map(_names_axes, (*self._resolved.values(), self._result)))
         self._compiled = False
+        self._test, self._calls = _test, 0
 
     def compile(self) -> None:
         arguments = _empty_twin(self._function)
@@ -48,6 +63,11 @@ class Checks:
         self._compiled = True
 
     def call(self, function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        if self._test != _test:
+            self._test, self._calls = _test, 0
+        self._calls += 1
+        if self._calls > FIRST_CALLS and self._calls % LATER_SHARE:
+            return function(*args, **kwargs)
         if not self._compiled:
             self.compile()
         if not self._names_axes:

@@ -158,6 +158,22 @@ def test_what_a_generator_is_given_is_checked() -> None:
         counted("3")
 
 
+def test_each_test_checks_the_first_calls_and_a_share_of_the_later_ones() -> None:
+    def refused(calls: int) -> int:
+        count = 0
+        for _ in range(calls):
+            try:
+                joined(zeros(4, 3), zeros(4, 2), rows=1)
+            except TypeCheckError:
+                count += 1
+        return count
+
+    for _ in range(2):
+        shape_checks.begin_test()
+        assert refused(shape_checks.FIRST_CALLS) == shape_checks.FIRST_CALLS
+        assert refused(3 * shape_checks.LATER_SHARE) == 3
+
+
 def test_the_checks_can_be_switched_off(no_jaxtyping: None) -> None:
     assert joined(zeros(4, 3), zeros(4, 2), rows=1).shape == (3, 5)
 
