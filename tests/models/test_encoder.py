@@ -256,11 +256,13 @@ def test_compiled_it_gives_the_same_and_is_not_compiled_for_every_number_of_cell
         graphs.append(graph)
         return graph.forward
 
-    network = encoder()
+    two_levels = {"encoder_depths": (1, 1), "encoder_channels": (16, 32)}
+    two_levels |= {"decoder_depths": (1,), "decoder_channels": (16,)}
+    network = encoder(replace(CONFIG, transformer=replace(TINY, **two_levels)))
     compiled = torch.compile(network, backend=count, dynamic=True)
     graphs_after = []
     for size in (64, 100, 150):
-        attributes, opacities, cloud = encoder_inputs(splat(size), CONFIG, 0.1)
+        attributes, opacities, cloud = encoder_inputs(splat(size), network.config, 0.1)
         plan = network.join([cloud])
         with torch.no_grad():
             torch.testing.assert_close(
