@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -22,27 +23,43 @@ def test_results_come_in_order_also_from_work_within_work(threads: int) -> None:
     assert found == [[(row, column) for column in range(5)] for row in range(7)]
 
 
-def test_work_within_work_stays_on_its_thread() -> None:
+@pytest.fixture
+def two_threads() -> Iterator[None]:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    try:
-        inner = parallel(lambda _: set(parallel(lambda _: threading.get_ident(), range(4))), range(6))
+    yield
+    torch.set_num_threads(before)
+
+
+def meet(barrier: threading.Barrier) -> int:
+    """The thread, once another one is there at the same time."""
+    barrier.wait(timeout=60)
+    return threading.get_ident()
+
+
+def test_work_within_work_stays_on_its_thread(two_threads: None) -> None:
+    barrier = threading.Barrier(2)
+    for _ in range(2):
+        inner = parallel(lambda _: {meet(barrier), *parallel(lambda _: threading.get_ident(), range(4))}, range(6))
         assert all(len(each) == 1 for each in inner)
-        assert threading.get_ident() not in set().union(*inner)
-        # The next call has its threads again.
-        assert threading.get_ident() not in parallel(lambda _: threading.get_ident(), range(4))
-    finally:
-        torch.set_num_threads(before)
+        # The caller is one of the two, and has all of its threads again the next time.
+        assert len(set().union(*inner) - {threading.get_ident()}) == 1
 
 
-def test_errors_of_a_piece_are_raised() -> None:
+def test_of_several_errors_the_one_of_the_first_piece_is_raised_and_no_more_pieces_begin(two_threads: None) -> None:
+    barrier, begun = threading.Barrier(2), []
+
     def work(piece: int) -> int:
-        if piece == 3:
-            raise ValueError("piece 3")
+        begun.append(piece)
+        if piece in (2, 3):
+            barrier.wait(timeout=60)
+            raise ValueError(f"piece {piece}")
         return piece
 
-    with pytest.raises(ValueError, match="piece 3"):
-        parallel(work, range(6))
+    with pytest.raises(ValueError, match="piece 2"):
+        parallel(work, range(9))
+    assert sorted(begun) == [0, 1, 2, 3]
+    assert parallel(lambda piece: piece, range(3)) == [0, 1, 2]
 
 
 def test_work_ahead_comes_in_order_and_one_item_before_it_is_asked_for() -> None:

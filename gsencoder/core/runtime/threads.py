@@ -82,14 +82,57 @@ def threads_unchanged() -> Iterator[None]:
             torch.set_num_threads(before)
 
 
-def parallel(work: Callable[[int], Any], pieces: Iterable[int]) -> list[Any]:
-    """Runs `work` for each piece in `thread_count` threads, and returns the results in order. A nested call runs its
-    pieces one after the other, since all threads are busy."""
-    threads = getattr(_here, "threads", thread_count())
-    if threads == 1:
-        return [work(piece) for piece in pieces]
-    with ThreadPoolExecutor(threads, initializer=_limit_threads, initargs=(1,)) as pool:
-        return list(pool.map(work, pieces))
+def parallel(work: Callable[[int], Result], pieces: Iterable[int]) -> list[Result]:
+    """Runs `work` for each piece in `thread_count` threads, the caller's among them, and returns the results in order.
+    A nested call runs its pieces one after the other, since all threads are busy.
+
+    Raises:
+        BaseException: what `work` raised of the first piece that failed; pieces that no thread has begun are left out.
+    """
+    waiting = list(pieces)
+    threads = min(getattr(_here, "threads", thread_count()), len(waiting))
+    if threads <= 1:
+        return [work(piece) for piece in waiting]
+    results: dict[int, Result] = {}
+    errors: dict[int, BaseException] = {}
+    # Each thread takes the next piece by itself: handing pieces over one by one costs more than small ones take.
+    following = iter(range(len(waiting)))
+
+    def run() -> None:
+        with _one_thread():
+            for number in following:
+                try:
+                    results[number] = work(waiting[number])
+                except BaseException as error:
+                    errors[number] = error
+                if errors:
+                    return
+
+    others = [threading.Thread(target=run) for _ in range(threads - 1)]
+    for thread in others:
+        thread.start()
+    try:
+        run()
+    finally:
+        for thread in others:
+            thread.join()
+    if errors:
+        raise errors[min(errors)]
+    return [results[number] for number in range(len(waiting))]
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Lets work within the block have no threads but the one that it runs on."""
+    before = getattr(_here, "threads", None)
+    _here.threads = 1
+    try:
+        yield
+    finally:
+        if before is None:
+            del _here.threads
+        else:
+            _here.threads = before
 
 
 def ahead(work: Callable[[int], Result], items: Iterable[int], workers: int = 1) -> Iterator[Result]:
