@@ -113,12 +113,20 @@ def parallel(work: Callable[[int], Result], pieces: Iterable[int]) -> list[Resul
         thread.start()
     try:
         run()
-    finally:
-        for thread in others:
-            thread.join()
+        _join(others)
+    except BaseException:
+        # Interrupted between two pieces, or while it waits: nothing goes on when this returns.
+        deque(following, maxlen=0)
+        _join(others)
+        raise
     if errors:
         raise errors[min(errors)]
     return [results[number] for number in range(len(waiting))]
+
+
+def _join(threads: Iterable[threading.Thread]) -> None:
+    for thread in threads:
+        thread.join()
 
 
 @contextlib.contextmanager
