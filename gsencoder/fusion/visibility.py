@@ -29,10 +29,11 @@ class VisibilityConfig:
     absolute: float = field(default=0.0, metadata={"help": "largest |d − z| in world units; 0 = not tested"})
 
     def __post_init__(self) -> None:
-        if not (0 <= self.relative <= 1e12 and 0 <= self.absolute <= 1e12):
-            raise InputError(f"visibility: expected tolerances from 0 to 1e12, got {self.relative} and {self.absolute}")
+        for name in ("relative", "absolute"):
+            if not 0 <= getattr(self, name) <= 1e12:
+                raise InputError(f"{name}: expected a tolerance from 0 to 1e12, got {getattr(self, name)}")
         if self.against and not (self.relative or self.absolute):
-            raise InputError("visibility: a test against a depth map needs relative or absolute above 0")
+            raise InputError("against: a test against a depth map needs relative or absolute above 0; [] = no test")
 
 
 def resolve(config: VisibilityConfig, views: Views, lift: str) -> VisibilityConfig:
