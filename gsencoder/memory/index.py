@@ -34,8 +34,8 @@ class IndexConfig:
     def __post_init__(self) -> None:
         if self.threshold and self.rows:
             raise InputError(
-                f"rows: {self.rows} rows need threshold=0 as well, got {self.threshold}; beside a budget, which chooses "
-                "both, leave both out"
+                f"rows: {self.rows} rows need threshold=0 as well, got {self.threshold}; beside a budget, which "
+                "chooses both, leave both out"
             )
         if not self.threshold and not self.rows:
             raise InputError("threshold: 0 needs rows= as well")

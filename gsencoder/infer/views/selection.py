@@ -63,7 +63,8 @@ class ViewsConfig:
             )
         if not 0 < self.least_share < self.most_share < 1:
             raise InputError(
-                f"least_share, most_share: expected shares that rise between 0 and 1, got {self.least_share}, {self.most_share}"
+                f"least_share, most_share: expected shares that rise between 0 and 1, got {self.least_share}, "
+                f"{self.most_share}"
             )
         for name in ("cover_weight", "context_weight", "spread_weight"):
             if not 0 <= getattr(self, name) <= MAX_WEIGHT:
