@@ -63,6 +63,22 @@ def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == list("abcd")
 
 
+def test_each_of_several_scenes_has_its_own_warnings_in_its_summary(tmp_path: Path) -> None:
+    summary = Summary("fuse", SETTINGS)
+    summary.warnings.append("weights: old")
+
+    def run(path: Path, out: Path, one: Summary) -> None:
+        with output_folder(out, summary=one):
+            # As the command line does, which knows the summary of the whole run alone.
+            summary.warnings.append(f"{path.name}: dark")
+
+    paths, options = [tmp_path / name for name in "ab"], {"overwrite": False, "worker": 0, "screen": console()}
+    run_scenes(paths, tmp_path / "out", "features", run, summary, **options)
+    for name in "ab":
+        record = json.loads((tmp_path / "out" / name / "summary.json").read_text())
+        assert record["warnings"] == ["weights: old", f"{name}: dark"]
+
+
 def test_results_of_other_settings_are_neither_taken_nor_replaced(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

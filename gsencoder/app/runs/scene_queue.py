@@ -53,7 +53,8 @@ def run_scenes(
     """Runs a command for one scene into `out`, or for each of several into the folder OUT/NAME.
 
     Of several scenes those are skipped whose folder holds the results of the same settings, and those that another
-    process is writing now. An error in one does not stop the others.
+    process is writing now. An error in one does not stop the others. The summary of each has its own
+    warnings, and those from before the first.
 
     Args:
         paths: the scenes.
@@ -77,6 +78,7 @@ def run_scenes(
         return
     first = int(len(paths) * ((worker * GOLDEN) % 1))
     failures: dict[Path, str] = {}
+    common = tuple(summary.warnings)
     skipped = 0
     for path in (*paths[first:], *paths[:first]):
         name = scene_name(path)
@@ -85,7 +87,11 @@ def run_scenes(
             if not overwrite and _is_finished(target, summary):
                 skipped += 1
                 continue
-            run(path, target, Summary(summary.command, summary.settings))
+            one = Summary(summary.command, summary.settings)
+            # Warnings arrive in the list of the whole run; those of other scenes are no part of this one's record.
+            summary.warnings[:] = common
+            one.warnings = summary.warnings
+            run(path, target, one)
         except BusyError:
             screen.print(f"{target}: another run is writing it now")
         except InputError as error:
