@@ -45,7 +45,9 @@ def resolve(config: VisibilityConfig, views: Views, lift: str) -> VisibilityConf
     """
     has_depth = views.depths is not None
     if "sensor" in config.against and not has_depth:
-        raise InputError("visibility: the scene has no sensor depth; test against rendered depth instead")
+        raise InputError(
+            "visibility.against=sensor: the scene has no sensor depth; test against rendered depth instead"
+        )
     automatic: tuple[Source, ...] = ("sensor",) if has_depth else ("rendered",) if lift == "center" else ()
     against = [name for source in config.against for name in (automatic if source == "auto" else (source,))]
     return replace(config, against=tuple(dict.fromkeys(against)))
