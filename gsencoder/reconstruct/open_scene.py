@@ -59,6 +59,9 @@ def find_photographed(paths: Sequence[str]) -> tuple[Path, ...]:
     """
     chosen = DistinctPaths()
     for path in listed_paths(paths):
+        if not path.exists():
+            # Not when its turn comes, after hours of others.
+            raise InputError(f"{path}: no such file or folder")
         scenes = [path]
         if path.is_dir() and not is_scene(path) and _pictures_of(path) is None:
             entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))

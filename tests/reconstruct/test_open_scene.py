@@ -145,6 +145,8 @@ def test_videos_and_photographs_are_found_in_folders_and_nothing_that_is_hidden(
     assert find_photographed(given) == (photographs, tmp_path / "walk.mp4")
     with pytest.raises(InputError, match="walk.mp4: is given twice; give it once"):
         find_photographed([*given, given[1]])
+    with pytest.raises(InputError, match="none: no such file or folder"):
+        find_photographed([*given, str(tmp_path / "none")])
     with pytest.raises(InputError, match=r"\.\./photographs: is the same as .*; give one of them"):
         find_photographed([*given, str(photographs / ".." / "photographs")])
     (tmp_path / "empty").mkdir()
