@@ -222,13 +222,13 @@ def test_a_downward_import_is_left_alone(module: str, source: str) -> None:
     assert upward(source, module, {}) == []
 
 
-def test_torch_free_modules_do_not_import_torch() -> None:
-    # One after the other in one process: the first that brings torch along is the one that is named.
+def test_torch_free_modules_import_neither_torch_nor_codecs() -> None:
+    # One after the other in one process: the first that brings one along is the one that is named.
     code = (
         "import importlib, sys\n"
         "for module in sys.argv[1:]:\n"
         "    importlib.import_module(module)\n"
-        "    if 'torch' in sys.modules: sys.exit(module + ' imports torch')\n"
+        "    if heavy := {'torch', 'imagecodecs'} & {*sys.modules}: sys.exit(f'{module} imports {heavy}')\n"
     )
     command = [sys.executable, "-W", "ignore", "-c", code, *TORCH_FREE]
     done = subprocess.run(command, capture_output=True, text=True)

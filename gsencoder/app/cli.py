@@ -219,13 +219,15 @@ def _run(command: Command, config: Any, debug: bool) -> None:
 
 
 def _run_one(command: Command, config: Any, debug: bool) -> str:
-    """Runs one of several runs; its error is printed and returned, and the others continue."""
+    """Runs one of several runs; its error is printed and returned, with those of its scenes, and the others
+    continue."""
     try:
         _run(command, config, debug)
     except InputError as error:
         message = f"{config.out}: {error}"
         _report("error", message, debug)
-        return message
+        # Whoever started the run in another process has not seen them.
+        return "\n".join((message, *getattr(error, "reasons", ())))
     return ""
 
 

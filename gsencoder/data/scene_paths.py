@@ -17,13 +17,12 @@ FEATURES_FILE = "scene.safetensors"
 def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
     """The scenes at paths: a path is a scene, a folder of scenes, which are sorted by name, or a list of paths (.txt).
 
-    A folder is a scene if `load_scene` recognizes it; of any other folder the direct subfolders are searched. A scene
-    that is named twice, also by different paths, is returned once.
+    A folder is a scene if `load_scene` recognizes it; of any other folder the direct subfolders are searched.
 
     Raises:
-        InputError: a path does not exist, or a folder holds no scene.
+        InputError: a path does not exist, a folder holds no scene, or a scene is given twice, also by different paths.
     """
-    scenes: dict[Path, Path] = {}
+    scenes = DistinctPaths()
     for path in listed_paths(paths):
         try:
             if not path.exists():
@@ -41,9 +40,35 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
             raise InputError(
                 f"{path}: neither a scene nor a folder of scenes; a scene holds one of: {describe_layouts()}; a splat"
             )
-        for scene in scenes_of_path:
-            scenes.setdefault(scene.resolve(), scene)
-    return tuple(scenes.values())
+        scenes.add(scenes_of_path)
+    return scenes.paths
+
+
+class DistinctPaths:
+    """Paths of scenes, of which none is given twice: whether the second was meant to be another, nobody can tell."""
+
+    def __init__(self) -> None:
+        self._by_target: dict[Path, Path] = {}
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """In the order in which they were added."""
+        return tuple(self._by_target.values())
+
+    def add(self, paths: Iterable[Path]) -> None:
+        """Adds paths.
+
+        Raises:
+            InputError: one is there already, also under another name or by a link.
+        """
+        for path in paths:
+            target = path.resolve()
+            first = self._by_target.get(target)
+            if first == path:
+                raise InputError(f"{path}: is given twice; give it once")
+            if first is not None:
+                raise InputError(f"{path}: is the same as {first}, which is given as well; give one of them")
+            self._by_target[target] = path
 
 
 def listed_paths(paths: Iterable[str | Path]) -> list[Path]:

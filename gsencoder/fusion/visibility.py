@@ -29,10 +29,11 @@ class VisibilityConfig:
     absolute: float = field(default=0.0, metadata={"help": "largest |d − z| in world units; 0 = not tested"})
 
     def __post_init__(self) -> None:
-        if not (0 <= self.relative <= 1e12 and 0 <= self.absolute <= 1e12):
-            raise InputError(f"visibility: expected tolerances from 0 to 1e12, got {self.relative} and {self.absolute}")
+        for name in ("relative", "absolute"):
+            if not 0 <= getattr(self, name) <= 1e12:
+                raise InputError(f"{name}: expected a tolerance from 0 to 1e12, got {getattr(self, name)}")
         if self.against and not (self.relative or self.absolute):
-            raise InputError("visibility: a test against a depth map needs relative or absolute above 0")
+            raise InputError("against: a test against a depth map needs relative or absolute above 0; [] = no test")
 
 
 def resolve(config: VisibilityConfig, views: Views, lift: str) -> VisibilityConfig:
@@ -44,7 +45,9 @@ def resolve(config: VisibilityConfig, views: Views, lift: str) -> VisibilityConf
     """
     has_depth = views.depths is not None
     if "sensor" in config.against and not has_depth:
-        raise InputError("visibility: the scene has no sensor depth; test against rendered depth instead")
+        raise InputError(
+            "visibility.against=sensor: the scene has no sensor depth; test against rendered depth instead"
+        )
     automatic: tuple[Source, ...] = ("sensor",) if has_depth else ("rendered",) if lift == "center" else ()
     against = [name for source in config.against for name in (automatic if source == "auto" else (source,))]
     return replace(config, against=tuple(dict.fromkeys(against)))

@@ -32,10 +32,13 @@ class IndexConfig:
     rows: int = field(default=0, metadata={"help": "largest number of rows of the table, with threshold=0"})
 
     def __post_init__(self) -> None:
-        if bool(self.threshold) == bool(self.rows):
+        if self.threshold and self.rows:
             raise InputError(
-                f"threshold, rows: expected one of the two, and 0 for the other, got {self.threshold} and {self.rows}"
+                f"rows: {self.rows} rows need threshold=0 as well, got {self.threshold}; beside a budget, which "
+                "chooses both, leave both out"
             )
+        if not self.threshold and not self.rows:
+            raise InputError("threshold: 0 needs rows= as well")
         if self.threshold:
             check_threshold(self.threshold)
         elif not 2 <= self.rows <= MAX_ROWS:

@@ -24,12 +24,13 @@ SHIPPED = "shipped:"
 """What a name of them begins with that cannot be taken for a path."""
 
 
-def find_weights(source: str) -> Path:
+def find_weights(source: str, option: str = "weights") -> Path:
     """Finds the file of weights: in a folder that `train` wrote, at a path, or by the name of an encoder that comes
     with the package. Relative paths are also looked up in GSENCODER_MODELS.
 
     Args:
         source: the path or name; `shipped:NAME` is never a path, and "" is DEFAULT_WEIGHTS.
+        option: that gives it, for errors.
 
     Raises:
         InputError: there is no such file, or the name of an encoder that comes with the package is that of a file or
@@ -42,7 +43,7 @@ def find_weights(source: str) -> Path:
             return SHIPPED_WEIGHTS / name / WEIGHTS_FILE
         if name in names:
             raise InputError(
-                f"weights: {source} is the name of an encoder that comes with gsencoder, and there is "
+                f"{option}: {source} is the name of an encoder that comes with gsencoder, and there is "
                 f"{Path(source).absolute()}, too; give {SHIPPED}{source} or ./{source}"
             )
         in_folder = Path(source) / WEIGHTS_FILE
@@ -51,12 +52,12 @@ def find_weights(source: str) -> Path:
         if Path(source).is_dir():
             exports = sorted(path.name for path in Path(source).glob("*.onnx"))
             hint = f"; give its {', '.join(exports)} by its full path" if exports else ""
-            raise InputError(f"weights: the folder {source} holds no {WEIGHTS_FILE}{hint}")
-        return find_file(source, "weights")
+            raise InputError(f"{option}: the folder {source} holds no {WEIGHTS_FILE}{hint}")
+        return find_file(source, option)
     except InputError as error:
         raise InputError(f"{error}; encoders that come with gsencoder: {', '.join(names)}") from error
     except (OSError, ValueError) as error:
-        raise InputError(f"weights: {source[:200]!r} is not a path ({type(error).__name__})") from error
+        raise InputError(f"{option}: {source[:200]!r} is not a path ({type(error).__name__})") from error
 
 
 def save_weights(
@@ -92,12 +93,13 @@ def save_weights(
     write_archive(path, arrays, header)
 
 
-def load_weights(source: str | Path) -> tuple[GaussianEncoder, OutputSpaces, dict[str, Any]]:
+def load_weights(source: str | Path, option: str = "weights") -> tuple[GaussianEncoder, OutputSpaces, dict[str, Any]]:
     """Loads an encoder.
 
     Args:
         source: a file, a folder that `train` wrote, or the name of an encoder that comes with the package; see
             `find_weights`.
+        option: that gives it, for errors.
 
     Returns:
         The encoder in evaluation mode, its output spaces, and settings and results of its training.
@@ -105,7 +107,7 @@ def load_weights(source: str | Path) -> tuple[GaussianEncoder, OutputSpaces, dic
     Raises:
         InputError: the file is missing, damaged or of another version, or its parameters do not fit its configuration.
     """
-    with open_archive(find_weights(str(source))) as file:
+    with open_archive(find_weights(str(source), option)) as file:
         config = _read_config(file.value("encoder", dict))
         outputs = read_output_spaces(file)
         dtype = file.value("dtype", str)

@@ -1,7 +1,9 @@
 """Checkpoints of a reconstruction: parameters, moments and step in one file, written atomically."""
 
 import math
+import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,8 @@ from gsencoder.reconstruct.parameters import shapes_of
 from gsencoder.reconstruct.row_adam import RowAdam
 
 CHECKPOINT_FILE = "reconstruction.safetensors"
+IMAGE_SCALE = "image_scale"
+"""The setting that says by which factor a budget made the photographs smaller."""
 ANCHOR_SHAPES: dict[str, tuple[int | str, ...]] = {"means": ("N", 3), "reach": ("N",)}
 
 
@@ -74,6 +78,21 @@ def save_state(path: Path, state: State, settings: Mapping[str, Any]) -> None:
     write_archive(path, arrays, header)
 
 
+def image_scale_of(path: Path) -> float | None:
+    """The factor by which an unfinished run makes photographs smaller; None where there is no such run, or its
+    checkpoint does not say so or is damaged, which `load_state` says.
+
+    Args:
+        path: the file.
+    """
+    if not os.path.lexists(path):
+        return None
+    with suppress(InputError), open_archive(path) as file:
+        scale = file.value("settings", dict).get(IMAGE_SCALE)
+        return scale if isinstance(scale, float) and 0 < scale <= 1 else None
+    return None
+
+
 def load_state(
     path: Path, settings: Mapping[str, Any], *, steps: int, sh_degree: int, device: torch.device | str = "cpu"
 ) -> State:
@@ -94,6 +113,9 @@ def load_state(
         if "budget" not in earlier:
             # Runs of earlier versions had none, and took the steps of their settings.
             settings = {name: value for name, value in settings.items() if name != "budget"}
+        if IMAGE_SCALE not in earlier:
+            # They did not say at which size they looked at photographs, which shows in the digest of these.
+            settings = {name: value for name, value in settings.items() if name != IMAGE_SCALE}
         # Runs of earlier versions fitted photographs as they were.
         if "optimize" in earlier:
             earlier["optimize"] = {"exposure": False, **earlier["optimize"]}

@@ -9,7 +9,8 @@ from pathlib import Path
 from gsencoder.core.errors import InputError, SceneWarning, advised, listed
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.data.scene_paths import find_scenes, is_scene, listed_paths
+from gsencoder.data.readers.posed import inside
+from gsencoder.data.scene_paths import DistinctPaths, find_scenes, is_scene, listed_paths
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.video.decode import is_video
 from gsencoder.data.video.frames import VideoConfig, take_frames
@@ -54,18 +55,20 @@ def find_photographed(paths: Sequence[str]) -> tuple[Path, ...]:
     those that a list (.txt) names.
 
     Raises:
-        InputError: a path does not exist, or holds nothing of the kind.
+        InputError: a path does not exist, holds nothing of the kind, or is given twice.
     """
-    chosen: dict[Path, Path] = {}
+    chosen = DistinctPaths()
     for path in listed_paths(paths):
-        inside = [path]
+        if not path.exists():
+            # Not when its turn comes, after hours of others.
+            raise InputError(f"{path}: no such file or folder")
+        scenes = [path]
         if path.is_dir() and not is_scene(path) and _pictures_of(path) is None:
             entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
-            inside = [entry for entry in entries if is_video(entry) or (entry.is_dir() and _is_photographed(entry))]
+            scenes = [entry for entry in entries if is_video(entry) or (entry.is_dir() and _is_photographed(entry))]
         # Of a path that holds nothing `find_scenes` says what was expected.
-        for scene in inside or find_scenes([path]):
-            chosen.setdefault(scene.resolve(), scene)
-    return tuple(chosen.values())
+        chosen.add(scenes or find_scenes([path]))
+    return chosen.paths
 
 
 def _pictures_of(path: Path) -> Path | None:
@@ -126,6 +129,9 @@ def open_scene(
             f"{path}: splat={splat} lies in a world of its own, and photographs without poses are placed "
             "in another; give a scene with the poses that belong to the splat"
         )
+    for name in () if is_video(path) else photographs_in(pictures):
+        # Placing them takes minutes, after which the reader of the scene would refuse links that lead elsewhere.
+        inside(pictures, name, str(pictures), allow_outside=data.allow_outside)
     placed = load_placement(pictures, work, sfm)
     if placed is None and os.path.lexists(work / CHECKPOINT_FILE):
         raise InputError(

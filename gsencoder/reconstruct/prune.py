@@ -1,5 +1,6 @@
 """Pruning during the optimization of a splat; nothing is ever added (SplatDistill, sec. 3.1)."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
@@ -33,7 +34,7 @@ class PruneConfig:
         if any(not 0 < share <= 1 for share in self.at):
             raise InputError(f"at: expected shares in (0, 1], got {self.at}")
         for name in ("opacity", "screen", "contribution"):
-            if not getattr(self, name) >= 0:
+            if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
     def due(self, step: int, steps: int) -> bool:

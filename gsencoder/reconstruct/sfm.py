@@ -47,11 +47,9 @@ class SfmConfig:
     camera: str = field(default="SIMPLE_RADIAL", metadata={"help": "COLMAP's camera model"})
 
     def __post_init__(self) -> None:
-        if not (64 <= self.size <= MAX_PIXELS and 64 <= self.features <= MAX_FEATURES):
-            raise InputError(
-                f"size and features: expected at least 64, and at most {MAX_PIXELS} pixels and {MAX_FEATURES} "
-                f"features, got {self.size} and {self.features}"
-            )
+        for name, most in (("size", MAX_PIXELS), ("features", MAX_FEATURES)):
+            if not 64 <= getattr(self, name) <= most:
+                raise InputError(f"{name}: expected 64 to {most}, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

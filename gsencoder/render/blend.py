@@ -4,6 +4,7 @@ With the geometry frozen, rendering anything is `B @ values`, lifting maps onto 
 the other's gradient. B depends on geometry and camera alone; it is made once per view and kept.
 """
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -48,8 +49,9 @@ class BlendConfig:
             raise InputError(f"min_weight: expected a number in [0, 1), got {self.min_weight}")
         if not 0 < self.stop_transmittance < 1:
             raise InputError(f"stop_transmittance: expected a number in (0, 1), got {self.stop_transmittance}")
-        if not self.near > 0 or not self.eps2d > 0:
-            raise InputError(f"near and eps2d: expected positive numbers, got {self.near} and {self.eps2d}")
+        for name in ("near", "eps2d"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
 
 
 class Blend:

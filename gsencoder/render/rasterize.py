@@ -4,6 +4,7 @@ Projection is plain torch (geometry.project), so autograd differentiates it; com
 numba kernels on a CPU (raster_cpu.py), gsplat on CUDA, and torch operations in any float type as their twin.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
@@ -37,8 +38,9 @@ class RasterConfig:
     def __post_init__(self) -> None:
         if not 0 < self.stop_transmittance < 1:
             raise InputError(f"stop_transmittance: expected a number in (0, 1), got {self.stop_transmittance}")
-        if not self.near > 0 or not self.eps2d > 0:
-            raise InputError(f"near and eps2d: expected positive numbers, got {self.near} and {self.eps2d}")
+        for name in ("near", "eps2d"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
 
 
 class Raster(NamedTuple):

@@ -64,10 +64,9 @@ class PrepareConfig:
             raise InputError(
                 "center: expected fusion.basis=false with center=false; coordinates in a basis are about the mean"
             )
-        if self.render_cell < 1 or self.basis_views < 1:
-            raise InputError(
-                f"render_cell and basis_views: expected 1 or more, got {self.render_cell} and {self.basis_views}"
-            )
+        for name in ("render_cell", "basis_views"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
         if self.render_views < 0:
             raise InputError(f"render_views: expected 0 (all) or more, got {self.render_views}")
         if not 0 <= self.render_min_weight < 1:

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,13 @@ from toy_commands import splat, write_toy
 from gsencoder import __version__
 from gsencoder.app import cli
 from gsencoder.app.commands import COMMANDS
+from gsencoder.app.commands.inspect import report_table
 from gsencoder.app.commands.repair import Fix
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.runtime.signals import Stopped
-from gsencoder.data.splat_formats.repair import FIXES
-from gsencoder.data.splats import load_splat, save_splat
+from gsencoder.data.splat_formats.repair import FIXES, inspect_splat
+from gsencoder.data.splats import load_splat, read_raw, save_splat
 
 
 def broken_splat(path: Path) -> Path:
@@ -128,6 +130,10 @@ def test_inspect_prints_a_table_and_writes_a_summary(tmp_path: Path, capsys: pyt
     assert [item["loadable"] for item in record["results"]["splats"]] == [True, False]
     assert [item["count"] for item in record["results"]["splats"]] == [20, 20]
     assert record["settings"]["paths"] == [str(good), str(bad)]
+    # One that is missing is said before the others are looked at, and so is one that is given twice.
+    for last, said in ((tmp_path / "none.ply", "no such file"), (good, "is given twice; give it once")):
+        assert cli.main(["inspect", str(good), str(last)]) == 2
+        assert capsys.readouterr() == ("", f"error: {last}: {said}\n")
 
 
 def test_quiet_prints_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -233,3 +239,11 @@ def test_an_input_is_never_replaced_by_the_output(toy: Any, tmp_path: Path, caps
     assert cli.main(["toy", str(tmp_path / "out" / "word"), f"out={tmp_path / 'out'}", "overwrite=true"]) == 2
     assert "holds the input" in capsys.readouterr().err
     assert (tmp_path / "out" / "word").read_text() == "old"
+
+
+def test_the_extent_of_a_splat_far_from_the_origin_shows_its_size(tmp_path: Path) -> None:
+    splat(tmp_path / "near.ply")
+    report = inspect_splat(read_raw(tmp_path / "near.ply"))
+    far = replace(report, extent_min=(999_998.5, -0.5, 2.0), extent_max=(1_000_001.25, 0.25, 2.0))
+    (row,) = [cell for cell in report_table("far.ply", far).columns[1].cells if "9999" in str(cell)]
+    assert row == "(999998.5, -0.5, 2) to (1000001.25, 0.25, 2)"

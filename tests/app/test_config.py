@@ -210,7 +210,7 @@ def test_brackets_around_a_list_of_text_are_text(conf: Path) -> None:
         ("voxel=(2", "fusion.voxel: expected a number, got '(2'"),
         ("voxel=", "fusion.voxel: expected a number, got ''"),
         ("voxel=true", "fusion.voxel: expected a number, got True"),
-        ("voxel=nan", "fusion.voxel: expected a number, got nan"),
+        ("voxel=nan", "fusion.voxel: expected a number, got nan (grid in metres); nan is not a finite number"),
         ("voxel=é", "fusion.voxel: expected a number, got 'é'"),
         ("voxel=null", "fusion.voxel: expected a number, got None"),
         ("voxel=1,2", "fusion.voxel: expected a number, got '1,2' (grid in metres); several values, one run each"),

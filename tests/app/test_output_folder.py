@@ -271,6 +271,11 @@ def test_inputs_inside_the_folder_to_replace_are_protected(tmp_path: Path) -> No
     for given in ({"paths": [inside]}, {"paths": [out]}, {"weights": out}, {"seeds": {"mesh": inside}, "voxel": 2}):
         with pytest.raises(InputError, match="holds the input"):
             refuse_to_replace_inputs(tmp_path / "out", given)
+    (tmp_path / "splat.ply").touch()
+    (tmp_path / "link.ply").symlink_to("splat.ply")
+    with pytest.raises(InputError, match=r"splat.ply: is the input paths=.*link.ply, so it cannot be replaced"):
+        refuse_to_replace_inputs(tmp_path / "splat.ply", {"paths": [str(tmp_path / "link.ply")]})
+    refuse_to_replace_inputs(tmp_path / "splat.ply", {"paths": [str(tmp_path)]})
     refuse_to_replace_inputs(tmp_path / "out", {"out": out, "paths": [str(tmp_path)], "splat": str(tmp_path / "out2")})
     refuse_to_replace_inputs(tmp_path / "out", {"weights": str(tmp_path / "out" / "nothing"), "query": "a\0b"})
     refuse_to_replace_inputs(tmp_path / "new", {"paths": [str(tmp_path / "new")]})

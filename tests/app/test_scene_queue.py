@@ -51,10 +51,11 @@ def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first = Work("b", "d")
-    with pytest.raises(InputError, match=r"2 of 4 scenes failed.*tries them again: .*/b: .*no photographs; .*/d: "):
+    with pytest.raises(InputError, match=r"2 of 4 scenes failed.*tries them again: .*/b, .*/d$"):
         queue(tmp_path, first)
     assert first.done == ["a", "c"]
-    assert "failed: " in capsys.readouterr().err
+    said = capsys.readouterr().err.splitlines()
+    assert said == [f"failed: {tmp_path / 'scenes' / name}: no photographs" for name in "bd"]
     second = Work()
     queue(tmp_path, second, settings={"quiet": True, "out": "elsewhere"})
     assert second.done == ["b", "d"]
@@ -62,16 +63,36 @@ def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == list("abcd")
 
 
-def test_results_of_other_settings_are_neither_taken_nor_replaced(tmp_path: Path) -> None:
+def test_each_of_several_scenes_has_its_own_warnings_in_its_summary(tmp_path: Path) -> None:
+    summary = Summary("fuse", SETTINGS)
+    summary.warnings.append("weights: old")
+
+    def run(path: Path, out: Path, one: Summary) -> None:
+        with output_folder(out, summary=one):
+            # As the command line does, which knows the summary of the whole run alone.
+            summary.warnings.append(f"{path.name}: dark")
+
+    paths, options = [tmp_path / name for name in "ab"], {"overwrite": False, "worker": 0, "screen": console()}
+    run_scenes(paths, tmp_path / "out", "features", run, summary, **options)
+    for name in "ab":
+        record = json.loads((tmp_path / "out" / name / "summary.json").read_text())
+        assert record["warnings"] == ["weights: old", f"{name}: dark"]
+
+
+def test_results_of_other_settings_are_neither_taken_nor_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     queue(tmp_path, Work())
     other = Work()
-    with pytest.raises(InputError, match=r"4 of 4 scenes failed.*results of other settings \(voxel\)"):
+    with pytest.raises(InputError, match="4 of 4 scenes failed"):
         queue(tmp_path, other, settings={"voxel": 0.01})
+    assert capsys.readouterr().err.count("results of other settings (voxel)") == 4
     assert other.done == []
     again = Work()
     (tmp_path / "out" / "b" / "summary.json").write_text("{")
-    with pytest.raises(InputError, match=r"1 of 4 scenes failed.*summary.json: cannot be read"):
+    with pytest.raises(InputError, match="1 of 4 scenes failed"):
         queue(tmp_path, again)
+    assert "summary.json: cannot be read" in capsys.readouterr().err
 
 
 def test_workers_begin_at_different_scenes_and_leave_alone_what_another_one_does(
@@ -141,7 +162,7 @@ def test_folders_of_photographs_alone_are_reconstructed_beside_scenes(tmp_path: 
         (tmp_path / "all" / name).mkdir(parents=True)
         Image.new("RGB", (8, 6)).save(tmp_path / "all" / name / "a.jpg")
     (tmp_path / "all" / "notes").mkdir()
-    chosen = find_photographed([str(tmp_path / "all"), str(tmp_path / "all" / "plain")])
+    chosen = find_photographed([str(tmp_path / "all")])
     assert [path.name for path in chosen] == ["nested", "plain", "scene"]
 
 

@@ -98,6 +98,9 @@ def test_a_stop_is_known_by_itself_and_within_what_compiled_code_raises() -> Non
         caused, met = SystemError("a"), SystemError("b")
         caused.__cause__, met.__context__ = inner, inner
         assert stop_of(caused) is stop_of(met) is inner
+        outermost = SystemError("<function g> returned a result with an exception set")
+        outermost.__cause__ = caused
+        assert stop_of(outermost) is inner
     assert stop_of(SystemError("alone")) is None
     other = ValueError("wrong")
     other.__cause__ = stop

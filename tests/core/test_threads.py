@@ -4,12 +4,15 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 import torch
 
-from gsencoder.core.runtime.threads import ahead, parallel
+from gsencoder.core.errors import SceneWarning
+from gsencoder.core.runtime import threads
+from gsencoder.core.runtime.threads import ahead, kernel, parallel
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -126,3 +129,20 @@ def test_a_parallel_loop_of_gsply_leaves_torch_the_threads_of_the_environment() 
     path = os.pathsep.join(each for each in sys.path if each)
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "2", "PYTHONPATH": path}
     assert subprocess.run([sys.executable, "-c", code], check=False, env=environment).returncode == 0
+
+
+def test_where_nothing_can_be_stored_kernels_are_compiled_anew_with_one_warning(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    import numba
+
+    def njit(*, cache: bool = False, **_: object) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+        if cache:
+            raise RuntimeError("cannot cache function 'f': no locator available for file 'f.py'")
+        return lambda function: function
+
+    monkeypatch.setattr(numba, "njit", njit)
+    threads._warn_uncached.cache_clear()
+    with pytest.warns(SceneWarning, match="cannot be stored .* NUMBA_CACHE_DIR=FOLDER names a folder") as said:
+        assert [kernel(abs)(-1), kernel(abs)(-2)] == [1, 2]
+    assert len(said) == 1

@@ -310,3 +310,14 @@ def test_a_folder_of_features_is_named_as_such(tmp_path: Path) -> None:
     (tmp_path / "scene.safetensors").touch()
     with pytest.raises(InputError, match="a folder of features, not a scene; localize, views"):
         find_scenes([tmp_path])
+
+
+def test_a_scene_that_is_given_twice_is_refused_under_whatever_name(tmp_path: Path) -> None:
+    write_transforms(tmp_path / "scenes" / "one", 1)
+    scene = tmp_path / "scenes" / "one"
+    with pytest.raises(InputError, match="one: is given twice; give it once"):
+        find_scenes([scene, tmp_path / "scenes"])
+    (tmp_path / "scenes" / "two").symlink_to(scene)
+    with pytest.raises(InputError, match="two: is the same as .*one, which is given as well; give one of them"):
+        find_scenes([tmp_path / "scenes"])
+    assert find_scenes([scene]) == (scene,)

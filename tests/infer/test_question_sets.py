@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.truth.entries import box_corners
 from gsencoder.infer.ask.ask import Question
 from gsencoder.infer.ask.predictions import predictions, short_answer
@@ -117,7 +117,14 @@ def test_boxes_of_another_file_stand_in_for_those_of_the_set(tmp_path: Path) -> 
     other = {"box": box_corners((5.0, 5.0, 5.0), (6.0, 6.0, 6.0))}
     boxes.write_text(json.dumps({"a": [other, other], "c": [other]}))
     bare = [{key: value for key, value in row.items() if key != "bbox"} for row in SCANREFER]
-    asked = read(tmp_path, bare, task="caption", proposals=str(boxes))
+    with pytest.warns(SceneWarning) as said:
+        asked = read(tmp_path, [*bare, {**bare[0], "scene_id": "b"}], task="caption", proposals=str(boxes))
+    assert [str(each.message).partition("proposals: ")[2] for each in said] == [
+        f"{boxes} has no boxes in 1 scene, of which there are no captions: b",
+        f"{tmp_path / 'set.json'} describes no object of 1 scene, of which there are no captions: c",
+    ]
+    with pytest.raises(InputError, match="has boxes in a, c, and .* describes objects of d; expected the same scenes"):
+        read(tmp_path, [{**bare[0], "scene_id": "d"}], task="caption", proposals=str(boxes))
     assert [each.question.question.aabb for each in asked.questions] == [(5.0, 5.0, 5.0, 6.0, 6.0, 6.0)] * 2
     assert len({each.question.id for each in asked.questions}) == 2
     localized = read(tmp_path, bare, task="caption", proposals="localize")

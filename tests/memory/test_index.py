@@ -212,7 +212,8 @@ def test_settings_of_an_index_and_another_splat_are_refused(
     out = tmp_path / "out"
     for words, message in (
         (["index.threshold=1.2"], "index.threshold: expected a cosine above 0 and up to 1, got 1.2"),
-        (["index.threshold=0"], "index: threshold, rows: expected one of the two, and 0 for the other, got 0.0 and 0"),
+        (["index.threshold=0"], "index.threshold: 0 needs rows= as well"),
+        (["index.rows=8", "budget.error=0.1"], "index.rows: 8 rows need threshold=0 as well, got 0.9; beside a budget"),
         (["decoded=true"], "form=index holds codes"),
     ):
         assert cli.main(["pack", str(folder), "form=index", f"out={out}", *words]) == 2

@@ -8,6 +8,7 @@ from PIL import Image
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.scenes import SceneConfig
 from gsencoder.reconstruct import open_scene as opening
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
 from gsencoder.reconstruct.open_scene import FRAMES_FOLDER, find_photographed, open_scene
@@ -93,6 +94,19 @@ def test_photographs_that_were_placed_before_are_not_placed_again(
     assert placing.calls == []
 
 
+def test_links_that_lead_out_of_the_folder_are_refused_before_photographs_are_placed(
+    photographs: Path, work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placing = Placing(monkeypatch)
+    (photographs / "a.jpg").rename(tmp_path / "elsewhere.jpg")
+    (photographs / "a.jpg").symlink_to(tmp_path / "elsewhere.jpg")
+    with pytest.raises(InputError, match=r"photographs: 'a.jpg' leads out of .* or set allow_outside=true"):
+        open_scene(photographs, work)
+    assert placing.calls == []
+    open_scene(photographs, work, data=SceneConfig(allow_outside=True))
+    assert placing.calls == [(photographs, False)]
+
+
 def test_a_run_that_was_cut_off_is_not_continued_with_other_poses(
     photographs: Path, work: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -126,9 +140,15 @@ def test_videos_and_photographs_are_found_in_folders_and_nothing_that_is_hidden(
     posed.rename(tmp_path / ".posed")
     found = find_photographed([str(tmp_path)])
     assert [path.name for path in found] == ["photographs", "walk.mp4"]
-    # What is given twice is reconstructed once, and a folder of photographs is not looked into.
-    again = find_photographed([str(photographs), str(photographs / ".." / "photographs"), str(tmp_path / "walk.mp4")])
-    assert again == (photographs, tmp_path / "walk.mp4")
+    # A folder of photographs is not looked into.
+    given = [str(photographs), str(tmp_path / "walk.mp4")]
+    assert find_photographed(given) == (photographs, tmp_path / "walk.mp4")
+    with pytest.raises(InputError, match="walk.mp4: is given twice; give it once"):
+        find_photographed([*given, given[1]])
+    with pytest.raises(InputError, match="none: no such file or folder"):
+        find_photographed([*given, str(tmp_path / "none")])
+    with pytest.raises(InputError, match=r"\.\./photographs: is the same as .*; give one of them"):
+        find_photographed([*given, str(photographs / ".." / "photographs")])
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="empty"):
         find_photographed([str(tmp_path / "empty")])

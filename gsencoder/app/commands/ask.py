@@ -235,6 +235,14 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
                 f"there are features of others ({listed(sorted(counts), 3) or 'none'})"
             )
         others = {name: count for name, count in question_counts.items() if name not in counts}
+        unasked = [name for name in counts if name not in question_counts]
+        if unasked:
+            warnings.warn(
+                f"{config.questions} asks nothing about {counted(len(unasked), 'scene')} with features: "
+                f"{listed(unasked)}",
+                SceneWarning,
+                stacklevel=2,
+            )
         summary.results.update(
             benchmark=question_set.benchmark,
             questions=sum(counts.values()),

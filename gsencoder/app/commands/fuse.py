@@ -156,7 +156,7 @@ def load_weights_spaces(weights: str) -> OutputSpaces:
     """The output spaces of an encoder's weights; torch is imported only for them."""
     from gsencoder.models.weights import load_weights
 
-    return load_weights(weights)[1]
+    return load_weights(weights, "basis")[1]
 
 
 def basis_for(space: FeatureSpace, outputs: OutputSpaces, weights: str) -> FeatureBasis:

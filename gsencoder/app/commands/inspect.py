@@ -1,5 +1,6 @@
 """`gsencoder inspect PATH…`: what splats and scenes hold, and what is wrong with them, without changing them."""
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.scene_splat import find_splat
-from gsencoder.data.scene_paths import find_scenes, has_views, scene_name
+from gsencoder.data.scene_paths import DistinctPaths, find_scenes, has_views, scene_name
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.splat_formats.repair import SplatReport, inspect_splat
 from gsencoder.data.splats import READABLE, read_raw
@@ -66,12 +67,15 @@ def run(config: InspectConfig, summary: Summary) -> None:
         show(lines)
 
 
-def _paths(given: tuple[str, ...]) -> list[Path]:
+def _paths(given: tuple[str, ...]) -> tuple[Path, ...]:
     """Splat files and scenes; a folder of scenes stands for all of them."""
-    paths: list[Path] = []
+    chosen = DistinctPaths()
     for path in map(Path, given):
-        paths += find_scenes([path]) if path.is_dir() and not (path / "meta.json").is_file() else [path]
-    return paths
+        if not path.exists():
+            # Not after all that stand before it were looked at.
+            raise InputError(f"{path}: no such file")
+        chosen.add(find_scenes([path]) if path.is_dir() and not (path / "meta.json").is_file() else [path])
+    return chosen.paths
 
 
 def _inspect(path: Path, config: InspectConfig, summary: Summary, folder: Path | None) -> list[Table | str]:
@@ -141,7 +145,7 @@ def report_table(path: str, report: SplatReport) -> Table:
         ("1st to 99th percentile", report.robust_min, report.robust_max),
     ):
         if low is not None and high is not None:
-            table.add_row(name, f"{_numbers(low)} to {_numbers(high)}")
+            table.add_row(name, " to ".join(_corners(low, high)))
     if report.median_scale is not None:
         table.add_row("median scale", f"{report.median_scale:.4g}")
     if report.opacity_quantiles:
@@ -154,5 +158,14 @@ def report_table(path: str, report: SplatReport) -> Table:
     return table
 
 
-def _numbers(values: tuple[float, ...]) -> str:
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+def _corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[str, str]:
+    """The corners of a box, with four digits of its size also where it lies far from the origin."""
+    digits = []
+    for one, other in zip(low, high, strict=True):
+        largest, size = max(abs(one), abs(other)), other - one
+        # No float32 has more than nine.
+        digits.append(4 + min(max(math.ceil(math.log10(largest / size)), 0), 5) if 0 < size < largest else 4)
+    first, second = (
+        ", ".join(f"{value:.{count}g}" for value, count in zip(corner, digits, strict=True)) for corner in (low, high)
+    )
+    return f"({first})", f"({second})"

@@ -1,10 +1,12 @@
 """The scenes that a question set is asked about: their folders of features, photographs, and boxes to be captioned."""
 
+import warnings
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from gsencoder.app.commands.evaluated_features import folder_of
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.data.scene_paths import DistinctPaths
 from gsencoder.fusion.store.folder import SCENE_FILE
 from gsencoder.fusion.store.package import PACKAGE_FILE
 from gsencoder.infer.ask.ask import Asker
@@ -23,19 +25,17 @@ def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:
     """The folders of features at paths: each path, or the folders in it that are called like one of the scenes.
 
     Raises:
-        InputError: a path that is no folder, or that holds neither features nor any such folder.
+        InputError: a path that is no folder, that holds neither features nor any such folder, or that is given twice.
     """
-    folders: dict[Path, Path] = {}
+    folders = DistinctPaths()
     for path in map(Path, paths):
         if not path.is_dir():
             raise InputError(f"{path}: no such folder of features")
         inner = [path] if holds_features(path) else sorted(each for each in path.iterdir() if holds_features(each))
         if not inner:
             raise InputError(f"{path}: holds no features, nor folders of features; expected what fuse or encode wrote")
-        for folder in inner:
-            if folder is path or folder.name in scenes:
-                folders.setdefault(folder.resolve(), folder)
-    return list(folders.values())
+        folders.add(folder for folder in inner if folder is path or folder.name in scenes)
+    return list(folders.paths)
 
 
 def photos_of(photos: str, features: Path) -> str:
@@ -48,11 +48,22 @@ def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[SetQuestion,
 
     Raises:
         InputError: no words lead into the features.
+
+    Warns:
+        SceneWarning: names that no table knows, or none of which has a box.
     """
     if asker.words is None:
         raise InputError(f"proposals=localize: no words lead into the features of {asker.scene.name}; give words=")
     table = closed_table(asker.words)
     known_names = [name for name in names if table is None or table.find(name) is not None]
+    if len(known_names) < len(names):
+        unknown = [name for name in names if name not in known_names]
+        warnings.warn(
+            f"proposals=localize: {asker.scene.name}: the text table lacks {len(unknown)} of {len(names)} names of "
+            f"objects, of which there are no captions: {listed(unknown)}; give a text tower (text=)",
+            SceneWarning,
+            stacklevel=2,
+        )
     if not known_names:
         return ()
     localization = localize(asker.scene, known_names, asker.words, asker.localization, space=asker.space)
@@ -63,4 +74,11 @@ def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[SetQuestion,
         keys = {"obj_prob": [1 - float(box.probability), float(box.probability)]}
         if (box.aabb_min < box.aabb_max).all():
             questions.append(caption_question(asker.scene.name, str(number), aabb, keys))
+    if not questions:
+        warnings.warn(
+            f"proposals=localize: {asker.scene.name}: no name of an object has a box there ({listed(known_names)}), so "
+            "that there is nothing to caption",
+            SceneWarning,
+            stacklevel=2,
+        )
     return tuple(questions)

@@ -42,11 +42,9 @@ class QuestionsCommandConfig(QuestionsConfig, CommonConfig):
 
     def __post_init__(self) -> None:
         QuestionsConfig.__post_init__(self)
-        if self.per_object < 1 or self.objects < 0:
-            raise InputError(
-                f"per_object, objects: expected per_object from 1 and objects from 0, got {self.per_object}, "
-                f"{self.objects}"
-            )
+        for name, least in (("per_object", 1), ("objects", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
 
 
 def run(config: QuestionsCommandConfig, summary: Summary) -> None:

@@ -27,6 +27,7 @@ from gsencoder.data.splats import READABLE, save_splat
 from gsencoder.data.video.frames import RECORD_FILE, VideoConfig
 from gsencoder.infer.draw.pictures import contact_sheet
 from gsencoder.reconstruct.budget import choose_scale
+from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, IMAGE_SCALE, image_scale_of
 from gsencoder.reconstruct.open_scene import FRAMES_FOLDER, OpenedScene, find_photographed, open_scene
 from gsencoder.reconstruct.report import Comparison, LogRow, describe
 from gsencoder.reconstruct.run import ReconstructConfig, reconstruct
@@ -90,7 +91,8 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
         refuse_to_replace_inputs(work.path, settings(config))
         work.take(anew=not config.resume)
         opened = _open(path, work.path, config, config.data)
-        opened = _at_affordable_size(opened, path, work.path, config, screen)
+        scale = _affordable_scale(opened, work.path, config)
+        opened = _at_scale(opened, scale, path, work.path, config, screen)
         summary.add_seconds(opened.seconds)
         with summary.step("check"):
             warn_of_faults(opened.scene)
@@ -99,7 +101,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             summary.results.update(placed=len(sfm.placed), missing=list(sfm.missing), sfm_error=sfm.error)
         parts = ("data", "sfm", "video") if opened.is_video else ("data", "sfm")
         reading = {name: settings(getattr(config, name)) for name in parts}
-        made_from = {"scene": str(path.resolve()), "splat": config.splat, **reading}
+        made_from = {"scene": str(path.resolve()), "splat": config.splat, IMAGE_SCALE: scale, **reading}
         result = reconstruct(
             opened.scene,
             ReconstructConfig(**{item.name: getattr(config, item.name) for item in fields(ReconstructConfig)}),
@@ -149,15 +151,26 @@ def _open(path: Path, work: Path, config: ReconstructCommandConfig, data: SceneC
     return open_scene(path, work, splat=config.splat, data=data, sfm=config.sfm, video=config.video, track=track)
 
 
-def _at_affordable_size(
-    opened: OpenedScene, path: Path, work: Path, config: ReconstructCommandConfig, screen: Console
-) -> OpenedScene:
-    """The scene with photographs of the size that the budget allows, unless data.image_scale states one."""
+def _affordable_scale(opened: OpenedScene, work: Path, config: ReconstructCommandConfig) -> float:
+    """The factor by which photographs are made smaller for the budget; 1 where data.image_scale states one.
+
+    That of an interrupted run stays: with other threads or on another device the same minutes would allow another.
+    """
     views = opened.scene.views
     if views is None or config.data.image_scale != 1:
-        return opened
-    scale = choose_scale(views.cameras, config.budget, choose_device(config.device), config.optimize)
-    if scale == 1:
+        return 1.0
+    begun = image_scale_of(work / CHECKPOINT_FILE)
+    if begun is not None:
+        return begun
+    return choose_scale(views.cameras, config.budget, choose_device(config.device), config.optimize)
+
+
+def _at_scale(
+    opened: OpenedScene, scale: float, path: Path, work: Path, config: ReconstructCommandConfig, screen: Console
+) -> OpenedScene:
+    """The scene with photographs that are so many times as large."""
+    views = opened.scene.views
+    if scale == 1 or views is None:
         return opened
     data = replace(config.data, image_scale=scale)
     with warnings.catch_warnings():

@@ -13,6 +13,7 @@ from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.data.scene_paths import DistinctPaths
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
@@ -105,6 +106,7 @@ class ViewConfig(WordsOptions):
 
 def run(config: ViewConfig, summary: Summary) -> None:
     """Serves the page until it is interrupted, or writes it."""
+    DistinctPaths().add(map(Path, config.paths))
     bundle = load_bundle()
     if config.out is not None:
         for path in (config.out, Path(f"{config.out}.summary.json")):

@@ -117,20 +117,21 @@ def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
 
 
 def refuse_to_replace_inputs(out: Path | None, given: Mapping[str, Any]) -> None:
-    """Checks that a folder that is about to be replaced holds none of the inputs.
+    """Checks that a folder that is about to be replaced holds none of the inputs, and that a file is none.
 
     Args:
-        out: the folder.
+        out: the folder or file.
         given: the settings of the run; every text in them that names an existing file or folder is an input.
 
     Raises:
-        InputError: it holds one.
+        InputError: it holds one, or is one.
     """
-    if out is None or not os.path.isdir(out):
+    if out is None or not os.path.exists(out):
         return
     for key, name in _texts({key: value for key, value in given.items() if key != "out"}):
         if os.path.exists(name) and lies_in(name, out):
-            raise InputError(f"{out}: holds the input {key}={name}, so it cannot be replaced; give another out=")
+            holds = "holds" if os.path.isdir(out) else "is"
+            raise InputError(f"{out}: {holds} the input {key}={name}, so it cannot be replaced; give another out=")
 
 
 def lies_in(path: str | Path, folder: str | Path) -> bool:

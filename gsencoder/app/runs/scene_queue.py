@@ -11,7 +11,7 @@ from rich.console import Console
 
 from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.summary import Summary
-from gsencoder.core.errors import BusyError, InputError
+from gsencoder.core.errors import BusyError, InputError, listed
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.files.written_files import SUMMARY_NAME
 from gsencoder.core.runtime.process_rank import refuse_several
@@ -21,6 +21,19 @@ NOT_COMPARED = ("paths", "out", "overwrite", "quiet", "worker", "resume", "devic
 """Settings in which two runs with the same results may differ; what a preset sets is compared."""
 GOLDEN = 0.6180339887
 """Workers begin at the fractional parts of its multiples, which are spread evenly however many there are."""
+
+
+class ScenesFailedError(InputError):
+    """Some of several scenes failed, each of which was said when it did.
+
+    Attributes:
+        reasons: one line a scene.
+    """
+
+    def __init__(self, message: str, reasons: tuple[str, ...]) -> None:
+        super().__init__(message)
+        self.reasons = reasons
+
 
 RunOne = Callable[[Path, Path, Summary], None]
 """Does one scene: its path, the folder for its results, and the summary that goes into it."""
@@ -40,7 +53,8 @@ def run_scenes(
     """Runs a command for one scene into `out`, or for each of several into the folder OUT/NAME.
 
     Of several scenes those are skipped whose folder holds the results of the same settings, and those that another
-    process is writing now. An error in one does not stop the others.
+    process is writing now. An error in one does not stop the others. The summary of each has its own
+    warnings, and those from before the first.
 
     Args:
         paths: the scenes.
@@ -63,7 +77,8 @@ def run_scenes(
         run(paths[0], out or Path("outputs") / name / part, summary)
         return
     first = int(len(paths) * ((worker * GOLDEN) % 1))
-    failures: list[str] = []
+    failures: dict[Path, str] = {}
+    common = tuple(summary.warnings)
     skipped = 0
     for path in (*paths[first:], *paths[:first]):
         name = scene_name(path)
@@ -72,21 +87,25 @@ def run_scenes(
             if not overwrite and _is_finished(target, summary):
                 skipped += 1
                 continue
-            run(path, target, Summary(summary.command, summary.settings))
+            one = Summary(summary.command, summary.settings)
+            # Warnings arrive in the list of the whole run; those of other scenes are no part of this one's record.
+            summary.warnings[:] = common
+            one.warnings = summary.warnings
+            run(path, target, one)
         except BusyError:
             screen.print(f"{target}: another run is writing it now")
         except InputError as error:
             if not overwrite and _was_finished(target, summary):
                 continue
-            failures.append(f"{path}: {error}")
-            print(one_line(f"failed: {path}: {error}"), file=sys.stderr)
+            failures[path] = str(error) if str(error).startswith(f"{path}: ") else f"{path}: {error}"
+            print(one_line(f"failed: {failures[path]}"), file=sys.stderr)
     if skipped:
         screen.print(f"{skipped} of {len(paths)} scenes were finished before")
     if failures:
-        raise InputError(
+        raise ScenesFailedError(
             f"{len(failures)} of {len(paths)} scenes failed, and the same command tries them again: "
-            + "; ".join(failures[:5])
-            + ("; …" if len(failures) > 5 else "")
+            f"{listed([str(path) for path in failures])}",
+            tuple(failures.values()),
         )
 
 

@@ -12,6 +12,7 @@ such a union, with `several="SECTION"`, takes several members of that choice: `s
 options are `sections.NAME.option=value`.
 """
 
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
@@ -36,6 +37,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.removed_options import REMOVED_OPTIONS, check_removed_option
 
 T = TypeVar("T")
+
+NOT_FINITE = "nan is not a finite number"
 
 HIDDEN = "(not shown)"
 """Shown and written in place of the value of a secret option."""
@@ -66,7 +69,8 @@ def _strict(wanted: type, accepted: tuple[type, ...]) -> Any:
     from dacite.exceptions import WrongTypeError
 
     def convert(value: Any) -> Any:
-        if not isinstance(value, accepted) or isinstance(value, bool) or value != value:
+        # NaN passes here, for `typed` to say what the class expects of it.
+        if not isinstance(value, accepted) or isinstance(value, bool):
             raise WrongTypeError(field_type=wanted, value=value)
         return wanted(value)
 
@@ -107,7 +111,7 @@ def _section(annotation: Any, value: Any, key: str) -> Any:
 def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
     """Builds settings from plain dicts, lists and scalars; missing options have their defaults.
 
-    Numbers must be numbers, not text, and NaN is refused.
+    Numbers must be numbers, not text, and NaN is refused, with what the class says of its range.
 
     Raises:
         InputError: an unknown key, a wrong type, or a value that the class refuses; the full key is named.
@@ -130,20 +134,38 @@ def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
         float: _strict(float, (int, float)),
         Path: lambda value: Path(value) if isinstance(value, str) and value else value,
     }
+    nan = next((name for name, value in values.items() if _has_nan(value)), "")
     try:
-        return dacite.from_dict(cls, values, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))
+        built = dacite.from_dict(cls, values, dacite.Config(strict=True, cast=[tuple], type_hooks=hooks))
     except DaciteFieldError as error:
         name = str(error.field_path).partition(".")[0]
         raise InputError(wrong_value(options_by_key(cls, prefix)[prefix + name], data.get(name))) from error
     except InputError as error:
-        raise InputError(_named(str(error), prefix, types)) from error
+        said = nan and str(error).startswith(f"{nan}:") and NOT_FINITE not in str(error)
+        raise InputError(_named(str(error), prefix, types) + (f"; {NOT_FINITE}" if said else "")) from error
+    except (ValueError, OverflowError):
+        # A class that counts with a number before it looks at it.
+        if not nan:
+            raise
+    if nan:
+        raise InputError(f"{wrong_value(options_by_key(cls, prefix)[prefix + nan], data[nan])}; {NOT_FINITE}")
+    return built
+
+
+def _has_nan(value: Any) -> bool:
+    """Whether a value, or one of a list, is the number NaN."""
+    if isinstance(value, (list, tuple)):
+        return any(map(_has_nan, value))
+    return isinstance(value, float) and value != value
 
 
 def _named(message: str, prefix: str, names: Iterable[str]) -> str:
-    """The message of an error of a settings class, with the name of the section before that of the field."""
-    if not prefix or message.partition(":")[0].split("[")[0] in names:
-        return prefix + message
-    return f"{prefix.rstrip('.')}: {message}"
+    """The message of an error of a settings class, with the name of the section before that of each field."""
+    head, _, said = message.partition(":")
+    named = re.split(r"(, | and )", head)
+    if not prefix or any(name.split("[")[0] not in names for name in named[::2]):
+        return f"{prefix.rstrip('.')}: {message}" if prefix else message
+    return f"{''.join(prefix + word if index % 2 == 0 else word for index, word in enumerate(named))}:{said}"
 
 
 def check_required(cls: type, config: object) -> None:

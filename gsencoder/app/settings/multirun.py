@@ -116,7 +116,7 @@ def run_many(
     if failed:
         if launcher != "basic":
             # Jobs in other processes print into logs of their own; workers of one list may fail at the same scenes.
-            for message in dict.fromkeys(failed):
+            for message in dict.fromkeys(line for error in failed for line in error.split("\n")):
                 print(one_line(f"error: {message}"), file=sys.stderr)
         print(f"error: {len(failed)} of {len(errors)} runs failed", file=sys.stderr)
     return 2 if failed else 0

@@ -21,8 +21,10 @@ class Stopped(BaseException):
 
 def stop_of(error: BaseException) -> Stopped | KeyboardInterrupt | None:
     """The signal or interrupt behind an exception, or None. A signal that arrives within a compiled function leaves it
-    wrapped in a `SystemError`."""
-    inner = error.__cause__ or error.__context__ if isinstance(error, SystemError) else error
+    wrapped in a `SystemError`, and in one more for each function that had called it."""
+    inner: BaseException | None = error
+    while isinstance(inner, SystemError):
+        inner = inner.__cause__ or inner.__context__
     return inner if isinstance(inner, Stopped | KeyboardInterrupt) else None
 
 

@@ -5,10 +5,12 @@ loaders do. Work is cut into a fixed number of pieces, so that results do not de
 """
 
 import contextlib
+import functools
 import importlib
 import os
 import sys
 import threading
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -16,6 +18,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Int64
+
+from gsencoder.core.errors import SceneWarning
 
 Result = TypeVar("Result")
 
@@ -25,10 +29,37 @@ PIECES = 32
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compiles a function for `parallel`; reassociation is off, so that sums have one order."""
+    return compiled(function, fastmath={"contract", "nsz"})
+
+
+def compiled(function: Callable[..., Any], **options: Any) -> Any:
+    """Compiles a function that does not hold the GIL, with further options of numba, and stores what was compiled.
+
+    Warns:
+        SceneWarning: it cannot be stored for later runs; once a process.
+    """
     # Threads are also asked for where nothing is compiled, and numba takes half a second to load.
     from numba import njit
 
-    return njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "nsz"})(function)
+    options |= {"nogil": True, "error_model": "numpy"}
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError as error:
+        # A package that another user installed, and no home that can be written, as in some containers.
+        if "no locator available" not in str(error):
+            raise
+        _warn_uncached()
+        return njit(**options)(function)
+
+
+@functools.cache
+def _warn_uncached() -> None:
+    warnings.warn(
+        "compiled kernels cannot be stored beside the package or in the user's cache, so that every run compiles them "
+        "anew, for up to a minute; NUMBA_CACHE_DIR=FOLDER names a folder that can be written",
+        SceneWarning,
+        stacklevel=3,
+    )
 
 
 _here = threading.local()

@@ -74,13 +74,13 @@ class SeedConfig:
 
     def __post_init__(self) -> None:
         if self.source not in ("auto", "depth", "points", "photographs", "mesh", "tsdf"):
-            raise InputError(f"source must be auto, depth, points, photographs, mesh or tsdf, got {self.source!r}")
+            raise InputError(f"source: expected auto, depth, points, photographs, mesh or tsdf, got {self.source!r}")
         for name in ("voxel", "voxel_units", "max_depth"):
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name} must be a positive length, got {value}")
+                raise InputError(f"{name}: expected a positive length, got {value}")
         if not 0 <= self.min_cos < 1:
-            raise InputError(f"min_cos must lie in [0, 1), got {self.min_cos}")
+            raise InputError(f"min_cos: expected a number in [0, 1), got {self.min_cos}")
         if self.source == "mesh" and not self.mesh:
             raise InputError("source=mesh needs the mesh's file (mesh=PATH)")
 

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import imagecodecs
 import numpy as np
 from jaxtyping import Float32, UInt8
 
@@ -202,6 +201,9 @@ def _decode_webp(path: Path, name: str, data: bytes, allowed: int) -> UInt8[np.n
         raise InputError(
             f"{path}: {name} claims {width}×{height} pixels, more than the {allowed:,} that the count allows"
         )
+    # Few scenes need it, and it is slow to import.
+    import imagecodecs
+
     try:
         image = imagecodecs.webp_decode(data, hasalpha=True)
     except (imagecodecs.WebpError, ValueError) as error:

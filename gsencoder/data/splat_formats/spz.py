@@ -16,7 +16,6 @@ import zlib
 from pathlib import Path
 from typing import BinaryIO
 
-import imagecodecs
 import numpy as np
 from jaxtyping import Float64, UInt8
 
@@ -58,6 +57,9 @@ def read_spz(path: Path, stream: BinaryIO, size: int) -> RawSplat:
         raise InputError(
             f"{path}: expected {len(sizes)} streams listed within the file, got {streams} at byte {table:,}"
         )
+    # As in sog.py: imported where it is used.
+    import imagecodecs
+
     parts = []
     for number, wanted in enumerate(sizes):
         packed, unpacked = struct.unpack_from("<QQ", data, table + 16 * number)
@@ -203,6 +205,8 @@ def write_spz(path: Path, stream: BinaryIO | io.BytesIO, raw: RawSplat, *, versi
             stream.write(pack.compress(part))
         stream.write(pack.flush())
         return
+    import imagecodecs
+
     frames = [imagecodecs.zstd_encode(part, level=_ZSTD_LEVEL) for part in parts]
     stream.write(struct.pack("<4sIIBBBBI12x", MAGIC, 4, len(raw), raw.sh_degree, bits, 0, len(parts), 32))
     stream.write(b"".join(struct.pack("<QQ", len(f), len(p)) for f, p in zip(frames, parts, strict=True)))

@@ -3,12 +3,13 @@
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
+
+from gsencoder.core.runtime.threads import compiled
 
 
 # Without fused products, unlike `gsencoder.core.runtime.threads.kernel`: of an edge of two triangles, each then finds a
 # pixel exactly as far on its side as the other finds it beyond, and no pixel between them is left to neither.
-@njit(nogil=True, cache=True, error_model="numpy")
+@compiled
 @no_type_check
 def draw_triangles(local, faces, labels, K, near, inverse, instances):
     """Draws triangles into a buffer of 1/z, which is linear in the picture; the larger one is nearer."""

@@ -49,8 +49,9 @@ class RetrievalProtocol:
     )
 
     def __post_init__(self) -> None:
-        if self.stride < 1 or self.count < 0:
-            raise InputError(f"stride, count: expected 1 and 0 or more, got {self.stride} and {self.count}")
+        for name, least in (("stride", 1), ("count", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

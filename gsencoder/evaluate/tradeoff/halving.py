@@ -29,10 +29,9 @@ class HalvingConfig:
     first: int = field(default=1, metadata={"help": "scenes of the first rung; each rung has 1 / keep times as many"})
 
     def __post_init__(self) -> None:
-        if self.settings < 0 or self.first < 1:
-            raise InputError(
-                f"settings, first: expected 0 or more settings and 1 scene or more, got {self.settings}, {self.first}"
-            )
+        for name, least in (("settings", 0), ("first", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
         if not 0 < self.keep < 1:
             raise InputError(f"keep: expected a share between 0 and 1, got {self.keep}")
 

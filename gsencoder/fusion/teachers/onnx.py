@@ -86,7 +86,7 @@ class OnnxTeacher:
         """
         self.config = config
         if not config.model:
-            raise InputError("teacher onnx: teacher.model= is missing: the .onnx file of the backbone")
+            raise InputError("teacher.model= is missing: the .onnx file of the backbone")
         path = find_file(config.model, "teacher.model")
         self._session = open_session(path, "teacher onnx", threads=config.threads)
         self._path = path

@@ -117,7 +117,7 @@ def radio_folder(config: RadioConfig) -> Path:
         InputError: none is named or there, or a file is.
     """
     if not config.model:
-        raise InputError(f"{WHAT}: teacher.model= is missing: the folder of a RADIO model")
+        raise InputError("teacher.model= is missing: the folder of a RADIO model")
     if config.model.lower().endswith(PICKLED) or Path(config.model).is_file():
         raise InputError(
             f"{WHAT}: teacher.model={config.model} is a file, and files of pickles, such as .pth.tar, are never "

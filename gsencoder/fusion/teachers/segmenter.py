@@ -109,9 +109,7 @@ class SegmenterTeacher:
             InputError: no such model, or names that are missing, of the wrong number, or unknown to `words`.
         """
         if not config.model:
-            raise InputError(
-                "teacher segmenter: teacher.model= is missing: an .onnx file, or a folder for transformers"
-            )
+            raise InputError("teacher.model= is missing: an .onnx file, or a folder for transformers")
         self.config = config
         self._network: Segmenter
         if Path(config.model).suffix.lower() == ".onnx":

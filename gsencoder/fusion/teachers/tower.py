@@ -88,7 +88,7 @@ class TransformersTeacher:
                 preprocessing.
         """
         if not config.model:
-            raise InputError(f"{WHAT}: teacher.model= is missing: the folder of a vision model")
+            raise InputError("teacher.model= is missing: the folder of a vision model")
         folder = find_file(config.model, "teacher.model", folder=True)
         tower = tower_in(folder)
         self._preprocessing = read_preprocessing(folder, WHAT, floats=tower.kind.resizes_floats)

@@ -1,12 +1,13 @@
 """Question sets of benchmarks, as `ask` takes them: ScanQA's, SQA3D's, ScanRefer's and Scan2Cap's files."""
 
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from gsencoder.core.errors import InputError, listed
+from gsencoder.core.errors import InputError, SceneWarning, counted, listed
 from gsencoder.data.truth.entries import Corner, corner_bounds, entries_of, object_of, read_benchmark_json, scene_name
 from gsencoder.data.truth.expressions import Expression, read_scanrefer
 from gsencoder.data.truth.questions import Question as TruthQuestion
@@ -91,6 +92,9 @@ def read_question_set(path: Path, task: Task = "answer", proposals: str = "") ->
 
     Raises:
         InputError: no such file, another task than the benchmark's, or boxes are missing.
+
+    Warns:
+        SceneWarning: scenes without captions, since they have no proposals or no descriptions.
     """
     content = read_benchmark_json(path)
     first = content[0] if isinstance(content, list) and content and isinstance(content[0], dict) else {}
@@ -184,10 +188,16 @@ def _captioned(expressions: Sequence[Expression], path: Path, proposals: str) ->
     if proposals:
         proposed = read_benchmark_json(Path(proposals))
         boxes = _read_boxes(object_of(proposed, proposals, "the boxes of each scene"), Path(proposals))
-        scenes = {each.scene for each in expressions}
-        return QuestionSet(
-            benchmark="scan2cap", questions=_captions({name: rows for name, rows in boxes.items() if name in scenes})
-        )
+        scenes = dict.fromkeys(each.scene for each in expressions)
+        chosen = {name: rows for name, rows in boxes.items() if name in scenes}
+        if not chosen:
+            raise InputError(
+                f"proposals: {proposals} has boxes in {listed(sorted(boxes), 3)}, and {path} describes objects of "
+                f"{listed(sorted(scenes), 3)}; expected the same scenes"
+            )
+        _warn_of_others([name for name in scenes if name not in boxes], f"{proposals} has no boxes in")
+        _warn_of_others([name for name in boxes if name not in scenes], f"{path} describes no object of")
+        return QuestionSet(benchmark="scan2cap", questions=_captions(chosen))
     unboxed = [each for each in expressions if each.aabb is None]
     if unboxed:
         raise InputError(
@@ -203,6 +213,16 @@ def _captioned(expressions: Sequence[Expression], path: Path, proposals: str) ->
             if aabb is not None
         ),
     )
+
+
+def _warn_of_others(scenes: Sequence[str], why: str) -> None:
+    """Says which scenes have no captions."""
+    if scenes:
+        warnings.warn(
+            f"proposals: {why} {counted(len(scenes), 'scene')}, of which there are no captions: {listed(scenes)}",
+            SceneWarning,
+            stacklevel=4,
+        )
 
 
 def _read_boxes(

@@ -58,8 +58,9 @@ class SelectConfig:
             raise InputError(f"share: expected a share between 0 and 1, got {self.share}")
         if not 0 <= self.reach < math.inf:
             raise InputError(f"reach: expected zero or a positive number, got {self.reach}")
-        if self.views < 0 or self.pixels < 1:
-            raise InputError(f"views and pixels: expected 0 or more and 1 or more, got {self.views} and {self.pixels}")
+        for name, least in (("views", 0), ("pixels", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
         check_orbits(self.orbits)
 
 

@@ -52,20 +52,19 @@ class ViewsConfig:
                 raise InputError(f"{name}: expected 1 to {MAX_CANDIDATES}, got {getattr(self, name)}")
         if self.method == "uniform" and self.source == "shells":
             raise InputError("source: expected frames or both with method=uniform, which spreads frames evenly")
-        if not (1 <= self.width <= MAX_PIXELS and 1 <= self.height <= MAX_PIXELS and 1 <= self.fov <= MAX_FOV):
-            raise InputError(
-                f"width, height, fov: expected at most {MAX_PIXELS} pixels and 1 to {MAX_FOV} degrees, "
-                f"got {self.width}, {self.height}, {self.fov}"
-            )
-        if not 1 <= self.frame_side <= MAX_PIXELS:
-            raise InputError(f"frame_side: expected 1 to {MAX_PIXELS} pixels, got {self.frame_side}")
+        for name in ("width", "height", "frame_side"):
+            if not 1 <= getattr(self, name) <= MAX_PIXELS:
+                raise InputError(f"{name}: expected 1 to {MAX_PIXELS} pixels, got {getattr(self, name)}")
+        if not 1 <= self.fov <= MAX_FOV:
+            raise InputError(f"fov: expected 1 to {MAX_FOV:g} degrees, got {self.fov}")
         if not JUDGED_SIDES[0] <= self.judged_side <= JUDGED_SIDES[1]:
             raise InputError(
                 f"judged_side: expected {JUDGED_SIDES[0]} to {JUDGED_SIDES[1]} pixels, got {self.judged_side}"
             )
         if not 0 < self.least_share < self.most_share < 1:
             raise InputError(
-                f"least_share, most_share: expected shares that rise, got {self.least_share}, {self.most_share}"
+                f"least_share, most_share: expected shares that rise between 0 and 1, got {self.least_share}, "
+                f"{self.most_share}"
             )
         for name in ("cover_weight", "context_weight", "spread_weight"):
             if not 0 <= getattr(self, name) <= MAX_WEIGHT:

@@ -83,7 +83,7 @@ def _vectors(config: RegionsConfig, words: Words | None) -> RegionVectors:
     """
     if not config.model:
         raise InputError(
-            f"teacher regions: teacher.model= is missing: the image tower of vector={config.vector}, an .onnx file or "
+            f"teacher.model= is missing: the image tower of vector={config.vector}, an .onnx file or "
             "a folder for transformers"
         )
     text_encoder = words.space.text_encoder if words is not None else ""

@@ -99,7 +99,7 @@ class FileMasks:
         """
         if not folder:
             raise InputError(
-                "teacher regions: teacher.folder= is missing: the folder of label images, one a view; or give "
+                "teacher.folder= is missing: the folder of label images, one a view; or give "
                 "masks=instances or masks=sam"
             )
         if scene.views is None:

@@ -79,7 +79,7 @@ class SamMasks:
             InputError: transformers is missing, or the folder holds no SAM with its preprocessing.
         """
         if not config.sam:
-            raise InputError(f"{WHAT}: teacher.sam= is missing: the folder of a SAM model, for masks=sam")
+            raise InputError("teacher.sam= is missing: the folder of a SAM model, for masks=sam")
         folder = find_file(config.sam, "teacher.sam", folder=True)
         kind = read_config(folder, WHAT).model_type
         if kind not in (*SAM, *SAM2):
