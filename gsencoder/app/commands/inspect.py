@@ -60,16 +60,16 @@ def run(config: InspectConfig, summary: Summary) -> None:
             show(_inspect(path, config, summary, None))
         return
     with output_folder(config.out, overwrite=config.overwrite, summary=summary) as folder:
-        shown = [_inspect(path, config, summary, folder) for path in _paths(config.paths)]
+        reports = [_inspect(path, config, summary, folder) for path in _paths(config.paths)]
     # What was written stays, also if nobody reads what is printed.
-    for lines in shown:
+    for lines in reports:
         show(lines)
 
 
-def _paths(given: tuple[str, ...]) -> list[Path]:
+def _paths(words: tuple[str, ...]) -> list[Path]:
     """Splat files and scenes; a folder of scenes stands for all of them."""
     paths: list[Path] = []
-    for path in map(Path, given):
+    for path in map(Path, words):
         paths += find_scenes([path]) if path.is_dir() and not (path / "meta.json").is_file() else [path]
     return paths
 
