@@ -105,8 +105,8 @@ def test_budgets_of_the_demo_room_are_measured_and_stand_beside_the_promise(demo
 def test_evaluate_scores_the_demo_room(demo: Path, tmp_path: Path) -> None:
     table = demo / "names" / "words.safetensors"
     out = tmp_path / "scores"
-    asked = ["protocol.min_views=1", "protocol.min_pixels=1", f"out={out}", "quiet=true"]
-    assert cli.main(["evaluate", str(demo / "room"), f"teacher.words={table}", *asked]) == 0
+    arguments = ["protocol.min_views=1", "protocol.min_pixels=1", f"out={out}", "quiet=true"]
+    assert cli.main(["evaluate", str(demo / "room"), f"teacher.words={table}", *arguments]) == 0
     results = summary_of(out)["results"]
     ious = list(summary_of(demo)["results"]["names"]["iou"].values())
     assert results["objects"] == 6

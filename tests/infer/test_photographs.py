@@ -132,9 +132,9 @@ def test_photographs_of_other_cameras_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_commands_show_photographs_and_say_so(tmp_path: Path) -> None:
-    taken = load_scene(write_room(tmp_path / "scene", larger=2))
-    assert taken.views is not None
-    save_room(tmp_path / "features", taken.views.names)
+    scene = load_scene(write_room(tmp_path / "scene", larger=2))
+    assert scene.views is not None
+    save_room(tmp_path / "features", scene.views.names)
     quick = ("choose.source=frames", "choose.candidates=12", "choose.count=3", "quiet=true")
     words = [str(tmp_path / "features"), f"photos={tmp_path / 'scene'}", "query=cube", *quick]
     assert cli.main(["views", *words, f"out={tmp_path / 'views'}"]) == 0
@@ -150,28 +150,28 @@ def test_commands_show_photographs_and_say_so(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_photograph_counts_as_sharp_and_solid_however_rough_the_splat_is(tmp_path: Path) -> None:
-    taken = load_scene(write_room(tmp_path / "taken"))
-    bare = kept_room(taken, list(range(COUNT)))
+    scene = load_scene(write_room(tmp_path / "taken"))
+    bare = kept_room(scene, list(range(COUNT)))
     assert bare.gaussians is not None
     thin = replace(bare.gaussians, scales=2 * bare.gaussians.scales, opacities=0.3 * bare.gaussians.opacities)
     rough = replace(bare, gaussians=thin)
     target = target_of("cube", thin, room()[1])
     config = ViewsConfig(source="frames", count=4, candidates=12)
     renders = choose_views(rough, [target], config)
-    photographs = choose_views(with_photographs(rough, taken), [target], config)
-    told = {each.frame: each.target_scores[0] for each in renders.chosen}
-    assert set(told) & {each.frame for each in photographs.chosen}
+    photographs = choose_views(with_photographs(rough, scene), [target], config)
+    scores = {each.frame: each.target_scores[0] for each in renders.chosen}
+    assert set(scores) & {each.frame for each in photographs.chosen}
     for each in photographs.chosen:
         (sight,) = each.target_scores
         assert (sight.alpha, sight.blur) == (1, 0)
-        if each.frame in told:
-            before = told[each.frame]
+        if each.frame in scores:
+            before = scores[each.frame]
             assert before.alpha < 1
             assert before.blur > 0
             assert sight.utility > before.utility
             assert (sight.visible, sight.share, sight.inside) == (before.visible, before.share, before.inside)
     # Cameras around the target show renders still.
-    both = choose_views(with_photographs(rough, taken), [target], ViewsConfig(count=8, candidates=24))
+    both = choose_views(with_photographs(rough, scene), [target], ViewsConfig(count=8, candidates=24))
     placed = [each.target_scores[0] for each in both.chosen if each.frame is None]
     assert placed
     assert all(sight.blur > 0 for sight in placed)

@@ -124,8 +124,8 @@ def test_videos_and_photographs_are_found_in_folders_and_nothing_that_is_hidden(
     for name in ("walk.mp4", ".walk.mp4", "notes.txt"):
         (tmp_path / name).write_bytes(b"")
     posed.rename(tmp_path / ".posed")
-    found = find_photographed([str(tmp_path)])
-    assert [path.name for path in found] == ["photographs", "walk.mp4"]
+    paths = find_photographed([str(tmp_path)])
+    assert [path.name for path in paths] == ["photographs", "walk.mp4"]
     # What is given twice is reconstructed once, and a folder of photographs is not looked into.
     again = find_photographed([str(photographs), str(photographs / ".." / "photographs"), str(tmp_path / "walk.mp4")])
     assert again == (photographs, tmp_path / "walk.mp4")

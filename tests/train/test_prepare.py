@@ -248,11 +248,11 @@ def test_scenes_of_two_spaces_are_refused() -> None:
 
 
 def test_the_space_of_a_dense_teacher_has_the_moments_of_its_maps() -> None:
-    found = dataset_space(
+    space = dataset_space(
         [Path("a"), Path("b")], lambda path: (scene(0), DenseSideTeacher()), FuseConfig(narrow=0), views=4
     )
-    assert found.codebook is None
-    outputs = found.outputs
+    assert space.codebook is None
+    outputs = space.outputs
     np.testing.assert_allclose(outputs.mean, (TABLE[1] + TABLE[2]) / 2, atol=1e-5)
     assert outputs.scale == pytest.approx(np.sqrt(0.5), rel=1e-4)
     assert outputs.basis is not None
