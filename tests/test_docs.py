@@ -260,8 +260,8 @@ def test_options_in_the_text_are_those_of_a_command(page: Path) -> None:
 @each_page
 def test_make_targets_exist(page: Path) -> None:
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    asked = set(re.findall(r"(?:^|\s|`)make ((?:[A-Z]+=\S+ )?[a-z][\w-]*)(?=`|\s+#|$)", text_of(page), re.MULTILINE))
-    assert {name.split()[-1] for name in asked} <= targets
+    calls = set(re.findall(r"(?:^|\s|`)make ((?:[A-Z]+=\S+ )?[a-z][\w-]*)(?=`|\s+#|$)", text_of(page), re.MULTILINE))
+    assert {name.split()[-1] for name in calls} <= targets
 
 
 def loaded(name: str) -> ModuleType:

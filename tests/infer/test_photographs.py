@@ -59,9 +59,9 @@ def kept_room(taken: Scene, order: list[int]) -> Scene:
 
 @pytest.mark.parametrize("larger", [1, 3])
 def test_each_frame_gets_its_own_photograph_in_the_size_of_its_camera(tmp_path: Path, larger: int) -> None:
-    taken = load_scene(write_room(tmp_path, larger=larger))
+    room = load_scene(write_room(tmp_path, larger=larger))
     order = [5, 0, 11]
-    scene = with_photographs(kept_room(taken, order), taken)
+    scene = with_photographs(kept_room(room, order), room)
     assert scene.views is not None
     assert scene.views.images is not None
     for frame, view in enumerate(order):
@@ -109,25 +109,25 @@ def test_large_frames_are_shown_no_larger_than_asked() -> None:
 
 
 def test_photographs_of_other_cameras_are_refused(tmp_path: Path) -> None:
-    taken = load_scene(write_room(tmp_path / "all"))
-    scene = kept_room(taken, list(range(COUNT)))
-    assert taken.views is not None
-    cameras = taken.views.cameras
+    room = load_scene(write_room(tmp_path / "all"))
+    scene = kept_room(room, list(range(COUNT)))
+    assert room.views is not None
+    cameras = room.views.cameras
     poses, focal = cameras.cam_from_world.copy(), cameras.Ks.copy()
     poses[2, :3, 3] += 0.05
     focal[4, :2, :2] *= 1.1
     for wrong in (replace(cameras, cam_from_world=poses), replace(cameras, Ks=focal)):
-        other = replace(taken, views=replace(taken.views, cameras=wrong))
+        other = replace(room, views=replace(room.views, cameras=wrong))
         with pytest.raises(InputError, match="1 of 12 differ"):
             with_photographs(scene, other)
     with pytest.raises(InputError, match="12 of 12 differ"):
-        with_photographs(replace(scene, origin=ORIGIN + 1), taken)
+        with_photographs(replace(scene, origin=ORIGIN + 1), room)
     with pytest.raises(InputError, match="no photograph of 4 of 12 frames"):
         with_photographs(scene, load_scene(write_room(tmp_path / "some", 8)))
     with pytest.raises(InputError, match="has no photographs"):
         with_photographs(scene, scene)
     with pytest.raises(InputError, match="have no cameras"):
-        with_photographs(replace(scene, views=None), taken)
+        with_photographs(replace(scene, views=None), room)
 
 
 @pytest.mark.slow

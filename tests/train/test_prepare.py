@@ -33,8 +33,8 @@ def test_targets_are_the_fused_features_in_standard_units(tmp_path: Path) -> Non
     np.testing.assert_array_equal(np.flatnonzero(one.weights), rows)
     np.testing.assert_allclose(outputs.restore(one.targets(rows)), fused.features[rows], atol=5e-3)
     assert codebook is not None
-    found = {tuple(row) for row in np.round(outputs.restore(codebook), 4).tolist()}
-    assert found == {tuple(row) for row in TABLE.tolist()}
+    kinds = {tuple(row) for row in np.round(outputs.restore(codebook), 4).tolist()}
+    assert kinds == {tuple(row) for row in TABLE.tolist()}
 
 
 def test_a_prepared_scene_gives_back_its_gaussians_and_cameras(tmp_path: Path) -> None:

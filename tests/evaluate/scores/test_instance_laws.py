@@ -119,8 +119,8 @@ def test_masks_begin_anew_and_may_be_empty() -> None:
 
 def test_places_count_from_one_and_other_classes_are_counted_beside() -> None:
     truth = [NamedInstance(scene="s", object=str(k), name=name) for k, name in enumerate(("a", "b", "a", "z"))]
-    said = [("b", "a"), (), ("a",)]
-    ranked = [RankedNames(scene="s", object=str(k), names=names) for k, names in enumerate(said)]
+    ranked_names = [("b", "a"), (), ("a",)]
+    ranked = [RankedNames(scene="s", object=str(k), names=names) for k, names in enumerate(ranked_names)]
     results, others = recognize(ranked, truth, ["a", "b"])
     assert [(each.rank, each.first) for each in results] == [(2, "b"), (0, None), (1, "a")]
     assert others == 1
