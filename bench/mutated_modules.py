@@ -28,6 +28,7 @@ SCENE_FILES = {
             "tests/data/test_layouts.py",
             "tests/data/test_scenes.py",
             "tests/data/test_transforms_json.py",
+            "tests/data/test_transforms_refusals.py",
         )
         for name in FILES
     },
@@ -37,7 +38,7 @@ SCENE_FILES = {
     "types/scene": ("tests/test_types.py",),
 }
 """Modules that read, check and seed scenes of others, drawn with `--scenes`, and the tests that belong to them."""
-SEGMENTER = "tests/fusion/test_segmenter.py"
+SEGMENTER = ("tests/fusion/test_segmenter.py", "tests/fusion/test_segmenter_settings.py")
 TOWERS = ("build", "embedding_cache", "onnx_tower", "open_vocabulary", "towers", "transformers_tower")
 SEGMENTERS = ("build", "segmenter", "segmenter_classes", "segmenter_onnx", "segmenter_transformers")
 WORD_FILES = {
@@ -46,14 +47,14 @@ WORD_FILES = {
         "tests/core/test_pretrained.py",
         "tests/text/test_transformers_tower.py",
         "tests/fusion/test_radio.py",
-        SEGMENTER,
+        *SEGMENTER,
     ),
-    **{f"fusion/teachers/{name}": (SEGMENTER, "tests/fusion/test_teachers.py") for name in SEGMENTERS},
-    "fusion/lift": ("tests/fusion/test_lift.py", SEGMENTER, "tests/fusion/test_fuse.py"),
+    **{f"fusion/teachers/{name}": (*SEGMENTER, "tests/fusion/test_teachers.py") for name in SEGMENTERS},
+    "fusion/lift": ("tests/fusion/test_lift.py", *SEGMENTER, "tests/fusion/test_fuse.py"),
     "fusion/interior_views": ("tests/fusion/test_interior_views.py",),
     "fusion/orbit_views": ("tests/fusion/test_interior_views.py",),
-    "fusion/teacher_maps": ("tests/fusion/test_teacher_maps.py", SEGMENTER),
-    "types/features": ("tests/test_types.py", SEGMENTER),
+    "fusion/teacher_maps": ("tests/fusion/test_teacher_maps.py", *SEGMENTER),
+    "types/features": ("tests/test_types.py", *SEGMENTER),
     "infer/localize/presence": ("tests/infer/test_presence.py",),
     "infer/localize/threshold": ("tests/infer/test_presence.py", "tests/infer/test_relevancy.py"),
     **{f"reconstruct/{name}": (f"tests/reconstruct/test_{name}.py",) for name in ("exposure_prediction", "budget")},
@@ -65,6 +66,8 @@ SCORE_TESTS = {
         "answers": ("answers", "lemmas", "sentences"),
         "dense_captions": ("dense_captions",),
         "instances": ("instance_masks", "instance_matches", "instances"),
+        "instance_orders": ("instance_masks", "instance_matches", "instances"),
+        "instance_refusals": ("instance_masks", "instance_matches", "instances"),
         "java_metrics": ("java_metrics",),
         "means": ("means",),
         "ngrams": ("ngrams",),

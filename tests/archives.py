@@ -24,8 +24,8 @@ def rewrite(
     path: Path, arrays: Mapping[str, np.ndarray] | None = None, header: Mapping[str, Any] | None = None
 ) -> None:
     """Writes an archive again with other arrays, or another header, and the checksums of these."""
-    given = load_file(path) if arrays is None else arrays
-    write_archive(path, given, header_of(path) if header is None else header)
+    contents = load_file(path) if arrays is None else arrays
+    write_archive(path, contents, header_of(path) if header is None else header)
 
 
 def as_version_1(path: Path) -> None:

@@ -220,8 +220,8 @@ def _remembered(given: Path) -> None:
 
 
 def _named(given: Path) -> None:
-    asked = ("protocol=recognition", "seeds.voxel=0.1", f"out={given / 'named'}")
-    _run("evaluate", str(given / "room"), _words(given), *asked)
+    arguments = ("protocol=recognition", "seeds.voxel=0.1", f"out={given / 'named'}")
+    _run("evaluate", str(given / "room"), _words(given), *arguments)
 
 
 def _model(given: Path) -> None:

@@ -12,8 +12,8 @@ QUICK = ("quiet=true", "optimize.steps=12", "holdout=4", "seeds.voxel=0.08", "op
 
 
 def summary_of(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    return found
+    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return summary
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

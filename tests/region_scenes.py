@@ -1,5 +1,6 @@
 """A small scene with label images in a folder, that tests of `teacher=regions` stand on."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,9 @@ from onnx import TensorProto, helper
 from scene_files import save
 from splats import front_camera, random_gaussians
 
+from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.teachers.build import build_teacher
+from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.text.towers import unit
 from gsencoder.types import Cameras, Scene, SceneObject, Views
@@ -44,11 +48,11 @@ def region_scene(folder: Path | None = None, *, names: Sequence[str] = NAMES, **
         heights=np.repeat(one.heights, 2),
     )
     images = [rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(2)]
-    given = {"images": images, **views}
+    fields = {"images": images, **views}
     return Scene(
         name="s",
         gaussians=random_gaussians(150),
-        views=Views(cameras=cameras, names=tuple(names), **given),
+        views=Views(cameras=cameras, names=tuple(names), **fields),
         folder=folder,
     )
 
@@ -79,3 +83,15 @@ def save_colors(path: Path) -> Path:
 def save_pool(path: Path) -> Path:
     """The mean color of a picture."""
     return save_net(path, helper.make_node("GlobalAveragePool", ["image"], ["out"]))
+
+
+WORDS = toy_words("mug", "table", "lamp")
+CAPTIONS: dict[str, Any] = {"1": "mug", "7": "table", "9": "lamp"}
+
+
+def captioned_teacher(
+    scene: Scene, masks: Path, captions: Any = CAPTIONS, words: TextTable | None = WORDS, **options: Any
+) -> Teacher:
+    if captions is not None:
+        (masks / "captions.json").write_text(json.dumps(captions))
+    return build_teacher(RegionsConfig(folder=str(masks), **options), scene, words)

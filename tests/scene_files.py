@@ -1,5 +1,6 @@
 """Writes small posed scenes in every layout that the readers know. The cameras look down on the origin."""
 
+import copy
 import json
 import math
 from pathlib import Path
@@ -136,3 +137,11 @@ def some_gaussians(means: np.ndarray, opacities: np.ndarray | None = None, scale
         opacities=np.ones(n, np.float32) if opacities is None else opacities.astype(np.float32),
         sh=np.zeros((n, 1, 3), np.float32),
     )
+
+
+def change(folder: Path, data: dict[str, Any], frame: int = 1, **values: Any) -> Path:
+    """Saves the scene with some values of one frame set; None removes a value."""
+    data = copy.deepcopy(data)
+    data["frames"][frame] |= values
+    data["frames"][frame] = {key: value for key, value in data["frames"][frame].items() if value is not None}
+    return rewrite(folder, data)

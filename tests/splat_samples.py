@@ -158,11 +158,11 @@ def spz2_bytes(xyz: np.ndarray, count: int = 5) -> bytes:
 def valid_files(folder: Path) -> dict[str, bytes]:
     """The bytes of a small valid file for every format, by suffix; the key tells variants apart before the dot."""
     gaussians = make_gaussians(40, 1)
-    found = {}
+    files = {}
     for name in ("a.ply", "a.compressed.ply", "a.spz", "v3.spz"):
         save_splat(folder / name, gaussians, spz_version=3 if name.startswith("v3") else 4)
-        found[name] = (folder / name).read_bytes()
-    found["ascii.ply"] = ply_bytes(ply_columns(make_raw(6, 0)), "ascii")
-    found["a.splat"] = dotsplat_bytes()
-    found["a.sog"] = zipped(sog_files())
-    return found
+        files[name] = (folder / name).read_bytes()
+    files["ascii.ply"] = ply_bytes(ply_columns(make_raw(6, 0)), "ascii")
+    files["a.splat"] = dotsplat_bytes()
+    files["a.sog"] = zipped(sog_files())
+    return files

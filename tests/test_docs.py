@@ -219,9 +219,9 @@ def complaint(line: str, made_on_the_page: set[str]) -> str:
     any_value = {word for word in settings if PLACEHOLDER.search(word.partition("=")[2]) or word.endswith("=")}
     try:
         read_words(sorted(any_value), choices(command), sweep=sweep)
-        _, given = read_words([word for word in settings if word not in any_value], choices(command), sweep=sweep)
+        _, texts = read_words([word for word in settings if word not in any_value], choices(command), sweep=sweep)
         overrides(
-            {key: value for key, value in given.items() if not key.startswith("hydra")}, choices(command), sweep=sweep
+            {key: value for key, value in texts.items() if not key.startswith("hydra")}, choices(command), sweep=sweep
         )
     except InputError as error:
         return f"{line}: {error}"
@@ -260,8 +260,8 @@ def test_options_in_the_text_are_those_of_a_command(page: Path) -> None:
 @each_page
 def test_make_targets_exist(page: Path) -> None:
     targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    asked = set(re.findall(r"(?:^|\s|`)make ((?:[A-Z]+=\S+ )?[a-z][\w-]*)(?=`|\s+#|$)", text_of(page), re.MULTILINE))
-    assert {name.split()[-1] for name in asked} <= targets
+    calls = set(re.findall(r"(?:^|\s|`)make ((?:[A-Z]+=\S+ )?[a-z][\w-]*)(?=`|\s+#|$)", text_of(page), re.MULTILINE))
+    assert {name.split()[-1] for name in calls} <= targets
 
 
 def loaded(name: str) -> ModuleType:

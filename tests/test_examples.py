@@ -1,4 +1,4 @@
-"""The numbered examples run on the demo's room, and print and write what they say; the fifth in infer/test_onnx.py."""
+"""The numbered examples run on the demo's room, and print and write what they say; the fifth in infer/."""
 
 import os
 import re

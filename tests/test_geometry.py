@@ -75,8 +75,8 @@ def test_the_pinhole_and_poses_of_tensors_are_those_of_arrays(kind: type) -> Non
         tensors = torch.from_numpy(np.ascontiguousarray(local)), torch.from_numpy(K)
         for min_depth in (None, 0.7):
             pixels = numpy_cameras.project_points(local, K, min_depth=min_depth)
-            found = project_points(*tensors, min_depth=min_depth)
-            np.testing.assert_allclose(found.numpy(), pixels, rtol=10 * eps, atol=1e4 * eps)
+            projection = project_points(*tensors, min_depth=min_depth)
+            np.testing.assert_allclose(projection.numpy(), pixels, rtol=10 * eps, atol=1e4 * eps)
         back = unproject_points(torch.from_numpy(pixels.copy()), tensors[0][:, 2], tensors[1])
         again = numpy_cameras.unproject_points(pixels, local[:, 2], K)
         np.testing.assert_allclose(back.numpy(), again, rtol=10 * eps, atol=50 * eps)
@@ -98,11 +98,11 @@ def test_the_middle_of_a_projected_gaussian_is_its_projected_mean() -> None:
     shapes = random_quats(n), torch.full((n, 3), 0.1, dtype=torch.float64), torch.ones(n, dtype=torch.float64)
     for view in range(len(cameras)):
         pose, K = (torch.from_numpy(array[view]).double() for array in (cameras.cam_from_world, cameras.Ks))
-        found = project(points, *shapes, pose, K, int(cameras.widths[view]), int(cameras.heights[view]))
+        projection = project(points, *shapes, pose, K, int(cameras.widths[view]), int(cameras.heights[view]))
         local = transform(pose, points)
-        torch.testing.assert_close(found.means2d[found.valid], project_points(local, K)[found.valid])
-        torch.testing.assert_close(found.depths[found.valid], local[found.valid, 2])
-        touching += int(found.valid.sum())
+        torch.testing.assert_close(projection.means2d[projection.valid], project_points(local, K)[projection.valid])
+        torch.testing.assert_close(projection.depths[projection.valid], local[projection.valid, 2])
+        touching += int(projection.valid.sum())
     assert touching > 100
 
 
@@ -202,8 +202,8 @@ def test_a_color_depends_on_the_direction_from_the_camera_and_not_on_the_distanc
     expected = np.maximum(np.einsum("nk,nkc->nc", basis, sh) + 0.5, 0)
     assert (expected == 0).any()
     for distance in (0.01, 1.0, 1000.0):
-        found = colors_from_sh(*map(torch.from_numpy, (sh, center + distance * away, center)))
-        np.testing.assert_allclose(found.numpy(), expected, atol=1e-9)
+        colors = colors_from_sh(*map(torch.from_numpy, (sh, center + distance * away, center)))
+        np.testing.assert_allclose(colors.numpy(), expected, atol=1e-9)
 
 
 def test_projection_is_ewa_splatting_with_the_jacobian_clamped_beyond_the_image() -> None:
@@ -218,30 +218,30 @@ def test_projection_is_ewa_splatting_with_the_jacobian_clamped_beyond_the_image(
     quats, scales = rng.normal(size=(n, 4)), rng.uniform(0.01, 0.3, (n, 3))
     opacities = rng.choice([0.001, 1 / 255 + 1e-6, 0.3, 1.0], n)
     arrays = (torch.from_numpy(array) for array in (means, quats, scales, opacities, pose, K))
-    found = project(*arrays, width, height, eps2d=eps2d, near=near)
+    projection = project(*arrays, width, height, eps2d=eps2d, near=near)
     turns = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
     for i, (x, y, z) in enumerate(local):
         if z <= near:
-            assert not found.valid[i]
+            assert not projection.valid[i]
             continue
         slack = 0.15 * width / 50, 0.15 * height / 60
         tx = np.clip(x / z, -25 / 50 - slack[0], (width - 25) / 50 + slack[0])
         ty = np.clip(y / z, -30 / 60 - slack[1], (height - 30) / 60 + slack[1])
         half = np.array([[50, 0, -50 * tx], [0, 60, -60 * ty]]) / z @ pose[:3, :3] @ turns[i] * scales[i]
         covariance = half @ half.T + eps2d * np.eye(2)
-        a, b, c = found.conics[i].tolist()
+        a, b, c = projection.conics[i].tolist()
         np.testing.assert_allclose([[a, b], [b, c]], np.linalg.inv(covariance), rtol=1e-9)
         mean = np.array([50 * x / z + 25, 60 * y / z + 30])
-        np.testing.assert_allclose(found.means2d[i].numpy(), mean)
-        assert found.depths[i].item() == pytest.approx(z)
+        np.testing.assert_allclose(projection.means2d[i].numpy(), mean)
+        assert projection.depths[i].item() == pytest.approx(z)
         # At the ellipse's rim a Gaussian's alpha is just what still marks a pixel.
         radius2 = 2 * np.log(max(opacities[i] * 255, 1))
-        assert found.mahalanobis2[i].item() == pytest.approx(radius2, abs=1e-12)
+        assert projection.mahalanobis2[i].item() == pytest.approx(radius2, abs=1e-12)
         extent = np.sqrt(radius2 * np.diag(covariance))
-        np.testing.assert_allclose(found.extents[i].numpy(), extent, atol=1e-9)
+        np.testing.assert_allclose(projection.extents[i].numpy(), extent, atol=1e-9)
         touches = (mean + extent > 0).all() and (mean - extent < [width, height]).all()
-        assert found.valid[i].item() == (touches and opacities[i] > 1 / 255)
-    assert 0.1 < found.valid.double().mean() < 0.9
+        assert projection.valid[i].item() == (touches and opacities[i] > 1 / 255)
+    assert 0.1 < projection.valid.double().mean() < 0.9
 
 
 def test_the_value_of_each_harmonic_in_simple_directions() -> None:

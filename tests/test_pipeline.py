@@ -105,8 +105,8 @@ def test_budgets_of_the_demo_room_are_measured_and_stand_beside_the_promise(demo
 def test_evaluate_scores_the_demo_room(demo: Path, tmp_path: Path) -> None:
     table = demo / "names" / "words.safetensors"
     out = tmp_path / "scores"
-    asked = ["protocol.min_views=1", "protocol.min_pixels=1", f"out={out}", "quiet=true"]
-    assert cli.main(["evaluate", str(demo / "room"), f"teacher.words={table}", *asked]) == 0
+    arguments = ["protocol.min_views=1", "protocol.min_pixels=1", f"out={out}", "quiet=true"]
+    assert cli.main(["evaluate", str(demo / "room"), f"teacher.words={table}", *arguments]) == 0
     results = summary_of(out)["results"]
     ious = list(summary_of(demo)["results"]["names"]["iou"].values())
     assert results["objects"] == 6
@@ -127,11 +127,11 @@ def test_a_room_a_million_metres_away_gives_the_same_boxes_there(demo: Path, tmp
     (far / "transforms.json").write_text(json.dumps(transforms))
     boxes = {}
     for name, room in (("near", demo / "room"), ("far", far)):
-        features, found = tmp_path / f"{name} features", tmp_path / f"{name} boxes"
+        features, box_folder = tmp_path / f"{name} features", tmp_path / f"{name} boxes"
         assert cli.main(["fuse", str(room), "teacher=palette", f"out={features}", "quiet=true"]) == 0
         words = ["query=red,orange", "pictures=0", "quiet=true"]
-        assert cli.main(["localize", str(features), *words, f"out={found}"]) == 0
-        boxes[name] = summary_of(found)["results"]["boxes"]
+        assert cli.main(["localize", str(features), *words, f"out={box_folder}"]) == 0
+        boxes[name] = summary_of(box_folder)["results"]["boxes"]
     assert len(boxes["far"]) == len(boxes["near"]) > 0
     best = [next(box for box in boxes[name] if box["query"] == "red") for name in ("near", "far")]
     corners = [np.array([box["aabb_min"], box["aabb_max"]]) for box in best]

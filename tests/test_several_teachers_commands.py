@@ -101,7 +101,7 @@ def test_encoding_writes_the_features_of_all_teachers_or_of_those_that_are_named
     assert cli.main([*words, "spaces=palette", f"out={tmp_path / 'one'}"]) == 0
     (only,) = load_features(tmp_path / "one").features.values()
     np.testing.assert_array_equal(only.features, scene.features["palette"].features)
-    asked = [
+    arguments = [
         "localize",
         str(tmp_path / "one"),
         "query=red",
@@ -109,7 +109,7 @@ def test_encoding_writes_the_features_of_all_teachers_or_of_those_that_are_named
         "localize.min_probability=0",
         "quiet=true",
     ]
-    assert cli.main([*asked, "pictures=0", f"out={tmp_path / 'red'}"]) == 0
+    assert cli.main([*arguments, "pictures=0", f"out={tmp_path / 'red'}"]) == 0
     assert {path.name for path in (tmp_path / "one").iterdir()} >= {"features.safetensors", "words.safetensors"}
     assert "got 'depth'" in refusal(capsys, *words[:3], "spaces=[depth,labels]", f"out={tmp_path / 'none'}")
     (encoded / "words.labels.safetensors").rename(tmp_path / "lost")

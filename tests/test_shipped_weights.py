@@ -65,8 +65,8 @@ def test_phrases_lead_into_the_space_of_a_sentence_encoder(shared: Path, monkeyp
     assert scene.gaussians is not None
     encoded = encoder.encode_spaces(scene.gaussians)
     words = words_of_table(encoder.tables["labels"])
-    asked = localize(replace(scene, features=encoded), ["something to sit on"], words, space="labels")
-    best = asked.boxes[0]
+    localization = localize(replace(scene, features=encoded), ["something to sit on"], words, space="labels")
+    best = localization.boxes[0]
     seats = [each for each in scene.objects if each.name in ("chair", "sofa")]
     assert max(aabb_iou(best.aabb_min, best.aabb_max, each.aabb_min, each.aabb_max) for each in seats) >= 0.25
     # DINOv2 has no words.

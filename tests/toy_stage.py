@@ -7,6 +7,7 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.knobs import Knob
+from gsencoder.evaluate.tradeoff.records import Record, Timing
 from gsencoder.evaluate.tradeoff.stage import Judged, Score, Stage
 
 
@@ -61,3 +62,10 @@ class ToyScene:
         self._toy.judged.append((self._name, settings))
         scores = {"error": Score(1 / settings.effort), "acc_25": Score(settings.effort, 8)}
         return Judged(scores=scores, bytes=100 * settings.effort)
+
+
+def record(scene: str, cpu: list[float], scores: dict[str, Score] | None = None, **knobs: int) -> Record:
+    timings = tuple(Timing(seconds=2 * value, cpu_seconds=value, mib=10.0) for value in cpu)
+    return Record(
+        stage="fusion", scene=scene, knobs=knobs, timings=timings, judged=Judged(scores=scores or {}, bytes=1)
+    )

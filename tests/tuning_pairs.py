@@ -41,8 +41,8 @@ def make_pairs(
     for number in range(count):
         text = f"Question: what is number {number // 5} of the {THINGS[number % 5]}?"
         shown = [png(number % 5 + 10 * each) for each in range(pictures)]
-        given = None if tokens is None else (tokens + 0.1 * number).astype(np.float16)
-        prompt = store.add(f"key {number}", text, shown, given, "" if tokens is None else "space")
+        features = None if tokens is None else (tokens + 0.1 * number).astype(np.float16)
+        prompt = store.add(f"key {number}", text, shown, features, "" if tokens is None else "space")
         answer = ANSWERS[(number + number // 5) % len(ANSWERS)]
         pairs.append(TuningPair(name=f"question {number}", prompt=prompt, answers=(answer,)))
     return pairs, store

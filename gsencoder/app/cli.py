@@ -157,9 +157,9 @@ def _split_flags(words: Sequence[str]) -> tuple[set[str], list[str]]:
         elif SHORT.get(word, word) in FLAGS:
             flags.add(SHORT.get(word, word))
         else:
-            shown = without_value(word)
-            hint = f"; settings are written {shown.lstrip('-')}" if "=" in word else near(word, FLAGS)
-            raise InputError(f"{shown}: no such flag{hint}")
+            flag = without_value(word)
+            hint = f"; settings are written {flag.lstrip('-')}" if "=" in word else near(word, FLAGS)
+            raise InputError(f"{flag}: no such flag{hint}")
     return flags, rest
 
 
@@ -173,8 +173,8 @@ def _dispatch(words: Sequence[str]) -> int:
         return 0
     name, *words = rest
     if name not in COMMANDS:
-        shown = without_value(name)
-        raise InputError(f"{shown}: no such command{near(shown, COMMANDS)} (gsencoder --help lists them)")
+        bare_name = without_value(name)
+        raise InputError(f"{bare_name}: no such command{near(bare_name, COMMANDS)} (gsencoder --help lists them)")
     command = COMMANDS[name]
     cls, _ = command.load()
     if "--help" in flags:
@@ -211,9 +211,9 @@ def _run(command: Command, config: Any, debug: bool) -> None:
         refuse_several(command.name, f"start it once; {together} are the commands that processes run together")
     cls, run = command.load()
     check_required(cls, config)
-    given = settings(config)
-    refuse_to_replace_inputs(config.out, given)
-    summary = Summary(command.name, given)
+    values = settings(config)
+    refuse_to_replace_inputs(config.out, values)
+    summary = Summary(command.name, values)
     with _collected_warnings(summary.warnings, debug):
         run(config, summary)
 

@@ -41,17 +41,17 @@ def make_views(
     Raises:
         InputError: no picture, a picture or depth of the wrong size, a camera that cannot be undistorted.
     """
-    chosen = posed.images
-    if not chosen:
+    images = posed.images
+    if not images:
         raise InputError(f"{posed.source}: no view")
     if max_views:
-        chosen = tuple(chosen[row] for row in even_indices(len(chosen), max_views))
-    cam_from_world = np.stack([image.cam_from_world for image in chosen])
+        images = tuple(images[row] for row in even_indices(len(images), max_views))
+    cam_from_world = np.stack([image.cam_from_world for image in images])
     origin = choose_origin(invert_rigid(cam_from_world)[:, :3, 3])
     pinholes: dict[CameraModel, Pinhole] = {}
     grids, depth_grids = [], []
     transparent: list[Path | None] = []
-    for image in chosen:
+    for image in images:
         where = f"{posed.source}: view {image.name[:120]!r}"
         if image.camera not in pinholes:
             pinholes[image.camera] = pinhole_for(image.camera, where)
@@ -69,27 +69,27 @@ def make_views(
         widths=np.array([grid.width for grid in grids], np.int32),
         heights=np.array([grid.height for grid in grids], np.int32),
     )
-    depths = [image.depth for image in chosen]
-    masks = [image.mask for image in chosen]
-    instances = [image.instance for image in chosen]
+    depths = [image.depth for image in images]
+    masks = [image.mask for image in images]
+    instances = [image.instance for image in images]
     partial = _have_empty_pixels(list({(grid.pinhole, grid.source): grid for grid in grids}), remaps)
     background = None
-    if mask_background and not _any(masks) and not _any(transparent) and not any(map(_is_fisheye, chosen)):
-        background = find_background([image.image for image in chosen])
-    outlined = transparent if background is None else [image.image for image in chosen]
+    if mask_background and not _any(masks) and not _any(transparent) and not any(map(_is_fisheye, images)):
+        background = find_background([image.image for image in images])
+    outlined = transparent if background is None else [image.image for image in images]
     has_outlines = _any(outlined)
     views = Views(
         cameras=cameras,
-        names=tuple(image.name for image in chosen),
-        images=ImageFiles([image.image for image in chosen], grids, remaps),
-        depths=DepthFiles(depths, depth_grids, remaps, [_depth_sensor(image) for image in chosen])
+        names=tuple(image.name for image in images),
+        images=ImageFiles([image.image for image in images], grids, remaps),
+        depths=DepthFiles(depths, depth_grids, remaps, [_depth_sensor(image) for image in images])
         if _any(depths)
         else None,
         masks=MaskFiles(masks, grids, remaps, outlined, background) if _any(masks) or has_outlines or partial else None,
         empty=EmptyFiles(masks, grids, remaps, outlined, background) if has_outlines else None,
         instances=InstanceFiles(instances, grids, remaps) if _any(instances) else None,
     )
-    _warn_of_odd_files(posed.source, chosen)
+    _warn_of_odd_files(posed.source, images)
     if background is not None:
         if _is_measured(views):
             return make_views(posed, max_views=max_views, image_scale=image_scale)
@@ -162,10 +162,10 @@ def _check_sizes(image: PosedImage, depth_camera: CameraModel, where: str) -> bo
             f"{where}: {image.image} has {size[0]}×{size[1]} pixels but its camera {camera.width}×{camera.height}; "
             "give the images at the size of the intrinsics (image_scale makes them smaller on load)"
         )
-    for file, wanted in ((image.depth, depth_camera), (image.mask, camera), (image.instance, camera)):
+    for file, expected in ((image.depth, depth_camera), (image.mask, camera), (image.instance, camera)):
         if file is not None:
             actual = picture_size(file)
-            if actual != (wanted.width, wanted.height):
+            if actual != (expected.width, expected.height):
                 raise InputError(
                     f"{where}: {file} has {actual[0]}×{actual[1]} pixels but {image.image} has {size[0]}×{size[1]}; "
                     "both must have the same size"

@@ -174,18 +174,18 @@ def _depth_facts(scene: Scene, posed: PosedImages) -> DepthFacts | None:
     views = scene.views
     if views is None or views.depths is None:
         return None
-    known, pixels, values = 0, 0, []
+    measured_pixels, pixels, values = 0, 0, []
     for view in even_indices(len(views), MAX_DEPTH_IMAGES):
         depth = views.depths[int(view)]
         measured = depth[depth > 0]
-        known, pixels = known + len(measured), pixels + depth.size
+        measured_pixels, pixels = measured_pixels + len(measured), pixels + depth.size
         values.append(measured[:: max(1, len(measured) // 10_000)])
     sample = np.concatenate(values)
     near, far = np.percentile(sample, (1, 99)) if len(sample) else (float("nan"),) * 2
     sensors = {_sensor(image) for image in posed.images if image.depth is not None} - {""}
     return DepthFacts(
         views=sum(image.depth is not None for image in posed.images),
-        coverage=known / max(1, pixels),
+        coverage=measured_pixels / max(1, pixels),
         near=float(near),
         far=float(far),
         sensor="; ".join(sorted(sensors)[:2]),
@@ -206,15 +206,15 @@ def _sensor(image: PosedImage) -> str:
 def _missing(scene: Scene, up: Up | None) -> tuple[str, ...]:
     views = scene.views
     assert views is not None
-    missing = []
+    gaps = []
     if views.depths is None and scene.sfm_points is None:
-        missing.append("depth and points: seeds are triangulated from the photographs")
+        gaps.append("depth and points: seeds are triangulated from the photographs")
     elif views.depths is None:
-        missing.append("depth: visibility is tested against rendered depth, and seeds come from the points")
+        gaps.append("depth: visibility is tested against rendered depth, and seeds come from the points")
     if len(views) > 1 and not np.ptp(views.cameras.centers, axis=0).any():
-        missing.append("baselines: all cameras stand in one place, so that photographs alone say nothing about depth")
+        gaps.append("baselines: all cameras stand in one place, so that photographs alone say nothing about depth")
     if scene.metres_per_unit is None:
-        missing.append("unit of length: sizes are in world units (metres_per_unit=)")
+        gaps.append("unit of length: sizes are in world units (metres_per_unit=)")
     if up is None or up.source != "stated":
-        missing.append("up: it is estimated" if up is not None else "up: boxes have any orientation")
-    return tuple(missing)
+        gaps.append("up: it is estimated" if up is not None else "up: boxes have any orientation")
+    return tuple(gaps)

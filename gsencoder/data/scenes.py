@@ -194,7 +194,7 @@ def read_posed(root: Path, options: SceneConfig = SceneConfig()) -> tuple[PosedI
     Raises:
         InputError: a file is wrong.
     """
-    read = ReadOptions(
+    read_options = ReadOptions(
         allow_outside=options.allow_outside,
         depth_scale=options.depth_scale,
         images=options.images,
@@ -204,13 +204,13 @@ def read_posed(root: Path, options: SceneConfig = SceneConfig()) -> tuple[PosedI
         if not is_transforms_file(root):
             return None, root.parent, "splat"
         name = "transforms.json"
-        posed, folder = read_transforms_file(root, read)
+        posed, folder = read_transforms_file(root, read_options)
     else:
         layout = layout_of(root)
         if layout is None:
             return None, root, "splat"
         name = layout.name
-        posed, folder = layout.read(root, read)
+        posed, folder = layout.read(root, read_options)
     images = tuple(_with_stated_sensors(image, options) for image in posed.images)
     return replace(posed, images=images), folder, name
 

@@ -160,8 +160,8 @@ def _read_file(path: Path, size: int) -> RawSplat:
             return read_sog_zip(path, size)
         if suffix == ".splat":
             return read_dotsplat(path, stream, size)
-    known = {".ply": "'ply'", ".spz": "'NGSP' or gzip", ".sog": "a zip"}
-    expected = f"a {suffix} starts with {known[suffix]}" if suffix in known else f"expected {READABLE}"
+    beginnings = {".ply": "'ply'", ".spz": "'NGSP' or gzip", ".sog": "a zip"}
+    expected = f"a {suffix} starts with {beginnings[suffix]}" if suffix in beginnings else f"expected {READABLE}"
     raise InputError(f"{path}: starts with {start!r}, which no known splat format does; {expected}")
 
 

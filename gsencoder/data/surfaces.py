@@ -107,8 +107,8 @@ def surfaces_of_depth(views: Views, *, limit: int = 16, seed: int = 0) -> Surfac
     for view in range(len(depth)):
         pixels = surface_pixels(depth.depths[view], depth.Ks[view].astype(np.float32))
         rows, columns = np.nonzero(pixels.use)
-        picked = rng.permutation(len(rows))[:SAMPLES]
-        rows, columns = rows[picked], columns[picked]
+        sample = rng.permutation(len(rows))[:SAMPLES]
+        rows, columns = rows[sample], columns[sample]
         z, normals = pixels.depth[rows, columns].astype(np.float64), pixels.normals[rows, columns].astype(np.float64)
         local = unproject_points(np.stack((columns, rows), axis=1) + 0.5, z, depth.Ks[view])
         facing = np.abs(np.einsum("ni,ni->n", local, normals)) / np.linalg.norm(local, axis=1)

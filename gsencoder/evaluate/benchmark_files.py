@@ -101,7 +101,7 @@ def write_predictions(
     Raises:
         InputError: a scene without true objects, words of another space, or a class that `words` does not know.
     """
-    done = []
+    predictions = []
     objects: list[NamedInstance] = []
     names: list[RankedNames] = []
     sentences: list[Expression] = []
@@ -143,14 +143,14 @@ def write_predictions(
                     write_whole_numbers(truth_file, true_instances(points, classes).ids)
                     write_instance_prediction(folder / PREDICTIONS, masks, form="npz")
         seconds = {"load": load_seconds, **seconds, protocol.name: time.perf_counter() - start}
-        done.append(PredictedScene(scene=scene.name, gaussians=len(features), seconds=seconds))
+        predictions.append(PredictedScene(scene=scene.name, gaussians=len(features), seconds=seconds))
     if isinstance(protocol, RecognitionProtocol):
         write_recognition_truth(folder / f"{TRUTH}.{part}.json", objects)
         write_recognition_predictions(folder / f"{PREDICTIONS}.{part}.json", names)
     elif isinstance(protocol, ReferringProtocol):
         write_scanrefer(folder / f"{TRUTH}.{part}.json", sentences)
         write_referring_predictions(folder / f"{PREDICTIONS}.{part}.json", boxes)
-    return done
+    return predictions
 
 
 def merge_lists(folder: Path, protocol: BenchmarkProtocol, *, parts: int = 1) -> None:

@@ -98,16 +98,16 @@ def generate_from_features(
         )
     replaced = 0
 
-    def replace(_: Any, given: tuple[Any, ...]) -> tuple[Any, ...]:
+    def replace(_: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
         nonlocal replaced
-        if not given or given[0].shape != tokens.shape:
-            expected = "none" if not given else str(tuple(given[0].shape))
+        if not arguments or arguments[0].shape != tokens.shape:
+            expected = "none" if not arguments else str(tuple(arguments[0].shape))
             raise InputError(
                 f"{WHAT}: {type(model).__name__} takes features [pictures, patches, channels] of {expected}, got "
                 f"{tuple(tokens.shape)}; render them on the grid of its tower"
             )
         replaced += 1
-        return (tokens.to(given[0].device, given[0].dtype), *given[1:])
+        return (tokens.to(arguments[0].device, arguments[0].dtype), *arguments[1:])
 
     handle = next(iter(connectors.values())).register_forward_pre_hook(replace)
     try:

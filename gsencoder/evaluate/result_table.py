@@ -67,19 +67,21 @@ class ResultTable:
     def markdown(self) -> str:
         """The table in Markdown, with notes below it, and the table of classes, if there are any, below these."""
         columns = self.without_classes().columns
-        named = [(row.method if row.source == "measured" else f"{row.method} (published)", row) for row in self.rows]
+        labeled = [(row.method if row.source == "measured" else f"{row.method} (published)", row) for row in self.rows]
         lines = _lines(
             f"**{self.title}** (percent)",
             ["method", *columns],
-            [[method, *(_figure(row, column) for column in columns)] for method, row in named],
+            [[method, *(_figure(row, column) for column in columns)] for method, row in labeled],
         )
         lines += [f"\n{note}" for note in self.notes]
         if self.by_class:
-            shown = [(method, row) for method, row in named if any(_figure(row, each) for each in self.by_class)]
+            with_classes = [
+                (method, row) for method, row in labeled if any(_figure(row, each) for each in self.by_class)
+            ]
             lines += _lines(
                 f"\n**{self.title}, by class** (percent)",
-                ["class", *(method for method, _ in shown)],
-                [[each, *(_figure(row, each) for _, row in shown)] for each in self.by_class],
+                ["class", *(method for method, _ in with_classes)],
+                [[each, *(_figure(row, each) for _, row in with_classes)] for each in self.by_class],
             )
         return "\n".join(lines) + "\n"
 
@@ -120,8 +122,8 @@ def published_rows(name: str) -> tuple[ResultRow, ...]:
     """
     file = PUBLISHED / f"{name}.csv"
     if not file.is_file():
-        known = ", ".join(sorted(path.stem for path in PUBLISHED.glob("*.csv")))
-        raise InputError(f"published table {name!r}: there is none; there are {known}")
+        tables = ", ".join(sorted(path.stem for path in PUBLISHED.glob("*.csv")))
+        raise InputError(f"published table {name!r}: there is none; there are {tables}")
     with file.open(newline="", encoding="utf-8") as stream:
         return tuple(
             ResultRow(

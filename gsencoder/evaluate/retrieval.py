@@ -97,7 +97,7 @@ def retrieve(pairs: ScoredPairs, texts: Sequence[str], *, count: int = 0, seed: 
     _, code = np.unique(np.array(texts, dtype=np.str_), return_inverse=True)
     rivals = [np.flatnonzero(code != code[query]) for query in range(number)]
     sides = []
-    for own, others in (
+    for scores, others in (
         (pairs.scores[:, :number], pairs.scores[:, number:]),
         (pairs.scores[:, :number].T, pairs.distractors.T),
     ):
@@ -111,14 +111,14 @@ def retrieve(pairs: ScoredPairs, texts: Sequence[str], *, count: int = 0, seed: 
             pool = (
                 others[query, draw(name, available, count or available, seed)]
                 if available
-                else own[query, rivals[query]]
+                else scores[query, rivals[query]]
             )
-            ranks.append(rank_of_first(np.concatenate([own[query, query : query + 1], pool])))
+            ranks.append(rank_of_first(np.concatenate([scores[query, query : query + 1], pool])))
         sides.append(
             Retrieval(
                 ranks=np.array(ranks, np.int64),
                 distractors=(count or available) if available else max(number - 1, 0),
-                not_finite=int((~np.isfinite(np.diagonal(own))).sum()),
+                not_finite=int((~np.isfinite(np.diagonal(scores))).sum()),
             )
         )
     return sides[0], sides[1]
@@ -185,8 +185,8 @@ def image_to_text(
     _check(names, len(views), texts, distractors, count)
     ranks, not_finite = [], 0
     for name, cells, text in zip(names, views, texts, strict=True):
-        drawn = draw(name, len(distractors), count, seed)
-        scores = view_scores(cells, np.concatenate([text[None], distractors[drawn]]), pooling)
+        picks = draw(name, len(distractors), count, seed)
+        scores = view_scores(cells, np.concatenate([text[None], distractors[picks]]), pooling)
         ranks.append(rank_of_first(scores))
         not_finite += not np.isfinite(scores[0])
     return Retrieval(ranks=np.array(ranks, np.int64), distractors=count, not_finite=not_finite)
@@ -223,8 +223,8 @@ def text_to_image(
     ranks, not_finite = [], 0
     for number, (name, text, cells) in enumerate(zip(names, texts, views, strict=True)):
         scores = view_scores(cells, text[None], pooling)
-        drawn = draw(name, len(pictures), count, seed)
-        ranks.append(rank_of_first(scores if others is None else np.concatenate([scores, others[drawn, number]])))
+        picks = draw(name, len(pictures), count, seed)
+        ranks.append(rank_of_first(scores if others is None else np.concatenate([scores, others[picks, number]])))
         not_finite += not np.isfinite(scores[0])
     return Retrieval(ranks=np.array(ranks, np.int64), distractors=count, not_finite=not_finite)
 

@@ -78,9 +78,9 @@ def score_retrieval(
     notes = [_pool(name, side, candidates[name]) for name, side in sides.items()]
     if same and not all(candidates.values()):
         notes.append("Views with the same text are no rivals of each other.")
-    broken = sum(side.not_finite for side in sides.values())
-    if broken:
-        notes.append(f"{counted(broken, 'score')} of a view with its own text not finite: last in its pool.")
+    not_finite = sum(side.not_finite for side in sides.values())
+    if not_finite:
+        notes.append(f"{counted(not_finite, 'score')} of a view with its own text not finite: last in its pool.")
     return ScoreReport(
         results={
             "protocol": "retrieval",
@@ -89,7 +89,7 @@ def score_retrieval(
                 name: {"distractors": side.distractors, "of": "distractors" if candidates[name] else "queries"}
                 for name, side in sides.items()
             },
-            "not_finite": broken,
+            "not_finite": not_finite,
             **overall,
             "spread": spread(by_scene, NAMES),
         },
@@ -104,8 +104,8 @@ def score_retrieval(
     )
 
 
-def _pool(name: str, side: Retrieval, given: int) -> str:
+def _pool(name: str, side: Retrieval, others: int) -> str:
     what = "texts" if name == "i2t" else "pictures"
-    if given:
-        return f"Pools of {name}: {side.distractors:,} of {given:,} {what} of others (M3: 1,999 of COCO)."
+    if others:
+        return f"Pools of {name}: {side.distractors:,} of {others:,} {what} of others (M3: 1,999 of COCO)."
     return f"Pools of {name}: the {what} of the other queries, and none of COCO as in M3, so that they are smaller."

@@ -117,11 +117,11 @@ def score_caption_files(
         _refuse_missing(silent, "scene", predictions, allow_missing)
         scores = score_box_captions(objects, boxes, min_iou=min_iou, tools=tools)
     else:
-        named = [each for each in captions if isinstance(each, NamedCaption)]
-        named_keys = {(each.scene, each.object_id) for each in named}
+        predicted = [each for each in captions if isinstance(each, NamedCaption)]
+        named_keys = {(each.scene, each.object_id) for each in predicted}
         missing = [f"{o.object_id} of {o.scene}" for o in objects if (o.scene, o.object_id) not in named_keys]
         _refuse_missing(missing, "object", predictions, allow_missing)
-        scores = score_named_captions(objects, named, tools=tools)
+        scores = score_named_captions(objects, predicted, tools=tools)
     ending = f"_{round(100 * min_iou)}" if boxes else ""
     overall = {f"{name}{ending}": value for name, value in _sentences(scores.sentences).items()}
     rows = [
@@ -181,8 +181,8 @@ def _sentences(scores: SentenceScores) -> dict[str, float]:
     """The figures by column; columns name their tokens where these are not those of the official script."""
     meteor = math.nan if scores.meteor is None else scores.meteor
     values = (*scores.bleu, meteor, scores.rouge_l, scores.cider)
-    named = dict(zip(SENTENCE_COLUMNS, values, strict=True))
-    return named if scores.official else {f"{name} ({scores.tokens})": value for name, value in named.items()}
+    by_column = dict(zip(SENTENCE_COLUMNS, values, strict=True))
+    return by_column if scores.official else {f"{name} ({scores.tokens})": value for name, value in by_column.items()}
 
 
 def _columns(overall: Mapping[str, float], published: tuple[str, ...]) -> tuple[str, ...]:

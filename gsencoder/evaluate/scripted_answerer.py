@@ -125,51 +125,51 @@ class ScriptedAnswerer:
         if not texts:
             raise InputError("the request has no text")
         text: str = texts[-1]
-        known = [self.sheet.pictures[each] for each in digests if each in self.sheet.pictures]
-        self.unknown_pictures += len(digests) - len(known)
-        scenes = {each.scene for each in known}
+        pictures = [self.sheet.pictures[each] for each in digests if each in self.sheet.pictures]
+        self.unknown_pictures += len(digests) - len(pictures)
+        scenes = {each.scene for each in pictures}
         if len(scenes) != 1:
             self.unknown_questions += 1
             return UNKNOWN
         scene = scenes.pop()
         pixels: dict[int, int] = {}
-        for each in known:
+        for each in pictures:
             for label, count in each.pixels.items():
                 pixels[label] = max(pixels.get(label, 0), count)
-        seen = frozenset(label for label, count in pixels.items() if count >= self.min_pixels)
+        visible = frozenset(label for label, count in pixels.items() if count >= self.min_pixels)
         marks = self.sheet.marks.get(request_digest(digests))
         if MEANT in text:
-            return self._mark(scene, text.rpartition(MEANT)[2], marks, seen)
+            return self._mark(scene, text.rpartition(MEANT)[2], marks, visible)
         if QUESTION in text:
-            return self._answer(scene, text.rpartition(QUESTION)[2], seen)
-        return self._caption(scene, marks, seen)
+            return self._answer(scene, text.rpartition(QUESTION)[2], visible)
+        return self._caption(scene, marks, visible)
 
-    def _answer(self, scene: str, question: str, seen: frozenset[int]) -> str:
+    def _answer(self, scene: str, question: str, visible: frozenset[int]) -> str:
         fact = self.sheet.facts.get((scene, question))
         if fact is None:
             self.unknown_questions += 1
             return UNKNOWN
-        return fact.answer if _is_seen(fact, seen) else UNKNOWN
+        return fact.answer if _is_seen(fact, visible) else UNKNOWN
 
-    def _mark(self, scene: str, description: str, marks: tuple[int, ...] | None, seen: frozenset[int]) -> str:
+    def _mark(self, scene: str, description: str, marks: tuple[int, ...] | None, visible: frozenset[int]) -> str:
         fact = self.sheet.facts.get((scene, description))
         if fact is None or marks is None:
             self.unknown_questions += 1
             return NO_MARK
         meant = fact.needed[0]
-        return str(marks.index(meant) + 1) if meant in marks and _is_seen(fact, seen) else NO_MARK
+        return str(marks.index(meant) + 1) if meant in marks and _is_seen(fact, visible) else NO_MARK
 
-    def _caption(self, scene: str, marks: tuple[int, ...] | None, seen: frozenset[int]) -> str:
+    def _caption(self, scene: str, marks: tuple[int, ...] | None, visible: frozenset[int]) -> str:
         if not marks:
             self.unknown_questions += 1
             return UNKNOWN
         caption = self.sheet.captions.get((scene, marks[0]))
-        return caption if caption is not None and marks[0] in seen else UNKNOWN
+        return caption if caption is not None and marks[0] in visible else UNKNOWN
 
 
-def _is_seen(fact: Fact, seen: frozenset[int]) -> bool:
-    wanted = set(fact.needed)
-    return bool(wanted & seen) if fact.any_of and wanted else wanted <= seen
+def _is_seen(fact: Fact, visible: frozenset[int]) -> bool:
+    labels = set(fact.needed)
+    return bool(labels & visible) if fact.any_of and labels else labels <= visible
 
 
 class _Handler(BaseHTTPRequestHandler):

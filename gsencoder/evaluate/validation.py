@@ -100,10 +100,11 @@ def validate_encoder(
     """
     process = current_process()
     # The first process takes the scenes that are drawn, and all take turns with the others.
-    drawn = scenes[:pictured] if process.is_first else []
-    share = [*drawn, *scenes[pictured:][process.rank :: process.world_size]]
+    with_pictures = scenes[:pictured] if process.is_first else []
+    share = [*with_pictures, *scenes[pictured:][process.rank :: process.world_size]]
     tallies = {
-        teacher: _Tally(outputs[teacher], codebook, pictured=len(drawn)) for teacher, codebook in codebooks.items()
+        teacher: _Tally(outputs[teacher], codebook, pictured=len(with_pictures))
+        for teacher, codebook in codebooks.items()
     }
     for scene in track(share, "validation"):
         gaussians = scene.gaussians(np.arange(len(scene)))
@@ -133,10 +134,10 @@ class _Tally:
     def add(self, scene: PreparedScene, features: Float32[np.ndarray, "N D"]) -> None:
         """Classifies the targets of a scene's seen Gaussians and the features predicted for them."""
         space, codebook = self._space, self._codebook
-        seen = np.flatnonzero(scene.weights)
-        predicted, targets = space.standardize(features[seen]), scene.targets(seen)
+        rows = np.flatnonzero(scene.weights)
+        predicted, targets = space.standardize(features[rows]), scene.targets(rows)
         if self.scenes < self._pictured:
-            self._pictures += draw_middle_view(scene, seen, targets, predicted)
+            self._pictures += draw_middle_view(scene, rows, targets, predicted)
             self._titles += [f"{scene.name}: {content}" for content in ("colors", "fused", "predicted")]
         true_codes = nearest_codes(codebook, targets)
         predicted_codes = nearest_classes(predicted, codebook, np.unique(true_codes))
@@ -144,11 +145,11 @@ class _Tally:
         self._total += np.bincount(true_codes, minlength=len(codebook))
         targets, predicted = space.standard_units(targets), space.standard_units(predicted)
         lengths = np.sqrt(np.square(targets).sum(axis=1))
-        named = lengths >= 0.5 * space.channels**0.5
-        dots = (targets[named] * predicted[named]).sum(axis=1)
-        norms = lengths[named] * np.sqrt(np.square(predicted[named]).sum(axis=1) + 1e-12)
+        directed = lengths >= 0.5 * space.channels**0.5
+        dots = (targets[directed] * predicted[directed]).sum(axis=1)
+        norms = lengths[directed] * np.sqrt(np.square(predicted[directed]).sum(axis=1) + 1e-12)
         self._cosines += float((dots / norms).sum())
-        self._named += int(named.sum())
+        self._named += int(directed.sum())
         self.scenes += 1
 
     def sum_over_processes(self) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -25,3 +26,12 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Any, Any], None]
 
     install(write_toy)
     return install
+
+
+@pytest.fixture(scope="session")
+def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one preset, of the toy's teacher."""
+    folder = tmp_path_factory.mktemp("conf")
+    (folder / "teacher").mkdir()
+    (folder / "teacher" / "dinov2.yaml").write_text("defaults:\n  - onnx\n  - _self_\nweights: dinov2.onnx\n")
+    return folder

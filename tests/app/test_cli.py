@@ -83,7 +83,7 @@ def test_cfg_prints_what_the_run_would_use(capsys: pytest.CaptureFixture[str]) -
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "problem"),
     [
         (["inspct"], "inspct: no such command; did you mean inspect?"),
         (["zzz"], "zzz: no such command (gsencoder --help lists them)"),
@@ -102,12 +102,12 @@ def test_cfg_prints_what_the_run_would_use(capsys: pytest.CaptureFixture[str]) -
     ],
 )
 def test_a_wrong_command_line_is_one_line_and_exit_code_2(
-    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+    words: list[str], problem: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main(words) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert said in err
+    assert problem in err
     assert err.startswith("error: ")
     assert err.count("\n") == 1
 
@@ -207,7 +207,7 @@ def wrapped(stop: Stopped) -> SystemError:
 
 
 @pytest.mark.parametrize(
-    ("error", "code", "said"),
+    ("error", "code", "problem"),
     [
         (KeyboardInterrupt(), 130, "interrupted\n"),
         (Stopped(15), 143, "stopped: SIGTERM\n"),
@@ -216,7 +216,7 @@ def wrapped(stop: Stopped) -> SystemError:
     ],
 )
 def test_what_ends_a_run_early_is_one_line(
-    toy: Any, error: BaseException, code: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    toy: Any, error: BaseException, code: int, problem: str, tmp_path: Path, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     def run(config: Any, summary: Any) -> None:
@@ -230,7 +230,7 @@ def test_what_ends_a_run_early_is_one_line(
     monkeypatch.setattr(cli, "_discard_stdout", lambda: None)
     toy(run)
     assert cli.main(["toy", f"out={tmp_path / 'out'}"]) == code
-    assert capsys.readouterr().err == said
+    assert capsys.readouterr().err == problem
     assert not [path for path in tmp_path.iterdir() if "partial" in path.name]
 
 

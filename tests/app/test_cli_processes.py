@@ -112,14 +112,14 @@ sys.exit(cli.main())
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.parametrize(
-    ("number", "code", "said"),
+    ("number", "code", "problem"),
     [
         (signal.SIGINT, 130, b"interrupted\n"),
         (signal.SIGTERM, 143, b"stopped: SIGTERM\n"),
         (signal.SIGHUP, 129, b"stopped: SIGHUP\n"),
     ],
 )
-def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code: int, said: bytes) -> None:
+def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code: int, problem: bytes) -> None:
     def defaults() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
@@ -133,6 +133,6 @@ def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code:
         assert process.stdout is not None
         assert process.stdout.readline() == b"writing\n"
         process.send_signal(number)
-        assert process.communicate()[1] == said
+        assert process.communicate()[1] == problem
         assert process.returncode == code
     assert list(tmp_path.iterdir()) == []

@@ -46,7 +46,7 @@ def test_a_failed_run_does_not_stop_the_others(toy: Any, tmp_path: Path, capsys:
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "problem"),
     [
         (["toy", "-m", "size=1,2"], "-m: out= is missing"),
         (["toy", "-m", "size=1,2", "out=choice(a,b)"], "out: cannot be swept"),
@@ -57,19 +57,19 @@ def test_a_failed_run_does_not_stop_the_others(toy: Any, tmp_path: Path, capsys:
     ],
 )
 def test_many_runs_complain_like_one(
-    toy: Any, words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    toy: Any, words: list[str], problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     monkeypatch.chdir(tmp_path)
     assert cli.main(words) == 2
     err = capsys.readouterr().err
-    assert said in err
+    assert problem in err
     assert err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "problem"),
     [
         (["hydra/launcher=nowhere"], "no such launcher is installed; .*pip install 'gsencoder\\[slurm\\]'"),
         (["hydra/launcher=submitit_local", "hydra.launcher.timeout_mim=1"], "timeout_mim: Hydra has no such setting"),
@@ -80,7 +80,7 @@ def test_many_runs_complain_like_one(
     ],
 )
 def test_a_launcher_that_cannot_start_jobs_says_so_in_one_line(
-    toy: Any, words: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    toy: Any, words: list[str], problem: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     if "submitit" in words[0]:
@@ -88,5 +88,5 @@ def test_a_launcher_that_cannot_start_jobs_says_so_in_one_line(
     monkeypatch.setenv("PATH", "")
     assert cli.main(["toy", "-m", "size=1,2", f"out={tmp_path / 'out'}", *words]) == 2
     err = capsys.readouterr().err
-    assert re.search(said, err)
+    assert re.search(problem, err)
     assert err.count("\n") == 1

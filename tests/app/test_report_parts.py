@@ -63,19 +63,19 @@ def last() -> Page:
     return Page.made[-1]
 
 
-def summary_of(**given: Any) -> Summary:
+def summary_of(**arguments: Any) -> Summary:
     summary = Summary("test", {})
-    summary.results.update(given)
+    summary.results.update(arguments)
     summary.add_seconds({"load": 1.5, "work": 2.0})
     return summary
 
 
 def found() -> Localization:
     """Two boxes of the mug (the book has its feature, paler), one of the table, and none of the lamp."""
-    given = SCENE.features["names"]
-    vectors = given.features.copy()
+    features = SCENE.features["names"]
+    vectors = features.features.copy()
     vectors[KINDS == 1] = 0.8 * vectors[KINDS == 0][0] + 0.2 * vectors[KINDS == 2][-1]
-    scene = replace(SCENE, features={"names": replace(given, features=vectors)})
+    scene = replace(SCENE, features={"names": replace(features, features=vectors)})
     made = localize(scene, ("mug", "table", "lamp"), words())
     counts = [sum(box.query == word for box in made.boxes) for word in made.queries]
     assert counts == [2, 1, 0]
@@ -161,14 +161,14 @@ def test_four_views_from_first_to_last_are_shown_with_their_numbers(page: Page) 
 
 
 def test_features_have_the_figures_of_their_basis_or_none(page: Page) -> None:
-    given = SCENE.features["names"]
-    weights = given.weights.copy()
+    features = SCENE.features["names"]
+    weights = features.weights.copy()
     weights[:7] = 0
-    bare = replace(given, weights=weights)
+    bare = replace(features, weights=weights)
     basis = FeatureBasis(
         mean=np.zeros(8, np.float32), components=np.eye(3, 8, dtype=np.float32), energy_kept=0.75, space=SPACE
     )
-    small = replace(given, features=given.features[:, :3].copy(), basis=basis)
+    small = replace(features, features=features.features[:, :3].copy(), basis=basis)
     parts.add_features(page, {"bare": bare, "small": small}, {"bare": 0.0, "small": 0.125})
     assert page.tables[0] == [
         {"features": "bare", "channels": 8, "rank of the basis": 8, "energy kept": 1.0, "centered cosine error": 0.0,
@@ -180,14 +180,14 @@ def test_features_have_the_figures_of_their_basis_or_none(page: Page) -> None:
 
 @pytest.mark.filterwarnings("ignore:.*words have no box")
 def test_pages_begin_with_counts_and_end_with_seconds(page: Page, tmp_path: Path) -> None:
-    given = SCENE.features["names"]
-    weights = given.weights.copy()
+    features = SCENE.features["names"]
+    weights = features.weights.copy()
     weights[:7] = 0
-    results.report_fusion(tmp_path, SCENE, replace(given, weights=weights), 0.125, "names", summary_of())
-    told = last().told
-    assert (told["Gaussians"], told["with features"], told["views"]) == (len(KINDS), len(KINDS) - 7, 8)
-    assert told["seconds"] == 3.5
-    assert told["steps"] == {"load": 1.5, "work": 2.0}
+    results.report_fusion(tmp_path, SCENE, replace(features, weights=weights), 0.125, "names", summary_of())
+    facts = last().told
+    assert (facts["Gaussians"], facts["with features"], facts["views"]) == (len(KINDS), len(KINDS) - 7, 8)
+    assert facts["seconds"] == 3.5
+    assert facts["steps"] == {"load": 1.5, "work": 2.0}
     assert last().tables[0][0]["centered cosine error"] == 0.125
     results.report_words(tmp_path, SCENE, found(), summary_of())
     assert {name: last().told[name] for name in ("words", "with a box", "boxes")} == {
@@ -219,24 +219,24 @@ def test_the_page_of_the_demo_counts_words_and_what_the_basis_costs(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(demo, "HtmlReport", Page)
-    given = SCENE.features["names"]
-    fusion = Fusion(features=given, views=(0,), tested=(), seconds={}, truncation=0.125)
+    features = SCENE.features["names"]
+    fusion = Fusion(features=features, views=(0,), tested=(), seconds={}, truncation=0.125)
     made = TeacherResult(
         title="names", words=("mug", "table", "lamp"), ious=(0.9, 0.4, 0.0), fusion=fusion, localization=found()
     )
     demo.write_report(tmp_path / "a.html", SCENE, [made], summary_of())
-    told = last().told
-    assert (told["names localized"], told["Gaussians"], told["views"]) == ("1 of 3", len(KINDS), 8)
-    assert told["seconds before this page"] == 3.5
+    facts = last().told
+    assert (facts["names localized"], facts["Gaussians"], facts["views"]) == ("1 of 3", len(KINDS), 8)
+    assert facts["seconds before this page"] == 3.5
     assert [row["IoU with the truth"] for row in last().tables[0]] == [0.9, 0.4, 0.0]
     assert last().tables[1][0]["centered cosine error"] == 0.125
 
 
 def test_a_teacher_counts_what_overlaps_by_half_or_more() -> None:
-    given = SCENE.features["names"]
-    weights = given.weights.copy()
+    features = SCENE.features["names"]
+    weights = features.weights.copy()
     weights[:7] = 0
-    fusion = Fusion(features=replace(given, weights=weights), views=(0,), tested=(), seconds={}, truncation=0.0)
+    fusion = Fusion(features=replace(features, weights=weights), views=(0,), tested=(), seconds={}, truncation=0.0)
     localization = Localization(
         queries=(),
         relevancy=np.zeros((0, len(KINDS)), np.float32),

@@ -17,17 +17,17 @@ def run(path: Path, inside: Callable[[Path], None] = lambda path: None, *, anew:
 
 def cut_off(path: Path, *names: str, anew: bool = False) -> list[str]:
     """Leaves what a run leaves that was stopped after it had written these files; what it had found there."""
-    found = []
+    names_before = []
 
     def inside(path: Path) -> None:
-        found.extend(contents(path))
+        names_before.extend(contents(path))
         for name in names:
             (path / name).write_text("state")
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run(path, inside, anew=anew)
-    return found
+    return names_before
 
 
 def contents(path: Path) -> list[str]:
@@ -170,9 +170,9 @@ def test_what_cannot_be_removed_is_said(tmp_path: Path, monkeypatch: pytest.Monk
     def refused(self: Path, **_: object) -> None:
         raise PermissionError(1, "Operation not permitted", str(self))
 
-    told = "cannot save the state of this run here" if anew else "results are written.*remove it"
+    problem = "cannot save the state of this run here" if anew else "results are written.*remove it"
     monkeypatch.setattr(Path, "unlink", refused)
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=problem):
         run(tmp_path / "run", anew=anew)
 
 

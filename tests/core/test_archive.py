@@ -35,7 +35,7 @@ def test_arrays_and_header_come_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "problem"),
     [
         ({"a": ARRAYS["a"]}, "the array 'b' is missing"),
         ({**ARRAYS, "b": ARRAYS["b"][:2]}, r"expected b float32\[3\], got float32\[2\]"),
@@ -45,10 +45,10 @@ def test_arrays_and_header_come_back(tmp_path: Path) -> None:
     ],
 )
 def test_an_array_that_is_not_as_asked_is_named_with_its_file(
-    tmp_path: Path, arrays: dict[str, np.ndarray], said: str
+    tmp_path: Path, arrays: dict[str, np.ndarray], problem: str
 ) -> None:
     write_archive(tmp_path / "x", arrays, {"name": "n"})
-    with pytest.raises(InputError, match=f"{tmp_path / 'x'}: .*{said}"):
+    with pytest.raises(InputError, match=f"{tmp_path / 'x'}: .*{problem}"):
         taken(tmp_path / "x")
 
 

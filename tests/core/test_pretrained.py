@@ -35,12 +35,12 @@ def test_the_first_160_characters_of_what_the_library_says_are_passed_on(tmp_pat
 
     (tmp_path / "config.json").write_text('{"model_type": "mystery"}')
     (tmp_path / "model.safetensors").touch()
-    said = reason(open_config)
-    assert len(said) > 160
+    message = reason(open_config)
+    assert len(message) > 160
     for call in (lambda: read_config(tmp_path, "a test"), lambda: load_pretrained(Loader, tmp_path, "a test")):
         with pytest.raises(InputError) as error:
             call()
-        assert str(error.value) == f"a test: {tmp_path} holds no model that transformers reads: {said[:160]}"
+        assert str(error.value) == f"a test: {tmp_path} holds no model that transformers reads: {message[:160]}"
 
 
 @pytest.fixture
@@ -83,9 +83,9 @@ def test_weights_of_other_parts_are_left_out_with_a_warning_unless_they_are_expe
         warnings.simplefilter("always")
         model = load_pretrained(transformers.BertModel, bert, "a test", other_parts=other_parts)
     assert not model.training
-    said = [str(each.message) for each in caught if each.category is SceneWarning]
-    assert len(said) == (other_parts == "warn")
-    assert all("weights that are no part of the backbone are not used: classifier" in each for each in said)
+    messages = [str(each.message) for each in caught if each.category is SceneWarning]
+    assert len(messages) == (other_parts == "warn")
+    assert all("weights that are no part of the backbone are not used: classifier" in each for each in messages)
 
 
 def test_the_fingerprint_is_that_of_settings_and_files_in_their_order(

@@ -66,8 +66,8 @@ def test_the_order_of_promises_is_that_of_all_commands_and_not_that_of_the_field
 
 
 def test_a_conflict_names_both_promises_what_is_needed_and_which_one_wins() -> None:
-    said = SmallBudget(error=0.01, megabytes=2).conflict("error", "megabytes", 3.25)
-    assert said == "budget.error=0.01 takes about 3.25 MB, more than budget.megabytes=2; budget.error comes first"
+    message = SmallBudget(error=0.01, megabytes=2).conflict("error", "megabytes", 3.25)
+    assert message == "budget.error=0.01 takes about 3.25 MB, more than budget.megabytes=2; budget.error comes first"
 
 
 def test_options_that_a_budget_chooses_are_refused_where_they_are_set_and_only_with_a_budget() -> None:

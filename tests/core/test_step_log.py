@@ -91,10 +91,10 @@ def test_an_event_that_cannot_be_written_is_an_error_of_the_caller_that_names_th
     log = Log(tmp_path, done=0, events=True)
     usual = Path.open
 
-    def full(self: Path, *given: Any, **more: Any) -> Any:
+    def full(self: Path, *arguments: Any, **more: Any) -> Any:
         if "tfevents" in self.name:
             raise OSError(errno.ENOSPC, "No space left on device")
-        return usual(self, *given, **more)
+        return usual(self, *arguments, **more)
 
     monkeypatch.setattr(Path, "open", full)
     with pytest.raises(InputError, match=r"tensorboard/events\.out\.tfevents\S*: cannot write: No space left"):

@@ -20,10 +20,10 @@ def test_results_come_in_order_also_from_work_within_work(threads: int) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        found = parallel(lambda row: parallel(lambda column: (row, column), range(5)), range(7))
+        table = parallel(lambda row: parallel(lambda column: (row, column), range(5)), range(7))
     finally:
         torch.set_num_threads(before)
-    assert found == [[(row, column) for column in range(5)] for row in range(7)]
+    assert table == [[(row, column) for column in range(5)] for row in range(7)]
 
 
 @pytest.fixture

@@ -148,8 +148,8 @@ def test_few_photographs_that_the_object_fills_do_not_hide_the_background(tmp_pa
     for view, path in enumerate(paths):
         save_over(path, *look(cameras, view, oversampling=2), "white")
     for view in range(4):
-        found = find_background(paths)
-        assert (found is not None) == (view < 3)
+        background = find_background(paths)
+        assert (background is not None) == (view < 3)
         save(paths[view], photograph(view, 48, 48))
 
 

@@ -212,7 +212,7 @@ def test_mutated_models_give_a_scene_or_an_input_error(tmp_path: Path, text: boo
             assert np.isfinite(scene.views.cameras.cam_from_world).all()
 
     mutate()
-    assert not any("\n" in said for said in outcomes)
+    assert not any("\n" in message for message in outcomes)
     assert any(outcomes)
 
 

@@ -21,11 +21,11 @@ def pose(view: int, count: int = 4) -> torch.Tensor:
 def test_a_sweep_finds_the_depth_of_a_slanted_wall() -> None:
     photographs = Photographs(wall_views())
     photos = [photographs.at_scale(view) for view in range(4)]
-    found = sweep(photos[1], pose(1), [photos[0], photos[2], photos[3]], [pose(0), pose(2), pose(3)], 2.0, 5.0)
+    estimate = sweep(photos[1], pose(1), [photos[0], photos[2], photos[3]], [pose(0), pose(2), pose(3)], 2.0, 5.0)
     truth = torch.from_numpy(seen(cameras(), 1)[1])
-    known = (found.depth > 0) & (found.score > 0.8)
+    known = (estimate.depth > 0) & (estimate.score > 0.8)
     assert known.float().mean() > 0.6
-    error = ((found.depth - truth).abs() / truth)[known]
+    error = ((estimate.depth - truth).abs() / truth)[known]
     assert error.median() < 0.01
     assert error.quantile(0.9) < 0.03
 
@@ -54,9 +54,9 @@ def test_points_go_to_the_world_and_back() -> None:
 
 def test_views_that_share_points_at_a_good_angle_are_neighbors() -> None:
     made = cameras(6, step=0.2)
-    found = source_views(made, wall_points(200), range(6), 2)
-    assert all(len(others) == 2 and view not in others for view, others in found.items())
-    assert 5 not in found[0]
+    neighbors = source_views(made, wall_points(200), range(6), 2)
+    assert all(len(others) == 2 and view not in others for view, others in neighbors.items())
+    assert 5 not in neighbors[0]
     alone = source_views(made, wall_points(200) + np.float32([0, 0, -100]), range(6), 2)
     assert all(others == [] for others in alone.values())
 
@@ -91,8 +91,8 @@ def test_what_stands_in_the_way_is_carved_out() -> None:
     floating, hidden, elsewhere = ([[0.2, 0.1, 2.0]], [[0.2, 0.1, 4.0]], [[50.0, 0.0, 2.0]])
     points = np.concatenate((on, np.array(floating + hidden + elsewhere, np.float32)))
     colors = np.arange(15, dtype=np.uint8).reshape(5, 3)
-    kept, tints = carve(points, colors, depths, photos, poses, 0.02)
-    np.testing.assert_array_equal(kept, points[[0, 1, 3, 4]])
+    remaining, tints = carve(points, colors, depths, photos, poses, 0.02)
+    np.testing.assert_array_equal(remaining, points[[0, 1, 3, 4]])
     np.testing.assert_array_equal(tints, colors[[0, 1, 3, 4]])
     unknown = {view: torch.zeros_like(depth) for view, depth in depths.items()}
     assert len(carve(points, colors, unknown, photos, poses, 0.02)[0]) == 5
@@ -100,12 +100,12 @@ def test_what_stands_in_the_way_is_carved_out() -> None:
 
 def test_few_points_on_a_wall_become_many_that_lie_on_it() -> None:
     photographs, points = Photographs(wall_views()), wall_points()
-    found = densify(photographs, range(4), points, np.full((len(points), 3), 128, np.uint8), SMALL)
-    assert found is not None
+    cloud = densify(photographs, range(4), points, np.full((len(points), 3), 128, np.uint8), SMALL)
+    assert cloud is not None
     # What fewer than three of the views show stays bare.
-    assert found.coverage[0] < 0.2 < 0.65 < found.coverage[1]
-    assert found.swept > 500
-    new = found.points[len(points) :]
+    assert cloud.coverage[0] < 0.2 < 0.65 < cloud.coverage[1]
+    assert cloud.swept > 500
+    new = cloud.points[len(points) :]
     off = np.abs(new[:, 2] - DEPTH - TILT * new[:, 0]) / DEPTH
     assert np.median(off) < 0.01
     assert np.quantile(off, 0.95) < 0.05

@@ -129,13 +129,13 @@ def test_depth_of_a_wrong_kind_is_an_error(tmp_path: Path) -> None:
     np.save(tmp_path / "cube.npy", np.zeros((24, 32, 2)))
     np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object), allow_pickle=True)
     np.save(tmp_path / "huge.npy", np.full((24, 32), 1e300))
-    for name, said in (
+    for name, problem in (
         ("negative", "negative"),
         ("cube", r"\[H, W\]"),
         ("pickle", "readable"),
         ("huge", "depth scale"),
     ):
-        with pytest.raises(InputError, match=f"{name}.npy.*{said}"):
+        with pytest.raises(InputError, match=f"{name}.npy.*{problem}"):
             DepthFiles([tmp_path / f"{name}.npy"], [grid()], RemapCache(), [DepthSensor()])[0]
     # A header that promises more than the file holds.
     data = (tmp_path / "negative.npy").read_bytes()
@@ -194,10 +194,10 @@ def test_mutated_pictures_give_a_picture_or_an_input_error(tmp_path: Path, data:
     try:
         color, _ = read_rgba(path)
     except InputError as error:
-        said = str(error)
+        message = str(error)
     else:
-        said = "mutated"
+        message = "mutated"
         assert color.dtype == np.uint8
         assert color.shape[2] == 3
-    assert "mutated" in said
-    assert "\n" not in said
+    assert "mutated" in message
+    assert "\n" not in message

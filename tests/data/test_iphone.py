@@ -82,8 +82,8 @@ def views_of(scene: Scene) -> Views:
 def test_a_room_is_read_back_from_each_kind_of_poses(room: Scene, tmp_path: Path, poses: Poses, prefix: str) -> None:
     folder = tmp_path / "scene"
     iphone = write_iphone(room, folder, poses, prefix=prefix)
-    for given in (folder, iphone):
-        recognized = layout_of(given)
+    for path in (folder, iphone):
+        recognized = layout_of(path)
         assert recognized is not None
         assert recognized.name == "ScanNet++"
     assert find_scenes([tmp_path]) == (folder,)
@@ -136,10 +136,10 @@ def test_frames_without_a_pose_or_depth_are_counted(room: Scene, tmp_path: Path)
     (iphone / "depth/frame_000020.png").unlink()
     with pytest.warns(SceneWarning) as caught:
         assert views_of(load_scene(iphone)).names == ("frame_000020.jpg", "frame_000030.jpg")
-    said = " ".join(str(warning.message) for warning in caught)
-    assert "1 of 4 frames are not in pose_intrinsic_imu.json and are left out (first: 'frame_000000.jpg')" in said
-    assert "1 of 4 frames lost tracking" in said
-    assert "1 of 2 depth files are missing (first: 'frame_000020.jpg')" in said
+    messages = " ".join(str(warning.message) for warning in caught)
+    assert "1 of 4 frames are not in pose_intrinsic_imu.json and are left out (first: 'frame_000000.jpg')" in messages
+    assert "1 of 4 frames lost tracking" in messages
+    assert "1 of 2 depth files are missing (first: 'frame_000020.jpg')" in messages
 
 
 @pytest.mark.parametrize("broken", ["[]", '{"frame_000000": 3}', '{"frame_000000": {"aligned_pose": [[1]]}}'])

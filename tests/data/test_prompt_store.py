@@ -32,17 +32,17 @@ def test_questions_about_the_same_thing_share_their_pictures(tmp_path: Path) -> 
     assert len(PromptStore(tmp_path).prompts) == 3
 
 
-@pytest.mark.parametrize("kept", [0, 1])
-def test_a_line_that_was_cut_off_is_written_again(tmp_path: Path, kept: int) -> None:
+@pytest.mark.parametrize("length", [0, 1])
+def test_a_line_that_was_cut_off_is_written_again(tmp_path: Path, length: int) -> None:
     store = PromptStore(tmp_path)
-    for number in range(kept + 1):
+    for number in range(length + 1):
         store.add(str(number), "text", [png(0)])
     path = tmp_path / PROMPTS_FILE
     path.write_bytes(path.read_bytes()[:-9])
     again = PromptStore(tmp_path)
-    assert list(again.prompts) == [str(number) for number in range(kept)]
+    assert list(again.prompts) == [str(number) for number in range(length)]
     again.add("next", "text", [png(0)])
-    assert list(PromptStore(tmp_path).prompts) == [*(str(number) for number in range(kept)), "next"]
+    assert list(PromptStore(tmp_path).prompts) == [*(str(number) for number in range(length)), "next"]
 
 
 def test_a_changed_picture_is_refused(tmp_path: Path) -> None:
@@ -92,8 +92,8 @@ def test_a_prompt_that_is_written_again_replaces_the_one_before(tmp_path: Path) 
     store.add("a", "old", [png(0)])
     store.add("b", "other", [png(1)])
     store.add("a", "new", [png(0)])
-    for found in (store, PromptStore(tmp_path)):
-        assert {key: each.text for key, each in found.prompts.items()} == {"a": "new", "b": "other"}
+    for each_store in (store, PromptStore(tmp_path)):
+        assert {key: each.text for key, each in each_store.prompts.items()} == {"a": "new", "b": "other"}
 
 
 @pytest.mark.parametrize("cut", [1, 2, 40])

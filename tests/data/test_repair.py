@@ -69,8 +69,8 @@ def test_the_fix_of_a_defect_leaves_none_and_touches_no_other_row(case: str) -> 
     assert len(gaussians_from_raw(fixed)) == len(fixed) == report.rows_after
     assert sum(change.count for change in report.changes) == len(rows)
     others = np.setdiff1d(np.arange(len(raw)), rows)
-    kept = others if len(fixed) < len(raw) else np.arange(len(raw))
-    touched = np.isin(kept, rows)
+    unaffected = others if len(fixed) < len(raw) else np.arange(len(raw))
+    touched = np.isin(unaffected, rows)
     for field in ("means", "quats", "log_scales", "logit_opacities", "sh"):
         assert np.array_equal(getattr(fixed, field)[~touched], getattr(raw, field)[others]), field
 

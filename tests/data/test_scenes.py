@@ -160,9 +160,9 @@ def test_objects_come_with_the_scene(tmp_path: Path) -> None:
     write_transforms(tmp_path)
     row = {"id": 3, "name": None, "aabb_min": [0, 0, 0], "aabb_max": [1, 2, 3], "placed": False, "views": 2}
     (tmp_path / "objects.json").write_text(json.dumps([row]))
-    (found,) = load_scene(tmp_path).objects
-    assert (found.id, found.name, found.placed, found.views, found.max_pixels) == (3, None, False, 2, 0)
-    assert found.aabb_max.tolist() == [1, 2, 3]
+    (thing,) = load_scene(tmp_path).objects
+    assert (thing.id, thing.name, thing.placed, thing.views, thing.max_pixels) == (3, None, False, 2, 0)
+    assert thing.aabb_max.tolist() == [1, 2, 3]
     for change, message in (
         ({"id": -1}, "id must be"),
         ({"id": 0}, "id must be a whole number from 1"),

@@ -109,14 +109,14 @@ def test_a_plane_is_used_where_it_is_seen_steeply_enough(min_cos: float) -> None
     normal = np.array([0.6, -0.1, -0.8]) / np.linalg.norm([0.6, -0.1, -0.8])
     facing = -(normal[0] * x + normal[1] * y + normal[2])
     depth = np.where(facing > 0.02, 2 / np.maximum(facing, 0.02), 0).astype(np.float32)
-    found = surface_pixels(depth, camera.Ks[0], min_cos=min_cos)
+    surface = surface_pixels(depth, camera.Ks[0], min_cos=min_cos)
     cosines = facing / np.sqrt(x * x + y * y + 1)
     clear = (np.abs(cosines - min_cos) > 0.01) & (depth > 0)
-    np.testing.assert_array_equal(found.use[clear], cosines[clear] > min_cos)
-    assert not found.use[depth == 0].any()
-    assert 0.1 < found.use.mean() < 0.9
-    np.testing.assert_allclose(found.normals[found.use], np.tile(normal, (found.use.sum(), 1)), atol=2e-3)
-    np.testing.assert_allclose(found.depth[found.use], depth[found.use], rtol=1e-3)
+    np.testing.assert_array_equal(surface.use[clear], cosines[clear] > min_cos)
+    assert not surface.use[depth == 0].any()
+    assert 0.1 < surface.use.mean() < 0.9
+    np.testing.assert_allclose(surface.normals[surface.use], np.tile(normal, (surface.use.sum(), 1)), atol=2e-3)
+    np.testing.assert_allclose(surface.depth[surface.use], depth[surface.use], rtol=1e-3)
 
 
 def test_depths_up_to_the_greatest_count_and_masked_ones_do_not() -> None:

@@ -18,14 +18,14 @@ def test_surfaces_of_gaussians_are_their_thin_axes_and_areas_count_opacity() -> 
         opacities=np.array([0.5, 1.0, 1.0], np.float32),
         sh=np.zeros((3, 1, 3), np.float32),
     )
-    found = surfaces_of_gaussians(some)
-    order = np.argsort(found.means[:, 0])
+    surfaces = surfaces_of_gaussians(some)
+    order = np.argsort(surfaces.means[:, 0])
     # The third is thicker than half of its middle axis.
-    np.testing.assert_allclose(found.means[order], some.means[:2])
+    np.testing.assert_allclose(surfaces.means[order], some.means[:2])
     axes = rotations.as_matrix()
     for row, axis in ((0, axes[0][:, 0]), (1, axes[1][:, 1])):
-        assert abs(found.normals[order][row] @ axis) == pytest.approx(1, abs=1e-6)
-    np.testing.assert_allclose(found.areas[order], (0.2 * 0.3 * 0.5, 0.2 * 0.5), rtol=1e-6)
+        assert abs(surfaces.normals[order][row] @ axis) == pytest.approx(1, abs=1e-6)
+    np.testing.assert_allclose(surfaces.areas[order], (0.2 * 0.3 * 0.5, 0.2 * 0.5), rtol=1e-6)
 
 
 def test_areas_of_depth_samples_are_those_of_the_surfaces() -> None:
@@ -41,14 +41,14 @@ def test_areas_of_depth_samples_are_those_of_the_surfaces() -> None:
     for slope in (0.0, 1.0):
         depth = (2 / (1 - slope * columns)).astype(np.float32)
         views = Views(cameras=cameras, names=("a",), depths=[depth])
-        found = surfaces_of_depth(views)
+        surfaces = surfaces_of_depth(views)
         normal = np.array([slope, 0, -1]) / np.hypot(1, slope)
-        np.testing.assert_allclose(np.abs(found.normals @ normal), 1, atol=1e-3)
-        z = found.means[:, 2]
-        rays = found.means / z[:, None]
+        np.testing.assert_allclose(np.abs(surfaces.normals @ normal), 1, atol=1e-3)
+        z = surfaces.means[:, 2]
+        rays = surfaces.means / z[:, None]
         exact = z**2 / focal**2 / np.abs(rays @ normal) * np.linalg.norm(rays, axis=1)
-        np.testing.assert_allclose(found.areas, exact, rtol=0.01)
-        np.testing.assert_allclose(z, 2 + slope * found.means[:, 0], rtol=2e-3)
+        np.testing.assert_allclose(surfaces.areas, exact, rtol=0.01)
+        np.testing.assert_allclose(z, 2 + slope * surfaces.means[:, 0], rtol=2e-3)
 
 
 def cloud(means: np.ndarray, opacity: float = 1.0) -> Gaussians:

@@ -39,7 +39,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_another_room(room):
 
 def test_every_pixel_lies_on_its_own_object_and_inside_its_box(room):
     things = {thing.id: thing for thing in plan_room(3)}
-    boxes = {found.id: (found.aabb_min, found.aabb_max) for found in room.objects}
+    boxes = {each.id: (each.aabb_min, each.aabb_max) for each in room.objects}
     for view in range(0, len(room.views), 5):
         points, labels = _world_points(room.views, view), room.views.instances[view]
         assert ((labels > 0) == (room.views.depths[view] > 0)).all()
@@ -70,37 +70,37 @@ def test_the_boxes_are_as_tight_as_what_all_views_see_of_free_standing_things():
         points, labels = _world_points(scene.views, view), scene.views.instances[view]
         for label in np.unique(labels[labels >= FIRST_ID]):
             seen.setdefault(int(label), []).append(points[labels == label])
-    for found in scene.objects:
-        if found.placed and found.views >= 16:
-            points = np.concatenate(seen[found.id])
+    for thing in scene.objects:
+        if thing.placed and thing.views >= 16:
+            points = np.concatenate(seen[thing.id])
             # The lower face is hidden, and the sides show to about a pixel.
-            assert np.abs(points.max(axis=0) - found.aabb_max).max() < 0.02
-            assert np.abs(points.min(axis=0) - found.aabb_min)[:2].max() < 0.02
+            assert np.abs(points.max(axis=0) - thing.aabb_max).max() < 0.02
+            assert np.abs(points.min(axis=0) - thing.aabb_min)[:2].max() < 0.02
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_objects_rest_on_something_keep_apart_and_show_in_several_views(seed):
     scene = make_room(seed, width=80, height=60)
-    placed = [found for found in scene.objects if found.placed]
+    placed = [thing for thing in scene.objects if thing.placed]
     assert len(placed) == 8
-    assert len({found.name for found in placed}) == 8
-    for row, found in enumerate(placed):
-        assert np.abs(found.aabb_min[2] - np.array([0, TABLE[2], SHELF[2]])).min() < 1e-9
-        assert (np.abs([found.aabb_min[:2], found.aabb_max[:2]]) < HALF_ROOM).all()
-        assert found.views >= 3, f"{found.name} shows in {found.views} views"
+    assert len({thing.name for thing in placed}) == 8
+    for row, thing in enumerate(placed):
+        assert np.abs(thing.aabb_min[2] - np.array([0, TABLE[2], SHELF[2]])).min() < 1e-9
+        assert (np.abs([thing.aabb_min[:2], thing.aabb_max[:2]]) < HALF_ROOM).all()
+        assert thing.views >= 3, f"{thing.name} shows in {thing.views} views"
         for other in placed[:row]:
-            apart = (found.aabb_min >= other.aabb_max) | (other.aabb_min >= found.aabb_max)
-            parts = [plan for plan in plan_room(seed) if plan.id in (found.id, other.id)]
+            apart = (thing.aabb_min >= other.aabb_max) | (other.aabb_min >= thing.aabb_max)
+            parts = [plan for plan in plan_room(seed) if plan.id in (thing.id, other.id)]
             points = np.concatenate([part.lattice(0.01) for part in parts[0].parts])
             touching = np.any([part.contains(points, 0.005) for part in parts[1].parts], axis=0)
             assert apart.any() or not touching.any()
 
 
 def test_views_and_pixels_are_counted_from_the_instance_maps(room):
-    for found in room.objects:
-        counts = [int((labels == found.id).sum()) for labels in room.views.instances]
-        assert found.views == sum(count > 0 for count in counts)
-        assert found.max_pixels == max(counts)
+    for thing in room.objects:
+        counts = [int((labels == thing.id).sum()) for labels in room.views.instances]
+        assert thing.views == sum(count > 0 for count in counts)
+        assert thing.max_pixels == max(counts)
 
 
 def test_gaussians_lie_on_the_surfaces_with_the_colors_of_the_pictures(room):
@@ -138,17 +138,17 @@ def test_every_pixel_has_a_gaussian_of_its_surface_beside_it(room):
 def test_color_words_are_the_hues_of_the_pictures():
     words = color_words(3)
     scene = make_room(3)
-    assert len({words[found.id] for found in scene.objects if found.placed}) == 8
-    for found in scene.objects:
-        if found.placed:
+    assert len({words[thing.id] for thing in scene.objects if thing.placed}) == 8
+    for thing in scene.objects:
+        if thing.placed:
             pixels = np.concatenate(
                 [
-                    image[labels == found.id]
+                    image[labels == thing.id]
                     for image, labels in zip(scene.views.images, scene.views.instances, strict=True)
                 ]
             )
             mean = pixels.mean(axis=0)
-            wanted = np.array(COLORS[words[found.id]], float)
+            wanted = np.array(COLORS[words[thing.id]], float)
             assert mean @ wanted / np.linalg.norm(mean) / np.linalg.norm(wanted) > 0.995
             assert 0.5 < np.linalg.norm(mean) / np.linalg.norm(wanted) <= 1.01
 

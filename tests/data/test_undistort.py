@@ -110,7 +110,7 @@ def test_pixels_without_content_are_black_and_masked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("camera", "said"),
+    ("camera", "problem"),
     [
         (CameraModel(model="EQUIRECTANGULAR", width=720, height=360, params=(720.0, 360.0)), "EQUIRECTANGULAR"),
         (
@@ -125,8 +125,8 @@ def test_pixels_without_content_are_black_and_masked(tmp_path: Path) -> None:
         (CameraModel(model="OPENCV", width=720, height=540, params=()), "finite numbers"),
     ],
 )
-def test_cameras_that_cannot_be_undistorted_are_named_errors(camera: CameraModel, said: str) -> None:
-    with pytest.raises(InputError, match=f"^here: .*{said}"):
+def test_cameras_that_cannot_be_undistorted_are_named_errors(camera: CameraModel, problem: str) -> None:
+    with pytest.raises(InputError, match=f"^here: .*{problem}"):
         pinhole_for(camera, "here")
 
 

@@ -174,8 +174,8 @@ def test_a_refined_direction_is_what_floors_and_walls_agree_on() -> None:
     exact = np.concatenate([np.tile(axis, (200, 1)) for axis in np.eye(3)]) @ tilt.T
     noisy = exact + 0.02 * made.normal(size=exact.shape)
     noisy /= np.linalg.norm(noisy, axis=1, keepdims=True)
-    found = _refine(UP, noisy, np.full(600, 1 / 600))
-    assert degrees(found, tilt @ UP) < 0.2
+    direction = _refine(UP, noisy, np.full(600, 1 / 600))
+    assert degrees(direction, tilt @ UP) < 0.2
     # Floors and walls that contradict each other by 2°: one floor counts as much as two walls of its area.
     leaning = Rotation.from_rotvec(np.deg2rad([0, 2.0, 0])).as_matrix()
     normals = np.array([[0.0, 0, 1], leaning @ [1.0, 0, 0]])
@@ -273,14 +273,14 @@ def test_confidence_is_how_level_cameras_stand_and_what_surfaces_support(room: S
     other = estimate_up(None, replace(cameras, cam_from_world=rolled.astype(np.float32)))
     assert other.confidence == pytest.approx(1 - 3 * np.mean(np.square(right @ other.direction)), abs=1e-5)
     assert estimate_up(None, cameras.select([0, 1])).confidence == 0
-    found = up_of_scene(room)
-    assert found is not None
-    assert found.from_cameras is not None
-    assert found.from_cameras < 0.02
-    assert found.to_dict() == {
-        "direction": found.direction.tolist(), "source": "cameras and surfaces", "confidence": found.confidence,
+    estimate = up_of_scene(room)
+    assert estimate is not None
+    assert estimate.from_cameras is not None
+    assert estimate.from_cameras < 0.02
+    assert estimate.to_dict() == {
+        "direction": estimate.direction.tolist(), "source": "cameras and surfaces", "confidence": estimate.confidence,
     }  # fmt: skip
-    assert found.describe().endswith(f"estimated from cameras and surfaces, confidence {found.confidence:.2f}")
+    assert estimate.describe().endswith(f"estimated from cameras and surfaces, confidence {estimate.confidence:.2f}")
 
 
 def test_surfaces_that_lie_far_from_what_cameras_say_do_not_count(room: Scene) -> None:

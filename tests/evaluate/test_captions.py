@@ -135,16 +135,18 @@ def test_other_models_take_their_towers_features_too(kind: str) -> None:
         # LLaVA reads the layer before the last one, without the token of the class.
         tokens = outputs.hidden_states[-2][:, 1:] if kind == "llava" else outputs.last_hidden_state
         ids = torch.tensor([[7, *[3] * model_tokens(model, flat), 8, 9]])
-        given = {"input_ids": ids, "attention_mask": torch.ones_like(ids)}
+        token_inputs = {"input_ids": ids, "attention_mask": torch.ones_like(ids)}
         if kind in ("paligemma", "gemma3"):
-            given["token_type_ids"] = (ids == 3).long()
+            token_inputs["token_type_ids"] = (ids == 3).long()
         own, *others = (
-            model.generate(**given, pixel_values=each[None], max_new_tokens=10, do_sample=False)[:, ids.shape[1] :]
+            model.generate(**token_inputs, pixel_values=each[None], max_new_tokens=10, do_sample=False)[
+                :, ids.shape[1] :
+            ]
             for each in pixels
         )
     # A picture to which the model says something else.
     different = next(number for number, other in enumerate(others, 1) if not torch.equal(other, own))
-    inputs = {**given, "pixel_values": pixels[different][None]}
+    inputs = {**token_inputs, "pixel_values": pixels[different][None]}
     assert torch.equal(generate_from_features(model, inputs, tokens, max_tokens=10), own)
 
 

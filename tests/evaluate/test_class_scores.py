@@ -60,12 +60,12 @@ def test_a_set_has_the_cosine_of_the_mean_of_its_seen_gaussians(words: TextTable
     seen = np.array([1, 1, 0, 0.1, 1, 5, 0, 1])
     features = features_of(words, vectors * (seen > 0)[:, None], seen)
     parts = [np.array([0, 1, 2]), np.array([3, 5]), np.array([2, 6]), np.array([], np.int64), np.array([7])]
-    found = class_cosines(features, parts, NAMES[:3], words)
+    cosines = class_cosines(features, parts, NAMES[:3], words)
     # Each Gaussian counts the same, whatever its weight.
     means = [vectors[[0, 1]].mean(axis=0), vectors[[3, 5]].mean(axis=0), vectors[7]]
-    assert found.shape == (5, 3)
-    np.testing.assert_allclose(found[[0, 1, 4]], expected(features, np.array(means), NAMES[:3], words), atol=1e-5)
-    assert np.isnan(found[[2, 3]]).all()
+    assert cosines.shape == (5, 3)
+    np.testing.assert_allclose(cosines[[0, 1, 4]], expected(features, np.array(means), NAMES[:3], words), atol=1e-5)
+    assert np.isnan(cosines[[2, 3]]).all()
 
 
 def test_words_of_another_space_are_refused(words: TextTable) -> None:

@@ -155,8 +155,8 @@ def test_scenes_without_labels_and_words_of_other_spaces_are_refused() -> None:
 
 
 def results_of(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())["results"]
-    return found
+    results: dict[str, Any] = json.loads((folder / "summary.json").read_text())["results"]
+    return results
 
 
 @pytest.mark.slow

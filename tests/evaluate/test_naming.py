@@ -50,5 +50,5 @@ def test_the_nearest_word_is_that_of_the_largest_cosine_with_a_basis_or_without(
     assert np.array_equal(nearest_words(plain, rows, vectors), expected)
     assert np.array_equal(nearest_words(in_basis, rows, vectors), expected)
     # In standard units the nearest unit vector is the one of largest cosine, whatever was taken off and divided out.
-    told = nearest_classes((features - mean) / 3, (vectors - mean) / 3, np.arange(5))
-    assert np.array_equal(told, expected)
+    classes = nearest_classes((features - mean) / 3, (vectors - mean) / 3, np.arange(5))
+    assert np.array_equal(classes, expected)

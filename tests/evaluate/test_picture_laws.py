@@ -65,11 +65,11 @@ def test_instance_maps_are_those_of_the_views_names_whatever_else_the_labeled_sc
 
 def test_a_rendered_pixel_shows_an_instance_from_half_of_the_weight_on() -> None:
     scene = scene_of([[-0.4, 0, 2], [0.4, 0, 2]])
-    found = truth_of(scene, halves()).pixels(row("render"))
+    pixels = truth_of(scene, halves()).pixels(row("render"))
     # A Gaussian of 0.95 has a weight of one half within sqrt(2 log 1.9) = 1.133 standard deviations, each of them
     # 50 · 0.1 / 2 = 2.5 pixels wide, and 0.3 of a pixel² more: an area of π · 1.133² · 6.55 = 26.4 pixels.
-    assert set(found) == {LEFT, RIGHT}
-    assert all(abs(count - 26.4) < 4 for count in found.values())
+    assert set(pixels) == {LEFT, RIGHT}
+    assert all(abs(count - 26.4) < 4 for count in pixels.values())
     faint = scene_of([[-0.4, 0, 2]], opacity=0.49)
     assert truth_of(faint, halves()).pixels(row("render")) == {}
 
@@ -104,5 +104,5 @@ def test_windows_of_photographs_are_counted_at_the_size_they_are_shown_in(
     inside = np.array(K)
     inside[:2, 2] -= (left, upper)
     inside[:2] *= np.array([60 / width, 40 / height])[:, None]
-    found = truth_of(scene, halves()).pixels(row("photograph") | {"K": inside.tolist()})
-    assert (found[LEFT], found[RIGHT]) == expected
+    pixels = truth_of(scene, halves()).pixels(row("photograph") | {"K": inside.tolist()})
+    assert (pixels[LEFT], pixels[RIGHT]) == expected

@@ -84,11 +84,11 @@ def test_a_box_is_of_the_instance_that_it_holds_best(room: Scene, truth: Picture
 def test_scenes_without_what_is_needed_are_refused(room: Scene) -> None:
     assert room.views is not None
     renamed = replace(room, views=replace(room.views, names=tuple(f"other {view}" for view in range(6))))
-    for scene, labeled, told in (
+    for scene, labeled, problem in (
         (replace(room, gaussians=None), room, "no Gaussians or no cameras"),
         (replace(room, views=None), room, "no Gaussians or no cameras"),
         (room, replace(room, views=replace(room.views, instances=None)), "no instance maps"),
         (room, renamed, "no instance map of view"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=problem):
             PictureTruth(scene, labeled)

@@ -23,17 +23,17 @@ def pictures(*sizes: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return made
 
 
-def errors_of(taken: list[tuple[np.ndarray, np.ndarray]], mean: np.ndarray = MEAN) -> RenderedErrors:
+def errors_of(renders: list[tuple[np.ndarray, np.ndarray]], mean: np.ndarray = MEAN) -> RenderedErrors:
     tally = RenderedTally(mean)
-    for predicted, target in taken:
+    for predicted, target in renders:
         tally.add(predicted, target)
     return tally.errors()
 
 
 def test_errors_are_means_over_the_cells_of_all_pictures_however_large_each_is() -> None:
-    taken = pictures(50, 7, 1)
-    errors = errors_of(taken)
-    predicted, target = (np.concatenate(each).astype(np.float64) for each in zip(*taken, strict=True))
+    renders = pictures(50, 7, 1)
+    errors = errors_of(renders)
+    predicted, target = (np.concatenate(each).astype(np.float64) for each in zip(*renders, strict=True))
     assert errors.cosine == pytest.approx(1 - paired_cosine_distances(predicted, target).mean(), abs=1e-6)
     centered = paired_cosine_distances(predicted - MEAN, target - MEAN)
     assert errors.centered == pytest.approx(1 - centered.mean(), abs=1e-6)
@@ -54,10 +54,10 @@ def test_a_picture_with_a_feature_that_is_not_finite_is_counted_and_changes_no_m
 
 def test_without_cells_there_are_no_means_and_a_picture_without_cells_changes_none() -> None:
     nothing = np.zeros((0, CHANNELS), np.float32)
-    for taken in ([], [(nothing, nothing)]):
-        errors = errors_of(taken)
+    for renders in ([], [(nothing, nothing)]):
+        errors = errors_of(renders)
         assert all(math.isnan(value) for value in (errors.cosine, errors.centered, errors.l2))
-        assert (errors.cells, errors.pictures) == (0, len(taken))
+        assert (errors.cells, errors.pictures) == (0, len(renders))
     with_empty, without = errors_of([*pictures(9), (nothing, nothing)]), errors_of(pictures(9))
     assert (with_empty.cosine, with_empty.l2, with_empty.cells) == (without.cosine, without.l2, 9)
 

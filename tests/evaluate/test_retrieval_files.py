@@ -60,8 +60,8 @@ def test_features_in_a_file_have_the_ranks_that_the_functions_for_features_give(
 ) -> None:
     views, texts = vectors(7, 4, 6, seed=0), vectors(7, 6, seed=1)
     more, others = vectors(20, 6, seed=2), vectors(30, 3, 6, seed=3)
-    given = {"views": views, "texts": texts, "text_distractors": more, "view_distractors": others}
-    np.savez(tmp_path / "a.npz", queries=np.array(NAMES), **given)
+    arrays = {"views": views, "texts": texts, "text_distractors": more, "view_distractors": others}
+    np.savez(tmp_path / "a.npz", queries=np.array(NAMES), **arrays)
     sides = retrieve(read_scored_pairs(tmp_path / "a.npz", pooling=pooling), list("abcdefg"), count=count, seed=4)
     options = {"seed": 4, "pooling": pooling}
     there = image_to_text(NAMES, list(views), texts, more, count=count or 20, **options)

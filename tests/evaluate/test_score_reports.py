@@ -36,10 +36,10 @@ def table(report: Any) -> dict[str, dict[str, float]]:
 
 def test_the_spread_is_over_scenes_that_have_a_value() -> None:
     rows = [{"a": 1.0, "b": None}, {"a": 4.0, "b": math.nan}, {"a": math.nan}]
-    found = spread(rows, ["a", "b"])
+    deviation = spread(rows, ["a", "b"])
     # The deviation of a sample: sqrt(((1 - 2.5)² + (4 - 2.5)²) / 1).
-    assert found["a"] == {"scenes": 2, "mean": 2.5, "std": pytest.approx(math.sqrt(4.5))}
-    assert found["b"] == pytest.approx(NOTHING, nan_ok=True)
+    assert deviation["a"] == {"scenes": 2, "mean": 2.5, "std": pytest.approx(math.sqrt(4.5))}
+    assert deviation["b"] == pytest.approx(NOTHING, nan_ok=True)
     assert spread(rows[:1], ["a"])["a"] == pytest.approx({"scenes": 1, "mean": 1, "std": math.nan}, nan_ok=True)
 
 
@@ -188,8 +188,8 @@ def test_recognition_is_reported_for_each_k_by_class_and_scene(tmp_path: Path) -
         score_recognition(predictions, truth, classes=["bed", "chair"])
     with pytest.raises(InputError, match="nothing to score: it holds no object of the 3 classes"):
         score_recognition(written(tmp_path / "none.json", []), truth, classes=["a", "b", "c"])
-    kept = written(tmp_path / "kept.json", rows[:1])
-    some = score_recognition(kept, truth, classes=["bed", "chair", "sofa"], allow_missing=True)
+    first_file = written(tmp_path / "kept.json", rows[:1])
+    some = score_recognition(first_file, truth, classes=["bed", "chair", "sofa"], allow_missing=True)
     assert (some.results["objects"], some.results["unanswered"], some.results["other_classes"]) == (4, 3, 1)
     assert some.rows["classes"][2]["objects"] == 0
     assert math.isnan(some.rows["classes"][2]["top_1"])
@@ -263,21 +263,23 @@ def test_what_is_scored_where_nothing_else_is_asked_for(tmp_path: Path) -> None:
     truth = written(tmp_path / "t.json", [{"scene_id": "s", "object_id": 1, "label": "bed"}])
     ranked = written(tmp_path / "p.json", [{"scene_id": "s", "object_id": 1, "labels": ["bed"]}])
     none = written(tmp_path / "n.json", [])
-    found = score_recognition(ranked, truth).results
-    assert {name for name in found if name.startswith(("mean_", "overall_"))} == {
+    results = score_recognition(ranked, truth).results
+    assert {name for name in results if name.startswith(("mean_", "overall_"))} == {
         f"{kind}_{k}" for kind in ("mean", "overall") for k in (1, 5)
     }
     with pytest.raises(InputError, match="object 1 of s has no prediction"):
         score_recognition(none, truth)
     keys = {"scene_id": "s", "object_id": 1, "ann_id": "0"}
-    said = written(tmp_path / "d.json", [keys | {"object_name": "x", "description": "x", "token": [], "bbox": cube(0)}])
-    boxes = score_referring(written(tmp_path / "b.json", [keys | {"bbox": cube(0)}]), said)
+    expressions = written(
+        tmp_path / "d.json", [keys | {"object_name": "x", "description": "x", "token": [], "bbox": cube(0)}]
+    )
+    boxes = score_referring(written(tmp_path / "b.json", [keys | {"bbox": cube(0)}]), expressions)
     assert set(boxes.results["best_of"]) == {"5", "all"}
     with pytest.raises(InputError, match="sentence 0 about object 1 of s has no prediction"):
-        score_referring(none, said)
-    asked = written(tmp_path / "q.json", [{"scene_id": "s", "question_id": "q", "question": "x", "answers": ["a"]}])
+        score_referring(none, expressions)
+    questions = written(tmp_path / "q.json", [{"scene_id": "s", "question_id": "q", "question": "x", "answers": ["a"]}])
     with pytest.raises(InputError, match="1 question without a prediction, first q; allow_missing=true counts"):
-        score_answer_files(none, asked, java=False)
+        score_answer_files(none, questions, java=False)
     with pytest.raises(InputError, match="1 object without a prediction, first 1 of s"):
-        score_caption_files(written(tmp_path / "c.json", {}), said, java=False)
-    assert score_caption_files(tmp_path / "c.json", said, java=False, allow_missing=True).results["missing"] == 1
+        score_caption_files(written(tmp_path / "c.json", {}), expressions, java=False)
+    assert score_caption_files(tmp_path / "c.json", expressions, java=False, allow_missing=True).results["missing"] == 1

@@ -69,7 +69,7 @@ def test_only_small_named_objects_that_were_seen_are_asked_for() -> None:
 
 def test_the_first_box_counts_and_any_object_of_its_name_may_be_the_one_found() -> None:
     cups = (thing(1, "cup", 0, 1), thing(2, "cup", 5, 6))
-    found = Localization(
+    localization = Localization(
         queries=("cup",),
         relevancy=np.zeros((1, 1), np.float32),
         thresholds=np.zeros(1, np.float32),
@@ -77,7 +77,7 @@ def test_the_first_box_counts_and_any_object_of_its_name_may_be_the_one_found() 
         # Out of order: ranks decide.
         boxes=(box("cup", 1, 0, 1), box("cup", 0, 5, 6.5)),
     )
-    hits = score_boxes(Scene(name="a", objects=cups), found, cups)
+    hits = score_boxes(Scene(name="a", objects=cups), localization, cups)
     assert [hit.iou for hit in hits] == pytest.approx([1 / 1.5**3] * 2)
     assert [hit.oracle_iou for hit in hits] == [1, 1]
     assert accuracy(hits, 0.25) == 1

@@ -29,8 +29,8 @@ def test_answers_are_reported_by_kind_and_scene_with_what_is_absent(tmp_path: Pa
         {"scene_id": "t", "question_id": "q3", "question": "Is it?", "answers": ["yes"]},
     ]
     # Right; right among ten, and refined; right when cleaned; blank.
-    given = {"q0": ["brown"], "q1": ["table", "on the table"], "q2": ["two"], "q3": ["?"]}
-    rows = [{"scene_id": "st"[int(key[1]) // 2], "question_id": key, "answer_top10": a} for key, a in given.items()]
+    answers = {"q0": ["brown"], "q1": ["table", "on the table"], "q2": ["two"], "q3": ["?"]}
+    rows = [{"scene_id": "st"[int(key[1]) // 2], "question_id": key, "answer_top10": a} for key, a in answers.items()]
     truth = written(tmp_path / "truth.json", questions)
     report = score_answer_files(written(tmp_path / "p.json", rows), truth, method="mine", java=False)
     results = report.results
@@ -99,11 +99,11 @@ def test_captions_are_reported_with_their_k(tmp_path: Path, min_iou: float, endi
 def test_java_is_looked_for_unless_it_is_not_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sentences, "find_java_tools", lambda: "there is none")
     questions = [{"scene_id": "s", "question_id": "q", "question": "What is it?", "answers": ["a"]}]
-    asked = written(tmp_path / "t.json", questions), [{"question_id": "q", "answer_top10": ["a"]}]
+    truth_file = written(tmp_path / "t.json", questions), [{"question_id": "q", "answer_top10": ["a"]}]
     described = [{"scene_id": "s", "object_id": 1, "object_name": "x", "ann_id": 0, "description": "a", "token": ["a"]}]
     captioned = written(tmp_path / "d.json", described), {"s|1": ["a"]}
-    for score, (truth, said) in ((score_answer_files, asked), (score_caption_files, captioned)):
-        predictions = written(tmp_path / "p.json", said)
+    for score, (truth, rows) in ((score_answer_files, truth_file), (score_caption_files, captioned)):
+        predictions = written(tmp_path / "p.json", rows)
         assert score(predictions, truth).results["absent"]["METEOR"] == "there is none"
         refused = score(predictions, truth, java=False).results["absent"]["METEOR"]
         assert refused == "Java was not asked for (java=false)"

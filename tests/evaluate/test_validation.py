@@ -53,20 +53,20 @@ def judged(
 def test_who_gives_the_targets_is_always_right(
     walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = judged(walls, monkeypatch, lambda targets: targets)
-    assert found.score == 1
-    assert found.cosine_named == pytest.approx(1, abs=1e-5)
+    results = judged(walls, monkeypatch, lambda targets: targets)
+    assert results.score == 1
+    assert results.cosine_named == pytest.approx(1, abs=1e-5)
     parts = [part for scene in walls[0] for part in scene.parts if part is not None]
-    assert found.total.sum() == sum(int((part.weights > 0).sum()) for part in parts)
+    assert results.total.sum() == sum(int((part.weights > 0).sum()) for part in parts)
 
 
 def test_who_always_says_the_same_is_right_about_one_kind_and_who_says_the_opposite_about_none(
     walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     codebook = walls[2]
-    found = judged(walls, monkeypatch, lambda targets: np.broadcast_to(codebook[1], targets.shape).copy())
-    assert found.accuracies()[1] == 1
-    assert found.score == pytest.approx(1 / np.isfinite(found.accuracies()).sum())
+    results = judged(walls, monkeypatch, lambda targets: np.broadcast_to(codebook[1], targets.shape).copy())
+    assert results.accuracies()[1] == 1
+    assert results.score == pytest.approx(1 / np.isfinite(results.accuracies()).sum())
     opposite = judged(walls, monkeypatch, lambda targets: -targets)
     assert opposite.cosine_named == pytest.approx(-1, abs=1e-5)
     assert opposite.score < 0.2

@@ -80,17 +80,17 @@ def outcomes(ranks: RankServer, folder: Path, *hows: str) -> dict[str, list[str]
 def test_processes_that_disagree_stop_at_the_start_and_one_that_hangs_is_not_waited_for(
     tmp_path: Path, ranks: RankServer
 ) -> None:
-    said = outcomes(ranks, tmp_path, "settings", "weights", "settings of training", "hangs")
+    messages = outcomes(ranks, tmp_path, "settings", "weights", "settings of training", "hangs")
     for how, what, advice in (
         ("settings", "the settings differ", "give all processes the same command"),
         ("weights", "the step and the weights that training begins with differ", "give all processes the same files"),
         ("settings of training", "the settings of training differ", "give all processes the same files"),
     ):
-        for each in said[how]:
+        for each in messages[how]:
             assert each.startswith(f"training: {what}: their digest is ")
             assert each.endswith(advice)
-        assert said[how][0] == said[how][1]
-    assert said["hangs"] == [
+        assert messages[how][0] == messages[how][1]
+    assert messages["hangs"] == [
         "training: process 0 of 2: another process has not answered for 0.0333333 minutes; its own message, if there "
         "is one, says why; start all of them again to continue",
         "",
@@ -102,9 +102,9 @@ def test_processes_that_disagree_stop_at_the_start_and_one_that_hangs_is_not_wai
 @pytest.mark.alone
 def test_a_process_whose_other_dies_ends_at_once(tmp_path: Path, ranks: RankServer) -> None:
     began = time.monotonic()
-    said = outcomes(ranks, tmp_path, "dies")["dies"]
-    assert said[0].startswith("training: process 0 of 2: another process has ended")
-    assert said[1] == ""
+    messages = outcomes(ranks, tmp_path, "dies")["dies"]
+    assert messages[0].startswith("training: process 0 of 2: another process has ended")
+    assert messages[1] == ""
     assert time.time() - (tmp_path / "lost").stat().st_mtime < 30
     assert time.monotonic() - began < 120
-    assert json.dumps(said)
+    assert json.dumps(messages)

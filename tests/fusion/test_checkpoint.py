@@ -77,15 +77,15 @@ def test_settings_that_cannot_be_read_say_what_to_delete(tmp_path: Path, content
 
 @pytest.mark.parametrize("kept_bytes", [0, 7, 100, 200])
 def test_damaged_maps_and_sums_are_named(tmp_path: Path, kept_bytes: int) -> None:
-    kept = FusionCheckpoint(tmp_path, {})
+    checkpoint = FusionCheckpoint(tmp_path, {})
     a_map(tmp_path, {})
-    kept.save_sums(1, np.ones((5, 3), np.float32), np.ones(5, np.float32))
+    checkpoint.save_sums(1, np.ones((5, 3), np.float32), np.ones(5, np.float32))
     for file in ("map_00000.safetensors", SUMS_FILE):
         (tmp_path / file).write_bytes((tmp_path / file).read_bytes()[:kept_bytes])
     with pytest.raises(InputError, match=r"map_00000\.safetensors.*delete .* to start anew"):
         a_map(tmp_path, {})
     with pytest.raises(InputError, match=r"sums\.safetensors.*delete .* to start anew"):
-        kept.load_sums(5, 3)
+        checkpoint.load_sums(5, 3)
 
 
 def test_sums_of_another_size_are_refused(tmp_path: Path) -> None:

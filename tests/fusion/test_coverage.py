@@ -65,9 +65,9 @@ def test_all_views_need_no_choice_and_rows_are_those_that_are_given() -> None:
     assert scene.gaussians is not None
     assert scene.views is not None
     assert covering_views(scene.gaussians, scene.views, OPEN, BlendConfig(), 9) == (0, 1, 2, 3, 4)
-    given, even = fuse(scene, teacher, EXACT, rows=(0, 2, 4)), fuse(scene, teacher, replace(EXACT, views=3))
-    assert given.views == even.views == chosen_views(5, replace(EXACT, views=3))
-    np.testing.assert_array_equal(given.features.features, even.features.features)
+    of_rows, even = fuse(scene, teacher, EXACT, rows=(0, 2, 4)), fuse(scene, teacher, replace(EXACT, views=3))
+    assert of_rows.views == even.views == chosen_views(5, replace(EXACT, views=3))
+    np.testing.assert_array_equal(of_rows.features.features, even.features.features)
 
 
 def test_views_are_judged_by_gaussians_that_they_were_not_chosen_by() -> None:

@@ -1,4 +1,4 @@
-"""Adapter heads: on disk, measured over maps, and applied to features and tokens."""
+"""Adapter heads on disk: written and read, named, copied beside weights, and files that are refused."""
 
 import copy
 import errno
@@ -10,35 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from measured_heads import SPACE, measured
 from torch import nn
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import write_archive
-from gsencoder.fusion.cell_sample import CellSample
-from gsencoder.fusion.heads.apply import equal_rows, head_features, head_space, head_tokens
-from gsencoder.fusion.heads.layers import Residual
-from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead, measure_heads
+from gsencoder.fusion.heads.measure import HeadSet
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import choose_heads, find_head, has_head, heads_digest, load_heads, save_heads
 from gsencoder.fusion.store.heads_file import copy_heads, heads_beside
-from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
-
-SPACE = FeatureSpace(name="radio", channels=6, teacher="radio", weights="abcd", preprocessing="resized")
-FIT = HeadFit(cells=3, cosine=0.5, worst=0.25)
-
-
-def body(channels: int = 4) -> nn.Sequential:
-    torch.manual_seed(channels)
-    block = Residual(nn.LayerNorm(8), nn.GELU(), nn.Linear(8, 8))
-    layers = nn.Sequential(nn.Linear(6, 8), block, nn.LayerNorm(8), nn.ReLU(), nn.Linear(8, channels))
-    for parameter in layers.parameters():
-        nn.init.normal_(parameter)
-    return layers
-
-
-def measured(name: str = "siglip.summary", channels: int = 4, text: str = "siglip") -> MeasuredHead:
-    mean = np.arange(channels, dtype=np.float32)
-    return MeasuredHead(head=Head(name=name, body=body(channels), text=text, model="M"), mean=mean, scale=2.0, fit=FIT)
 
 
 def head_set() -> HeadSet:
@@ -153,150 +133,6 @@ def test_heads_are_chosen_in_the_order_of_their_names_each_once() -> None:
     assert choose_heads(head_set(), ["sam", "siglip", "siglip.summary"]).names == ("sam.features", "siglip.summary")
 
 
-def feature_map(values: np.ndarray) -> FeatureMap:
-    return FeatureMap(features=values, grid_from_image=np.array([[1.0, 0, 0], [0, 1.0, 0]]), space=SPACE)
-
-
-def test_a_sample_holds_evenly_spaced_cells_that_have_a_vector() -> None:
-    values = np.arange(10 * 10 * 6, dtype=np.float32).reshape(10, 10, 6)
-    values[0, 0] = np.nan
-    sample = CellSample(maps=2, limit=20)
-    sample.add(feature_map(values))
-    np.testing.assert_array_equal(sample.vectors(), values.reshape(-1, 6)[1::10])
-    with pytest.raises(InputError, match="no view has a cell with a vector"):
-        CellSample(1).vectors()
-    empty = CellSample(1)
-    empty.add(feature_map(np.full((2, 2, 6), np.nan, np.float32)))
-    with pytest.raises(InputError, match="no view has a cell with a vector"):
-        empty.vectors()
-
-
-def a_basis(rank: int) -> FeatureBasis:
-    rng = np.random.default_rng(0)
-    components = np.linalg.qr(rng.normal(size=(6, 6)))[0][:rank].astype(np.float32)
-    return FeatureBasis(mean=rng.normal(size=6).astype(np.float32), components=components, energy_kept=0.9, space=SPACE)
-
-
-def a_sample(vectors: np.ndarray) -> CellSample:
-    sample = CellSample(1)
-    sample.add(feature_map(vectors.reshape(1, *vectors.shape)))
-    return sample
-
-
-@pytest.mark.parametrize("rank", [0, 3, 6])
-def test_mean_scale_and_what_a_basis_costs_equal_those_computed_by_hand(rank: int) -> None:
-    vectors = np.random.default_rng(1).normal(size=(200, 6)).astype(np.float32)
-    head, basis = measured().head, a_basis(rank) if rank else None
-    (one,) = measure_heads([head], a_sample(vectors), SPACE, basis).heads
-    full = head.body(torch.from_numpy(vectors)).detach().double().numpy()
-    mean = full.mean(axis=0)
-    np.testing.assert_allclose(one.mean, mean, atol=1e-5)
-    assert one.scale == pytest.approx(np.sqrt(((full - mean) ** 2).sum(axis=1).mean()), rel=1e-5)
-    projected = vectors
-    if basis is not None:
-        projected = ((vectors - basis.mean) @ basis.components.T) @ basis.components + basis.mean
-    kept = head.body(torch.from_numpy(projected)).detach().double().numpy()
-    lengths = np.linalg.norm(full - mean, axis=1) * np.linalg.norm(kept - mean, axis=1)
-    cosines = ((full - mean) * (kept - mean)).sum(axis=1) / lengths
-    assert one.fit.cosine == pytest.approx(cosines.mean(), abs=1e-5)
-    assert one.fit.worst == pytest.approx(np.quantile(cosines, 0.05), abs=1e-5)
-    assert (one.fit.cosine > 0.9999) == (rank != 3)
-
-
-def test_outputs_that_are_all_equal_or_not_finite_are_refused() -> None:
-    vectors = np.random.default_rng(1).normal(size=(20, 6)).astype(np.float32)
-    constant = nn.Sequential(nn.Linear(6, 4))
-    nn.init.zeros_(constant[0].weight)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"heads: a\.summary gives the same vector for all 20 cells"):
-        measure_heads([Head(name="a.summary", body=constant)], a_sample(vectors), SPACE, None)
-    nn.init.constant_(constant[0].weight, 1e38)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"heads: outputs of a\.summary are not finite"):
-        measure_heads([Head(name="a.summary", body=constant)], a_sample(vectors * 100), SPACE, None)
-
-
-def fields(n: int = 300, rank: int = 3) -> GaussianFeatures:
-    """Features of which many rows are equal, and some were never seen."""
-    rng = np.random.default_rng(2)
-    distinct = rng.normal(size=(11, rank or 6)).astype(np.float32)
-    values, weights = distinct[rng.integers(0, 11, n)], rng.uniform(0.1, 1, n).astype(np.float32)
-    values[::7], weights[::7] = 0, 0
-    basis = a_basis(rank) if rank else None
-    mean = basis.mean if basis is not None else np.ones(6, np.float32)
-    return GaussianFeatures(features=values, weights=weights, mean=mean, space=SPACE, basis=basis)
-
-
-@pytest.mark.parametrize("rank", [0, 3])
-def test_features_through_a_head_are_its_outputs_for_the_decoded_vectors(rank: int) -> None:
-    features, head = fields(rank=rank), measured()
-    made = head_features(features, head, SPACE, text_encoder="tower")
-    with torch.no_grad():
-        expected = head.head.body(torch.from_numpy(features.decode())).numpy()
-    seen = features.seen
-    np.testing.assert_allclose(made.features[seen], expected[seen], rtol=1e-5, atol=1e-5)
-    assert not made.features[~seen].any()
-    np.testing.assert_array_equal(made.weights, features.weights)
-    np.testing.assert_array_equal(made.mean, head.mean)
-    assert made.space == FeatureSpace(
-        name="radio/siglip.summary",
-        channels=4,
-        teacher="radio",
-        weights="abcd",
-        layer="siglip.summary",
-        preprocessing="resized",
-        text_encoder="tower",
-    )
-
-
-def test_rows_that_are_equal_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsencoder.fusion.heads import apply
-
-    computed = []
-    original = apply.head_outputs
-    monkeypatch.setattr(apply, "head_outputs", lambda head, x: computed.append(len(x)) or original(head, x))
-    head_features(fields(), measured(), SPACE)
-    assert sum(computed) == 11
-
-
-@pytest.mark.parametrize("rows", [0, 1, 5000])
-def test_groups_of_equal_rows_give_the_rows_back(rows: int) -> None:
-    values = np.random.default_rng(0).integers(0, 3, (rows, 3)).astype(np.float32)
-    first, inverse = equal_rows(values)
-    np.testing.assert_array_equal(values[first][inverse], values)
-    assert len(first) == len(np.unique(values, axis=0))
-
-
-def test_rows_whose_keys_collide_are_kept_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    # With factors of 1 the keys of rows of the same numbers in another order are equal.
-    values = np.array([[1, 2, 0], [2, 1, 0], [1, 2, 0]], np.float32)
-
-    class Zeros:
-        def integers(self, *arguments: Any, **options: Any) -> np.ndarray:
-            return np.zeros(3, np.uint64)
-
-    monkeypatch.setattr(np.random, "default_rng", lambda seed: Zeros())
-    first, inverse = equal_rows(values)
-    np.testing.assert_array_equal(values[first][inverse], values)
-
-
-def test_features_of_another_backbone_are_refused() -> None:
-    with pytest.raises(InputError, match=r"siglip\.summary: the heads take features of \(radio.*other.*radio · 6 chan"):
-        head_features(fields(), measured(), replace(SPACE, weights="other"))
-
-
-def test_a_scene_in_which_nothing_was_seen_has_no_outputs() -> None:
-    features = fields()
-    unseen = replace(features, features=np.zeros_like(features.features), weights=np.zeros_like(features.weights))
-    assert not head_features(unseen, measured(), SPACE).features.any()
-
-
-def test_tokens_go_through_a_head_one_by_one() -> None:
-    tokens, head = torch.randn(2, 5, 6), measured()
-    made = head_tokens(tokens, head)
-    for view, rows in enumerate(made):
-        torch.testing.assert_close(rows, head.head.body(tokens[view]).detach(), rtol=1e-4, atol=1e-4)
-    assert head_space(SPACE, head).text_encoder == ""
-
-
 def test_the_file_of_heads_lies_beside_weights_and_graphs_and_is_copied_for_its_space_only(tmp_path: Path) -> None:
     save_heads(tmp_path / "heads.safetensors", head_set())
     assert heads_beside(tmp_path / "encoder.safetensors") == tmp_path / "heads.safetensors"
@@ -328,29 +164,3 @@ def test_earlier_heads_beside_a_graph_stand_until_their_copy_is_on_the_disk(
     with pytest.raises(InputError, match=r"e\.onnx\.heads\.safetensors: no space left"):
         copy_heads(tmp_path / "heads.safetensors", target, [SPACE])
     assert target.read_bytes() == b"earlier"
-
-
-def test_a_fusion_that_continues_from_its_cache_samples_the_cells_of_all_views(tmp_path: Path) -> None:
-    from training_scenes import DenseSideTeacher
-    from training_scenes import scene as a_scene
-
-    from gsencoder.fusion.fuse import FuseConfig, fuse
-
-    class Expensive(DenseSideTeacher):
-        cheap = False
-        asked = 0
-
-        def feature_map(self, views: Any, view: int) -> FeatureMap:
-            Expensive.asked += 1
-            return super().feature_map(views, view)
-
-    scene, config = a_scene(0), FuseConfig(basis=False)
-    plain = fuse(scene, Expensive(), config, sample_cells=True).sample
-    fuse(scene, Expensive(), config, work=tmp_path / "work")
-    Expensive.asked = 0
-    continued = fuse(scene, Expensive(), config, work=tmp_path / "work", sample_cells=True).sample
-    assert plain is not None
-    assert continued is not None
-    assert Expensive.asked == 0
-    np.testing.assert_allclose(continued.vectors(), plain.vectors(), rtol=1e-3, atol=1e-3)
-    assert fuse(scene, Expensive(), config).sample is None

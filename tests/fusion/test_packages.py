@@ -82,9 +82,9 @@ def test_codes_are_mapped_and_not_read(package: Path) -> None:
 def test_a_flipped_bit_anywhere_is_noticed(package: Path) -> None:
     file = package / PACKAGE_FILE
     whole = file.read_bytes()
-    for place in np.linspace(0, len(whole) - 1, 150).astype(int):
+    for offset in np.linspace(0, len(whole) - 1, 150).astype(int):
         damaged = bytearray(whole)
-        damaged[place] ^= 4
+        damaged[offset] ^= 4
         file.write_bytes(damaged)
         with pytest.raises(InputError):
             load_features(package)
@@ -190,8 +190,8 @@ def test_the_ply_holds_features_as_properties(folder: Path, tmp_path: Path, open
     expected = load_features(folder).features["s"]
     values = expected.decode() if decoded else expected.features
     for number in (0, values.shape[1] - 1):
-        found = points[f"feature_{number}"].numpy()[:, 0]
-        np.testing.assert_allclose(found[expected.seen], values[expected.seen, number], atol=4e-3)
+        column = points[f"feature_{number}"].numpy()[:, 0]
+        np.testing.assert_allclose(column[expected.seen], values[expected.seen, number], atol=4e-3)
     np.testing.assert_array_equal(points["feature_weight"].numpy()[:, 0], expected.weights)
 
     ours, source = load_splat(out / SPLAT_FILE), load_features(folder).gaussians
@@ -204,9 +204,9 @@ def test_pack_writes_what_localize_reads(folder: Path, tmp_path: Path, capsys: p
     out = tmp_path / "out"
     assert cli.main(["pack", str(folder), f"out={out}", "error=0.02"]) == 0
     assert "bytes a row" in capsys.readouterr().out
-    told = json.loads((out / "summary.json").read_text())["results"]
-    assert told["error"] <= 0.02
-    assert told["bytes"] == (out / PACKAGE_FILE).stat().st_size
+    results = json.loads((out / "summary.json").read_text())["results"]
+    assert results["error"] <= 0.02
+    assert results["bytes"] == (out / PACKAGE_FILE).stat().st_size
     assert cli.main(["localize", str(out), "query=mug", f"out={tmp_path / 'boxes'}", "pictures=0"]) == 0
     again = tmp_path / "again"
     assert cli.main(["pack", str(out), "form=npz", f"out={again}", "quiet=true"]) == 0

@@ -23,10 +23,10 @@ def test_the_budget_is_met_and_the_error_told_is_the_error_made(error: float, ba
     over_rows = field_error(made.features(), features, sample=0).centered
     assert over_rows <= made.error + 1e-5
     assert over_rows >= made.error / 20
-    found = made.features()
-    np.testing.assert_array_equal(found.seen, features.seen)
-    assert not found.features[~found.seen].any()
-    np.testing.assert_allclose(found.weights, features.weights, rtol=0.03)
+    decoded = made.features()
+    np.testing.assert_array_equal(decoded.seen, features.seen)
+    assert not decoded.features[~decoded.seen].any()
+    np.testing.assert_allclose(decoded.weights, features.weights, rtol=0.03)
 
 
 @pytest.mark.slow
@@ -67,12 +67,12 @@ def test_a_rare_kind_is_kept_as_well_as_a_common_one() -> None:
     values[rare] = other[np.arange(len(rare)) % 3]
     mixed = replace(features, features=values)
     made = compact(mixed, error=0.02)
-    found = made.features()
-    common = field_error(found, mixed, sample=0).centered
-    kept = np.setdiff1d(np.arange(10_000), rare)
-    alone = replace(mixed, weights=np.where(np.isin(np.arange(10_000), kept), 0, 1).astype(np.float32))
+    decoded = made.features()
+    common = field_error(decoded, mixed, sample=0).centered
+    common_rows = np.setdiff1d(np.arange(10_000), rare)
+    alone = replace(mixed, weights=np.where(np.isin(np.arange(10_000), common_rows), 0, 1).astype(np.float32))
     assert common <= 0.02
-    assert field_error(found, alone, sample=0).centered <= 0.06
+    assert field_error(decoded, alone, sample=0).centered <= 0.06
 
 
 def test_a_kind_that_the_sample_misses_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,10 +106,10 @@ def test_weights_of_any_range_come_back_within_their_step(low: float, high: floa
     rng = np.random.default_rng(0)
     weights = np.exp(rng.uniform(np.log(low), np.log(high), len(features))).astype(np.float32)
     weights[:2] = low, high
-    found = compact(replace(features, weights=weights), error=0.1).features().weights
+    decoded = compact(replace(features, weights=weights), error=0.1).features().weights
     step = (high / low) ** (1 / 510)
-    assert (found <= weights * step * 1.001).all()
-    assert (found >= weights / step / 1.001).all()
+    assert (decoded <= weights * step * 1.001).all()
+    assert (decoded >= weights / step / 1.001).all()
 
 
 def test_any_rows_decode_to_what_all_decode_to(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,13 +128,13 @@ def test_codes_lie_as_the_format_says() -> None:
     """Read bit by bit, without numpy's unpacking."""
     made = compact(make_features(n=200), error=0.01)
     offsets = np.concatenate(([0], np.cumsum(1 << made.bits.astype(int))))
-    for place in (0, 7, 100):
-        digits = "".join(f"{byte:08b}" for byte in made.codes[place])
+    for index in (0, 7, 100):
+        digits = "".join(f"{byte:08b}" for byte in made.codes[index])
         begin, expected = 0, []
         for number, width in enumerate(made.bits.tolist()):
             expected.append(made.levels[offsets[number] + int(digits[begin : begin + width], 2)])
             begin += width
-        np.testing.assert_array_equal(made.coordinates(np.array([place]))[0], np.array(expected, np.float32))
+        np.testing.assert_array_equal(made.coordinates(np.array([index]))[0], np.array(expected, np.float32))
 
 
 @pytest.mark.parametrize("kinds", [False, True])

@@ -50,11 +50,11 @@ def picture(height: int = 30, width: int = 44) -> np.ndarray:
 
 def test_a_picture_becomes_a_grid_of_patch_features(folder: Path) -> None:
     teacher = RadioTeacher(RadioConfig(model=str(folder), size=48, device="cpu"))
-    found = teacher.feature_map(views(picture()), 0)
-    assert found.features is not None
-    assert found.features.shape == (4, 6, 24)
-    np.testing.assert_allclose(found.grid_from_image, [[6 / 44, 0, 0], [0, 4 / 30, 0]])
-    assert np.array_equal(found.features, teacher.feature_map(views(picture()), 0).features)
+    feature_map = teacher.feature_map(views(picture()), 0)
+    assert feature_map.features is not None
+    assert feature_map.features.shape == (4, 6, 24)
+    np.testing.assert_allclose(feature_map.grid_from_image, [[6 / 44, 0, 0], [0, 4 / 30, 0]])
+    assert np.array_equal(feature_map.features, teacher.feature_map(views(picture()), 0).features)
 
 
 def test_its_features_are_those_of_the_model_without_summary_tokens(folder: Path) -> None:
@@ -66,9 +66,9 @@ def test_its_features_are_those_of_the_model_without_summary_tokens(folder: Path
     pixels = torch.from_numpy(image.astype(np.float32) / 255).permute(2, 0, 1)[None]
     with torch.no_grad():
         everything = model(pixel_values=pixels).last_hidden_state[0]
-    found = teacher.feature_map(views(image), 0).features
-    assert found is not None
-    np.testing.assert_allclose(found.reshape(-1, 24), everything[-6:].numpy(), rtol=1e-4, atol=1e-5)
+    features = teacher.feature_map(views(image), 0).features
+    assert features is not None
+    np.testing.assert_allclose(features.reshape(-1, 24), everything[-6:].numpy(), rtol=1e-4, atol=1e-5)
 
 
 def test_its_space_tells_weights_apart(folder: Path, tmp_path: Path) -> None:

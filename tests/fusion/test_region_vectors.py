@@ -1,61 +1,25 @@
-"""Vectors of regions from pictures: means of dense maps, and crops through image towers."""
+"""Vectors of regions as means of dense maps, and settings of their teachers."""
 
-import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 import transformers
-from onnx import helper, numpy_helper
-from PIL import Image
-from region_scenes import (
-    HEIGHT,
-    WIDTH,
-    labels_of,
-    region_scene,
-    save_colors,
-    save_net,
-    save_pool,
-    toy_words,
-    write_masks,
-)
+from onnx import helper
+from region_scenes import HEIGHT, WIDTH, labels_of, region_scene, save_colors, save_net, save_pool, write_masks
+from region_teachers import PLAIN, VISION, build, made
 from scene_files import save
-from vision_towers import JOINT_CHANNELS, save_preprocessing, save_vision_tower
-from vision_towers import VISION as TOWER_VISION
+from vision_towers import save_preprocessing, save_vision_tower
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import build_teacher, takes_text, words_of
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.radio import RadioTeacher
 from gsencoder.fusion.teachers.regions.build import dense_teacher
 from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions, RegionsConfig
-from gsencoder.fusion.teachers.regions.crops import TransformersImageTower, square_crop
 from gsencoder.fusion.teachers.regions.vectors import MapVectors, region_means
-from gsencoder.text.onnx_tower import OnnxTextConfig
-from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureMap, FeatureSpace
-
-PLAIN = {"scale": 1.0, "mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
-SMALL: dict[str, Any] = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
-VISION = {**SMALL, "image_size": 8, "patch_size": 4}
-TEXT = {**SMALL, "vocab_size": 8, "max_position_embeddings": 12, "eos_token_id": 3, "bos_token_id": 2}
-
-
-def build(masks: Path, model: Path, vector: str, words: TextTable | None = None, **options: Any) -> Teacher:
-    plain = OnnxRegionOptions(layout="grid", patch=4, size=WIDTH, **PLAIN)
-    config = RegionsConfig(folder=str(masks), vector=vector, model=str(model), **{"onnx": plain, **options})  # type: ignore[arg-type]
-    return build_teacher(config, region_scene(), words)
-
-
-def made(teacher: Teacher, view: int) -> FeatureMap:
-    scene = region_scene()
-    assert scene.views is not None
-    return teacher.feature_map(scene.views, view)
 
 
 def test_means_over_regions_weight_cells_by_their_pixels(rng: np.random.Generator) -> None:
@@ -142,93 +106,6 @@ def test_vectors_that_are_not_finite_are_refused_with_view_and_label(tmp_path: P
         MapVectors(NanTeacher(options)).vectors(scene.views, 0, labels_of(0).astype(np.int32), [1, 9])
 
 
-@pytest.mark.parametrize("around", ["picture", "nothing"])
-def test_a_crop_is_the_box_of_the_region_in_a_gray_square(rng: np.random.Generator, around: str) -> None:
-    image = rng.integers(0, 256, (9, 12, 3), dtype=np.uint8)
-    mask = np.zeros((9, 12), bool)
-    mask[2:5, 1:8] = True
-    mask[3, 4] = False
-    crop = square_crop(image, mask, (1, 2, 3), masked=around == "nothing")
-    expected = np.full((7, 7, 3), (1, 2, 3), np.uint8)
-    expected[2:5] = image[2:5, 1:8]
-    if around == "nothing":
-        expected[3, 3] = (1, 2, 3)
-    np.testing.assert_array_equal(crop, expected)
-
-
-@pytest.mark.parametrize("around", ["picture", "nothing"])
-def test_crops_through_an_onnx_tower_are_its_pooled_output(tmp_path: Path, around: Any) -> None:
-    teacher = build(
-        write_masks(tmp_path / "m"),
-        save_pool(tmp_path / "net.onnx"),
-        "crop",
-        min_area=1,
-        around=around,
-        onnx=OnnxRegionOptions(size=16, **PLAIN),
-    )
-    scene = region_scene()
-    assert scene.views is not None
-    assert scene.views.images is not None
-    table = made(teacher, 1).table
-    assert table is not None
-    for row, label in enumerate((1, 7)):
-        square = square_crop(scene.views.images[1], labels_of(1) == label, (0, 0, 0), masked=around == "nothing")
-        mean = np.asarray(Image.fromarray(square).resize((16, 16), Image.Resampling.BICUBIC)).mean(axis=(0, 1))
-        np.testing.assert_allclose(table[row], mean / np.linalg.norm(mean), rtol=1e-5)
-
-
-def joint_clip() -> Any:
-    config = transformers.CLIPConfig(
-        text_config={**TEXT, "projection_dim": 8}, vision_config={**VISION, "projection_dim": 8}, projection_dim=8
-    )
-    return transformers.CLIPModel(config), transformers.CLIPImageProcessor(
-        size={"shortest_edge": 8}, crop_size={"height": 8, "width": 8}
-    )
-
-
-def joint_siglip() -> Any:
-    config = transformers.SiglipConfig(text_config={**TEXT, "projection_size": 16}, vision_config=VISION)
-    return transformers.SiglipModel(config), transformers.SiglipImageProcessor(size={"height": 8, "width": 8})
-
-
-def plain_vit() -> Any:
-    return transformers.ViTModel(transformers.ViTConfig(**VISION)), transformers.ViTImageProcessor(
-        size={"height": 8, "width": 8}
-    )
-
-
-@pytest.mark.parametrize(("make", "joint"), [(joint_clip, True), (joint_siglip, True), (plain_vit, False)])
-def test_crops_through_a_tower_of_transformers_equal_a_direct_call_of_the_library(
-    tmp_path: Path, make: Any, joint: bool
-) -> None:
-    torch.manual_seed(0)
-    model, processor = make()
-    model = model.eval()
-    model.save_pretrained(tmp_path / "model")
-    processor.save_pretrained(tmp_path / "model")
-    masks = write_masks(tmp_path / "m")
-    words = toy_words("mug", "table", channels=8 if make is joint_clip else 16)
-    if not joint:
-        with pytest.raises(InputError, match="if teacher.joint=true says that both belong to one joint model"):
-            build(masks, tmp_path / "model", "crop", words)
-    teacher = build(masks, tmp_path / "model", "crop", words, min_area=1, joint=not joint, device="cpu")
-    assert teacher.space.text_encoder == "toy"
-    scene = region_scene()
-    assert scene.views is not None
-    assert scene.views.images is not None
-    gray = tuple(round(255 * value) for value in processor.image_mean)
-    square = square_crop(scene.views.images[0], labels_of(0) == 7, gray, masked=False)
-    inputs = processor(images=Image.fromarray(square), return_tensors="pt")
-    with torch.inference_mode():
-        outputs = model.get_image_features(**inputs) if joint else model(**inputs)
-    vector = outputs.pooler_output[0].numpy()
-    table = made(teacher, 0).table
-    assert table is not None
-    np.testing.assert_allclose(table[1], vector / np.linalg.norm(vector), atol=1e-5)
-    with pytest.raises(InputError, match="channels and its words 5"):
-        build(masks, tmp_path / "model", "crop", toy_words("mug", channels=5), joint=True, device="cpu")
-
-
 def test_folders_of_radio_and_of_vision_towers_give_dense_maps_and_others_are_refused(tmp_path: Path) -> None:
     small = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 8, "image_size": 32}
     transformers.RadioModel(transformers.RadioConfig(**small, max_img_size=64)).save_pretrained(tmp_path / "radio")
@@ -241,30 +118,6 @@ def test_folders_of_radio_and_of_vision_towers_give_dense_maps_and_others_are_re
     transformers.ViTModel(transformers.ViTConfig(**VISION)).save_pretrained(tmp_path / "vit")
     with pytest.raises(InputError, match="vit"):
         dense_teacher(RegionsConfig(vector="map", model=str(tmp_path / "vit"), device="cpu"), "")
-
-
-def test_models_without_a_pooled_output_are_refused(tmp_path: Path) -> None:
-    masks = write_masks(tmp_path / "m")
-    with pytest.raises(InputError, match=r"gave 'out' of shape \[1, 3, 8, 8\], expected a pooled output"):
-        build(masks, save_colors(tmp_path / "net.onnx"), "crop")
-    with pytest.raises(InputError, match="teacher.model= is missing: the image tower of vector=map"):
-        build_teacher(RegionsConfig(folder=str(masks), vector="map"), region_scene(), None)
-    config = RegionsConfig(folder=str(masks), vector="crop", model=str(save_pool(tmp_path / "p.onnx")))
-    with pytest.raises(InputError, match="no pictures to make vectors of regions from"):
-        build_teacher(config, region_scene(images=None), None)
-
-
-def test_a_text_tower_needs_a_joint_model(tmp_path: Path) -> None:
-    tower = OnnxTextConfig(model="nowhere")
-    with pytest.raises(InputError, match="if teacher.joint=true says that teacher.model= and text= belong to one"):
-        words_of(RegionsConfig(vector="map", model="x.onnx"), tower)
-    model, masks = save_pool(tmp_path / "net.onnx"), write_masks(tmp_path / "m")
-    with pytest.raises(
-        InputError, match="the vectors of net are taken for those of the text tower if teacher.joint=true"
-    ):
-        build(masks, model, "crop", toy_words("mug", channels=3))
-    joint = build(masks, model, "crop", toy_words("mug", channels=3), joint=True, min_area=1)
-    assert joint.space.text_encoder == "toy"
 
 
 def test_settings_follow_what_changes_the_vectors(tmp_path: Path) -> None:
@@ -292,79 +145,3 @@ def test_settings_follow_what_changes_the_vectors(tmp_path: Path) -> None:
 def test_options_of_onnx_files_out_of_range_are_refused(options: dict[str, Any], problem: str) -> None:
     with pytest.raises(InputError, match=problem):
         OnnxRegionOptions(**options)
-
-
-def clip_folder(folder: Path, **preprocessing: Any) -> Path:
-    """A CLIP folder that states the width of its joint space at the top alone, as releases do."""
-    torch.manual_seed(0)
-    text = {key: value for key, value in TEXT.items() if key != "projection_dim"}
-    config = transformers.CLIPConfig(text_config=text, vision_config=TOWER_VISION, projection_dim=JOINT_CHANNELS)
-    transformers.CLIPModel(config).save_pretrained(folder)
-    save_preprocessing("clip", folder)
-    if preprocessing:
-        path = folder / "preprocessor_config.json"
-        path.write_text(json.dumps({**json.loads(path.read_text()), **preprocessing}))
-    return folder
-
-
-def test_a_clip_folder_may_state_its_joint_space_at_the_top_alone(tmp_path: Path) -> None:
-    tower = TransformersImageTower(clip_folder(tmp_path / "clip"), "cpu")
-    assert tower.channels == JOINT_CHANNELS
-    picture = np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8)
-    model = transformers.CLIPModel.from_pretrained(tmp_path / "clip").eval()
-    processor = transformers.CLIPImageProcessorPil.from_pretrained(tmp_path / "clip")
-    with torch.inference_mode():
-        inputs = processor(images=Image.fromarray(picture), return_tensors="pt")
-        vision = model.vision_model(**inputs).pooler_output
-        expected = model.visual_projection(vision)[0].numpy()
-    np.testing.assert_allclose(tower.embed(picture), expected, atol=1e-5)
-
-
-def test_a_preprocessing_of_another_size_than_the_model_is_one_line(tmp_path: Path) -> None:
-    folder = clip_folder(tmp_path / "clip", crop_size={"height": 64, "width": 64}, size={"shortest_edge": 64})
-    with pytest.raises(InputError, match="clip does not run on what its preprocessing makes of a picture"):
-        TransformersImageTower(folder, "cpu")
-
-
-def test_no_end_of_a_square_is_cut_off_by_a_tower_that_crops(tmp_path: Path) -> None:
-    """As released DINOv2 folders do, which resize to 256 pixels and take the middle 224."""
-    masks, vectors = write_masks(tmp_path / "m"), []
-    for edge in (8, 10):
-        torch.manual_seed(0)
-        model, _ = joint_clip()
-        model.eval().save_pretrained(tmp_path / f"model{edge}")
-        processor = transformers.CLIPImageProcessor(
-            size={"shortest_edge": edge}, crop_size={"height": 8, "width": 8}, resample=2
-        )
-        processor.save_pretrained(tmp_path / f"model{edge}")
-        words = toy_words("mug", "table", channels=8)
-        teacher = build(masks, tmp_path / f"model{edge}", "crop", words, min_area=1, device="cpu")
-        vectors.append(made(teacher, 0).table)
-    np.testing.assert_allclose(vectors[0], vectors[1], atol=1e-6)
-
-
-def test_a_crop_teacher_without_a_joint_space_takes_no_words_beside_one_that_has_some(tmp_path: Path) -> None:
-    for name, make in (("clip", joint_clip), ("vit", plain_vit)):
-        make()[0].save_pretrained(tmp_path / name)
-    config = RegionsConfig(masks="instances", vector="crop", model=str(tmp_path / "vit"))
-    assert not takes_text(config)
-    assert takes_text(replace(config, joint=True))
-    assert takes_text(replace(config, model=str(tmp_path / "clip")))
-
-
-def test_tokens_before_those_of_patches_are_skipped(tmp_path: Path) -> None:
-    """The same map as a grid, and as tokens behind one of the whole picture."""
-    masks, grid = write_masks(tmp_path / "m"), save_colors(tmp_path / "grid.onnx")
-    constants = {"shape": np.array([1, 3, -1]), "first": np.full((1, 1, 3), 9, np.float32)}
-    tokens = save_net(
-        tmp_path / "tokens.onnx",
-        *(helper.make_node("Constant", [], [name], value=numpy_helper.from_array(v)) for name, v in constants.items()),
-        helper.make_node("AveragePool", ["image"], ["cells"], kernel_shape=[4, 4], strides=[4, 4]),
-        helper.make_node("Reshape", ["cells", "shape"], ["rows"]),
-        helper.make_node("Transpose", ["rows"], ["patches"], perm=[0, 2, 1]),
-        helper.make_node("Concat", ["first", "patches"], ["out"], axis=1),
-    )
-    options = OnnxRegionOptions(layout="tokens", skip_tokens=1, patch=4, size=WIDTH, **PLAIN)
-    expected = made(build(masks, grid, "map", min_area=1), 0)
-    skipped = made(build(masks, tokens, "map", min_area=1, onnx=options), 0)
-    np.testing.assert_allclose(skipped.table, expected.table, rtol=1e-6)

@@ -117,7 +117,7 @@ def changed(path: Path, **arrays: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "said"),
+    ("name", "values", "problem"),
     [
         ("rows", np.zeros(30, np.int32), "row numbers that rise"),
         ("rows", np.arange(11, 41, dtype=np.int32), "row numbers that rise from 0 to at most 39"),
@@ -131,11 +131,11 @@ def changed(path: Path, **arrays: np.ndarray) -> None:
     ],
 )
 def test_features_that_do_not_belong_together_are_named(
-    tmp_path: Path, name: str, values: np.ndarray, said: str
+    tmp_path: Path, name: str, values: np.ndarray, problem: str
 ) -> None:
     save_features(tmp_path, make_scene(), make_features(), {})
     changed(tmp_path / FEATURES_FILE, **{name: values})
-    with pytest.raises(InputError, match=f"{FEATURES_FILE}: .*({said})"):
+    with pytest.raises(InputError, match=f"{FEATURES_FILE}: .*({problem})"):
         load_features(tmp_path)
 
 

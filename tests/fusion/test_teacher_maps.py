@@ -31,9 +31,9 @@ class ScaledTeacher(DenseSideTeacher):
 
 
 def views() -> Views:
-    found = scene(0).views
-    assert found is not None
-    return found
+    source = scene(0).views
+    assert source is not None
+    return source
 
 
 def test_each_channel_keeps_three_digits_whatever_its_magnitude(tmp_path: Path) -> None:
@@ -102,16 +102,16 @@ def test_coded_maps_and_those_of_cheap_teachers_are_made_each_time(tmp_path: Pat
 def test_fusing_with_a_cache_and_preparing_see_the_same_maps(tmp_path: Path) -> None:
     class Recording(CachedTeacher):
         def feature_map(self, views: Views, view: int) -> FeatureMap:
-            found = super().feature_map(views, view)
-            given.append(found.features)
-            return found
+            result = super().feature_map(views, view)
+            maps.append(result.features)
+            return result
 
-    given: list[np.ndarray | None] = []
+    maps: list[np.ndarray | None] = []
     config = replace(FuseConfig(), basis=False)
     by_work = fuse(scene(0), ScaledTeacher(), config, work=tmp_path / "work").features
     by_cache = fuse(scene(0), Recording(ScaledTeacher(), tmp_path), config).features
     np.testing.assert_array_equal(by_work.features, by_cache.features)
-    assert all(values is not None and np.isfinite(values).all() for values in given)
+    assert all(values is not None and np.isfinite(values).all() for values in maps)
 
 
 def test_a_scene_with_channels_beyond_float16_is_prepared(tmp_path: Path) -> None:

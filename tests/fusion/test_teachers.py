@@ -76,9 +76,9 @@ def test_labels_give_each_pixel_its_name_and_the_rest_the_mean_direction() -> No
     embeddings = np.eye(4, 8, dtype=np.float32)
     teacher = LabelsTeacher(label_objects(), ("ball", "cup", "mug", "pen"), embeddings, text_encoder="t")
     instances = np.array([[0, 3, 5], [9, 9, 77]], np.int32)
-    found = teacher.feature_map(views_of(instances=instances), 0)
-    assert found.codes is not None
-    vectors = teacher.table[found.codes]
+    feature_map = teacher.feature_map(views_of(instances=instances), 0)
+    assert feature_map.codes is not None
+    vectors = teacher.table[feature_map.codes]
     np.testing.assert_allclose(vectors[0, 1], embeddings[2])
     np.testing.assert_allclose(vectors[1, 0], embeddings[0])
     other = embeddings.mean(axis=0) / np.linalg.norm(embeddings.mean(axis=0))
@@ -140,14 +140,14 @@ def test_an_onnx_backbone_sees_each_patch_where_it_is(tmp_path: Path) -> None:
     teacher = OnnxTeacher(onnx_config(tmp_path / "m.onnx"))
     image = np.zeros((24, 32, 3), np.uint8)
     image[8:12, 20:24, 1] = 255
-    found = teacher.feature_map(views_of(image), 0)
-    assert found.features is not None
-    assert found.features.shape == (6, 8, 3)
+    feature_map = teacher.feature_map(views_of(image), 0)
+    assert feature_map.features is not None
+    assert feature_map.features.shape == (6, 8, 3)
     assert teacher.space.channels == 3
-    row, column = np.unravel_index(found.features[..., 1].argmax(), (6, 8))
+    row, column = np.unravel_index(feature_map.features[..., 1].argmax(), (6, 8))
     assert (int(row), int(column)) == (2, 5)
-    assert found.features[2, 5, 1] == pytest.approx(1)
-    np.testing.assert_allclose(found.grid_from_image, [[0.25, 0, 0], [0, 0.25, 0]])
+    assert feature_map.features[2, 5, 1] == pytest.approx(1)
+    np.testing.assert_allclose(feature_map.grid_from_image, [[0.25, 0, 0], [0, 0.25, 0]])
 
 
 def test_a_classifier_becomes_a_mixture_of_the_known_classes_words(tmp_path: Path) -> None:

@@ -158,8 +158,8 @@ def test_a_scene_is_fused_and_words_are_localized_in_it(
     assert features.seen.any()
     # A noun of the stored table needs no tower; a phrase beside it takes the tower that is given.
     assert cli.main(["localize", str(out), "query=mug", f"out={boxes}", "pictures=0", "quiet=true"]) == 0
-    found = json.loads((boxes / "summary.json").read_text())["results"]
-    assert "boxes" in found
+    results = json.loads((boxes / "summary.json").read_text())["results"]
+    assert "boxes" in results
     phrase = ["localize", str(out), "query=red wooden chair", "pictures=0", f"out={tmp_path / 'phrase'}"]
     assert "text tower" in refusal(capsys, *phrase)
     assert cli.main([*phrase, "text=transformers", f"text.model={model}", "quiet=true"]) == 0

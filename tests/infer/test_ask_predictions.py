@@ -44,8 +44,8 @@ def test_the_meant_box_comes_first_and_the_others_in_their_order(tmp_path: Path)
 
 
 def test_answers_have_the_box_of_the_best_target_and_unanswered_descriptions_come_last(tmp_path: Path) -> None:
-    asked = read(tmp_path, [{"scene_id": "a", "question_id": "q", "question": "What?"}]).questions
-    (row,) = predictions("scanqa", [(asked[0], {"answer": "A.", "targets": [target(3), target(0)]})])
+    questions = read(tmp_path, [{"scene_id": "a", "question_id": "q", "question": "What?"}]).questions
+    (row,) = predictions("scanqa", [(questions[0], {"answer": "A.", "targets": [target(3), target(0)]})])
     assert row == {"scene_id": "a", "question_id": "q", "answer_top10": ["a"], "bbox": corners(3)}
     first, second = read(tmp_path, [described(1), described(2)]).questions
     rows = predictions("scanrefer", [(second, {"mark": 1, "targets": [target(0)]})], [first])
@@ -82,14 +82,14 @@ def test_each_object_is_captioned_once_in_its_own_box_and_only_in_scenes_that_ar
         described(4, ann_id="1", bbox=corners(4)),
         described(4, "b", bbox=corners(9)),
     ]
-    asked = read(tmp_path, rows, task="caption")
-    assert [(each.scene, each.question.id, each.question.question.aabb) for each in asked.questions] == [
+    question_set = read(tmp_path, rows, task="caption")
+    assert [(each.scene, each.question.id, each.question.question.aabb) for each in question_set.questions] == [
         ("a", "a/4", (4.0, 0.0, -1.0, 5.0, 2.0, 3.0)),
         ("a", "a/2", (2.0, 0.0, -1.0, 3.0, 2.0, 3.0)),
         ("b", "b/4", (9.0, 0.0, -1.0, 10.0, 2.0, 3.0)),
     ]
-    assert asked.scenes() == {"a": 2, "b": 1}
-    assert [each.question.id for each in asked.of_scene("a")] == ["a/4", "a/2"]
+    assert question_set.scenes() == {"a": 2, "b": 1}
+    assert [each.question.id for each in question_set.of_scene("a")] == ["a/4", "a/2"]
     boxes = tmp_path / "boxes.json"
     boxes.write_text(json.dumps({"c": [{"box": corners(1)}], "b": [{"box": corners(3)}, {"box": corners(8)}]}))
     proposed = read(tmp_path, rows, task="caption", proposals=str(boxes))
@@ -103,9 +103,9 @@ def test_each_object_is_captioned_once_in_its_own_box_and_only_in_scenes_that_ar
 
 def test_names_that_are_localized_are_each_once_in_every_scene(tmp_path: Path) -> None:
     rows = [described(1, name="office_chair"), described(2, name="lamp"), described(3, name="office_chair")]
-    asked = read(tmp_path, [*rows, described(1, "b", name="lamp")], task="caption", proposals="localize")
-    assert asked.names == {"a": ("office chair", "lamp"), "b": ("lamp",)}
-    assert (asked.questions, asked.scenes()) == ((), {"a": 2, "b": 1})
+    question_set = read(tmp_path, [*rows, described(1, "b", name="lamp")], task="caption", proposals="localize")
+    assert question_set.names == {"a": ("office chair", "lamp"), "b": ("lamp",)}
+    assert (question_set.questions, question_set.scenes()) == ((), {"a": 2, "b": 1})
 
 
 def test_questions_without_a_situation_are_named_by_their_id_alone(tmp_path: Path) -> None:

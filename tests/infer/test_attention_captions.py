@@ -53,8 +53,8 @@ def test_captions_name_the_pixel_and_the_views_and_weights_of_the_components(
     scene = replace(scene, views=replace(scene.views, images=images))
     # Components of both views are among those that are found.
     sources = memory.bank.sources.copy()
-    found = strongest_components(memory, scene.gaussians, scene.views.cameras, view, (24, 20), 3)
-    sources[found.components, 0] = [0, 1, 0]
+    components = strongest_components(memory, scene.gaussians, scene.views.cameras, view, (24, 20), 3)
+    sources[components.components, 0] = [0, 1, 0]
     attention_picture(
         replace(memory, bank=replace(memory.bank, sources=sources)), scene, view, (24, 20), count=3
     )  # fmt: skip
@@ -64,9 +64,9 @@ def test_captions_name_the_pixel_and_the_views_and_weights_of_the_components(
     assert [text for text in written if text.removesuffix(", rendered") in names] == [
         f"{names[source]}{ending}" for source in (0, 1, 0)
     ]
-    weights = [f"{number + 1}.  {100 * weight:.1f} %" for number, weight in enumerate(found.weights.tolist())]
+    weights = [f"{number + 1}.  {100 * weight:.1f} %" for number, weight in enumerate(components.weights.tolist())]
     assert [text for text in written if text in weights] == weights
-    total = 100 * float(found.weights.sum())
+    total = 100 * float(components.weights.sum())
     assert any(
         f"these 3 of {len(memory.bank)} components: {total:.1f} % together" in text for text in written
     )  # fmt: skip
@@ -80,17 +80,17 @@ def test_as_many_components_are_shown_as_are_asked_for(memory: QueryMemory, writ
 
 
 def test_views_are_rendered_as_accurately_as_is_asked_for(memory: QueryMemory, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[object] = []
+    settings: list[object] = []
     blend = module.blend
 
     def recorded(*arguments: object, config: BlendConfig) -> Blend:
-        asked.append(config)
+        settings.append(config)
         return blend(*arguments, config=config)  # type: ignore[arg-type]
 
     monkeypatch.setattr(module, "blend", recorded)
     config = BlendConfig(min_weight=1e-3)
     assert len(list(attention_pictures(memory, wall(0), views=2, config=config))) == 2
-    assert asked == [config, config]
+    assert settings == [config, config]
 
 
 @pytest.mark.parametrize("case", ["haze", "below the middle", "beside the middle"])
@@ -101,10 +101,12 @@ def test_the_salient_pixel_is_opaque_and_in_the_middle_though_others_attend_to_l
     scene = wall(0)
     assert scene.gaussians is not None
     assert scene.views is not None
-    place = {"haze": (0.4, 0.0, 3.0), "below the middle": (0.0, 0.95, 3.0), "beside the middle": (1.1, 0.0, 3.0)}[case]
+    positions = {"haze": (0.4, 0.0, 3.0), "below the middle": (0.0, 0.95, 3.0), "beside the middle": (1.1, 0.0, 3.0)}[
+        case
+    ]
     gaussians = replace(
         scene.gaussians.select(np.zeros(2, int)),
-        means=np.array([(0, 0, 3), place], np.float32),
+        means=np.array([(0, 0, 3), positions], np.float32),
         scales=np.full((2, 3), 0.1, np.float32),
         opacities=np.array([0.95, 0.4 if case == "haze" else 0.95], np.float32),
     )

@@ -89,22 +89,22 @@ def test_the_components_are_the_first_of_the_attention_of_the_pixels_query(
     row = pixel[1] * b.shape[1] + pixel[0]
     query = (b.render(torch.from_numpy(memory.queries)) / b.render(seen)[:, None])[row].numpy()
     attention = memory.attention(query[None])[0]
-    found = strongest_components(memory, scene.gaussians, scene.views.cameras, view, pixel, 4, blended=b)
-    assert found.pixel == pixel
-    np.testing.assert_allclose(found.weights, np.sort(attention)[::-1][:4], rtol=1e-5)
-    np.testing.assert_allclose(attention[found.components], found.weights, rtol=1e-5)
+    components = strongest_components(memory, scene.gaussians, scene.views.cameras, view, pixel, 4, blended=b)
+    assert components.pixel == pixel
+    np.testing.assert_allclose(components.weights, np.sort(attention)[::-1][:4], rtol=1e-5)
+    np.testing.assert_allclose(attention[components.components], components.weights, rtol=1e-5)
     again = strongest_components(memory, scene.gaussians, scene.views.cameras, view, pixel, 4)
-    np.testing.assert_array_equal(again.components, found.components)
-    np.testing.assert_array_equal(again.weights, found.weights)
+    np.testing.assert_array_equal(again.components, components.components)
+    np.testing.assert_array_equal(again.weights, components.weights)
 
 
 def test_weights_of_all_components_sum_to_one_and_a_bank_may_have_fewer(memory: QueryMemory, scene: Scene) -> None:
     assert scene.gaussians is not None
     assert scene.views is not None
-    found = strongest_components(memory, scene.gaussians, scene.views.cameras, 0, (24, 20), 10_000)
-    assert sorted(found.components.tolist()) == list(range(len(memory.bank)))
-    assert found.weights.sum() == pytest.approx(1, abs=1e-5)
-    assert (np.diff(found.weights) <= 0).all()
+    components = strongest_components(memory, scene.gaussians, scene.views.cameras, 0, (24, 20), 10_000)
+    assert sorted(components.components.tolist()) == list(range(len(memory.bank)))
+    assert components.weights.sum() == pytest.approx(1, abs=1e-5)
+    assert (np.diff(components.weights) <= 0).all()
     single = strongest_components(one_component(memory), scene.gaussians, scene.views.cameras, 0, (24, 20), 6)
     assert single.components.tolist() == [0]
     assert single.weights.tolist() == [1.0]
@@ -116,8 +116,8 @@ def test_of_equal_components_the_first_come_first(memory: QueryMemory, scene: Sc
     bank = memory.bank
     same = replace(bank, components=np.repeat(bank.components[:1], len(bank), axis=0))
     tied = replace(memory, bank=same)
-    found = strongest_components(tied, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
-    assert found.components.tolist() == [0, 1, 2]
+    components = strongest_components(tied, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
+    assert components.components.tolist() == [0, 1, 2]
 
 
 def test_rendered_features_are_what_rendered_queries_attend_to(memory: QueryMemory, scene: Scene) -> None:
@@ -229,9 +229,9 @@ def test_a_picture_holds_the_view_and_the_tiles_of_the_components_and_comes_agai
     assert scene.views.images is not None
     picture = attention_picture(memory, scene, view, (24, 20), count=3)
     np.testing.assert_array_equal(picture, attention_picture(memory, scene, view, (24, 20), count=3))
-    found = strongest_components(memory, scene.gaussians, scene.views.cameras, view, (24, 20), 3)
+    components = strongest_components(memory, scene.gaussians, scene.views.cameras, view, (24, 20), 3)
     tiles = []
-    for number, component in enumerate(found.components.tolist()):
+    for number, component in enumerate(components.components.tolist()):
         photograph = scene.views.images[int(memory.bank.sources[component, 0])]
         tile = cell_tile(photograph, memory.bank.cells[component])
         left = 3 * GAP + VIEW_SIDE + number * (TILE_SIDE + GAP)
@@ -247,9 +247,9 @@ def test_a_picture_holds_the_view_and_the_tiles_of_the_components_and_comes_agai
 def test_the_bar_under_a_tile_is_as_long_as_its_weight(memory: QueryMemory, scene: Scene) -> None:
     assert scene.gaussians is not None
     assert scene.views is not None
-    found = strongest_components(memory, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
+    components = strongest_components(memory, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
     picture = attention_picture(memory, scene, 0, (24, 20), count=3)
-    for number, weight in enumerate(found.weights.tolist()):
+    for number, weight in enumerate(components.weights.tolist()):
         left = 3 * GAP + VIEW_SIDE + number * (TILE_SIDE + GAP)
         row = picture[HEAD + 250 + 6, left : left + TILE_SIDE]
         full = (row == np.array(FULL_BAR)).all(axis=1)

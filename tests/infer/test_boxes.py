@@ -134,9 +134,9 @@ def test_nothing_selected_has_no_clusters() -> None:
 def test_a_small_cluster_that_answers_better_comes_before_a_large_one_that_answers_worse() -> None:
     labels = np.r_[np.zeros(900, int), np.ones(100, int), [-1]]
     scores = np.where(labels == 1, 0.9, 0.45).astype(np.float32)
-    found = score_clusters(labels, np.arange(1001), scores, np.ones(1001, np.float32))
-    assert [len(one.rows) for one in found] == [100, 900]
-    assert found[0].score == pytest.approx(0.9 * (100 / 1001) ** 0.25)
+    clusters = score_clusters(labels, np.arange(1001), scores, np.ones(1001, np.float32))
+    assert [len(one.rows) for one in clusters] == [100, 900]
+    assert clusters[0].score == pytest.approx(0.9 * (100 / 1001) ** 0.25)
 
 
 def test_floaters_are_dropped_by_their_share_of_the_best_clusters_weight() -> None:
@@ -144,8 +144,8 @@ def test_floaters_are_dropped_by_their_share_of_the_best_clusters_weight() -> No
     scores, weights = np.full(100, 0.8, np.float32), np.ones(100, np.float32)
     rows = np.arange(100) + 7
     assert len(score_clusters(labels, rows, scores, weights)) == 2
-    found = score_clusters(labels, rows, scores, weights, min_share=0.05)
-    assert [one.rows.tolist() for one in found] == [list(range(7, 103))]
+    clusters = score_clusters(labels, rows, scores, weights, min_share=0.05)
+    assert [one.rows.tolist() for one in clusters] == [list(range(7, 103))]
 
 
 def test_scores_do_not_change_when_all_weights_are_scaled(rng: np.random.Generator) -> None:
@@ -275,18 +275,18 @@ def test_clusters_are_scored_by_their_weighted_mean_and_the_fourth_root_of_their
         average = np.average(scores[own].astype(float), weights=weights[own].astype(float))
         root = (weights[own].sum(dtype=float) / weights.sum(dtype=float)) ** 0.25
         expected[tuple(sorted(rows[own].tolist()))] = average * root if average >= 0 else average / root
-    found = score_clusters(labels, rows, scores, weights)
-    assert {tuple(one.rows.tolist()) for one in found} == set(expected)
-    for one in found:
+    clusters = score_clusters(labels, rows, scores, weights)
+    assert {tuple(one.rows.tolist()) for one in clusters} == set(expected)
+    for one in clusters:
         assert one.score == pytest.approx(expected[tuple(one.rows.tolist())], rel=1e-6)
-    assert [one.score for one in found] == sorted((one.score for one in found), reverse=True)
+    assert [one.score for one in clusters] == sorted((one.score for one in clusters), reverse=True)
 
 
 def test_equal_clusters_come_in_the_order_of_their_rows_and_a_share_may_just_be_reached() -> None:
     labels, rows = np.array([1, 1, 0, 0, 2]), np.array([4, 5, 8, 9, 2])
-    found = score_clusters(labels, rows, np.ones(5, np.float32), np.ones(5, np.float32), min_share=0.5)
-    assert [one.rows.tolist() for one in found] == [[4, 5], [8, 9], [2]]
-    assert found[2].weight == 0.5 * found[0].weight
+    clusters = score_clusters(labels, rows, np.ones(5, np.float32), np.ones(5, np.float32), min_share=0.5)
+    assert [one.rows.tolist() for one in clusters] == [[4, 5], [8, 9], [2]]
+    assert clusters[2].weight == 0.5 * clusters[0].weight
 
 
 @pytest.mark.parametrize(("thickness", "flat"), [(1e-3, False), (1e-4, False), (1e-6, True)])

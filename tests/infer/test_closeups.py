@@ -46,20 +46,20 @@ def test_a_close_up_shows_each_point_where_the_photograph_has_it() -> None:
     assert scene.views is not None
     large = photograph_cameras(scene.views)
     assert large.widths.tolist() == [WIDTH] * len(scene.views)
-    found, rows = closeups(large, scene.gaussians, target, **SIZE)
-    assert len(found) == len(rows) > 6
+    cameras, rows = closeups(large, scene.gaussians, target, **SIZE)
+    assert len(cameras) == len(rows) > 6
     points = scene.gaussians.means[target.rows].astype(np.float64)
     for view, frame in enumerate(rows):
-        picture = photograph_of(scene.views, int(frame), found, view).astype(np.float64)
+        picture = photograph_of(scene.views, int(frame), cameras, view).astype(np.float64)
         assert picture.shape == (240, 320, 3)
-        at = places(found, view, points)
+        at = places(cameras, view, points)
         shown = ((at > 2) & (at < np.array([318, 238]))).all(axis=1)
         assert shown.mean() > 0.9
         column, row = at[shown].astype(int).T
-        told = picture[row, column]
+        color = picture[row, column]
         wanted = places(scene.views.cameras, int(frame), points[shown]) / (64, 48) * 255
-        assert np.abs(told[:, :2] - wanted).max() < 2
-        assert (told[:, 2] == 20 * frame).all()
+        assert np.abs(color[:, :2] - wanted).max() < 2
+        assert (color[:, 2] == 20 * frame).all()
 
 
 def test_windows_keep_their_shape_stay_in_the_frame_and_leave_room_around_the_target() -> None:
@@ -68,18 +68,18 @@ def test_windows_keep_their_shape_stay_in_the_frame_and_leave_room_around_the_ta
     assert scene.views is not None
     large = photograph_cameras(scene.views)
     for shape in ((320, 240), (300, 300), (200, 400)):
-        found, rows = closeups(large, scene.gaussians, target, width=shape[0], height=shape[1])
+        cameras, rows = closeups(large, scene.gaussians, target, width=shape[0], height=shape[1])
         assert len(rows)
-        zoom = large.Ks[rows][:, [0, 1], [0, 1]] / found.Ks[:, [0, 1], [0, 1]]
+        zoom = large.Ks[rows][:, [0, 1], [0, 1]] / cameras.Ks[:, [0, 1], [0, 1]]
         assert np.allclose(zoom[:, 0], zoom[:, 1], rtol=1e-5)
-        begins = large.Ks[rows][:, :2, 2] - zoom * found.Ks[:, :2, 2]
+        begins = large.Ks[rows][:, :2, 2] - zoom * cameras.Ks[:, :2, 2]
         size = zoom * shape
         assert (begins > -0.01).all()
         assert (begins + size < np.array([WIDTH, HEIGHT]) + 0.01).all()
         assert (size[:, 0] >= CONSTANTS.min_closeup_width * 0.999).all()
         assert (size <= CONSTANTS.max_closeup_share * np.array([WIDTH, HEIGHT]) * 1.001).all()
         for view in range(len(rows)):
-            at = places(found, view, scene.gaussians.means[target.rows].astype(np.float64))
+            at = places(cameras, view, scene.gaussians.means[target.rows].astype(np.float64))
             # Half of the target's size on every side: it takes half of the picture along one axis at most.
             assert np.ptp(at, axis=0)[0] <= 0.501 * shape[0]
             assert np.ptp(at, axis=0)[1] <= 0.501 * shape[1]

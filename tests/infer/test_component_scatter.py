@@ -120,16 +120,16 @@ def test_umap_is_given_the_directions_that_the_bank_compares_and_its_dots_are_to
     rng = np.random.default_rng(0)
     mean = np.array([5, 0, 0, 0], np.float32)
     raw, components = (rng.normal(size=(count, 4)).astype(np.float32) + mean for count in (50, 7))
-    given = []
+    calls = []
 
     def plane(vectors: np.ndarray, seed: int) -> np.ndarray:
-        given.append((vectors, seed))
+        calls.append((vectors, seed))
         return np.stack([np.arange(len(vectors)) >= 50, np.linspace(0, 1, len(vectors))], axis=1).astype(np.float32)
 
     monkeypatch.setattr("gsencoder.infer.draw.component_scatter.umap_plane", plane)
     monkeypatch.setattr("gsencoder.infer.draw.component_scatter.check_umap", lambda: None)
     picture = component_scatter(replace(bank_of(components), mean=mean), sample_of(raw), umap=True, seed=3)
-    ((vectors, seed),) = given
+    ((vectors, seed),) = calls
     local = np.concatenate([raw, components]).astype(np.float64) - mean
     np.testing.assert_allclose(vectors, local / np.linalg.norm(local, axis=1, keepdims=True), atol=1e-6)
     assert seed == 3

@@ -121,10 +121,10 @@ def test_chunks_give_nearly_what_the_whole_gives_and_the_halo_is_why() -> None:
 
 
 def test_features_come_with_their_space_and_a_weight_for_every_gaussian() -> None:
-    found = encode(random_gaussians(50), encoder(), OUTPUTS, WHOLE)
-    assert found.space == SPACE.space
-    assert (found.weights == 1).all()
-    assert found.basis is None
+    features = encode(random_gaussians(50), encoder(), OUTPUTS, WHOLE)
+    assert features.space == SPACE.space
+    assert (features.weights == 1).all()
+    assert features.basis is None
 
 
 def test_the_unit_of_the_scene_is_taken_into_account() -> None:

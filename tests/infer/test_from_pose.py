@@ -1,98 +1,33 @@
-"""Words to points from a pose: beside the plain definition in float64, in moved worlds, at the ends of the range."""
+"""Words to points from a pose: beside the plain definition in float64, in moved worlds, and what is not visible."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from jaxtyping import Float64
+from posed_words import (
+    CHANNELS,
+    NAMES,
+    SPACE,
+    memory_of,
+    opaque_ball,
+    plain_relevancy,
+    scene_of,
+    some_features,
+    two_kinds,
+    words,
+)
 from scipy.spatial.transform import Rotation
-from splats import front_camera, one_gaussian, random_gaussians, random_rotation
+from splats import front_camera, one_gaussian, random_rotation
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.draw.pose_pictures import pose_picture, view_picture
-from gsencoder.infer.localize.from_pose import MAX_RAYS, FeatureField, FromPoseConfig, PosePoint, from_pose
-from gsencoder.infer.localize.relevancy import relevancy, word_directions
+from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig, PosePoint, from_pose
+from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.infer.localize.threshold import ThresholdConfig
-from gsencoder.memory.render import render_features
 from gsencoder.render import blend
-from gsencoder.text.table import TextTable, make_text_table
-from gsencoder.types import (
-    Cameras,
-    FeatureBasis,
-    FeatureSpace,
-    GaussianFeatures,
-    Gaussians,
-    MemoryBank,
-    QueryMemory,
-    Scene,
-)
+from gsencoder.text.table import make_text_table
+from gsencoder.types import Cameras, GaussianFeatures, Gaussians
 
-CHANNELS = 40
-SPACE = FeatureSpace(name="toy", channels=CHANNELS, text_encoder="toy")
-NAMES = tuple(f"word {letter}" for letter in "abcdefghijklmnopqrst")
 EVERYTHING = FromPoseConfig(threshold=ThresholdConfig(kind="fixed", fixed=-1.0))
-
-
-def words() -> TextTable:
-    vectors = np.random.default_rng(5).normal(size=(len(NAMES), CHANNELS))
-    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    return make_text_table(NAMES, vectors.astype(np.float32), "toy")
-
-
-def opaque_ball(n: int = 400) -> Gaussians:
-    ball = random_gaussians(n, log_scale=-1.6)
-    return replace(ball, opacities=np.sqrt(ball.opacities))
-
-
-def some_features(n: int, kind: str) -> GaussianFeatures:
-    """Random features with a mean, some of them never seen: as vectors, in a basis, or rows of a shared table."""
-    rng = np.random.default_rng(1)
-    weights = rng.uniform(0.1, 2, n).astype(np.float32)
-    weights[::5] = 0
-    mean = (3 * rng.normal(size=CHANNELS)).astype(np.float32)
-    basis, index, rows, columns = None, None, n, CHANNELS
-    if kind == "basis":
-        columns = 35
-        components = np.linalg.qr(rng.normal(size=(CHANNELS, columns)))[0].T.astype(np.float32)
-        basis = FeatureBasis(mean=mean, components=components, energy_kept=0.9, space=SPACE)
-    if kind == "table":
-        rows = 7
-        index = np.where(weights > 0, rng.integers(0, rows, n), -1).astype(np.int32)
-    values = rng.normal(size=(rows, columns)).astype(np.float32) + (0 if basis else mean)
-    if index is None:
-        values[weights == 0] = 0
-    return GaussianFeatures(
-        features=values.astype(np.float32), weights=weights, mean=mean, space=SPACE, basis=basis, index=index
-    )
-
-
-def scene_of(gaussians: Gaussians, features: GaussianFeatures, origin: tuple[float, float, float] = (0, 0, 0)) -> Scene:
-    return Scene(name="toy", gaussians=gaussians, features={"toy": features}, origin=np.array(origin, np.float64))
-
-
-def plain_relevancy(
-    scene: Scene, cameras: Cameras, text: TextTable, names: tuple[str, ...]
-) -> Float64[np.ndarray, "Q P"]:
-    """The definition: features of all channels are rendered, then centered cosines; −2 where alpha is below 0.5."""
-    assert scene.gaussians is not None
-    features = scene.features["toy"]
-    b = blend(scene.gaussians, cameras)
-    dense = np.zeros((b.rows, b.gaussians))
-    rows = np.repeat(np.arange(b.rows), np.diff(b.crow.numpy()))
-    np.add.at(dense, (rows, b.col.numpy()), b.weight.numpy().astype(np.float64))
-    dense[:, ~features.seen] = 0
-    alpha = dense.sum(axis=1)
-    decoded = features.decode().astype(np.float64)
-    local = dense @ decoded / np.maximum(alpha, 1e-300)[:, None] - features.mean
-    # A feature much shorter than the mean has no direction: `relevancy` adds a thousandth of the mean's length.
-    length = np.sqrt(
-        (local**2).sum(axis=1, keepdims=True) + 1e-6 * float((features.mean.astype(np.float64) ** 2).sum())
-    )
-    local /= length
-    targets = text.encode(names).astype(np.float64) - text.mean
-    targets /= np.linalg.norm(targets, axis=1, keepdims=True)
-    return np.where(alpha >= 0.5, targets @ local.T, -2)
 
 
 @pytest.mark.parametrize("kind", ["vectors", "basis", "table"])
@@ -191,25 +126,6 @@ def test_an_origin_a_thousand_kilometres_away_loses_nothing() -> None:
         np.testing.assert_allclose(b.position - origin, a.position, atol=1e-9)
 
 
-def two_kinds(first: Gaussians, second: Gaussians) -> tuple[Gaussians, GaussianFeatures]:
-    """Gaussians of two kinds whose features are the words a and b themselves."""
-    joined = Gaussians(
-        **{
-            name: np.concatenate([getattr(first, name), getattr(second, name)])
-            for name in ("means", "quats", "scales", "opacities", "sh")
-        }
-    )
-    kinds = np.repeat([0, 1], [len(first), len(second)])
-    # The means of features and words are far from both, so that neither is the mean's opposite of the other.
-    features = GaussianFeatures(
-        features=words().encode(NAMES[:2])[kinds],
-        weights=np.ones(len(joined), np.float32),
-        mean=words().mean,
-        space=SPACE,
-    )
-    return joined, features
-
-
 def test_one_gaussian_is_found_at_its_depth() -> None:
     gaussians = one_gaussian((0.3, -0.2, 2.0), scale=0.1, opacity=0.8)
     features = some_features(2, "vectors")
@@ -303,9 +219,9 @@ def test_a_small_share_before_a_background_of_the_mean_feature_has_its_own_depth
 def test_words_together_are_as_one_by_one_and_a_kept_blend_answers_as_a_new_one() -> None:
     gaussians, cameras, text = opaque_ball(), front_camera(), words()
     field = FeatureField(scene_of(gaussians, some_features(len(gaussians), "basis")))
-    kept = field.at(cameras, b=blend(gaussians, cameras))
+    frame = field.at(cameras, b=blend(gaussians, cameras))
     assert len(NAMES) > 16
-    for together, name in zip(kept.find(NAMES, text), NAMES, strict=True):
+    for together, name in zip(frame.find(NAMES, text), NAMES, strict=True):
         (alone,) = field.at(cameras).find([name], text)
         assert np.array_equal(together.pixel, alone.pixel)
         assert together.relevancy == pytest.approx(alone.relevancy, abs=1e-6)
@@ -326,116 +242,6 @@ def test_cameras_are_answered_in_order_each_with_all_words() -> None:
         (1, NAMES[0], False),
         (1, NAMES[1], True),
     ]
-
-
-@pytest.mark.parametrize(("width", "height"), [(61, 43), (2, 1), (8, 5), (1, 9)])
-@pytest.mark.parametrize("stride", [1, 3, 4])
-def test_rays_at_a_stride_are_those_of_their_pixels(width: int, height: int, stride: int) -> None:
-    gaussians, cameras = opaque_ball(), front_camera(width, height)
-    full, strided = blend(gaussians, cameras), blend(gaussians, cameras, stride=stride)
-    lattice = strided.lattice
-    x = lattice.x0 + lattice.dx * np.arange(lattice.width)
-    y = lattice.y0 + lattice.dy * np.arange(lattice.height)
-    assert (x < width).all()
-    assert (y < height).all()
-    assert x[-1] + stride > width - stride
-    of_pixels = full.alpha.reshape(full.shape)[np.ix_((y - 0.5).astype(int), (x - 0.5).astype(int))]
-    torch.testing.assert_close(strided.alpha.reshape(strided.shape), of_pixels, rtol=0, atol=1e-6)
-
-
-def test_at_a_stride_the_best_of_these_pixels_is_found() -> None:
-    gaussians, cameras, text = opaque_ball(), front_camera(), words()
-    scene = scene_of(gaussians, some_features(len(gaussians), "basis"))
-    plain = plain_relevancy(scene, cameras, text, NAMES).reshape(len(NAMES), 43, 61)[:, 2::4, 2::4]
-    for point, scores in zip(from_pose(scene, cameras, NAMES, text, FromPoseConfig(stride=4)), plain, strict=True):
-        column, row = (point.pixel - 2.5).astype(int) // 4
-        assert scores[row, column] == pytest.approx(scores.max(), abs=5e-6)
-
-
-def memory_of(n: int, *, components: int, temperature: float = 0.05) -> QueryMemory:
-    rng = np.random.default_rng(2)
-    weights = rng.uniform(0.5, 2, n).astype(np.float32)
-    weights[::7] = 0
-    mean = rng.normal(size=CHANNELS).astype(np.float32)
-    queries = rng.normal(size=(n, 6)).astype(np.float32)
-    queries[weights == 0] = 0
-    bank = MemoryBank(
-        components=(rng.normal(size=(components, CHANNELS)) + mean).astype(np.float32),
-        sources=np.zeros((components, 3), np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (components, 1, 1)),
-        mean=mean,
-        threshold=0.9,
-        coverage=1.0,
-        cosine=0.95,
-        space=SPACE,
-    )
-    projection = rng.normal(size=(6, CHANNELS)).astype(np.float32)
-    return QueryMemory(
-        queries=queries,
-        weights=weights,
-        projection=projection,
-        bank=bank,
-        scoring="centered",
-        temperature=temperature,
-        mean=mean,
-    )
-
-
-@pytest.mark.parametrize("components", [9, 90])
-def test_the_features_of_a_memory_are_those_that_blended_queries_attend_to(components: int) -> None:
-    gaussians, cameras, text = opaque_ball(), front_camera(), words()
-    memory = memory_of(len(gaussians), components=components)
-    scene = Scene(name="toy", gaussians=gaussians)
-    field = FeatureField(scene, memory=memory, config=FromPoseConfig(stride=1))
-    maps = field.at(cameras).relevancy(NAMES, text)
-    plain, _ = render_features(memory, blend(gaussians, cameras))
-    local = plain.astype(np.float64) - memory.mean
-    local /= np.linalg.norm(local, axis=1, keepdims=True)
-    expected = (word_directions(text.encode(NAMES), text.mean) @ local.T).reshape(maps.shape)
-    opaque = np.isfinite(maps)
-    assert opaque.any()
-    np.testing.assert_allclose(maps[opaque], expected[opaque], atol=1e-4)
-    for point in field.at(cameras).find(NAMES, text):
-        column, row = (point.pixel - 0.5).astype(int)
-        scores = np.where(opaque, expected, -2)[NAMES.index(point.query)]
-        assert scores[row, column] == pytest.approx(scores.max(), abs=1e-4)
-
-
-def test_a_memory_answers_as_features_where_its_attention_is_exact() -> None:
-    """Queries that fit one component each, and no pixel that blends two kinds."""
-    gaussians, features = two_kinds(one_gaussian((-0.7, 0, 2)), one_gaussian((0.7, 0, 2)))
-    local = features.features - features.mean
-    bank = MemoryBank(
-        components=features.features,
-        sources=np.zeros((2, 3), np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (2, 1, 1)),
-        mean=features.mean,
-        threshold=0.9,
-        coverage=1.0,
-        cosine=1.0,
-        space=SPACE,
-    )
-    memory = QueryMemory(
-        queries=local, weights=features.weights, projection=np.eye(CHANNELS, dtype=np.float32), bank=bank,
-        scoring="centered", temperature=0.01, mean=features.mean,
-    )  # fmt: skip
-    scene, config = scene_of(gaussians, features), FromPoseConfig(stride=1)
-    plain, remembered = (
-        FeatureField(scene, memory=each, config=config).at(front_camera()).relevancy(NAMES[:2], words())
-        for each in (None, memory)
-    )
-    assert np.isfinite(plain).any()
-    np.testing.assert_allclose(remembered, plain, atol=1e-5)
-    for a, b in zip(
-        from_pose(scene, front_camera(), NAMES[:2], words(), config),
-        from_pose(scene, front_camera(), NAMES[:2], words(), config, memory=memory),
-        strict=True,
-    ):
-        assert a.visible
-        assert b.visible
-        assert a.threshold == pytest.approx(b.threshold, abs=1e-5)
-        np.testing.assert_allclose(b.position, a.position, atol=0.3)
-    assert FeatureField(scene, memory=memory).stride_in(front_camera(), 0) == 4
 
 
 def test_wrong_input_is_refused() -> None:
@@ -463,37 +269,3 @@ def test_wrong_input_is_refused() -> None:
     for options in ({"stride": 0}, {"min_alpha": 0.0}, {"min_alpha": float("nan")}):
         with pytest.raises(InputError, match=next(iter(options))):
             FromPoseConfig(**options)  # type: ignore[arg-type]
-
-
-def test_large_views_are_looked_at_in_fewer_pixels_and_drawn_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsencoder.infer.localize.from_pose.MAX_RAYS", 500)
-    monkeypatch.setattr("gsencoder.infer.draw.pose_pictures.MAX_SIDE", 40)
-    gaussians, features = two_kinds(one_gaussian((-0.7, 0, 2)), one_gaussian((0.7, 0, 2)))
-    camera = front_camera()
-    width, height = int(camera.widths[0]), int(camera.heights[0])
-    field = FeatureField(scene_of(gaussians, features))
-    stride = field.stride_in(camera, 0)
-    assert stride > 1
-    assert -(-width // stride) * -(-height // stride) <= 500 < -(-width // (stride - 1)) * -(-height // (stride - 1))
-    seen = field.at(camera)
-    (point,) = seen.find(NAMES[:1], words())
-    whole = FeatureField(scene_of(gaussians, features), config=FromPoseConfig(stride=1)).at(camera)
-    (exact,) = whole.find(NAMES[:1], words())
-    np.testing.assert_allclose(point.position, exact.position, atol=0.1)
-    rgb = view_picture(seen)
-    assert max(rgb.shape[:2]) == 40
-    (relevancy,) = seen.relevancy(NAMES[:1], words())
-    small = pose_picture(rgb, seen, point, relevancy)
-    monkeypatch.setattr("gsencoder.infer.draw.pose_pictures.MAX_SIDE", 2000)
-    large = pose_picture(view_picture(seen), seen, point, relevancy)
-    # Both are enlarged to be legible; the ring is in one place.
-    assert abs(small.shape[0] / small.shape[1] - large.shape[0] / large.shape[1]) < 0.1
-
-
-def test_a_stride_that_is_asked_for_holds_in_views_of_any_size() -> None:
-    gaussians, features = two_kinds(one_gaussian((-0.7, 0, 2)), one_gaussian((0.7, 0, 2)))
-    field = FeatureField(scene_of(gaussians, features), config=FromPoseConfig(stride=3))
-    huge = replace(front_camera(), widths=np.array([1 << 24], np.int32), heights=np.array([1], np.int32))
-    assert field.stride_in(huge, 0) == 3
-    free = FeatureField(scene_of(gaussians, features)).stride_in(huge, 0)
-    assert -(-(1 << 24) // free) <= MAX_RAYS

@@ -115,20 +115,20 @@ def test_names_of_a_server_are_written_down_no_longer_than_names_are() -> None:
 
 @pytest.mark.parametrize("stream", [True, False])
 def test_no_error_repeats_the_key(stream: bool) -> None:
-    told = ""
+    text = ""
 
     def behave(handler: Handler, body: Any) -> None:
         if body["stream"]:
-            handler.raw(200, f"data: {json.dumps({'detail': told})}\n\n".encode(), "text/event-stream")
+            handler.raw(200, f"data: {json.dumps({'detail': text})}\n\n".encode(), "text/event-stream")
         else:
-            handler.reply(400, {"error": {"message": told}})
+            handler.reply(400, {"error": {"message": text}})
 
     with serving(behave) as server:
         config = VlmConfig(base_url=server.url, model="m", key=KEY, retries=0, stream=stream)
         client = VlmServer(config)
         for before in (0, 280, 1990):
             for name, spelling in SPELLINGS.items():
-                told = "x" * before + spelling
+                text = "x" * before + spelling
                 with pytest.raises(InputError) as caught:
                     client.ask(request_body([], config))
                 assert spelling[:8] not in "".join(traceback.format_exception(caught.value)), name

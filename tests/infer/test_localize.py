@@ -43,9 +43,9 @@ def make_room_scene(*, basis: bool = False, origin: tuple[float, float, float] =
     parts = [lattice(np.zeros(3), np.array([4, 4, 0.0]))]
     vectors = [np.tile(TABLE.mean / np.linalg.norm(TABLE.mean), (len(parts[0]), 1))]
     for word, places in PLACES.items():
-        for place in places:
+        for center in places:
             half = np.array(SIZES[word]) / 2
-            parts.append(lattice(np.array(place) - half, np.array(place) + half))
+            parts.append(lattice(np.array(center) - half, np.array(center) + half))
             vectors.append(np.tile(TABLE.embeddings[WORDS.index(word)], (len(parts[-1]), 1)))
     means, features = np.concatenate(parts).astype(np.float32), np.concatenate(vectors).astype(np.float32)
     weights = np.ones(len(means), np.float32)
@@ -58,12 +58,12 @@ def make_room_scene(*, basis: bool = False, origin: tuple[float, float, float] =
         opacities=np.ones(len(means), np.float32),
         sh=np.zeros((len(means), 1, 3), np.float32),
     )
-    space, found = replace(TABLE.space, teacher="labels"), None
+    space, stored_basis = replace(TABLE.space, teacher="labels"), None
     if basis:
         rows = np.linalg.svd(np.unique(features[50:], axis=0) - TABLE.mean, full_matrices=False)[2][:4]
-        found = FeatureBasis(mean=TABLE.mean, components=rows.astype(np.float32), energy_kept=1.0, space=space)
+        stored_basis = FeatureBasis(mean=TABLE.mean, components=rows.astype(np.float32), energy_kept=1.0, space=space)
         features = ((features - TABLE.mean) @ rows.T).astype(np.float32) * (weights > 0)[:, None]
-    fused = GaussianFeatures(features=features, weights=weights, mean=TABLE.mean, space=space, basis=found)
+    fused = GaussianFeatures(features=features, weights=weights, mean=TABLE.mean, space=space, basis=stored_basis)
     up = np.array([0.0, 0, 1])
     return Scene(name="room", gaussians=gaussians, features={"toy": fused}, origin=np.array(origin, float), up=up)
 
@@ -71,25 +71,25 @@ def make_room_scene(*, basis: bool = False, origin: tuple[float, float, float] =
 SCENE = make_room_scene()
 
 
-def first(found: Localization, word: str) -> Box:
-    return next(box for box in found.boxes if box.query == word)
+def first(localization: Localization, word: str) -> Box:
+    return next(box for box in localization.boxes if box.query == word)
 
 
 @pytest.mark.parametrize("basis", [False, True])
 def test_words_are_found_where_they_are(basis: bool) -> None:
-    found = localize(make_room_scene(basis=basis), ["mug", "lamp"], TABLE)
+    localization = localize(make_room_scene(basis=basis), ["mug", "lamp"], TABLE)
     for word in ("mug", "lamp"):
-        box, place, size = first(found, word), np.array(PLACES[word][0]), np.array(SIZES[word])
-        assert np.abs(box.aabb_min - (place - size / 2)).max() <= STEP + 1e-6
-        assert np.abs(box.aabb_max - (place + size / 2)).max() <= STEP + 1e-6
+        box, center, size = first(localization, word), np.array(PLACES[word][0]), np.array(SIZES[word])
+        assert np.abs(box.aabb_min - (center - size / 2)).max() <= STEP + 1e-6
+        assert np.abs(box.aabb_max - (center + size / 2)).max() <= STEP + 1e-6
         assert box.score == pytest.approx(1, abs=1e-3)
         assert box.rank == 0
 
 
 def test_every_object_of_a_name_has_a_box_and_ranks_count_up() -> None:
-    found = localize(SCENE, ["chair"], TABLE)
-    assert [box.rank for box in found.boxes] == [0, 1, 2]
-    centers = np.round([box.center for box in found.boxes], 1)
+    localization = localize(SCENE, ["chair"], TABLE)
+    assert [box.rank for box in localization.boxes] == [0, 1, 2]
+    centers = np.round([box.center for box in localization.boxes], 1)
     assert {tuple(center[:2]) for center in centers.tolist()} == {(2, 0.5), (2, 2), (0.5, 2.5)}
     assert len(localize(SCENE, ["chair"], TABLE, LocalizeConfig(max_boxes=2)).boxes) == 2
 
@@ -143,27 +143,27 @@ def test_the_origin_is_added_back_in_double_precision() -> None:
 
 
 def test_gaussians_never_seen_are_never_taken_and_have_no_relevancy() -> None:
-    found = localize(SCENE, ["mug", "chair"], TABLE, LocalizeConfig(threshold=ThresholdConfig(fixed=-1.0)))
-    assert np.isnan(found.relevancy[:, :50]).all()
-    assert np.isfinite(found.relevancy[:, 50:]).all()
-    assert min(int(box.rows.min()) for box in found.boxes) >= 50
+    localization = localize(SCENE, ["mug", "chair"], TABLE, LocalizeConfig(threshold=ThresholdConfig(fixed=-1.0)))
+    assert np.isnan(localization.relevancy[:, :50]).all()
+    assert np.isfinite(localization.relevancy[:, 50:]).all()
+    assert min(int(box.rows.min()) for box in localization.boxes) >= 50
 
 
 def test_a_word_that_is_not_there_has_no_box_and_one_warning() -> None:
     with pytest.warns(SceneWarning, match="2 of 3 words have no box \\('spoon', 'door'\\)") as caught:
-        found = localize(SCENE, ["spoon", "mug", "door"], TABLE)
+        localization = localize(SCENE, ["spoon", "mug", "door"], TABLE)
     assert len(caught) == 1
-    assert {box.query for box in found.boxes} == {"mug"}
-    assert found.thresholds.shape == (3,)
+    assert {box.query for box in localization.boxes} == {"mug"}
+    assert localization.thresholds.shape == (3,)
 
 
 def test_a_scene_that_nothing_saw_has_no_boxes() -> None:
     fused = SCENE.features["toy"]
     blind = replace(SCENE, features={"toy": replace(fused, weights=np.zeros_like(fused.weights))})
     with pytest.warns(SceneWarning, match="1 of 1 words have no box"):
-        found = localize(blind, ["mug"], TABLE)
-    assert found.boxes == ()
-    assert np.isnan(found.thresholds).all()
+        localization = localize(blind, ["mug"], TABLE)
+    assert localization.boxes == ()
+    assert np.isnan(localization.thresholds).all()
 
 
 @pytest.mark.parametrize("kind", ["relative", "quantile", "otsu"])
@@ -171,17 +171,17 @@ def test_every_kind_of_threshold_finds_the_chairs(kind: str) -> None:
     config = LocalizeConfig(threshold=ThresholdConfig(kind=kind, quantile=0.9))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SceneWarning)
-        found = localize(SCENE, ["chair"], TABLE, config)
-    assert any(np.linalg.norm(found.boxes[0].center - place) < 0.05 for place in PLACES["chair"])
+        localization = localize(SCENE, ["chair"], TABLE, config)
+    assert any(np.linalg.norm(localization.boxes[0].center - center) < 0.05 for center in PLACES["chair"])
 
 
 def test_contrast_finds_words_and_counts_the_negative_words_that_the_table_lacks() -> None:
     config = LocalizeConfig(contrast=True, threshold=ThresholdConfig(kind="fixed", fixed=0.8))
     with pytest.warns(SceneWarning, match="4 of 4 negative words are unknown to toy .*the mean of its words stands"):
-        found = localize(SCENE, ["mug", "lamp"], TABLE, config)
-    assert np.linalg.norm(first(found, "mug").center - PLACES["mug"][0]) < 0.02
-    assert np.nanmin(found.relevancy) >= 0
-    assert np.nanmax(found.relevancy) <= 1
+        localization = localize(SCENE, ["mug", "lamp"], TABLE, config)
+    assert np.linalg.norm(first(localization, "mug").center - PLACES["mug"][0]) < 0.02
+    assert np.nanmin(localization.relevancy) >= 0
+    assert np.nanmax(localization.relevancy) <= 1
     known = replace(config, negatives=("rug", "door"))
     assert np.linalg.norm(first(localize(SCENE, ["lamp"], TABLE, known), "lamp").center - PLACES["lamp"][0]) < 0.02
 
@@ -254,10 +254,10 @@ def test_a_text_table_is_a_text_encoder() -> None:
 
 
 def test_json_holds_what_the_boxes_hold() -> None:
-    found = localize(SCENE, ["mug", "chair"], TABLE)
-    listed = json.loads(json.dumps(localization_to_json(found)))
+    localization = localize(SCENE, ["mug", "chair"], TABLE)
+    listed = json.loads(json.dumps(localization_to_json(localization)))
     assert [one["query"] for one in listed] == ["mug", "chair", "chair", "chair"]
-    for one, box in zip(listed, found.boxes, strict=True):
+    for one, box in zip(listed, localization.boxes, strict=True):
         assert one["count"] == len(box.rows)
         assert one["aabb_min"] == box.aabb_min.tolist()
         turn, size = np.array(one["obb"]["rotation"]), np.array(one["obb"]["size"])
@@ -274,15 +274,15 @@ def test_the_ply_of_boxes_opens_in_other_programs_with_all_its_points(
     tmp_path: Path, open3d: Any, oriented: bool
 ) -> None:
     far = make_room_scene(origin=(1e6, 0, 0))
-    found = localize(far, ["mug", "chair"], TABLE)
+    localization = localize(far, ["mug", "chair"], TABLE)
     path = tmp_path / "boxes.ply"
-    write_boxes_ply(path, far, found, oriented=oriented)
+    write_boxes_ply(path, far, localization, oriented=oriented)
     cloud = open3d.io.read_point_cloud(str(path))
     points, colors = np.asarray(cloud.points), np.asarray(cloud.colors)
-    assert len(points) == sum(len(box.rows) for box in found.boxes) + len(found.boxes) * (8 + 12 * 98)
-    np.testing.assert_allclose(points[:8], box_corners(found.boxes[0], oriented=oriented), atol=1e-9)
+    assert len(points) == sum(len(box.rows) for box in localization.boxes) + len(localization.boxes) * (8 + 12 * 98)
+    np.testing.assert_allclose(points[:8], box_corners(localization.boxes[0], oriented=oriented), atol=1e-9)
     assert len(np.unique(colors, axis=0)) == 3
-    assert len(open3d.io.read_line_set(str(path)).lines) == 12 * len(found.boxes)
+    assert len(open3d.io.read_line_set(str(path)).lines) == 12 * len(localization.boxes)
 
 
 def test_the_edges_of_a_box_are_its_twelve_sides() -> None:
@@ -303,7 +303,7 @@ def test_no_boxes_make_an_empty_ply(tmp_path: Path) -> None:
     )
     write_boxes_ply(tmp_path / "none.ply", Scene(name="x"), empty)
     assert b"element vertex 0\n" in (tmp_path / "none.ply").read_bytes()
-    found = localize(SCENE, ["mug"], TABLE)
+    localization = localize(SCENE, ["mug"], TABLE)
     with pytest.raises(InputError, match="of 0 Gaussians"):
-        write_boxes_ply(tmp_path / "wrong.ply", Scene(name="x"), found)
+        write_boxes_ply(tmp_path / "wrong.ply", Scene(name="x"), localization)
     assert not (tmp_path / "wrong.ply").exists()

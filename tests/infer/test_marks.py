@@ -35,11 +35,11 @@ def scene(*places: tuple[float, float], half: int = 20) -> tuple[Gaussians, list
 
 def discs(picture: np.ndarray, numbers: int) -> list[np.ndarray]:
     """The middle of each number's color in a picture that was black."""
-    found = []
+    circles = []
     for number in range(numbers):
         pixels = np.argwhere((picture == word_color(number)).all(axis=2))[:, ::-1]
-        found.append(np.median(pixels, axis=0) if len(pixels) else np.full(2, np.nan))
-    return found
+        circles.append(np.median(pixels, axis=0) if len(pixels) else np.full(2, np.nan))
+    return circles
 
 
 BLACK = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
@@ -50,8 +50,8 @@ def test_marks_of_large_things_stand_on_them_in_their_order() -> None:
     _, targets, b = scene(*places, half=40)
     picture, drawn = draw_marks(BLACK, b, targets)
     assert drawn == {1, 2}
-    for place, disc in zip(places, discs(picture, 2), strict=True):
-        assert np.abs(disc - place).max() < 4
+    for center, disc in zip(places, discs(picture, 2), strict=True):
+        assert np.abs(disc - center).max() < 4
 
 
 def test_marks_of_small_things_stand_beside_them_with_a_line_to_them() -> None:
@@ -69,12 +69,12 @@ def test_no_mark_hides_another_or_leaves_the_picture(half: int) -> None:
     places = ((8.0, 8.0), (14.0, 10.0), (20.0, 12.0), (310.0, 232.0), (312.0, 120.0), (160.0, 236.0))
     _, targets, b = scene(*places, half=half)
     picture, drawn = draw_marks(BLACK, b, targets)
-    found = [disc for number, disc in enumerate(discs(picture, len(places)), start=1) if number in drawn]
-    assert len(found) == len(drawn) >= 4
-    for index, disc in enumerate(found):
+    circles = [disc for number, disc in enumerate(discs(picture, len(places)), start=1) if number in drawn]
+    assert len(circles) == len(drawn) >= 4
+    for index, disc in enumerate(circles):
         assert (disc >= RADIUS).all()
         assert (disc <= (WIDTH - RADIUS, HEIGHT - RADIUS)).all()
-        assert all(np.linalg.norm(disc - other) > 2 * RADIUS - 1 for other in found[:index])
+        assert all(np.linalg.norm(disc - other) > 2 * RADIUS - 1 for other in circles[:index])
 
 
 def test_things_that_are_hidden_or_too_small_carry_no_mark() -> None:

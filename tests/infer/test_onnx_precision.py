@@ -80,8 +80,8 @@ def test_a_cheaper_precision_is_smaller_and_close(
     np.testing.assert_allclose(runtime.words.embeddings, full.words.embeddings, atol=0.02)
     for count in (1, 2, 40):
         cloud = random_cloud(count, 0.05)
-        found = runtime.encode(cloud, ANY).features
-        assert np.abs(found - full.encode(cloud, ANY).features).max() < 0.5
+        features = runtime.encode(cloud, ANY).features
+        assert np.abs(features - full.encode(cloud, ANY).features).max() < 0.5
     with pytest.raises(InputError, match=f"the model computes in {precision}, not float32"):
         runtime.encode(CLOUD.gaussians, EncodeConfig(precision="float32"))
     loaded = onnx.load_from_string(model)
@@ -115,8 +115,8 @@ def operator(name: str, values: dict[str, np.ndarray]) -> np.ndarray:
     opsets = [helper.make_opsetid("", OPSET), helper.make_opsetid(OURS.domain, OURS.version)]
     model = in_standard_operators(helper.make_model(graph, opset_imports=opsets, ir_version=10))
     session = onnxruntime.InferenceSession(model.SerializeToString())
-    (found,) = session.run(None, values)
-    return np.asarray(found)
+    (result,) = session.run(None, values)
+    return np.asarray(result)
 
 
 @pytest.mark.parametrize("rows", [1, 2, 1023, 1024, 1025, 3000])
@@ -127,16 +127,16 @@ def test_a_convolution_of_integers_is_that_of_what_they_stand_for(rows: int) -> 
     x = rng.integers(0, 256, (len(cells), 5)).astype(np.uint8)
     weight = rng.integers(-127, 128, (27 * 5, 7)).astype(np.int8)
     step, zero, scale = np.float32(0.02), np.uint8(113), rng.uniform(0.001, 0.1, 7).astype(np.float32)
-    found = operator(
+    output = operator(
         "convolve_int8",
         {"x": x, "step": np.array(step), "zero": np.array(zero), "n": neighbors, "weight": weight, "scale": scale},
     )
     stands = torch.from_numpy(step.astype(np.float64) * (x.astype(np.float64) - zero))
     matrix = torch.from_numpy((weight * scale.astype(np.float64)).reshape(27, 5, 7))
     expected = convolve_reference(stands, torch.from_numpy(neighbors), matrix).numpy()
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
-    found = operator("convolve", {"x": stands.numpy().astype(np.float32), "n": neighbors, "w": matrix.float().numpy()})
-    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(output, expected, rtol=1e-5, atol=1e-4)
+    output = operator("convolve", {"x": stands.numpy().astype(np.float32), "n": neighbors, "w": matrix.float().numpy()})
+    np.testing.assert_allclose(output, expected, rtol=1e-3, atol=1e-3)
 
 
 def test_a_linear_layer_of_integers_is_that_of_what_they_stand_for() -> None:

@@ -59,9 +59,9 @@ def kept_room(taken: Scene, order: list[int]) -> Scene:
 
 @pytest.mark.parametrize("larger", [1, 3])
 def test_each_frame_gets_its_own_photograph_in_the_size_of_its_camera(tmp_path: Path, larger: int) -> None:
-    taken = load_scene(write_room(tmp_path, larger=larger))
+    room = load_scene(write_room(tmp_path, larger=larger))
     order = [5, 0, 11]
-    scene = with_photographs(kept_room(taken, order), taken)
+    scene = with_photographs(kept_room(room, order), room)
     assert scene.views is not None
     assert scene.views.images is not None
     for frame, view in enumerate(order):
@@ -109,32 +109,32 @@ def test_large_frames_are_shown_no_larger_than_asked() -> None:
 
 
 def test_photographs_of_other_cameras_are_refused(tmp_path: Path) -> None:
-    taken = load_scene(write_room(tmp_path / "all"))
-    scene = kept_room(taken, list(range(COUNT)))
-    assert taken.views is not None
-    cameras = taken.views.cameras
+    room = load_scene(write_room(tmp_path / "all"))
+    scene = kept_room(room, list(range(COUNT)))
+    assert room.views is not None
+    cameras = room.views.cameras
     poses, focal = cameras.cam_from_world.copy(), cameras.Ks.copy()
     poses[2, :3, 3] += 0.05
     focal[4, :2, :2] *= 1.1
     for wrong in (replace(cameras, cam_from_world=poses), replace(cameras, Ks=focal)):
-        other = replace(taken, views=replace(taken.views, cameras=wrong))
+        other = replace(room, views=replace(room.views, cameras=wrong))
         with pytest.raises(InputError, match="1 of 12 differ"):
             with_photographs(scene, other)
     with pytest.raises(InputError, match="12 of 12 differ"):
-        with_photographs(replace(scene, origin=ORIGIN + 1), taken)
+        with_photographs(replace(scene, origin=ORIGIN + 1), room)
     with pytest.raises(InputError, match="no photograph of 4 of 12 frames"):
         with_photographs(scene, load_scene(write_room(tmp_path / "some", 8)))
     with pytest.raises(InputError, match="has no photographs"):
         with_photographs(scene, scene)
     with pytest.raises(InputError, match="have no cameras"):
-        with_photographs(replace(scene, views=None), taken)
+        with_photographs(replace(scene, views=None), room)
 
 
 @pytest.mark.slow
 def test_commands_show_photographs_and_say_so(tmp_path: Path) -> None:
-    taken = load_scene(write_room(tmp_path / "scene", larger=2))
-    assert taken.views is not None
-    save_room(tmp_path / "features", taken.views.names)
+    scene = load_scene(write_room(tmp_path / "scene", larger=2))
+    assert scene.views is not None
+    save_room(tmp_path / "features", scene.views.names)
     quick = ("choose.source=frames", "choose.candidates=12", "choose.count=3", "quiet=true")
     words = [str(tmp_path / "features"), f"photos={tmp_path / 'scene'}", "query=cube", *quick]
     assert cli.main(["views", *words, f"out={tmp_path / 'views'}"]) == 0
@@ -150,28 +150,28 @@ def test_commands_show_photographs_and_say_so(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_photograph_counts_as_sharp_and_solid_however_rough_the_splat_is(tmp_path: Path) -> None:
-    taken = load_scene(write_room(tmp_path / "taken"))
-    bare = kept_room(taken, list(range(COUNT)))
+    scene = load_scene(write_room(tmp_path / "taken"))
+    bare = kept_room(scene, list(range(COUNT)))
     assert bare.gaussians is not None
     thin = replace(bare.gaussians, scales=2 * bare.gaussians.scales, opacities=0.3 * bare.gaussians.opacities)
     rough = replace(bare, gaussians=thin)
     target = target_of("cube", thin, room()[1])
     config = ViewsConfig(source="frames", count=4, candidates=12)
     renders = choose_views(rough, [target], config)
-    photographs = choose_views(with_photographs(rough, taken), [target], config)
-    told = {each.frame: each.target_scores[0] for each in renders.chosen}
-    assert set(told) & {each.frame for each in photographs.chosen}
+    photographs = choose_views(with_photographs(rough, scene), [target], config)
+    scores = {each.frame: each.target_scores[0] for each in renders.chosen}
+    assert set(scores) & {each.frame for each in photographs.chosen}
     for each in photographs.chosen:
         (sight,) = each.target_scores
         assert (sight.alpha, sight.blur) == (1, 0)
-        if each.frame in told:
-            before = told[each.frame]
+        if each.frame in scores:
+            before = scores[each.frame]
             assert before.alpha < 1
             assert before.blur > 0
             assert sight.utility > before.utility
             assert (sight.visible, sight.share, sight.inside) == (before.visible, before.share, before.inside)
     # Cameras around the target show renders still.
-    both = choose_views(with_photographs(rough, taken), [target], ViewsConfig(count=8, candidates=24))
+    both = choose_views(with_photographs(rough, scene), [target], ViewsConfig(count=8, candidates=24))
     placed = [each.target_scores[0] for each in both.chosen if each.frame is None]
     assert placed
     assert all(sight.blur > 0 for sight in placed)

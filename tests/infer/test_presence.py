@@ -72,12 +72,12 @@ def make_scene(strength: float = 1.0, *, basis: bool = False) -> Scene:
     )
     features = (TABLE.mean + away + rng.normal(0, 0.02, away.shape)).astype(np.float32)
     weights = rng.uniform(0.5, 2, len(means)).astype(np.float32)
-    space, found = replace(TABLE.space, teacher="labels"), None
+    space, stored_basis = replace(TABLE.space, teacher="labels"), None
     if basis:
         rows = np.linalg.qr(rng.normal(size=(16, 12)))[0].T.astype(np.float32)
-        found = FeatureBasis(mean=TABLE.mean, components=rows, energy_kept=1.0, space=space)
+        stored_basis = FeatureBasis(mean=TABLE.mean, components=rows, energy_kept=1.0, space=space)
         features = ((features - TABLE.mean) @ rows.T).astype(np.float32)
-    fused = GaussianFeatures(features=features, weights=weights, mean=TABLE.mean, space=space, basis=found)
+    fused = GaussianFeatures(features=features, weights=weights, mean=TABLE.mean, space=space, basis=stored_basis)
     gaussians = Gaussians(
         means=means,
         quats=np.tile(np.float32([1, 0, 0, 0]), (len(means), 1)),
@@ -162,44 +162,46 @@ def test_the_model_is_the_logistic_function_of_its_coefficients() -> None:
 
 def test_a_word_that_another_answers_better_is_absent_and_boxed_only_when_everything_is() -> None:
     with pytest.warns(SceneWarning, match=r"1 of 2 words have no box \('spoon'\).*\(probability 0\.0"):
-        found = localize(SCENE, ["mug", "spoon"], TABLE)
-    assert {box.query for box in found.boxes} == {"mug"}
-    assert list(found.absent) == ["spoon"]
-    assert found.absent["spoon"] == found.probabilities[1]
-    assert found.absent["spoon"] < LocalizeConfig().min_probability
-    mug, spoon = words_to_json(found)
+        localization = localize(SCENE, ["mug", "spoon"], TABLE)
+    assert {box.query for box in localization.boxes} == {"mug"}
+    assert list(localization.absent) == ["spoon"]
+    assert localization.absent["spoon"] == localization.probabilities[1]
+    assert localization.absent["spoon"] < LocalizeConfig().min_probability
+    mug, spoon = words_to_json(localization)
     assert (mug["absent"], spoon["absent"], spoon["boxes"]) == (False, True, 0)
     everything = quietly(SCENE, ["mug", "spoon"], TABLE, EVERYTHING)
     assert {box.query for box in everything.boxes} == {"mug", "spoon"}
-    np.testing.assert_array_equal(everything.probabilities, found.probabilities)
+    np.testing.assert_array_equal(everything.probabilities, localization.probabilities)
 
 
 def test_the_probability_of_a_word_is_that_of_its_most_probable_box() -> None:
-    found = quietly(SCENE, ["mug", "chair", "lamp"], TABLE, EVERYTHING)
-    for word, value in zip(found.queries, found.probabilities, strict=True):
-        assert value == pytest.approx(max((box.probability for box in found.boxes if box.query == word), default=0))
-    assert all(0 <= each["probability"] <= 1 for each in localization_to_json(found))
+    localization = quietly(SCENE, ["mug", "chair", "lamp"], TABLE, EVERYTHING)
+    for word, value in zip(localization.queries, localization.probabilities, strict=True):
+        assert value == pytest.approx(
+            max((box.probability for box in localization.boxes if box.query == word), default=0)
+        )
+    assert all(0 <= each["probability"] <= 1 for each in localization_to_json(localization))
 
 
 def test_ranks_count_the_boxes_that_are_left() -> None:
     everything = quietly(SCENE, ["chair"], TABLE, EVERYTHING)
     values = sorted({box.probability for box in everything.boxes})
-    found = quietly(SCENE, ["chair"], TABLE, LocalizeConfig(min_probability=float(values[-1])))
-    assert [box.rank for box in found.boxes] == list(range(len(found.boxes)))
-    assert len(found.boxes) < len(everything.boxes) or len(values) == 1
+    localization = quietly(SCENE, ["chair"], TABLE, LocalizeConfig(min_probability=float(values[-1])))
+    assert [box.rank for box in localization.boxes] == list(range(len(localization.boxes)))
+    assert len(localization.boxes) < len(everything.boxes) or len(values) == 1
 
 
 def test_a_scene_without_seen_gaussians_has_no_word() -> None:
     fused = SCENE.features["toy"]
     blind = replace(SCENE, features={"toy": replace(fused, weights=np.zeros_like(fused.weights))})
-    found = quietly(blind, ["mug"], TABLE, EVERYTHING)
-    assert found.absent == {"mug": 0.0}
+    localization = quietly(blind, ["mug"], TABLE, EVERYTHING)
+    assert localization.absent == {"mug": 0.0}
 
 
 def test_a_text_encoder_without_names_gives_probabilities_too() -> None:
-    found = quietly(SCENE, ["mug", "spoon"], Phrases())
-    assert found.boxes[0].query == "mug"
-    assert found.probabilities[0] > 0.5 > found.probabilities[1]
+    localization = quietly(SCENE, ["mug", "spoon"], Phrases())
+    assert localization.boxes[0].query == "mug"
+    assert localization.probabilities[0] > 0.5 > localization.probabilities[1]
     # With words to compare with, it is as sure as the table.
     table, phrases = (quietly(SCENE, ["mug"], text, rivals=TABLE) for text in (TABLE, Phrases()))
     assert table.boxes[0].probability == phrases.boxes[0].probability
@@ -289,9 +291,9 @@ def test_boxes_are_as_probable_as_is_asked_whatever_was_trained_on(trained: tupl
     table, words = replace(TABLE, trained=trained), ["mug", "spoon", "chair"]
     everything = quietly(SCENE, words, table, EVERYTHING)
     for least in (0.0, *(box.probability for box in everything.boxes), 1.0):
-        asked = quietly(SCENE, words, table, LocalizeConfig(min_probability=least))
+        localization = quietly(SCENE, words, table, LocalizeConfig(min_probability=least))
         expected = [(box.query, box.probability) for box in everything.boxes if box.probability >= least]
-        assert [(box.query, box.probability) for box in asked.boxes] == expected
+        assert [(box.query, box.probability) for box in localization.boxes] == expected
 
 
 def test_of_several_feature_sets_the_named_one_is_asked_by_key_space_or_teacher() -> None:
@@ -305,6 +307,6 @@ def test_of_several_feature_sets_the_named_one_is_asked_by_key_space_or_teacher(
     for key, names in (("a", ("a", own.space.name, own.space.teacher)), ("b", ("b", "other", "colors"))):
         for name in names:
             assert select_features(both, name)[1] is both.features[key]
-            asked = quietly(both, ["mug"], TABLE, space=name)
-            np.testing.assert_array_equal(asked.relevancy, alone[key].relevancy)
+            localization = quietly(both, ["mug"], TABLE, space=name)
+            np.testing.assert_array_equal(localization.relevancy, alone[key].relevancy)
     assert not np.array_equal(alone["a"].relevancy, alone["b"].relevancy)

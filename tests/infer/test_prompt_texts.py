@@ -61,7 +61,7 @@ def test_prompts_say_what_the_pictures_are() -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "question", "names", "marked", "told"),
+    ("task", "question", "names", "marked", "problem"),
     [
         ("answer", " ", ["a"], True, "question= is missing"),
         ("ground", "", ["a"], True, "question= is missing"),
@@ -71,9 +71,9 @@ def test_prompts_say_what_the_pictures_are() -> None:
     ],
 )
 def test_prompts_without_what_they_need_are_refused(
-    task: Any, question: str, names: list[str], marked: bool, told: str
+    task: Any, question: str, names: list[str], marked: bool, problem: str
 ) -> None:
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match=problem):
         prompt_text(task, question, names, marks=(1,) if marked else (), kinds=RENDERS)
 
 

@@ -48,58 +48,61 @@ def read(tmp_path: Path, content: Any, **settings: Any) -> QuestionSet:
     return read_question_set(path, **settings)
 
 
-def answers(asked: QuestionSet, **row: Any) -> Any:
+def answers(question_set: QuestionSet, **row: Any) -> Any:
     targets = [{"aabb_min": [0, 1, 2], "aabb_max": [1, 3, 2.5]}]
-    return predictions(asked.benchmark, [(each, {"targets": targets} | row) for each in asked.questions])
+    return predictions(question_set.benchmark, [(each, {"targets": targets} | row) for each in question_set.questions])
 
 
 def test_questions_of_scanqa_are_answered(tmp_path: Path) -> None:
-    asked = read(tmp_path, SCANQA)
-    assert asked.benchmark == "scanqa"
-    assert asked.scenes() == {"a": 1, "b": 1}
-    (first,) = asked.of_scene("a")
+    question_set = read(tmp_path, SCANQA)
+    assert question_set.benchmark == "scanqa"
+    assert question_set.scenes() == {"a": 1, "b": 1}
+    (first,) = question_set.of_scene("a")
     assert first.question.question == Question(text="What is on the table?")
-    assert answers(asked, answer="<think>Hm.</think> A red Mug. ")[0] == {
+    assert answers(question_set, answer="<think>Hm.</think> A red Mug. ")[0] == {
         "scene_id": "a",
         "question_id": "q1",
         "answer_top10": ["a red mug"],
         "bbox": box_corners(LOW, HIGH),
     }
-    assert "bbox" not in answers(asked, answer="x", targets=[])[0]
+    assert "bbox" not in answers(question_set, answer="x", targets=[])[0]
 
 
 def test_situations_of_sqa3d_are_said_before_the_question(tmp_path: Path) -> None:
-    asked = read(tmp_path, SQA3D)
-    assert asked.benchmark == "sqa3d"
-    assert asked.questions[0].question.question.text == "I sit. What is left?"
-    assert answers(asked, answer="Chair") == [
+    question_set = read(tmp_path, SQA3D)
+    assert question_set.benchmark == "sqa3d"
+    assert question_set.questions[0].question.question.text == "I sit. What is left?"
+    assert answers(question_set, answer="Chair") == [
         {"scene_id": "a", "question_id": "220602000002", "situation": "I sit.", "question": "What is left?"}
         | {"answer": "chair"}
     ]
 
 
 def test_descriptions_of_scanrefer_are_grounded(tmp_path: Path) -> None:
-    asked = read(tmp_path, SCANREFER)
-    assert asked.benchmark == "scanrefer"
-    assert asked.questions[1].question.question == Question(text="the cabinet 1", task="ground")
+    question_set = read(tmp_path, SCANREFER)
+    assert question_set.benchmark == "scanrefer"
+    assert question_set.questions[1].question.question == Question(text="the cabinet 1", task="ground")
     other = {"aabb_min": (5, 5, 5), "aabb_max": (6, 6, 6)}
     targets = [other, {"aabb_min": LOW, "aabb_max": HIGH}]
     keys = {"scene_id": "a", "object_id": "8", "ann_id": "1"}
     meant, missed = box_corners(LOW, HIGH), box_corners((5.0, 5.0, 5.0), (6.0, 6.0, 6.0))
-    assert answers(asked, answer="2", mark=2, targets=targets)[1] == keys | {"bbox": meant, "bboxes": [meant, missed]}
+    assert answers(question_set, answer="2", mark=2, targets=targets)[1] == keys | {
+        "bbox": meant,
+        "bboxes": [meant, missed],
+    }
     nothing = keys | {"bbox": None, "bboxes": []}
-    assert answers(asked, answer="0", mark=0, targets=targets)[1] == nothing
-    assert answers(asked, answer="?", mark=None, targets=targets)[1] == nothing
-    assert predictions("scanrefer", [], asked.questions)[1] == nothing
-    assert predictions("scanqa", [], asked.questions) == []
+    assert answers(question_set, answer="0", mark=0, targets=targets)[1] == nothing
+    assert answers(question_set, answer="?", mark=None, targets=targets)[1] == nothing
+    assert predictions("scanrefer", [], question_set.questions)[1] == nothing
+    assert predictions("scanqa", [], question_set.questions) == []
 
 
 def test_objects_of_scanrefer_are_captioned_once_each_in_the_boxes_of_the_file(tmp_path: Path) -> None:
-    asked = read(tmp_path, SCANREFER, task="caption")
-    assert asked.benchmark == "scan2cap"
-    (question,) = asked.questions
+    question_set = read(tmp_path, SCANREFER, task="caption")
+    assert question_set.benchmark == "scan2cap"
+    (question,) = question_set.questions
     assert question.question.question == Question(task="caption", aabb=(*LOW, *HIGH))
-    (caption,) = answers(asked, answer="A cabinet. It is gray.")["a"]
+    (caption,) = answers(question_set, answer="A cabinet. It is gray.")["a"]
     assert caption["caption"] == "sos a cabinet . it is gray . eos"
     np.testing.assert_allclose(caption["box"], box_corners(LOW, HIGH))
     assert caption["obj_prob"] == [0.0, 1.0]
@@ -107,8 +110,8 @@ def test_objects_of_scanrefer_are_captioned_once_each_in_the_boxes_of_the_file(t
 
 
 def test_boxes_of_scan2cap_are_captioned_and_keep_their_probabilities(tmp_path: Path) -> None:
-    asked = read(tmp_path, SCAN2CAP)
-    (caption,) = answers(asked, answer="New")["a"]
+    question_set = read(tmp_path, SCAN2CAP)
+    (caption,) = answers(question_set, answer="New")["a"]
     assert caption == SCAN2CAP["a"][0] | {"caption": "sos new eos", "box": caption["box"]}
 
 
@@ -118,15 +121,15 @@ def test_boxes_of_another_file_stand_in_for_those_of_the_set(tmp_path: Path) -> 
     boxes.write_text(json.dumps({"a": [other, other], "c": [other]}))
     bare = [{key: value for key, value in row.items() if key != "bbox"} for row in SCANREFER]
     with pytest.warns(SceneWarning) as said:
-        asked = read(tmp_path, [*bare, {**bare[0], "scene_id": "b"}], task="caption", proposals=str(boxes))
+        question_set = read(tmp_path, [*bare, {**bare[0], "scene_id": "b"}], task="caption", proposals=str(boxes))
     assert [str(each.message).partition("proposals: ")[2] for each in said] == [
         f"{boxes} has no boxes in 1 scene, of which there are no captions: b",
         f"{tmp_path / 'set.json'} describes no object of 1 scene, of which there are no captions: c",
     ]
     with pytest.raises(InputError, match="has boxes in a, c, and .* describes objects of d; expected the same scenes"):
         read(tmp_path, [{**bare[0], "scene_id": "d"}], task="caption", proposals=str(boxes))
-    assert [each.question.question.aabb for each in asked.questions] == [(5.0, 5.0, 5.0, 6.0, 6.0, 6.0)] * 2
-    assert len({each.question.id for each in asked.questions}) == 2
+    assert [each.question.question.aabb for each in question_set.questions] == [(5.0, 5.0, 5.0, 6.0, 6.0, 6.0)] * 2
+    assert len({each.question.id for each in question_set.questions}) == 2
     localized = read(tmp_path, bare, task="caption", proposals="localize")
     assert localized.names == {"a": ("file cabinet",)}
     assert localized.scenes() == {"a": 1}
@@ -135,7 +138,7 @@ def test_boxes_of_another_file_stand_in_for_those_of_the_set(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("content", "settings", "told"),
+    ("content", "settings", "problem"),
     [
         (SCANQA, {"task": "ground"}, "holds ScanQA's questions; expected task=answer"),
         (SQA3D, {"task": "caption"}, "holds SQA3D's questions"),
@@ -153,8 +156,10 @@ def test_boxes_of_another_file_stand_in_for_those_of_the_set(tmp_path: Path) -> 
         ([*SCANQA, SCANQA[0]], {}, "one question_id"),
     ],
 )
-def test_what_is_no_question_set_is_an_error(tmp_path: Path, content: Any, settings: dict[str, Any], told: str) -> None:
-    with pytest.raises(InputError, match=told):
+def test_what_is_no_question_set_is_an_error(
+    tmp_path: Path, content: Any, settings: dict[str, Any], problem: str
+) -> None:
+    with pytest.raises(InputError, match=problem):
         read(tmp_path, content, **settings)
 
 

@@ -120,14 +120,14 @@ def test_every_word_gets_its_pictures_with_names_that_any_disk_takes() -> None:
     scores = np.linspace(0, 1, len(splat), dtype=np.float32)
     scores[3] = np.nan
     words = ("a/b\\c", "é?", "x" * 500)
-    found = Localization(
+    localization = Localization(
         queries=words,
         relevancy=np.tile(scores, (3, 1)),
         thresholds=np.full(3, LocalizeConfig().threshold.fixed, np.float32),
         probabilities=np.ones(3, np.float32),
         boxes=(),
     )
-    pictures = dict(relevancy_pictures(scene, found, per_word=2))
+    pictures = dict(relevancy_pictures(scene, localization, per_word=2))
     assert sorted(pictures) == [
         f"{index:02d}_{word}_view{view:03d}" for index, word in enumerate(("a_b_c", "é_", "x" * 60)) for view in (0, 1)
     ]
@@ -141,7 +141,7 @@ def test_the_photograph_is_on_the_left_and_relevancy_on_the_right() -> None:
     photograph = rng.integers(0, 256, (int(cameras.heights[0]), int(cameras.widths[0]), 3), dtype=np.uint8)
     views = Views(cameras=cameras, names=("a",), images=[photograph])
     scores = np.ones((1, len(splat)), np.float32)
-    found = Localization(
+    localization = Localization(
         queries=("wall",),
         relevancy=scores,
         thresholds=np.full(1, 0.5, np.float32),
@@ -151,7 +151,7 @@ def test_the_photograph_is_on_the_left_and_relevancy_on_the_right() -> None:
     drawn = {}
     for name, images in (("photograph", [photograph]), ("rendered", None)):
         scene = Scene(name="wall", gaussians=splat, views=replace(views, images=images))
-        ((_, picture),) = relevancy_pictures(scene, found, per_word=1)
+        ((_, picture),) = relevancy_pictures(scene, localization, per_word=1)
         drawn[name] = np.asarray(picture)
     assert drawn["photograph"].shape == drawn["rendered"].shape
     middle = drawn["photograph"].shape[1] // 2

@@ -20,8 +20,8 @@ from gsencoder.types import FeatureBasis, GaussianFeatures, Scene
 SCENE, KINDS = selected_room()
 
 
-def chosen(scene: Scene = SCENE, *asked: str, config: SelectConfig = SelectConfig(), **options: object) -> Selection:
-    return select(scene, asked or ("mug",), words(), config, **options)[0]  # type: ignore[arg-type]
+def chosen(scene: Scene = SCENE, *names: str, config: SelectConfig = SelectConfig(), **options: object) -> Selection:
+    return select(scene, names or ("mug",), words(), config, **options)[0]  # type: ignore[arg-type]
 
 
 def test_an_object_is_selected_with_its_rims_and_without_what_it_stands_on() -> None:
@@ -113,8 +113,8 @@ def test_what_is_inside_of_an_object_stays_and_what_is_as_relevant_is_no_surroun
     side = np.arange(0.0, 1.0, 0.02)
     table = np.stack([*np.meshgrid(side, side), np.zeros((50, 50))], axis=-1).reshape(-1, 3)
     table += rng.normal(size=table.shape) * 0.0005
-    taken = table[:, 0] < 0.5
-    vectors = np.where(taken[:, None], np.eye(4)[0], np.eye(4)[1])
+    table_half = table[:, 0] < 0.5
+    vectors = np.where(table_half[:, None], np.eye(4)[0], np.eye(4)[1])
     relevancy = vectors[:, 0].copy()
     # In the middle of the object are a few Gaussians with the feature of something else, that were taken,
     stain = np.linalg.norm(table - [0.25, 0.5, 0], axis=1) < 0.05
@@ -129,7 +129,7 @@ def test_what_is_inside_of_an_object_stays_and_what_is_as_relevant_is_no_surroun
         mean=np.zeros(4, np.float32),
         space=space,
     )
-    rows = np.flatnonzero(taken)
+    rows = np.flatnonzero(table_half)
     candidates, shares = object_shares(
         features,
         table.astype(np.float32),
@@ -139,9 +139,9 @@ def test_what_is_inside_of_an_object_stays_and_what_is_as_relevant_is_no_surroun
         reach=4.0,
         same=rows,
     )
-    found = np.zeros(len(table), bool)
-    found[candidates] = shares > 0.5
-    assert (found == (taken | spot)).all()
+    mask = np.zeros(len(table), bool)
+    mask[candidates] = shares > 0.5
+    assert (mask == (table_half | spot)).all()
 
 
 def test_an_object_with_nothing_around_it_is_all_object() -> None:
@@ -173,11 +173,11 @@ def test_what_no_view_shows_goes_with_what_is_around_it() -> None:
 
 
 def test_without_growing_the_gaussians_of_the_boxes_are_taken() -> None:
-    selection, found = select(SCENE, ("mug", "book"), words(), SelectConfig(grow=False))
+    selection, localization = select(SCENE, ("mug", "book"), words(), SelectConfig(grow=False))
     assert (selection.labels == selection.seeds).all()
     assert selection.views == 0
     for number in (0, 1):
-        boxes = [box.rows for box in found.boxes if box.query == selection.words[number]]
+        boxes = [box.rows for box in localization.boxes if box.query == selection.words[number]]
         assert set(selection.rows(number).tolist()) <= set(np.concatenate(boxes).tolist())
 
 
@@ -204,13 +204,13 @@ def test_votes_are_the_blending_weights_of_the_views() -> None:
     gaussians, cameras = SCENE.gaussians, circling(count=3)
     assert gaussians is not None
     every = sampling(cameras, views=3, pixels=10_000)
-    found = votes(gaussians, cameras, (KINDS == 0).astype(np.int32), 1, every, spacing=np.inf)
+    votes_of_gaussians = votes(gaussians, cameras, (KINDS == 0).astype(np.int32), 1, every, spacing=np.inf)
     expected = sum(blend(gaussians, cameras, view).lift(torch.ones(96 * 72)) for view in range(3))
-    assert np.allclose(found.present.sum(axis=1), np.asarray(expected), rtol=1e-4, atol=1e-4)
+    assert np.allclose(votes_of_gaussians.present.sum(axis=1), np.asarray(expected), rtol=1e-4, atol=1e-4)
     # What has no label covers no less when that which has one is gone; what has one is gone.
     left = KINDS != 0
-    assert (found.removed.sum(axis=1)[left] >= found.present.sum(axis=1)[left] - 1e-3).all()
-    assert not found.removed[~left].any()
+    assert (votes_of_gaussians.removed.sum(axis=1)[left] >= votes_of_gaussians.present.sum(axis=1)[left] - 1e-3).all()
+    assert not votes_of_gaussians.removed[~left].any()
     # Without a label nothing is removed.
     nothing = votes(gaussians, cameras, np.zeros(len(KINDS), np.int32), 1, every, spacing=0.02)
     assert (nothing.present == nothing.removed).all()
@@ -231,7 +231,7 @@ def test_fewer_pixels_give_about_the_same_votes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "options", "message"),
+    ("names", "options", "message"),
     [
         (("mug",), {"boxes": (0,), "threshold": 0.5}, "box= and threshold= are two ways"),
         (("mug",), {"boxes": (7,)}, r"box=7: 'mug' has one box, number 0"),
@@ -247,9 +247,9 @@ def test_fewer_pixels_give_about_the_same_votes() -> None:
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*words have no box")
-def test_what_cannot_be_selected_is_refused(asked: tuple[str, ...], options: dict[str, object], message: str) -> None:
+def test_what_cannot_be_selected_is_refused(names: tuple[str, ...], options: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        chosen(SCENE, *asked, config=SelectConfig(grow=False), **options)
+        chosen(SCENE, *names, config=SelectConfig(grow=False), **options)
 
 
 @pytest.mark.parametrize(

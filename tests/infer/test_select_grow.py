@@ -170,10 +170,10 @@ def test_a_share_that_is_equal_to_the_limit_is_not_taken() -> None:
     # The rim is as near to the object as a spacing, so that it is no surroundings.
     places[rim, 0] = places[object_ & (places[:, 0] > 9.5), 0] + 0.9
     parts = ((np.flatnonzero(object_),),)
-    taken, possible = by_features(places, features_of(vectors), parts, vectors[None, :, 0], share=0.5)
+    members, possible = by_features(places, features_of(vectors), parts, vectors[None, :, 0], share=0.5)
     assert (possible[rim] == 1).all()
-    assert (taken[object_] == 1).all()
-    assert not taken[rim].any()
+    assert (members[object_] == 1).all()
+    assert not members[rim].any()
     assert (by_features(places, features_of(vectors), parts, vectors[None, :, 0], share=0.49)[0][rim] == 1).all()
 
 
@@ -185,11 +185,11 @@ def test_what_has_no_feature_could_be_of_the_first_of_the_words_within_reach() -
     parts = ((np.flatnonzero(left),), (np.flatnonzero(right),))
     features = features_of(vectors, seen=~blind)
     for order in ([0, 1], [1, 0]):
-        taken, possible = by_features(
+        members, possible = by_features(
             places, features, tuple(parts[each] for each in order), vectors[:, order].T, reach=5.0
         )
         assert possible[blind].tolist() == [1]
-        assert taken[blind].tolist() == [0]
+        assert members[blind].tolist() == [0]
 
 
 def test_all_boxes_of_a_word_are_one_object_whose_inside_stays() -> None:
@@ -203,8 +203,8 @@ def test_all_boxes_of_a_word_are_one_object_whose_inside_stays() -> None:
     relevancy = vectors[:, 0].copy()
     vectors[stain] = np.eye(8)[1]
     parts = ((np.flatnonzero(one), np.flatnonzero(other)),)
-    taken, _ = by_features(places, features_of(vectors), parts, relevancy[None])
-    assert ((taken == 1) == (one | other)).all()
+    members, _ = by_features(places, features_of(vectors), parts, relevancy[None])
+    assert ((members == 1) == (one | other)).all()
 
 
 SCENE, KINDS = selected_room()

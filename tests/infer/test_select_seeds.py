@@ -87,8 +87,8 @@ def test_parts_of_several_words_share_no_gaussian_when_they_grow(monkeypatch: py
         return grow(*arguments, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(module, "grow", recording)
-    selection, found = select(SCENE, ("mug", "table"), words(), threshold=0.0)
-    assert (found.relevancy >= 0.0).all(axis=0).any()  # The rims are both.
+    selection, localization = select(SCENE, ("mug", "table"), words(), threshold=0.0)
+    assert (localization.relevancy >= 0.0).all(axis=0).any()  # The rims are both.
     for number, groups in enumerate(seen[0]):
         for rows in groups:
             assert (selection.seeds[rows] == number + 1).all()
@@ -104,14 +104,14 @@ def two_mugs() -> Scene:
 
 
 def test_of_two_mugs_the_more_probable_one_or_both_are_taken() -> None:
-    taken = {}
+    counts = {}
     for probable in (0.0, 1.0):
-        selection, found = select(two_mugs(), ("mug",), words(), SelectConfig(probable=probable))
-        assert [each.probability for each in found.boxes] == sorted(
-            {each.probability for each in found.boxes}, reverse=True
+        selection, localization = select(two_mugs(), ("mug",), words(), SelectConfig(probable=probable))
+        assert [each.probability for each in localization.boxes] == sorted(
+            {each.probability for each in localization.boxes}, reverse=True
         )
-        taken[probable] = {int(kind) for kind in KINDS[selection.labels == 1]}
-    assert taken == {0.0: {0, 1}, 1.0: {0}}
+        counts[probable] = {int(kind) for kind in KINDS[selection.labels == 1]}
+    assert counts == {0.0: {0, 1}, 1.0: {0}}
 
 
 def test_seeds_are_the_labels_before_they_grew() -> None:

@@ -115,7 +115,7 @@ def test_a_model_answers_from_rendered_tokens_as_from_its_own_tower(tmp_path: Pa
     tower: list[torch.Tensor] = []
 
     def ask(replacement: torch.Tensor | None) -> torch.Tensor:
-        def hook(module: Any, given: Any, output: Any) -> Any:
+        def hook(module: Any, inputs: Any, output: Any) -> Any:
             tower.append(output.last_hidden_state)
             if replacement is not None:
                 output.last_hidden_state = replacement

@@ -50,11 +50,11 @@ def test_frames_of_a_film_are_taken_from_all_along_it() -> None:
     turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     film = around(np.array([0.3, 0.2, 0.8]), 1.0 + 0.3 * np.abs(turns - np.pi) / np.pi, turns)
     free = FreeSpace(scene.gaussians).without(target.rows)
-    taken = frames_on(film, scene.gaussians, [target], 16, [free])
-    assert len(taken) == 16
-    assert len(np.unique(taken)) == 16
+    frames = frames_on(film, scene.gaussians, [target], 16, [free])
+    assert len(frames) == 16
+    assert len(np.unique(frames)) == 16
     # The nearest stand together on one side.
-    assert np.ptp(turns[taken]) > 0.8
+    assert np.ptp(turns[frames]) > 0.8
 
 
 def test_targets_take_turns_at_the_frames() -> None:
@@ -65,8 +65,8 @@ def test_targets_take_turns_at_the_frames() -> None:
     cameras = joined(around(large.center, np.full(20, 1.2), at), around(target.center, np.full(20, 1.2), at))
     free = FreeSpace(scene.gaussians)
     spaces = [free.without(each.rows) for each in (large, target)]
-    taken = frames_on(cameras, scene.gaussians, [large, target], 8, spaces)
-    assert len(taken) == 8
+    frames = frames_on(cameras, scene.gaussians, [large, target], 8, spaces)
+    assert len(frames) == 8
     for each, space in zip((large, target), spaces, strict=True):
         (best,) = frames_on(cameras, scene.gaussians, [each], 1, [space])
-        assert best in taken
+        assert best in frames

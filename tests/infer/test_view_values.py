@@ -58,10 +58,10 @@ def test_views_of_two_targets_are_judged_as_each_by_itself() -> None:
     )
     cameras = corner_cameras(5)
     both = score_views(scene.gaussians, cameras, [target, other])
-    for place, one in enumerate((target, other)):
+    for number, one in enumerate((target, other)):
         (alone,) = score_views(scene.gaussians, cameras, [one])
         for name in ("visible", "share", "inside", "alpha", "blur", "target", "context"):
-            assert (getattr(both[place], name) == getattr(alone, name)).all()
+            assert (getattr(both[number], name) == getattr(alone, name)).all()
 
 
 def test_gains_never_grow_and_the_choice_is_near_the_best_of_all() -> None:

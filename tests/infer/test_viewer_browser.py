@@ -117,8 +117,8 @@ def find_and_click_the_mug(page: Any, scene: Scene, search: SceneSearch, asked: 
     view, point = seen_mug(scene)
     page.evaluate("view => gsencoderViewer.stand(view)", view)
     before = picture_of(page)
-    place = page.evaluate("point => gsencoderViewer.placeOf(0, point)", point)
-    x, y = round(place["x"]), round(place["y"])
+    position = page.evaluate("point => gsencoderViewer.placeOf(0, point)", point)
+    x, y = round(position["x"]), round(position["y"])
     assert np.ptp(before[:, : WIDTH - 300].reshape(-1, 3), axis=0).min() > 60  # a scene, and no flat color
     page.fill("input[type=search]", "the Mug")
     page.press("input[type=search]", "Enter")
@@ -245,7 +245,7 @@ def test_thresholds_boxes_and_probabilities_of_a_file_are_those_of_localize_for_
         search.shown.scene, gaussians=load_splat(tmp_path / "splat.spz"), features={quantized.space.name: quantized}
     )
     page = opened_page(browser, (tmp_path / "page.html").as_uri(), offline=True)
-    clusters = found = 0
+    clusters = box_count = 0
     for word in container.meta["words"]:
         scores = relevancy(quantized, search.words.encode([word]), search.words.mean)[0]
         # A tenth to a fifth of the scene, where no rounding changes which Gaussians reach it.
@@ -269,8 +269,8 @@ def test_thresholds_boxes_and_probabilities_of_a_file_are_those_of_localize_for_
                 assert ((middle > low) & (middle < high)).all()
                 assert np.prod(size) == pytest.approx(np.prod(box.obb_size), rel=0.02, abs=1e-5)
             clusters += len(boxes)
-            found += count
-    assert 2 * len(container.meta["words"]) < clusters < found  # Improbable ones are left out.
+            box_count += count
+    assert 2 * len(container.meta["words"]) < clusters < box_count  # Improbable ones are left out.
     page.context.close()
 
 

@@ -40,9 +40,9 @@ def test_a_page_may_run_its_own_script_alone_and_connect_to_its_server_alone(ser
         made = file_page(AWKWARD, "a", SETTINGS, [])
     page = made.decode()
     if not served:
-        found = re.search(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', page)
-        assert found is not None
-        policy = unescape(found[1])
+        match = re.search(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', page)
+        assert match is not None
+        policy = unescape(match[1])
     script = page[page.rindex("<script>") + len("<script>") : page.rindex("</script>")]
     style = page[page.index("<style>") + len("<style>") : page.index("</style>")]
     assert dict(part.split(" ", 1) for part in policy.split("; ")) == {
@@ -68,10 +68,10 @@ def test_titles_that_no_encoding_knows_become_question_marks() -> None:
 
 def test_a_page_of_the_same_scene_is_the_same_whenever_it_is_written() -> None:
     page = file_page(STUB, "a", SETTINGS, [Container(meta={}, arrays={})]).decode()
-    found = re.search(r'id="scene-0">([^<]+)<', page)
-    assert found is not None
+    match = re.search(r'id="scene-0">([^<]+)<', page)
+    assert match is not None
     # The time in the header of gzip.
-    assert base64.b64decode(found[1])[4:8] == bytes(4)
+    assert base64.b64decode(match[1])[4:8] == bytes(4)
 
 
 @pytest.mark.parametrize("broken", [SCRIPT, STYLE])
@@ -102,8 +102,8 @@ def fitted(search: SceneSearch, limit: int, *degrees: int, options: FileOptions 
 
 
 def scenes_of(made: MadePage) -> list[Container]:
-    found = re.findall(r'id="scene-\d+">([^<]+)<', made.page.decode())
-    return [read_container(gzip.decompress(base64.b64decode(blob))) for blob in found]
+    matches = re.findall(r'id="scene-\d+">([^<]+)<', made.page.decode())
+    return [read_container(gzip.decompress(base64.b64decode(blob))) for blob in matches]
 
 
 def test_a_page_holds_all_up_to_its_last_byte_and_says_what_it_knows(search: SceneSearch) -> None:

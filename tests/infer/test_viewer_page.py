@@ -129,11 +129,11 @@ def test_words_of_a_page_lose_no_more_than_their_rounding(search: SceneSearch, w
 
 
 def test_a_page_orders_boxes_of_a_word_as_localize_does(search: SceneSearch, written: Container) -> None:
-    found = localize(search.shown.scene, ["mug"], search.words, search.config)
+    localization = localize(search.shown.scene, ["mug"], search.words, search.config)
     page = cosines_of_page(written, written.meta["words"].index("mug"))
-    rows = np.concatenate([box.rows for box in found.boxes])
+    rows = np.concatenate([box.rows for box in localization.boxes])
     assert len(rows)
-    assert (page[rows] >= found.thresholds[0] - 0.1).all()
+    assert (page[rows] >= localization.thresholds[0] - 0.1).all()
 
 
 def test_what_a_server_answers_is_the_relevancy_in_steps(search: SceneSearch) -> None:
@@ -148,10 +148,10 @@ def test_what_a_server_answers_is_the_relevancy_in_steps(search: SceneSearch) ->
 
 
 def test_boxes_of_a_server_are_those_of_localize(search: SceneSearch) -> None:
-    found = localize(search.shown.scene, ["mug"], search.words, search.config)
+    localization = localize(search.shown.scene, ["mug"], search.words, search.config)
     sent = search.boxes("mug")
-    assert [box["score"] for box in sent["boxes"]] == [box.score for box in found.boxes]
-    assert sent["probability"] == pytest.approx(float(found.probabilities[0]))
+    assert [box["score"] for box in sent["boxes"]] == [box.score for box in localization.boxes]
+    assert sent["probability"] == pytest.approx(float(localization.probabilities[0]))
     assert search.boxes("piano")["boxes"] == []
     assert search.boxes("piano")["probability"] < 0.02
 

@@ -39,15 +39,15 @@ def test_targets_are_the_best_boxes_of_each_word_with_the_ball_that_holds_them()
     splat_ = splat(np.concatenate([cube((0, 0, 0)), cube((1, 0, 0))]))
     half = len(splat_) // 2
     boxes = (box_of("a", 0, np.arange(half)), box_of("a", 1, np.arange(half, 2 * half)), box_of("b", 0, np.array([3])))
-    found = Localization(
+    localization = Localization(
         queries=("a", "b", "c"),
         relevancy=np.zeros((3, len(splat_)), np.float32),
         thresholds=np.zeros(3, np.float32),
         probabilities=np.ones(3, np.float32),
         boxes=boxes,
     )
-    assert [each.name for each in targets_of(splat_, found)] == ["a", "b"]
-    named = targets_of(splat_, found, 2)
+    assert [each.name for each in targets_of(splat_, localization)] == ["a", "b"]
+    named = targets_of(splat_, localization, 2)
     assert [each.name for each in named] == ["a", "a 2", "b"]
     np.testing.assert_allclose(named[1].center, [1, 0, 0], atol=1e-6)
     assert named[0].radius == pytest.approx(CUBE * np.sqrt(3), rel=1e-3)

@@ -134,8 +134,8 @@ def test_a_bank_of_less_coverage_has_the_fewest_components_and_states_its_own_fi
     assert part.coverage == pytest.approx((best >= 0.99).mean())
     assert part.cosine == pytest.approx(best.mean(), abs=1e-6)
     assert part.coverage >= 0.9
-    kept = [int((rows == component).all(axis=1).sum()) for component in part.components]
-    assert (sum(kept) - min(kept)) / len(rows) < 0.9
+    counts = [int((rows == component).all(axis=1).sum()) for component in part.components]
+    assert (sum(counts) - min(counts)) / len(rows) < 0.9
 
 
 def test_one_component_is_refused_where_cells_at_the_mean_need_one_of_their_own() -> None:

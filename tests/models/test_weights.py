@@ -39,15 +39,15 @@ def test_what_is_read_is_what_was_written(basis: bool, dtype: str, tmp_path: Pat
     space, path = outputs(basis), tmp_path / "e.safetensors"
     written = encoder(space)
     save_weights(path, written, space, {"steps": 3}, dtype=dtype)  # type: ignore[arg-type]
-    read, found, made_by = load_weights(path)
+    read, spaces, made_by = load_weights(path)
     assert made_by == {"steps": 3}
     assert read.config == SMALL
     assert not read.training
-    assert list(found) == ["labels"]
-    assert found["labels"].space == SPACE
-    assert found["labels"].scale == space["labels"].scale
-    np.testing.assert_array_equal(found["labels"].mean, space["labels"].mean)
-    assert (found["labels"].basis is None) == (not basis)
+    assert list(spaces) == ["labels"]
+    assert spaces["labels"].space == SPACE
+    assert spaces["labels"].scale == space["labels"].scale
+    np.testing.assert_array_equal(spaces["labels"].mean, space["labels"].mean)
+    assert (spaces["labels"].basis is None) == (not basis)
     tolerance = 0.0 if dtype == "float32" else 1e-3
     for name, value in written.state_dict().items():
         torch.testing.assert_close(read.state_dict()[name], value, rtol=tolerance, atol=tolerance)

@@ -105,10 +105,10 @@ def test_points_before_empty_pixels_of_two_photographs_are_outside_the_hull() ->
 def test_seeds_are_added_where_something_is_and_masked_cells_need_none() -> None:
     photographs, points = Photographs(half_empty_views()), wall_points()
     small = DenseConfig(size=48, spacing=4.0)
-    found = densify(photographs, range(4), points, np.full((len(points), 3), 128, np.uint8), small)
-    assert found is not None
-    assert found.swept + found.filled > 20
-    assert not outside_hull(found.points, photographs, range(4)).any()
+    cloud = densify(photographs, range(4), points, np.full((len(points), 3), 128, np.uint8), small)
+    assert cloud is not None
+    assert cloud.swept + cloud.filled > 20
+    assert not outside_hull(cloud.points, photographs, range(4)).any()
     below = wall_points(20_000)
     below = below[below[:, 1] > -0.4 * (DEPTH + TILT * below[:, 0]) / 3]
     assert covered_share(photographs, range(4), below) > 0.9 > covered_share(Photographs(wall_views()), range(4), below)

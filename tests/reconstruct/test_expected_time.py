@@ -48,9 +48,9 @@ class Work:
         gradients, contributing = Optimizer.gradients, Optimizer.contributing
 
         def timed_gradients(one: Optimizer, view: int, shrink: int) -> PhotographGradients:
-            found = gradients(one, view, shrink)
-            self.now += len(found.rows) / shrink**2
-            return found
+            slopes = gradients(one, view, shrink)
+            self.now += len(slopes.rows) / shrink**2
+            return slopes
 
         def timed_contributing(one: Optimizer) -> torch.Tensor:
             self.now += 3 * len(one.parameters["means"])

@@ -63,8 +63,8 @@ def random_pair(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_an_affine_map_is_recovered_from_a_picture_and_its_image() -> None:
     render, affine = random_pair()
-    found = fitted_colors(render, apply_colors(render, affine), torch.ones(24, 32, dtype=torch.bool))
-    torch.testing.assert_close(found, affine, atol=0.02, rtol=0)
+    colors = fitted_colors(render, apply_colors(render, affine), torch.ones(24, 32, dtype=torch.bool))
+    torch.testing.assert_close(colors, affine, atol=0.02, rtol=0)
     again = fitted_colors(render, render, torch.ones(24, 32, dtype=torch.bool))
     torch.testing.assert_close(again, IDENTITY, atol=1e-6, rtol=0)
 
@@ -87,9 +87,9 @@ def test_pixels_that_are_masked_or_not_covered_do_not_count() -> None:
 def test_a_picture_of_one_color_or_of_nothing_gives_a_finite_map(value: float) -> None:
     render, image = torch.full((8, 8, 3), value), torch.full((8, 8, 3), 0.5)
     everything, nothing = torch.ones(8, 8, dtype=torch.bool), torch.zeros(8, 8, dtype=torch.bool)
-    found = fitted_colors(render, image, everything)
-    assert bool(torch.isfinite(found).all())
-    torch.testing.assert_close(apply_colors(render, found), image, atol=0.01, rtol=0)
+    colors = fitted_colors(render, image, everything)
+    assert bool(torch.isfinite(colors).all())
+    torch.testing.assert_close(apply_colors(render, colors), image, atol=0.01, rtol=0)
     assert torch.equal(fitted_colors(render, image, nothing), IDENTITY)
 
 
@@ -125,14 +125,14 @@ def test_photographs_differ_where_one_channel_of_one_does() -> None:
     torch.testing.assert_close(warm.brightness(), torch.ones(50), atol=1e-6, rtol=0)
 
 
-@pytest.mark.parametrize(("gains", "kept"), [(np.ones(6), False), (GAINS, True)])
+@pytest.mark.parametrize(("gains", "stays"), [(np.ones(6), False), (GAINS, True)])
 def test_maps_are_given_up_after_three_looks_at_each_photograph_if_they_do_not_differ(
-    gains: np.ndarray, kept: bool
+    gains: np.ndarray, stays: bool
 ) -> None:
     rounds = len(TRAINING) * ROUNDS
     early, late = (fitted(exposed_views(gains), replace(CONFIG, steps=steps)) for steps in (rounds - 1, rounds))
     assert early.exposures is not None
-    assert (late.exposures is not None) == kept
+    assert (late.exposures is not None) == stays
     again = Optimizer(late.adam, late.photographs, TRAINING, CONFIG, prune=PruneConfig(), step=rounds)
     assert again.exposures is None
     if late.exposures is not None:

@@ -83,22 +83,22 @@ def test_colors_are_equally_frequent_in_the_error_of_maps(row: int) -> None:
 
 def test_exposures_that_drift_along_the_recording_are_interpolated() -> None:
     gains = 1 + 0.3 * np.sin(np.arange(COUNT) / 4)
-    found = predict_exposures(exposures(gains), cameras(COUNT), HELD_OUT.tolist())
-    assert found.source == "order"
-    assert found.errors["order"] < 0.3 * found.errors["mean"]
+    prediction = predict_exposures(exposures(gains), cameras(COUNT), HELD_OUT.tolist())
+    assert prediction.source == "order"
+    assert prediction.errors["order"] < 0.3 * prediction.errors["mean"]
     relative = gains[HELD_OUT] - gains[TRAINING].mean() + 1
     # The first and the last photograph have a neighbor on one side alone.
-    np.testing.assert_allclose(found.maps[1:-1, 0, 0], relative[1:-1], atol=0.01)
-    np.testing.assert_allclose(found.maps[:, 0, 0], relative, atol=0.08)
-    assert not found.maps[:, 0, 1:].any()
+    np.testing.assert_allclose(prediction.maps[1:-1, 0, 0], relative[1:-1], atol=0.01)
+    np.testing.assert_allclose(prediction.maps[:, 0, 0], relative, atol=0.08)
+    assert not prediction.maps[:, 0, 1:].any()
 
 
 def test_exposures_that_follow_nothing_are_taken_to_be_the_mean() -> None:
     gains = np.random.default_rng(0).uniform(0.7, 1.4, COUNT)
     for one in (exposures(gains), exposures(np.ones(COUNT)), exposures(gains, np.array([1, 2]))):
-        found = predict_exposures(one, cameras(COUNT), HELD_OUT.tolist())
-        assert found.source == "mean"
-        torch.testing.assert_close(found.maps, IDENTITY.repeat(len(HELD_OUT), 1, 1))
+        prediction = predict_exposures(one, cameras(COUNT), HELD_OUT.tolist())
+        assert prediction.source == "mean"
+        torch.testing.assert_close(prediction.maps, IDENTITY.repeat(len(HELD_OUT), 1, 1))
     assert predict_exposures(None, cameras(COUNT), [3, 4]).maps.shape == (2, 3, 4)
     assert predict_exposures(exposures(gains, np.array([1])), cameras(COUNT), []).maps.shape == (0, 3, 4)
 
@@ -116,9 +116,9 @@ def test_two_photographs_are_enough_to_predict_from_and_one_is_not() -> None:
 def test_where_the_order_is_none_the_nearest_cameras_tell() -> None:
     shuffled = np.random.default_rng(0).permutation(COUNT)
     gains = (1 + 0.3 * np.sin(np.arange(COUNT) / 4))[shuffled]
-    found = predict_exposures(exposures(gains), cameras(COUNT).select(shuffled), HELD_OUT.tolist())
-    assert found.source == "cameras"
-    np.testing.assert_allclose(found.maps[:, 0, 0], gains[HELD_OUT] - gains[TRAINING].mean() + 1, atol=0.12)
+    prediction = predict_exposures(exposures(gains), cameras(COUNT).select(shuffled), HELD_OUT.tolist())
+    assert prediction.source == "cameras"
+    np.testing.assert_allclose(prediction.maps[:, 0, 0], gains[HELD_OUT] - gains[TRAINING].mean() + 1, atol=0.12)
 
 
 def test_scores_and_pictures_are_in_the_exposure_that_is_predicted() -> None:

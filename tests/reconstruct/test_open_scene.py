@@ -138,17 +138,17 @@ def test_videos_and_photographs_are_found_in_folders_and_nothing_that_is_hidden(
     for name in ("walk.mp4", ".walk.mp4", "notes.txt"):
         (tmp_path / name).write_bytes(b"")
     posed.rename(tmp_path / ".posed")
-    found = find_photographed([str(tmp_path)])
-    assert [path.name for path in found] == ["photographs", "walk.mp4"]
+    paths = find_photographed([str(tmp_path)])
+    assert [path.name for path in paths] == ["photographs", "walk.mp4"]
     # A folder of photographs is not looked into.
-    given = [str(photographs), str(tmp_path / "walk.mp4")]
-    assert find_photographed(given) == (photographs, tmp_path / "walk.mp4")
+    words = [str(photographs), str(tmp_path / "walk.mp4")]
+    assert find_photographed(words) == (photographs, tmp_path / "walk.mp4")
     with pytest.raises(InputError, match="walk.mp4: is given twice; give it once"):
-        find_photographed([*given, given[1]])
+        find_photographed([*words, words[1]])
     with pytest.raises(InputError, match="none: no such file or folder"):
-        find_photographed([*given, str(tmp_path / "none")])
+        find_photographed([*words, str(tmp_path / "none")])
     with pytest.raises(InputError, match=r"\.\./photographs: is the same as .*; give one of them"):
-        find_photographed([*given, str(photographs / ".." / "photographs")])
+        find_photographed([*words, str(photographs / ".." / "photographs")])
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="empty"):
         find_photographed([str(tmp_path / "empty")])

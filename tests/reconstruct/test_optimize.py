@@ -45,13 +45,13 @@ def optimizer(config: OptimizeConfig = QUICK, start: Gaussians | None = None, **
 
 def test_parameters_give_back_the_splat() -> None:
     splat = random_gaussians(50, degree=1)
-    found = gaussians_of(parameters_from(splat, 2))
-    assert found.sh.shape == (50, 9, 3)
-    np.testing.assert_array_equal(found.sh[:, :4], splat.sh)
-    assert not found.sh[:, 4:].any()
+    gaussians = gaussians_of(parameters_from(splat, 2))
+    assert gaussians.sh.shape == (50, 9, 3)
+    np.testing.assert_array_equal(gaussians.sh[:, :4], splat.sh)
+    assert not gaussians.sh[:, 4:].any()
     for name in ("means", "quats", "scales"):
-        np.testing.assert_allclose(getattr(found, name), getattr(splat, name), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(found.opacities, splat.opacities.clip(1e-3, 1 - 1e-3), atol=1e-6)
+        np.testing.assert_allclose(getattr(gaussians, name), getattr(splat, name), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(gaussians.opacities, splat.opacities.clip(1e-3, 1 - 1e-3), atol=1e-6)
     assert gaussians_of(parameters_from(splat, 0)).sh.shape == (50, 1, 3)
 
 
@@ -84,7 +84,7 @@ def test_a_splat_gets_nearer_to_photographs_that_it_was_not_fitted_to() -> None:
 def test_each_round_shows_every_photograph_once() -> None:
     one = optimizer()
     for turn in range(3):
-        assert sorted(one.view_at(3 * turn + place) for place in range(3)) == [0, 1, 3]
+        assert sorted(one.view_at(3 * turn + step) for step in range(3)) == [0, 1, 3]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
@@ -118,17 +118,17 @@ def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None
     assert not torch.equal(maps[0], maps[1])
     state = State(adam=cut.adam, anchor=None, exposures=maps, step=cut.step, seconds=1.5, facts={"seeds": 7})
     save_state(tmp_path / "state", state, {"run": 1})
-    asked = {"steps": QUICK.steps, "sh_degree": QUICK.sh_degree}
-    found = load_state(tmp_path / "state", {"run": 1}, **asked)
-    assert (found.step, found.seconds, found.facts) == (8, 1.5, {"seeds": 7})
-    carried_on = {"exposures": found.exposures, "step": found.step}
-    again = Optimizer(found.adam, cut.photographs, cut.training, QUICK, prune=NEVER, **carried_on)
+    expected_run = {"steps": QUICK.steps, "sh_degree": QUICK.sh_degree}
+    read_state = load_state(tmp_path / "state", {"run": 1}, **expected_run)
+    assert (read_state.step, read_state.seconds, read_state.facts) == (8, 1.5, {"seeds": 7})
+    carried_on = {"exposures": read_state.exposures, "step": read_state.step}
+    again = Optimizer(read_state.adam, cut.photographs, cut.training, QUICK, prune=NEVER, **carried_on)
     for _ in range(12):
         again.advance()
     for name, value in whole.parameters.items():
         assert torch.equal(value, again.parameters[name]), name
     with pytest.raises(InputError, match=r"run=1, and this run asks run=2; give resume=false"):
-        load_state(tmp_path / "state", {"run": 2}, **asked)
+        load_state(tmp_path / "state", {"run": 2}, **expected_run)
     with pytest.raises(InputError, match=r"a state that no run was in \(step 8 of 7\)"):
         load_state(tmp_path / "state", {"run": 1}, steps=7, sh_degree=1)
     with pytest.raises(InputError, match=r"parameters.shN"):
@@ -143,13 +143,13 @@ def test_what_does_nothing_is_taken_out_and_nothing_else() -> None:
     raw["log_scales"][7] = 3
     raw["means"][9] += torch.tensor([0.0, 0, 2.0])  # Behind the wall.
     photos = [(view, photographs.at_scale(view, 2)) for view in range(4)]
-    kept = rows_to_keep(raw, photographs.cameras, photos, PruneConfig(screen=0.9), RasterConfig())
-    gone = sorted(set(range(len(splat))) - set(kept.tolist()))
+    rows = rows_to_keep(raw, photographs.cameras, photos, PruneConfig(screen=0.9), RasterConfig())
+    gone = sorted(set(range(len(splat))) - set(rows.tolist()))
     assert {3, 5, 7} <= set(gone)
     raw["log_scales"][7] = raw["log_scales"][8]
-    kept = rows_to_keep(raw, photographs.cameras, photos, PruneConfig(screen=0.9), RasterConfig())
-    assert {3, 5, 9} <= set(range(len(splat))) - set(kept.tolist())
-    assert len(kept) > 0.8 * len(splat)
+    rows = rows_to_keep(raw, photographs.cameras, photos, PruneConfig(screen=0.9), RasterConfig())
+    assert {3, 5, 9} <= set(range(len(splat))) - set(rows.tolist())
+    assert len(rows) > 0.8 * len(splat)
 
 
 @pytest.mark.slow

@@ -47,20 +47,20 @@ def test_a_contribution_is_counted_in_pixels_of_the_photograph_whatever_size_it_
     pixels = torch.maximum(*columns).numpy()
     least = float(np.median(pixels))
     config = replace(NOTHING, contribution=least)
-    kept = rows_to_keep(parameters_from(splat, 0), cameras, photos(cameras, shrink), config, RasterConfig()).numpy()
+    rows = rows_to_keep(parameters_from(splat, 0), cameras, photos(cameras, shrink), config, RasterConfig()).numpy()
     # Coarser pixels round.
     slack = 1.02 if shrink == 1 else 1.5
     clear = (pixels > slack * least) | (pixels < least / slack)
     assert clear.mean() > 0.6
-    np.testing.assert_array_equal(np.isin(np.arange(150), kept)[clear], pixels[clear] > least)
+    np.testing.assert_array_equal(np.isin(np.arange(150), rows)[clear], pixels[clear] > least)
 
 
 def test_opacities_below_the_least_are_taken_out_and_all_others_stay() -> None:
     splat, cameras = random_gaussians(150), two_cameras()
-    kept = rows_to_keep(
+    rows = rows_to_keep(
         parameters_from(splat, 0), cameras, photos(cameras, 1), replace(NOTHING, opacity=0.4), RasterConfig()
     )
-    np.testing.assert_array_equal(kept.numpy(), np.flatnonzero(splat.opacities >= 0.4))
+    np.testing.assert_array_equal(rows.numpy(), np.flatnonzero(splat.opacities >= 0.4))
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
@@ -80,8 +80,8 @@ def test_what_is_wider_than_a_share_of_some_picture_is_taken_out(shrink: int) ->
     everything = rows_to_keep(raw, cameras, some, NOTHING, RasterConfig())
     assert everything.tolist() == list(range(5))
     for screen, count in ((0.5, 2), (1.0, 3), (4.0, 5)):
-        kept = rows_to_keep(raw, cameras, some, replace(NOTHING, screen=screen), RasterConfig())
-        assert kept.tolist() == list(range(count))
+        rows = rows_to_keep(raw, cameras, some, replace(NOTHING, screen=screen), RasterConfig())
+        assert rows.tolist() == list(range(count))
 
 
 def test_pruning_is_due_once_for_each_share_of_the_steps() -> None:

@@ -26,7 +26,7 @@ def optimizer(views: Views) -> Optimizer:
 
 def test_a_pixel_is_seen_where_its_point_lies_in_another_picture() -> None:
     views = wall_views(depth=True)
-    found = covisible_pixels(Photographs(views), [3], [0])[3]
+    mask = covisible_pixels(Photographs(views), [3], [0])[3]
     assert views.depths is not None
     K, depth = views.cameras.Ks[3].astype(np.float64), views.depths[3].astype(np.float64)
     # Camera 3 stands 0.45 to the right of camera 0, and both look along z: the point moves right by f·0.45/z pixels.
@@ -35,7 +35,7 @@ def test_a_pixel_is_seen_where_its_point_lies_in_another_picture() -> None:
     assert 0.8 < inside.mean() < 0.95
     # At the edge of the picture a pixel may fall on either side.
     sure = np.abs(moved - 96) > 1e-3
-    np.testing.assert_array_equal(found.numpy()[sure], inside[sure])
+    np.testing.assert_array_equal(mask.numpy()[sure], inside[sure])
     assert bool(covisible_pixels(Photographs(views), [3], [0, 2, 3])[3].all())
 
 
@@ -45,23 +45,23 @@ def test_what_something_hides_is_not_seen_and_what_is_not_measured_neither() -> 
     depths = [depth.copy() for depth in views.depths]
     depths[0][20:40] *= 0.9
     depths[1][50:60] = 0
-    found = covisible_pixels(Photographs(replace(views, depths=depths)), [1], [0])[1]
-    assert not found[21:39].any()
-    assert not found[50:60].any()
-    assert found[:18, :80].all()
-    assert found[42:49, :80].all()
+    mask = covisible_pixels(Photographs(replace(views, depths=depths)), [1], [0])[1]
+    assert not mask[21:39].any()
+    assert not mask[50:60].any()
+    assert mask[:18, :80].all()
+    assert mask[42:49, :80].all()
 
 
 def test_pixels_that_are_all_seen_score_as_the_whole_picture() -> None:
     one = optimizer(wall_views(depth=True))
-    found = score(one, [2], {2: torch.ones(72, 96, dtype=torch.bool)})
-    assert (found.seen_psnr, found.seen) == (found.psnr, 1.0)
-    assert found.seen_ssim == pytest.approx(found.ssim, rel=1e-6)
+    scores = score(one, [2], {2: torch.ones(72, 96, dtype=torch.bool)})
+    assert (scores.seen_psnr, scores.seen) == (scores.psnr, 1.0)
+    assert scores.seen_ssim == pytest.approx(scores.ssim, rel=1e-6)
     half = torch.zeros(72, 96, dtype=torch.bool)
     half[:, 48:] = True
     parts = [score(one, [2], {2: mask}) for mask in (half, ~half)]
     errors = [10 ** (-(part.seen_psnr or 0) / 10) for part in parts]
-    np.testing.assert_allclose(np.mean(errors), 10 ** (-found.psnr / 10), rtol=1e-6)
+    np.testing.assert_allclose(np.mean(errors), 10 ** (-scores.psnr / 10), rtol=1e-6)
     assert [part.seen for part in parts] == [0.5, 0.5]
 
 
@@ -70,8 +70,8 @@ def test_nothing_is_said_about_seen_pixels_where_no_sensor_or_no_photograph_tell
     bare = Photographs(wall_views())
     assert covisible_pixels(bare, [2], [0, 1]) == {}
     for seen in ({}, {2: torch.zeros(72, 96, dtype=torch.bool)}):
-        found = score(one, [2], seen)
-        assert (found.seen_psnr, found.seen_ssim, found.seen) == (None, None, None)
+        scores = score(one, [2], seen)
+        assert (scores.seen_psnr, scores.seen_ssim, scores.seen) == (None, None, None)
     average_by_voxel = torch.zeros(72, 96, dtype=torch.bool)
     average_by_voxel[:3] = True
     assert score(one, [2], {2: average_by_voxel}).seen_psnr is None

@@ -22,13 +22,13 @@ def test_photographs_far_aside_are_placed_by_features_that_follow_slants(shared:
     work.mkdir()
     for path in sorted((plush / "images").iterdir())[:44:4]:
         shutil.copy(path, photographs)
-    found = sfm.register_photographs(photographs, work, sfm.SfmConfig(size=400, features=4096))
-    assert len(found.placed) >= 8
-    assert not set(found.placed) & set(found.missing)
+    registration = sfm.register_photographs(photographs, work, sfm.SfmConfig(size=400, features=4096))
+    assert len(registration.placed) >= 8
+    assert not set(registration.placed) & set(registration.missing)
     truth = {
         image.name: image.cam_from_world for image in read_colmap(plush / "sparse", plush / "images", plush).images
     }
-    ours = read_colmap(found.model, photographs, photographs).images
+    ours = read_colmap(registration.model, photographs, photographs).images
     # The rotation of the world that fits all of them best; what is left is what poses are off.
     turns = Rotation.from_matrix([image.cam_from_world[:3, :3].T @ truth[image.name][:3, :3] for image in ours])
     off = np.rad2deg((turns.mean().inv() * turns).magnitude())

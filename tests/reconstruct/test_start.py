@@ -29,9 +29,9 @@ def begun(made: Scene, seeds: SeedConfig = SeedConfig(), dense: DenseConfig = NE
 
 def test_a_splat_is_taken_as_it_is() -> None:
     splat = seed_from_depth(wall_views(depth=True), voxel=0.1)
-    found = begun(scene(gaussians=splat))
-    assert (found.source, found.dense) == ("splat", None)
-    assert found.gaussians is splat
+    start = begun(scene(gaussians=splat))
+    assert (start.source, start.dense) == ("splat", None)
+    assert start.gaussians is splat
 
 
 def test_depth_of_the_photographs_that_are_kept_is_not_looked_at() -> None:
@@ -48,10 +48,10 @@ def test_gaussians_stand_on_a_mesh(tmp_path: Path) -> None:
     corners = np.array([[x, y, DEPTH + TILT * x] for x in (-2.0, 3.0) for y in (-1.8, 1.8)])
     trimesh.Trimesh(corners, [[0, 1, 2], [1, 3, 2]]).export(tmp_path / "wall.ply")
     config = SeedConfig(source="mesh", mesh=str(tmp_path / "wall.ply"), voxel=0.1)
-    found = begun(scene(), config)
-    assert found.source == "mesh"
-    assert len(found.gaussians) > 1000
-    means = found.gaussians.means
+    start = begun(scene(), config)
+    assert start.source == "mesh"
+    assert len(start.gaussians) > 1000
+    means = start.gaussians.means
     np.testing.assert_allclose(means[:, 2], DEPTH + TILT * means[:, 0], atol=1e-3)
 
 
@@ -70,11 +70,11 @@ def test_points_without_colors_are_grey_and_it_is_said_once() -> None:
     bare = scene(views=wall_views(), sfm_points=points)
     for dense in (NEVER, DenseConfig(size=96, sources=3, samples=1)):
         with pytest.warns(SceneWarning, match="40 points without colors are made mid-grey") as warned:
-            found = begun(bare, dense=dense)
+            start = begun(bare, dense=dense)
         assert len(warned) == 1
-        grey = np.abs(found.gaussians.sh[:, 0]).max(axis=1) < 0.02
+        grey = np.abs(start.gaussians.sh[:, 0]).max(axis=1) < 0.02
         assert 40 <= grey.sum() < 45 + 0.02 * len(grey)
-        assert (len(found.gaussians) > 300) == (dense is not NEVER)
+        assert (len(start.gaussians) > 300) == (dense is not NEVER)
 
 
 def test_nothing_to_begin_with_is_told() -> None:

@@ -31,11 +31,11 @@ def stand_in(
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     assert (viewmats.shape, Ks.shape, packed, render_mode) == ((1, 4, 4), (1, 3, 3), False, "RGB+D")
     config = RasterConfig(near=near_plane, eps2d=eps2d, backend="reference")
-    found = rasterize(means, quats, scales, opacities, colors, viewmats[0], Ks[0], width, height, config=config)
-    rendered = torch.cat((found.rgb, found.depth.unsqueeze(-1)), dim=-1)
-    radii = found.radii.ceil().int()
-    info = {"radii": torch.stack((radii, radii // 2), dim=-1)[None], "means2d": found.means2d[None]}
-    return rendered[None], found.alpha[None, ..., None], info
+    raster = rasterize(means, quats, scales, opacities, colors, viewmats[0], Ks[0], width, height, config=config)
+    rendered = torch.cat((raster.rgb, raster.depth.unsqueeze(-1)), dim=-1)
+    radii = raster.radii.ceil().int()
+    info = {"radii": torch.stack((radii, radii // 2), dim=-1)[None], "means2d": raster.means2d[None]}
+    return rendered[None], raster.alpha[None, ..., None], info
 
 
 def both(config: RasterConfig) -> tuple[Raster, Raster]:

@@ -51,15 +51,15 @@ def test_kernels_and_plain_twin_agree_in_values_and_gradients(log_scale: float) 
     inputs = inputs_of(random_gaussians(200, log_scale=log_scale))
     fast, fast_slopes = slopes(inputs, CPU)
     plain, plain_slopes = slopes(inputs, REFERENCE)
-    for found, expected in zip([*fast[:3], *fast_slopes], [*plain[:3], *plain_slopes], strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9 * float(expected.detach().abs().max()))
+    for actual, expected in zip([*fast[:3], *fast_slopes], [*plain[:3], *plain_slopes], strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-9, atol=1e-9 * float(expected.detach().abs().max()))
 
 
 def test_gradients_in_float32_are_within_a_thousandth_of_those_in_float64() -> None:
     splat = random_gaussians(400)
     _, exact = slopes(inputs_of(splat), CPU)
-    _, found = slopes(inputs_of(splat, torch.float32), CPU)
-    for name, a, b in zip(inputs_of(splat), found, exact, strict=True):
+    _, gradients = slopes(inputs_of(splat, torch.float32), CPU)
+    for name, a, b in zip(inputs_of(splat), gradients, exact, strict=True):
         assert float((a.double() - b).norm() / b.norm()) < 1e-3, name
 
 
@@ -94,8 +94,8 @@ def test_a_rerun_gives_the_same_bits_whatever_the_number_of_threads() -> None:
     try:
         for threads in (1, 2, 2):
             torch.set_num_threads(threads)
-            raster, found = slopes(inputs, CPU)
-            runs.append([*raster[:3], *found])
+            raster, gradients = slopes(inputs, CPU)
+            runs.append([*raster[:3], *gradients])
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(a, b) for run in runs[1:] for a, b in zip(runs[0], run, strict=True))
@@ -167,16 +167,16 @@ def test_pictures_and_gradients_stay_finite_at_the_extremes(
 ) -> None:
     inputs = {name: value.detach().clone() for name, value in inputs_of(random_gaussians(50), dtype).items()}
     change(inputs)
-    raster, found = slopes({name: value.requires_grad_() for name, value in inputs.items()}, CPU)
-    assert all(bool(torch.isfinite(part).all()) for part in (*raster, *found))
+    raster, gradients = slopes({name: value.requires_grad_() for name, value in inputs.items()}, CPU)
+    assert all(bool(torch.isfinite(part).all()) for part in (*raster, *gradients))
 
 
 def test_an_empty_splat_gives_an_empty_picture() -> None:
     inputs = {name: value.detach()[:0].requires_grad_() for name, value in inputs_of(random_gaussians(2)).items()}
-    raster, found = slopes(inputs, CPU)
+    raster, gradients = slopes(inputs, CPU)
     assert raster.rgb.shape == (43, 61, 3)
     assert not raster.rgb.any()
-    assert all(part.numel() == 0 for part in found)
+    assert all(part.numel() == 0 for part in gradients)
 
 
 def test_radii_are_zero_where_nothing_reaches_the_picture() -> None:

@@ -88,10 +88,10 @@ def test_without_the_tower_its_words_work_and_an_error_says_what_to_get(
     assert words.encode(["mug"]).shape == (1, 16)
     with pytest.raises(InputError) as error:
         words.encode(["mug", "mug with a handle"])
-    said = str(error.value)
-    assert f"'mug with a handle': not among the {len(REFERENCE_NOUNS)} words stored with these features" in said
-    assert "'hash' (onnx:0123456789abcdef); put its folder into GSENCODER_MODELS or give text=onnx" in said
-    assert "known without it: handle, mug, …" in said
+    message = str(error.value)
+    assert f"'mug with a handle': not among the {len(REFERENCE_NOUNS)} words stored with these features" in message
+    assert "'hash' (onnx:0123456789abcdef); put its folder into GSENCODER_MODELS or give text=onnx" in message
+    assert "known without it: handle, mug, …" in message
 
 
 def test_a_missing_tower_names_three_phrases_and_three_near_names_of_each(
@@ -102,9 +102,9 @@ def test_a_missing_tower_names_three_phrases_and_three_near_names_of_each(
     phrases = [f"{thing} by the chair, the lamp, the table and the bed" for thing in ("mug", "cup", "sofa", "door")]
     with pytest.raises(InputError) as error:
         words.encode(phrases)
-    said = str(error.value)
-    assert [phrase in said for phrase in phrases] == [True, True, True, False]
-    assert said.rpartition("known without it: ")[2].count(", ") == 9
+    message = str(error.value)
+    assert [phrase in message for phrase in phrases] == [True, True, True, False]
+    assert message.rpartition("known without it: ")[2].count(", ") == 9
 
 
 def test_the_record_of_a_tower_has_a_known_kind_and_short_texts(no_jaxtyping: None) -> None:
@@ -146,14 +146,14 @@ def make_record(tower: OnnxTower):
 def test_a_tower_that_did_not_make_the_words_is_refused(tower: HashTower, tmp_path: Path) -> None:
     save_graph(tmp_path / "model.onnx")
     save_tokenizer(tmp_path / "tokenizer.json")
-    given = OnnxTextConfig(model=str(tmp_path), pooling="mean")
+    config = OnnxTextConfig(model=str(tmp_path), pooling="mean")
     with pytest.raises(InputError, match=r"were made by 'hash' \(onnx:0123456789abcdef\), and this is"):
-        words_of_table(vocabulary(tower).table, given)
+        words_of_table(vocabulary(tower).table, config)
     closed = TextTable(
         names=("mug",), embeddings=np.eye(1, 16, dtype=np.float32), space=vocabulary(tower).space, mean=tower_mean()
     )
     with pytest.raises(InputError, match="were made by 'onnx:0123456789abcdef'"):
-        words_of_table(closed, given)
+        words_of_table(closed, config)
 
 
 def tower_mean() -> np.ndarray:

@@ -61,9 +61,9 @@ def save_npz(path: Path, **arrays: np.ndarray) -> Path:
     ],
 )
 def test_simple_variations_mean_the_same_word(table: TextTable, word: str, name: str) -> None:
-    found = table.find(word)
-    assert found is not None
-    assert table.names[found] == name
+    row = table.find(word)
+    assert row is not None
+    assert table.names[row] == name
     assert np.array_equal(table.encode([word])[0], table.embeddings[NAMES.index(name)])
 
 

@@ -24,9 +24,9 @@ def test_the_frustum_of_a_camera_is_what_its_pixels_look_at() -> None:
     with np.errstate(divide="ignore", invalid="ignore"):
         u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
     expected = (z > 0.01) & (u >= 0) & (u < camera.widths[0]) & (v >= 0) & (v < camera.heights[0])
-    found = in_frusta(points, camera)
-    assert (found == expected).mean() > 0.999  # Rounding may move a point on the border.
-    assert 0 < found.sum() < len(points)
+    inside = in_frusta(points, camera)
+    assert (inside == expected).mean() > 0.999  # Rounding may move a point on the border.
+    assert 0 < inside.sum() < len(points)
 
 
 def test_the_union_of_frusta_is_what_any_camera_sees() -> None:
@@ -170,9 +170,9 @@ def test_a_scene_behind_its_cameras_is_an_error() -> None:
 @given(st.integers(1, 40), st.floats(0, 0.9), st.integers(0, 50))
 def test_thinning_out_leaves_something(count: int, most: float, seed: int) -> None:
     rows = np.arange(count) * 2
-    kept = drop_random(rows, most, RNG(seed))
-    assert len(kept) >= 1
-    assert np.isin(kept, rows).all()
+    remaining = drop_random(rows, most, RNG(seed))
+    assert len(remaining) >= 1
+    assert np.isin(remaining, rows).all()
 
 
 def test_crops_are_of_sizes_in_equal_ratios() -> None:

@@ -64,9 +64,9 @@ def test_if_one_of_two_processes_fails_in_a_block_both_do(tmp_path: Path, error:
     path = tmp_path / "run.py"
     path.write_text(TOGETHER.format(error=error))
     ranks.started(path).end_well()
-    found = [Path(f"{path}.{rank}").read_text() for rank in (0, 1)]
+    messages = [Path(f"{path}.{rank}").read_text() for rank in (0, 1)]
     elsewhere = "InputError: another process stopped; its own message says why"
-    assert found == [elsewhere, f"{error.partition('(')[0]}: its own"]
+    assert messages == [elsewhere, f"{error.partition('(')[0]}: its own"]
 
 
 def test_one_process_leaves_a_block_as_it_entered_it() -> None:

@@ -54,15 +54,15 @@ def begin(
     **losses: Any,
 ) -> tuple[SampleDataset, list[str], dict[str, Any]]:
     """The samples and heads that `fit` gives the loop, and the scenes that its validation is given."""
-    given: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
 
     def trainer(encoder: torch.nn.Module, dataset: SampleDataset, *others: object, **named: Any) -> None:
-        given.update(dataset=dataset, heads=named["heads"])
+        arguments.update(dataset=dataset, heads=named["heads"])
         named["validate"](encoder)
         raise Begun
 
     def validate(scenes: Sequence[Any], encoder: object, outputs: OutputSpaces, codebooks: object) -> ValidationResult:
-        given.update(validated=[scene.name for scene in scenes])
+        arguments.update(validated=[scene.name for scene in scenes])
         return ValidationResult({})
 
     monkeypatch.setattr(run, "encoder_trainer", trainer)
@@ -76,7 +76,7 @@ def begin(
             fit(datasets, training, ["wall_1"], {}, config, validate=validate, **around)  # type: ignore[arg-type]
     if warned is not None:
         warned += [str(each.message) for each in caught]
-    return given["dataset"], given["validated"], given["heads"]
+    return arguments["dataset"], arguments["validated"], arguments["heads"]
 
 
 def test_each_teacher_has_its_own_weight_and_classes(

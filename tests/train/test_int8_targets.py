@@ -101,8 +101,8 @@ def dataset_of(folder: Path, config: PrepareConfig, **without: str) -> PreparedD
 def test_a_folder_of_the_other_type_is_refused_and_one_of_an_earlier_version_is_of_float16(tmp_path: Path) -> None:
     dataset_of(tmp_path, PREPARE, prepare="targets")
     assert dataset_of(tmp_path, PREPARE).precision == "float16"
-    said = "prepare.targets=float16, and this run asks prepare.targets=int8; give another folder as prepared="
-    with pytest.raises(InputError, match=said):
+    problem = "prepare.targets=float16, and this run asks prepare.targets=int8; give another folder as prepared="
+    with pytest.raises(InputError, match=problem):
         dataset_of(tmp_path, replace(PREPARE, targets="int8"))
 
 

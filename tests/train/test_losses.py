@@ -61,9 +61,9 @@ def test_without_confidence_the_matching_loss_is_equation_three_for_targets_of_a
 def test_without_division_by_alpha_composited_features_are_compared() -> None:
     b = blend(random_gaussians(60), front_camera(), patch=8)
     predicted, target, weights = torch.randn(60, 8), typical(b.rows), (b.alpha > 0.3).float()
-    found = render_loss(predicted, b, target, weights, replace(CONFIG, divide_by_alpha=False))
-    torch.testing.assert_close(found, (match_loss(b.render(predicted), target, CONFIG) * weights).sum())
-    assert not torch.isclose(found, render_loss(predicted, b, target, weights, CONFIG))
+    loss = render_loss(predicted, b, target, weights, replace(CONFIG, divide_by_alpha=False))
+    torch.testing.assert_close(loss, (match_loss(b.render(predicted), target, CONFIG) * weights).sum())
+    assert not torch.isclose(loss, render_loss(predicted, b, target, weights, CONFIG))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0, 3.0])
@@ -87,10 +87,10 @@ def test_gaussians_that_were_never_seen_neither_cost_nor_learn() -> None:
     predicted = torch.randn(5, 8, requires_grad=True)
     target = typical(5)
     weights = torch.tensor([1.0, 0.0, 2.0, 0.0, 1.0])
-    found = field_loss(predicted, target, weights, CONFIG)
+    loss = field_loss(predicted, target, weights, CONFIG)
     expected = (match_loss(predicted, target, CONFIG) * weights).sum()
-    torch.testing.assert_close(found, expected)
-    (gradient,) = torch.autograd.grad(found, [predicted])
+    torch.testing.assert_close(loss, expected)
+    (gradient,) = torch.autograd.grad(loss, [predicted])
     assert (gradient[[1, 3]] == 0).all()
     spoiled = target.clone()
     spoiled[1] = float("nan")
@@ -98,9 +98,9 @@ def test_gaussians_that_were_never_seen_neither_cost_nor_learn() -> None:
 
 
 def test_no_seen_gaussian_is_a_sum_of_nothing() -> None:
-    found = field_loss(torch.randn(3, 8), typical(3), torch.zeros(3), CONFIG)
-    assert found == 0
-    assert found == 0
+    loss = field_loss(torch.randn(3, 8), typical(3), torch.zeros(3), CONFIG)
+    assert loss == 0
+    assert loss == 0
 
 
 def test_the_render_loss_compares_what_is_left_after_dividing_by_alpha() -> None:
@@ -114,9 +114,9 @@ def test_the_render_loss_compares_what_is_left_after_dividing_by_alpha() -> None
     dense[torch.repeat_interleave(torch.arange(b.rows), b.crow.diff()), b.col.long()] = b.weight
     rendered = (dense @ predicted) / b.alpha.clamp(min=1e-12)[:, None]
     expected = (match_loss(rendered, target, CONFIG) * weights).sum()
-    found = render_loss(predicted, b, target, weights, CONFIG)
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4)
-    ours = torch.autograd.grad(found, [predicted])[0]
+    loss = render_loss(predicted, b, target, weights, CONFIG)
+    torch.testing.assert_close(loss, expected, rtol=1e-4, atol=1e-4)
+    ours = torch.autograd.grad(loss, [predicted])[0]
     plain = torch.autograd.grad(expected, [predicted])[0]
     torch.testing.assert_close(ours, plain, rtol=1e-3, atol=1e-5)
 
@@ -125,8 +125,8 @@ def test_a_field_of_one_vector_renders_to_that_vector_wherever_anything_is() -> 
     b = blend(random_gaussians(60), front_camera(), patch=8)
     vector = typical(1)
     target = vector.expand(b.rows, -1)
-    found = render_loss(vector.expand(60, -1).contiguous(), b, target, (b.alpha > 1e-3).float(), CONFIG)
-    assert found < 1e-3
+    loss = render_loss(vector.expand(60, -1).contiguous(), b, target, (b.alpha > 1e-3).float(), CONFIG)
+    assert loss < 1e-3
 
 
 def test_heads_are_compared_in_their_own_spaces_and_do_not_learn() -> None:
@@ -136,11 +136,11 @@ def test_heads_are_compared_in_their_own_spaces_and_do_not_learn() -> None:
     head = AdapterHead(body, torch.zeros(5), 1.0)
     predicted = torch.randn(60, 8, requires_grad=True)
     weights = (b.alpha > 0.3).float()
-    found = render_loss(predicted, b, typical(b.rows), weights, CONFIG, [(head, decode), (head, decode)])
+    loss = render_loss(predicted, b, typical(b.rows), weights, CONFIG, [(head, decode), (head, decode)])
     once = render_loss(predicted, b, typical(b.rows), weights, CONFIG, [(head, decode)])
-    torch.testing.assert_close(found, 2 * once)
+    torch.testing.assert_close(loss, 2 * once)
     assert body.weight.requires_grad is False
-    assert torch.autograd.grad(found, [predicted])[0].abs().sum() > 0
+    assert torch.autograd.grad(loss, [predicted])[0].abs().sum() > 0
 
 
 @pytest.mark.parametrize("change", [{"cosine": -1.0}, {"min_alpha": 0.0}, {"min_kept": 1.5}, {"rarity": float("inf")}])
@@ -174,10 +174,10 @@ def test_the_contrast_is_a_cross_entropy_over_squared_distances_to_the_kinds() -
     codebook = typical(5) * torch.tensor([[0.2], [0.5], [1.0], [1.5], [2.0]])
     predicted, codes = torch.randn(7, 8), torch.tensor([0, 1, 2, 3, 4, 4, 0])
     weights = torch.tensor([1.0, 2.0, 0.5, 1.0, 3.0, 1.0, 1.0])
-    found = contrast_loss(predicted, codes, weights, codebook, CONFIG)
+    loss = contrast_loss(predicted, codes, weights, codebook, CONFIG)
     logits = -(torch.cdist(predicted.double(), codebook.double()) ** 2) / (2 * 8 * CONFIG.temperature)
     expected = (torch.nn.functional.cross_entropy(logits, codes, reduction="none") * weights).sum()
-    torch.testing.assert_close(found.double(), expected, atol=1e-4, rtol=1e-5)
+    torch.testing.assert_close(loss.double(), expected, atol=1e-4, rtol=1e-5)
 
 
 def test_where_kinds_look_alike_the_contrast_ends_nearer_to_the_likelier_one_by_the_logarithm_of_the_odds() -> None:
@@ -187,9 +187,9 @@ def test_where_kinds_look_alike_the_contrast_ends_nearer_to_the_likelier_one_by_
 
     def closure() -> torch.Tensor:
         optimizer.zero_grad()
-        found = contrast_loss(guess.expand(10, 8), codes, torch.ones(10, dtype=torch.float64), codebook, CONFIG)
-        found.backward()
-        return found
+        loss = contrast_loss(guess.expand(10, 8), codes, torch.ones(10, dtype=torch.float64), codebook, CONFIG)
+        loss.backward()
+        return loss
 
     optimizer.step(closure)
     squares = (guess.detach() - codebook).square().sum(dim=1)
@@ -201,9 +201,9 @@ def test_where_kinds_look_alike_the_contrast_ends_nearer_to_the_likelier_one_by_
 @pytest.mark.parametrize("size", [0.0, 1e-20, 1e6, 1e15])
 def test_the_contrast_is_finite_for_predictions_of_any_length(size: float) -> None:
     predicted = (torch.randn(5, 8) * size).requires_grad_()
-    found = contrast_loss(predicted, torch.arange(5), torch.ones(5), typical(5), CONFIG)
-    (gradient,) = torch.autograd.grad(found, [predicted])
-    assert torch.isfinite(found)
+    loss = contrast_loss(predicted, torch.arange(5), torch.ones(5), typical(5), CONFIG)
+    (gradient,) = torch.autograd.grad(loss, [predicted])
+    assert torch.isfinite(loss)
     assert torch.isfinite(gradient).all()
 
 
@@ -243,9 +243,9 @@ def test_a_head_gives_standard_units_of_its_own_space() -> None:
     vectors = torch.randn(500, 6, generator=torch.Generator().manual_seed(0)).double() * 3 + 7
     mean = vectors.mean(dim=0)
     scale = float((vectors - mean).square().sum(dim=1).mean().sqrt())
-    found = AdapterHead(torch.nn.Identity(), mean.float(), scale)(vectors.float())
-    torch.testing.assert_close(found.double(), (vectors - mean) / scale * 6**0.5, rtol=1e-4, atol=1e-5)
-    assert abs(found.square().mean() - 1) < 1e-4
+    outputs = AdapterHead(torch.nn.Identity(), mean.float(), scale)(vectors.float())
+    torch.testing.assert_close(outputs.double(), (vectors - mean) / scale * 6**0.5, rtol=1e-4, atol=1e-5)
+    assert abs(outputs.square().mean() - 1) < 1e-4
 
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])

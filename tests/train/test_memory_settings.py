@@ -93,12 +93,12 @@ def test_both_terms_of_the_loss_count_each_row_by_its_weight(prepared: MemorySce
 def test_a_decoder_is_given_the_mean_query_of_a_row_however_opaque_the_row_is(prepared: MemoryScene) -> None:
     rows = sample(prepared, 0, config=MemoryConfig(points=40, min_alpha=0.1)).rows
     queries = torch.randn(400, 3, generator=torch.Generator().manual_seed(0))
-    (given,) = MemoryNetwork({"a": queries}, {"a": torch.nn.Identity()})(rows)
+    (inputs,) = MemoryNetwork({"a": queries}, {"a": torch.nn.Identity()})(rows)
     crow, col, weight = (part.numpy() for part in rows[0][:3])
-    for row in range(len(given)):
+    for row in range(len(inputs)):
         part = slice(crow[row], crow[row + 1])
         expected = np.average(queries.numpy()[col[part]].astype(np.float64), axis=0, weights=weight[part])
-        np.testing.assert_allclose(given[row].detach().numpy(), expected, atol=1e-4)
+        np.testing.assert_allclose(inputs[row].detach().numpy(), expected, atol=1e-4)
 
 
 def test_the_error_of_a_sample_is_that_of_its_batch(prepared: MemoryScene) -> None:

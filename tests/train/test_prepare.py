@@ -33,8 +33,8 @@ def test_targets_are_the_fused_features_in_standard_units(tmp_path: Path) -> Non
     np.testing.assert_array_equal(np.flatnonzero(one.weights), rows)
     np.testing.assert_allclose(outputs.restore(one.targets(rows)), fused.features[rows], atol=5e-3)
     assert codebook is not None
-    found = {tuple(row) for row in np.round(outputs.restore(codebook), 4).tolist()}
-    assert found == {tuple(row) for row in TABLE.tolist()}
+    kinds = {tuple(row) for row in np.round(outputs.restore(codebook), 4).tolist()}
+    assert kinds == {tuple(row) for row in TABLE.tolist()}
 
 
 def test_a_prepared_scene_gives_back_its_gaussians_and_cameras(tmp_path: Path) -> None:
@@ -248,11 +248,11 @@ def test_scenes_of_two_spaces_are_refused() -> None:
 
 
 def test_the_space_of_a_dense_teacher_has_the_moments_of_its_maps() -> None:
-    found = dataset_space(
+    space = dataset_space(
         [Path("a"), Path("b")], lambda path: (scene(0), DenseSideTeacher()), FuseConfig(narrow=0), views=4
     )
-    assert found.codebook is None
-    outputs = found.outputs
+    assert space.codebook is None
+    outputs = space.outputs
     np.testing.assert_allclose(outputs.mean, (TABLE[1] + TABLE[2]) / 2, atol=1e-5)
     assert outputs.scale == pytest.approx(np.sqrt(0.5), rel=1e-4)
     assert outputs.basis is not None

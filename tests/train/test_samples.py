@@ -29,11 +29,6 @@ from gsencoder.train.training_scene import TrainingScene
 from gsencoder.types import Cameras
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[PreparedDataset, list[str]]:
-    return prepared(tmp_path_factory.mktemp("prepared"))
-
-
 def same(first: object, second: object) -> bool:
     if isinstance(first, torch.Tensor):
         return torch.equal(first, second)  # type: ignore[arg-type]
@@ -54,7 +49,7 @@ def test_a_sample_depends_on_the_seed_and_its_number_alone(dataset: tuple[Prepar
 def test_every_pass_shows_every_scene_once(dataset: tuple[PreparedDataset, list[str]]) -> None:
     data = samples(*dataset)
     for epoch in range(3):
-        seen = {data[3 * epoch + place].name.split(" ")[0] for place in range(3)}
+        seen = {data[3 * epoch + step].name.split(" ")[0] for step in range(3)}
         assert seen == set(dataset[1])
 
 
@@ -67,9 +62,9 @@ def test_processes_share_a_step_and_a_resumed_run_goes_on_in_the_middle(
 
     sampler = StepSampler(first, first + steps, batch=batch, accumulate=accumulate, rank=0, world=world)
     assert len(sampler) == len(list(sampler)) == steps * accumulate
-    taken = sorted(number for rank in range(world) for micro in numbers(rank, first) for number in micro)
+    sample_numbers = sorted(number for rank in range(world) for micro in numbers(rank, first) for number in micro)
     size = batch * accumulate * world
-    assert taken == list(range(first * size, (first + steps) * size))
+    assert sample_numbers == list(range(first * size, (first + steps) * size))
     assert numbers(0, 0)[-steps * accumulate :] == numbers(0, first)
 
 
@@ -84,14 +79,14 @@ def test_one_process_with_more_micro_batches_takes_the_samples_of_several(
 def test_without_changes_a_sample_holds_the_scene_as_it_is(dataset: tuple[PreparedDataset, list[str]]) -> None:
     whole = SamplingConfig(scope="scene", gaussians=0, views=2)
     data = samples(*dataset, augmentation=None, sampling=whole)
-    found, source = data[0], None
+    sample, source = data[0], None
     for scene in data.scenes:
-        if found.name.startswith(scene.name):
+        if sample.name.startswith(scene.name):
             source = scene
     assert source is not None
-    assert len(found.attributes) == len(source)
+    assert len(sample.attributes) == len(source)
     everything = np.arange(len(source))
-    (targets,), (part,) = found.teachers, source.parts
+    (targets,), (part,) = sample.teachers, source.parts
     assert part is not None
     np.testing.assert_array_equal(targets.targets.numpy(), part.targets(everything))
     assert ((targets.loss_weights > 0).numpy() == (part.weights > 0)).all()
@@ -102,12 +97,12 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
     teacher's own cells."""
     whole = SamplingConfig(scope="scene", gaussians=0, views=1)
     data = samples(*dataset, augmentation=None, sampling=whole, losses=LossConfig(rarity=0.0))
-    found = data[0]
-    scene = next(scene for scene in data.scenes if found.name.startswith(scene.name))
-    view = scene.view_names.index(found.name.split("(")[1].rstrip(")"))
+    sample = data[0]
+    scene = next(scene for scene in data.scenes if sample.name.startswith(scene.name))
+    view = scene.view_names.index(sample.name.split("(")[1].rstrip(")"))
     config = BlendConfig(rays_per_patch=16)  # One a pixel.
     b = blend(scene.gaussians(np.arange(len(scene))), scene.cameras, view, patch=4, config=config)
-    (targets,) = found.teachers
+    (targets,) = sample.teachers
     ours = targets.rows.blend(len(scene))
     opaque = b.alpha >= 0.5
     assert ours.rows == int(opaque.sum())
@@ -152,10 +147,10 @@ def test_the_grid_has_the_encoders_voxel_in_metres(
     assert SMALL.voxel == 0.1
     recipe = samples(*dataset, augmentation=None).recipe
     scene = dataset[0].scenes(dataset[1])[0]
-    found = SampleDataset([TrainingScene([in_units(scene, metres)])], recipe)[0]
+    sample = SampleDataset([TrainingScene([in_units(scene, metres)])], recipe)[0]
     alike = [TrainingScene([in_units(scene, 1.0)])]
     expected = SampleDataset(alike, replace(recipe, encoder=replace(SMALL, voxel=voxel)))[0]
-    assert same(found, expected)
+    assert same(sample, expected)
 
 
 def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
@@ -171,10 +166,10 @@ def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
     expected = np.where(scene.weights > 0, squares.argmin(axis=1), -1)
     (codes,) = target_codes(TrainingScene([scene]), recipe)
     np.testing.assert_array_equal(codes, expected)
-    (found,) = SampleDataset([TrainingScene([scene])], recipe)[0].teachers
-    np.testing.assert_array_equal(found.codes.numpy(), expected)
+    (targets,) = SampleDataset([TrainingScene([scene])], recipe)[0].teachers
+    np.testing.assert_array_equal(targets.codes.numpy(), expected)
     np.testing.assert_array_equal(
-        found.loss_weights.numpy(), np.where(expected < 0, 0, balance.class_weights(power)[expected])
+        targets.loss_weights.numpy(), np.where(expected < 0, 0, balance.class_weights(power)[expected])
     )
 
 
@@ -270,15 +265,17 @@ ALL = np.arange(4)
 def test_rows_stay_where_they_mean_something(
     row: list[float], selected: np.ndarray, kept: np.ndarray, stays: bool
 ) -> None:
-    found = restrict_rows(rows_of([row, [1.0, 0, 0, 0]]), 4, selected, kept, LossConfig())
-    assert found.targets.ravel().tolist() == ([0.0, 1.0] if stays else [1.0])
-    assert found.col.max() < len(kept)
+    restricted = restrict_rows(rows_of([row, [1.0, 0, 0, 0]]), 4, selected, kept, LossConfig())
+    assert restricted.targets.ravel().tolist() == ([0.0, 1.0] if stays else [1.0])
+    assert restricted.col.max() < len(kept)
 
 
 def test_cells_without_a_teachers_vector_are_left_out() -> None:
-    found = restrict_rows(rows_of([[1.0, 0], [0, 1.0]], [False, True]), 2, np.arange(2), np.arange(2), LossConfig())
-    assert found.targets.ravel().tolist() == [1.0]
-    assert found.col.tolist() == [1]
+    restricted = restrict_rows(
+        rows_of([[1.0, 0], [0, 1.0]], [False, True]), 2, np.arange(2), np.arange(2), LossConfig()
+    )
+    assert restricted.targets.ravel().tolist() == [1.0]
+    assert restricted.col.tolist() == [1]
 
 
 def test_samples_side_by_side_are_the_samples_alone(dataset: tuple[PreparedDataset, list[str]]) -> None:

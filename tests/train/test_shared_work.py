@@ -93,5 +93,5 @@ def test_processes_of_a_machine_divide_its_cores_unless_threads_are_given() -> N
 )
 def test_launchers_state_the_processes_of_a_machine(environment: dict[str, str], local: int) -> None:
     task = {"SLURM_STEP_ID": "0", "SLURM_PROCID": "5", "SLURM_NTASKS": "9", "SLURM_STEP_NODELIST": "a"}
-    given = environment if "RANK" in environment else {**task, **environment}
-    assert rank_from_environment(given)[0].local_world_size == local
+    variables = environment if "RANK" in environment else {**task, **environment}
+    assert rank_from_environment(variables)[0].local_world_size == local

@@ -1,11 +1,6 @@
-"""The loop: it learns, it goes on after a kill, it does the same on several processes, and it stops before harm."""
+"""The loop: it learns, micro batches add up, and it stops before a value that is not finite does harm."""
 
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,68 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from archives import header_of
-from forked_ranks import RankServer
-from safetensors.numpy import load_file
-from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
+from trainer_runs import Prepared, losses, steps_in, trainer
+from training_scenes import LOSSES, SHORT, samples, small_encoder
 
-from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import LOG_FILE, read_log
 from gsencoder.core.runtime.process_rank import ProcessRank
-from gsencoder.core.runtime.signals import Stopped
 from gsencoder.train import data_workers
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
-from gsencoder.train.data_workers import automatic_workers, silence_connection_errors
+from gsencoder.train.data_workers import automatic_workers
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.trainer import Trainer, ValidationResult, _parameter_groups
+from gsencoder.train.trainer import ValidationResult, _parameter_groups
 from gsencoder.train.trainer_config import TrainerConfig
 
 pytestmark = pytest.mark.slow
-
-Prepared = tuple[PreparedDataset, list[str]]
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Prepared:
-    return prepared(tmp_path_factory.mktemp("prepared"))
-
-
-def trainer(dataset: Prepared, folder: Path, config: TrainerConfig = SHORT, **changes: object) -> Trainer:
-    folder.mkdir(exist_ok=True)
-    return encoder_trainer(
-        small_encoder(), samples(*dataset), LOSSES, config, folder=folder, settings={"run": 1}, **changes
-    )
-
-
-def losses(folder: Path, column: str = "loss") -> list[float]:
-    return [float(row[column]) for row in read_log(folder / LOG_FILE)]
-
-
-def rows(folder: Path) -> list[dict[str, str]]:
-    """The log without what the clock says."""
-    return [{name: value for name, value in row.items() if name != "seconds"} for row in read_log(folder / LOG_FILE)]
-
-
-def weights_in(folder: Path) -> dict[str, np.ndarray]:
-    """Parameters of the checkpoint."""
-    found = load_file(folder / TRAINING_CHECKPOINT_FILE)
-    return {name: value for name, value in found.items() if name.startswith("model.")}
-
-
-def steps_in(folder: Path) -> int:
-    with open_archive(folder / TRAINING_CHECKPOINT_FILE) as file:
-        return file.value("step", int)
-
-
-def assert_same_weights(one: Path, other: Path) -> None:
-    first, second = weights_in(one), weights_in(other)
-    assert first.keys() == second.keys()
-    for name, value in first.items():
-        np.testing.assert_array_equal(value, second[name])
 
 
 def test_training_brings_the_loss_down(dataset: Prepared, tmp_path: Path) -> None:
@@ -98,164 +47,12 @@ def test_a_rerun_gives_the_same_losses(dataset: Prepared, tmp_path: Path) -> Non
     assert losses(tmp_path / "a") == losses(tmp_path / "b")
 
 
-def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(dataset: Prepared, tmp_path: Path) -> None:
-    trainer(dataset, tmp_path / "whole").run()
-
-    def stop_at_five(steps: range, label: str):
-        for step in steps:
-            if step == 5:
-                raise KeyboardInterrupt
-            yield step
-
-    with pytest.raises(KeyboardInterrupt):
-        trainer(dataset, tmp_path / "cut").run(stop_at_five)
-    assert len(losses(tmp_path / "cut")) == 5
-    again = trainer(dataset, tmp_path / "cut")
-    assert again.state.step == 5
-    again.run()
-    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
-    assert_same_weights(tmp_path / "cut", tmp_path / "whole")
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals")
-@pytest.mark.usefixtures("interrupts")
-def test_a_signal_within_a_step_ends_the_run_after_it(dataset: Prepared, tmp_path: Path) -> None:
-    trainer(dataset, tmp_path / "whole").run()
-    cut = trainer(dataset, tmp_path / "cut")
-    step = cut.optimizer.step
-
-    def half() -> None:
-        if cut.state.step == 4:
-            os.kill(os.getpid(), signal.SIGINT)
-        step()
-
-    cut.optimizer.step = half  # type: ignore[method-assign,assignment]
-    with pytest.raises(KeyboardInterrupt):
-        cut.run()
-    assert steps_in(tmp_path / "cut") == 5
-    trainer(dataset, tmp_path / "cut").run()
-    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
-    assert_same_weights(tmp_path / "cut", tmp_path / "whole")
-
-
-@pytest.mark.parametrize(("cause", "saved"), [(Stopped(15), True), (KeyboardInterrupt(), True), (None, False)])
-def test_a_stop_that_compiled_code_wraps_is_a_stop(
-    dataset: Prepared, tmp_path: Path, cause: BaseException | None, saved: bool
-) -> None:
-    def stop_at_three(steps: range, label: str):
-        for step in steps:
-            if step == 3:
-                raise SystemError("returned a result with an exception set") from cause
-            yield step
-
-    with pytest.raises(SystemError):
-        trainer(dataset, tmp_path, replace(SHORT, checkpoint_every=1e9)).run(stop_at_three)
-    assert (tmp_path / TRAINING_CHECKPOINT_FILE).is_file() == saved
-
-
-def test_a_worker_whose_training_process_is_gone_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    for error in (ConnectionResetError(), BrokenPipeError(), EOFError()):
-        silence_connection_errors(type(error), error, None)
-    assert capsys.readouterr().err == ""
-    silence_connection_errors(ValueError, ValueError("wrong"), None)
-    assert "ValueError: wrong" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("at", [4, 8])
-def test_an_interrupted_validation_is_done_again(dataset: Prepared, tmp_path: Path, at: int) -> None:
-    config = replace(SHORT, validate_every=4, log_every=4, checkpoint_every=1e9)
-    asked: list[float] = []
-
-    def validate(encoder: torch.nn.Module) -> ValidationResult:
-        asked.append(float(sum(value.double().sum() for value in encoder.state_dict().values())))
-        if len(asked) == at // 4:
-            raise KeyboardInterrupt
-        return ValidationResult({"score": asked[-1]})
-
-    with pytest.raises(KeyboardInterrupt):
-        trainer(dataset, tmp_path / "cut", config, validate=validate).run()
-    assert steps_in(tmp_path / "cut") == at
-    trainer(dataset, tmp_path / "cut", config, validate=validate).run()
-    asked += [0.0] * 10
-    trainer(dataset, tmp_path / "whole", config, validate=validate).run()
-    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
-    assert len([row for row in rows(tmp_path / "cut") if "validation/score" in row]) == 2
-
-
 def test_a_sample_that_cannot_be_made_stops_the_run_in_its_own_words(dataset: Prepared, tmp_path: Path) -> None:
     one = trainer(dataset, tmp_path)
     refused = InputError("scene wall_1: its file is gone")
     one.dataset.make = lambda number: (_ for _ in ()).throw(refused)  # type: ignore[method-assign]
     with pytest.raises(InputError, match="wall_1: its file is gone"):
         one.run()
-
-
-def test_rows_of_steps_that_are_done_again_are_taken_out_of_the_log(dataset: Prepared, tmp_path: Path) -> None:
-    first = trainer(dataset, tmp_path, replace(SHORT, checkpoint_every=1e9, steps=8))
-
-    def stop_at_five(steps: range, label: str):
-        for step in steps:
-            if step == 5:
-                raise KeyboardInterrupt
-            if step == 3:
-                first.save()
-            yield step
-
-    with pytest.raises(KeyboardInterrupt):
-        first.run(stop_at_five)
-    assert len(losses(tmp_path)) == 5  # Two rows more than the checkpoint has steps.
-    trainer(dataset, tmp_path).run()
-    assert [int(row["step"]) for row in read_log(tmp_path / LOG_FILE)] == list(range(1, 9))
-
-
-def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, tmp_path: Path) -> None:
-    trainer(dataset, tmp_path).run()
-    with pytest.raises(InputError, match=r"was made with run=1, and this run asks run=2"):
-        encoder_trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 2})
-    for key, message in (("samples_per_step", "a step had None samples, and this run has 4"), ("space", "changed")):
-        with pytest.raises(InputError, match=message):
-            encoder_trainer(
-                small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 1, key: 4}
-            )
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("step", -5),
-        ("step", 0),
-        ("step", 1000),
-        ("seconds", -1.0),
-        ("unlogged", [3]),
-        ("unlogged", [{"loss": "x"}]),
-        ("closed", False),
-        ("moved", "all"),
-    ],
-)
-def test_a_state_that_no_run_was_in_is_refused(dataset: Prepared, tmp_path: Path, key: str, value: object) -> None:
-    trainer(dataset, tmp_path).run()
-    path = tmp_path / TRAINING_CHECKPOINT_FILE
-    header = header_of(path)
-    assert header["unlogged"] == []
-    write_archive(path, load_file(path), {**header, key: value})
-    with pytest.raises(InputError, match="give resume=false"):
-        trainer(dataset, tmp_path)
-
-
-def test_a_checkpoint_without_moments_is_refused(dataset: Prepared, tmp_path: Path) -> None:
-    trainer(dataset, tmp_path).run()
-    path = tmp_path / TRAINING_CHECKPOINT_FILE
-    arrays = {name: array for name, array in load_file(path).items() if not name.startswith("optimizer.step")}
-    write_archive(path, arrays, header_of(path))
-    with pytest.raises(InputError, match=r"'optimizer\.step\..*' is missing"):
-        trainer(dataset, tmp_path)
-
-
-def test_a_log_that_is_gone_is_told(dataset: Prepared, tmp_path: Path) -> None:
-    trainer(dataset, tmp_path).run()
-    (tmp_path / LOG_FILE).unlink()
-    with pytest.warns(SceneWarning, match=r"log\.csv: is missing; the log starts at step 8"):
-        trainer(dataset, tmp_path)
 
 
 def test_a_training_that_compares_nothing_is_refused(dataset: Prepared, tmp_path: Path) -> None:
@@ -378,95 +175,6 @@ def test_workers_are_spawned_and_make_the_same_samples(dataset: Prepared, tmp_pa
     trainer(dataset, tmp_path / "alone", replace(SHORT, steps=3)).run()
     trainer(dataset, tmp_path / "helped", replace(SHORT, steps=3, workers=1)).run()
     np.testing.assert_allclose(losses(tmp_path / "alone"), losses(tmp_path / "helped"), rtol=1e-5)
-
-
-EIGHT_GPUS = """
-import torch
-
-def refuse() -> None:
-    raise AssertionError("the GPU was used")
-
-torch.cuda.is_available, torch.cuda.device_count, torch.cuda._lazy_init = lambda: True, lambda: 8, refuse
-"""
-"""Lets torch say that the machine has GPUs, and lets every use of one fail."""
-SCRIPT = """
-import sys
-from dataclasses import replace
-from pathlib import Path
-sys.path.insert(0, {tests!r})
-from training_scenes import LOSSES, SHORT, samples, small_encoder
-from gsencoder.train.distributed import join_processes
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.distill import encoder_trainer
-
-if __name__ == "__main__":
-    dataset = PreparedDataset(Path({prepared!r}), {{"made": "for a test"}})
-    names = {names!r}
-    with join_processes("cpu") as (process, device):
-        config = replace(SHORT, steps={steps}, accumulate={accumulate})
-        trainer = encoder_trainer(small_encoder(), samples(dataset, names), LOSSES, config, folder=Path({folder!r}),
-                          settings={{}}, process=process, device=device)
-        trainer.run()
-    threads = [(task / "comm").read_text() for task in Path("/proc/self/task").glob("*")]
-    sys.exit(any("gloo" in name for name in threads) and "threads of the process group are left: " + str(threads))
-"""
-
-
-def script(dataset: Prepared, folder: Path, *, steps: int, accumulate: int, before: str = "") -> Path:
-    folder.mkdir(exist_ok=True)
-    path = folder / "run.py"
-    path.write_text(
-        before
-        + SCRIPT.format(
-            tests=str(Path(__file__).resolve().parent.parent),
-            prepared=str(dataset[0].folder),
-            names=dataset[1],
-            steps=steps,
-            accumulate=accumulate,
-            folder=str(folder),
-        )
-    )
-    return path
-
-
-@pytest.mark.alone
-def test_two_processes_on_the_cpu_of_a_machine_with_gpus_follow_the_losses_of_one(
-    dataset: Prepared, tmp_path: Path, ranks: RankServer
-) -> None:
-    alone = script(dataset, tmp_path / "one", steps=6, accumulate=2)
-    pair = script(dataset, tmp_path / "two", steps=6, accumulate=1, before=EIGHT_GPUS)
-    ranks.started(alone, count=1).end_well()
-    launcher = [sys.executable, "-W", "ignore", "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [*launcher, str(pair)], check=False, timeout=300, env=environment, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    # AdamW does not see the scale of a gradient, and clipping hides it: the norm is what tells.
-    for column in ("loss", "field", "render", "contrast", "gradient"):
-        two, one = (losses(tmp_path / name, column) for name in ("two", "one"))
-        np.testing.assert_allclose(two, one, rtol=1e-4 if column != "gradient" else 1e-3)
-    two, one = weights_in(tmp_path / "two"), weights_in(tmp_path / "one")
-    assert two.keys() == one.keys()
-    for name, value in two.items():
-        np.testing.assert_allclose(value, one[name], atol=2e-3)
-
-
-def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_path: Path, ranks: RankServer) -> None:
-    whole = script(dataset, tmp_path / "whole", steps=40, accumulate=1)
-    cut = script(dataset, tmp_path / "cut", steps=40, accumulate=1)
-    ranks.started(whole, count=1).end_well()
-    running = ranks.started(cut, count=1)
-    log, deadline = tmp_path / "cut" / LOG_FILE, time.monotonic() + 120
-    while time.monotonic() < deadline and not (log.is_file() and len(log.read_text().splitlines()) > 5):
-        time.sleep(0.02)
-    running.kill()
-    assert len(losses(tmp_path / "cut")) < 40
-    assert 0 < steps_in(tmp_path / "cut") < 40
-    ranks.started(cut, count=1).end_well()
-    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
-    assert_same_weights(tmp_path / "cut", tmp_path / "whole")
 
 
 def test_matrices_decay_and_norms_and_biases_do_not() -> None:

@@ -122,18 +122,18 @@ def test_the_fingerprint_of_pairs_changes_with_everything_that_is_learned() -> N
 def test_pairs_need_answers_and_one_space() -> None:
     check_pairs([PAIR, PAIR])
     other = replace(PAIR, name="r", prompt=replace(PROMPT, space="other"))
-    for wrong, said in (
+    for wrong, problem in (
         ([], "there are no questions to train on"),
         ([PAIR, replace(PAIR, answers=())], "q: there is no answer"),
         ([replace(PAIR, answers=("a", " \n"))], "q: an answer is empty"),
         ([PAIR, other], r"scenes have features of 2 spaces \(other; s\)"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=problem):
             check_pairs(wrong)
 
 
 @pytest.mark.parametrize(
-    ("changes", "taken"),
+    ("changes", "valid"),
     [
         ({"rank": 1}, True),
         ({"rank": 4096}, True),
@@ -149,8 +149,8 @@ def test_pairs_need_answers_and_one_space() -> None:
         ({"dropout": -0.1}, False),
     ],
 )
-def test_adapters_have_their_ranges(changes: dict[str, Any], taken: bool) -> None:
-    if taken:
+def test_adapters_have_their_ranges(changes: dict[str, Any], valid: bool) -> None:
+    if valid:
         AdapterConfig(**changes)
         return
     with pytest.raises(InputError, match=f"{next(iter(changes))}: expected"):
@@ -164,7 +164,7 @@ def test_models_of_transformers_are_not_compiled_and_the_rate_falls_to_nothing()
 
 
 @pytest.mark.parametrize(
-    ("lacking", "said"),
+    ("lacking", "problem"),
     [
         ("image_processor", "has no processor of pictures and text"),
         ("tokenizer", "has no processor of pictures and text"),
@@ -172,18 +172,20 @@ def test_models_of_transformers_are_not_compiled_and_the_rate_falls_to_nothing()
         ("", ""),
     ],
 )
-def test_a_processor_has_pictures_text_and_a_template(monkeypatch: pytest.MonkeyPatch, lacking: str, said: str) -> None:
+def test_a_processor_has_pictures_text_and_a_template(
+    monkeypatch: pytest.MonkeyPatch, lacking: str, problem: str
+) -> None:
     transformers = pytest.importorskip("transformers")
     parts = {"image_processor": 1, "tokenizer": 2, "chat_template": "x", "apply_chat_template": lambda *_, **__: "x"}
     processor = SimpleNamespace(**{name: value for name, value in parts.items() if name != lacking})
     config = transformers.Idefics3Config()
     monkeypatch.setattr(vlm, "read_config", lambda folder, what: config)
     monkeypatch.setattr(vlm, "weight_files", lambda folder, what: [])
-    monkeypatch.setattr(vlm, "load_companion", lambda *given: processor)
+    monkeypatch.setattr(vlm, "load_companion", lambda *arguments: processor)
     if not lacking:
         assert vlm.load_processor(Path("model")) == (config, processor)
         return
-    with pytest.raises(InputError, match=f"tune: model: {said}"):
+    with pytest.raises(InputError, match=f"tune: model: {problem}"):
         vlm.load_processor(Path("model"))
 
 
@@ -198,13 +200,13 @@ def idefics(kind: str = "idefics3", side: int = 90, patch: int = 14) -> tuple[An
 
 
 def llava(**changes: Any) -> tuple[Any, Any]:
-    given = {"layer": -2, "tower": "clip_vision_model", "crop": True, "height": 42, "width": 42, "edge": 42} | changes
-    size = None if given["edge"] is None else {"shortest_edge": given["edge"]}
+    fields = {"layer": -2, "tower": "clip_vision_model", "crop": True, "height": 42, "width": 42, "edge": 42} | changes
+    size = None if fields["edge"] is None else {"shortest_edge": fields["edge"]}
     pictures = SimpleNamespace(
-        size=size, do_center_crop=given["crop"], crop_size={"height": given["height"], "width": given["width"]}
+        size=size, do_center_crop=fields["crop"], crop_size={"height": fields["height"], "width": fields["width"]}
     )
-    tower = SimpleNamespace(model_type=given["tower"], image_size=42, patch_size=14, hidden_size=5)
-    config = SimpleNamespace(model_type="llava", vision_config=tower, vision_feature_layer=given["layer"])
+    tower = SimpleNamespace(model_type=fields["tower"], image_size=42, patch_size=14, hidden_size=5)
+    config = SimpleNamespace(model_type="llava", vision_config=tower, vision_feature_layer=fields["layer"])
     return config, SimpleNamespace(image_processor=pictures)
 
 
@@ -216,7 +218,7 @@ def test_the_grid_is_that_of_whole_patches() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "problem"),
     [
         ({"layer": [-2, -1]}, r"vision_feature_layer=\[-2, -1\]"),
         ({"tower": "siglip_vision_model"}, "this one has siglip_vision_model"),
@@ -227,8 +229,8 @@ def test_the_grid_is_that_of_whole_patches() -> None:
         ({"edge": None}, "got shortest_edge=None"),
     ],
 )
-def test_a_llava_whose_grid_is_not_known_is_refused(changes: dict[str, Any], said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_a_llava_whose_grid_is_not_known_is_refused(changes: dict[str, Any], problem: str) -> None:
+    with pytest.raises(InputError, match=problem):
         tower_layout(*llava(**changes))
 
 

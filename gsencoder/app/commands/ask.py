@@ -1,6 +1,5 @@
 """`gsencoder ask FEATURES question=…`: the answer of a VLM that sees the best views of what the question names."""
 
-import os
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,7 +13,7 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.printable import printable
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
-from gsencoder.app.runs.work_folder import WorkFolder
+from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
 from gsencoder.app.settings.config import settings
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed
 from gsencoder.core.files.json_values import write_json
@@ -155,9 +154,9 @@ def ask_file(
     summary: Summary,
 ) -> None:
     """Asks the questions of a file; the answers of an interrupted run stay in a folder beside out=."""
-    target, clock = Path(os.path.realpath(out)), Clock()
+    clock = Clock()
     with (
-        WorkFolder(target.with_name(f"{target.name}.answers")) as work,
+        WorkFolder(folder_beside(out, "answers")) as work,
         output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
     ):
         work.take(anew=not config.resume)
@@ -184,13 +183,13 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
             f"({listed(sorted(question_counts), 3)}), and none of "
             f"them has features in {', '.join(config.paths)}"
         )
-    target, clock, screen = Path(os.path.realpath(out)), Clock(), console(config.quiet)
+    clock, screen = Clock(), console(config.quiet)
     answered: list[tuple[SetQuestion, dict[str, Any]]] = []
     silent: list[SetQuestion] = []
     unanswered: dict[str, str] = {}
     counts: dict[str, int] = {}
     with (
-        WorkFolder(target.with_name(f"{target.name}.answers")) as work,
+        WorkFolder(folder_beside(out, "answers")) as work,
         output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
     ):
         work.take(anew=not config.resume)
@@ -255,8 +254,8 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
         if server is not None:
             entries = predictions(question_set.benchmark, answered, silent)
             write_json(folder / PREDICTIONS, entries)
-            written = sum(map(len, entries.values())) if isinstance(entries, dict) else len(entries)
-            summary.results.update(predictions=PREDICTIONS, predicted=written)
+            predicted = sum(map(len, entries.values())) if isinstance(entries, dict) else len(entries)
+            summary.results.update(predictions=PREDICTIONS, predicted=predicted)
     if unanswered:
         first = next(iter(unanswered.values()))
         warnings.warn(

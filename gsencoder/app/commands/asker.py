@@ -59,8 +59,8 @@ def asker_of(settings: AskerSettings, scene: Scene, folder: Path) -> Asker:
         )
     else:
         space = select_features(scene, settings.space or None)[1].space
-        stated = settings.words or not isinstance(settings.text, TableTextConfig)
-        has_words = stated or table_path(folder, space.text_encoder) is not None
+        has_own_words = settings.words or not isinstance(settings.text, TableTextConfig)
+        has_words = has_own_words or table_path(folder, space.text_encoder) is not None
         words = load_words(folder, space, settings.words, settings.text) if has_words else None
     return Asker(
         scene,

@@ -70,14 +70,14 @@ def run(config: DemoConfig, summary: Summary) -> None:
         assert scene.gaussians is not None
         save_splat(folder / "splat.ply", scene.gaussians, origin=scene.origin)
         screen.print(f"seeds: {len(scene.gaussians):,} Gaussians, no optimization")
-        named = [thing for thing in scene.objects if thing.placed and thing.name]
+        things = [thing for thing in scene.objects if thing.placed and thing.name]
         names = room_words(scene)
         labels = LabelsTeacher(scene.objects, names.names, names.embeddings, text_encoder=names.space.text_encoder)
         palette, colors = PaletteTeacher(), text_table_of(PaletteConfig())
         assert colors is not None
         hues = color_words(config.seed, objects=config.objects)
-        by_name = [(thing.name, thing) for thing in named if thing.name]
-        by_color = [(hues[thing.id], thing) for thing in named]
+        by_name = [(thing.name, thing) for thing in things if thing.name]
+        by_color = [(hues[thing.id], thing) for thing in things]
         results = (
             search(scene, labels, names, by_name, config, folder / "names", summary),
             search(scene, palette, colors, unrepeated(by_color), config, folder / "colors", summary),
@@ -94,11 +94,11 @@ def run(config: DemoConfig, summary: Summary) -> None:
             **{one.title: one.to_dict() for one in results},
         )
         with summary.step("page"):
-            missing = write_page(folder / PAGE, scene, results[0], names, config.localize)
-        if missing:
-            screen.print(f"{PAGE} is left out: {missing}")
+            problem = write_page(folder / PAGE, scene, results[0], names, config.localize)
+        if problem:
+            screen.print(f"{PAGE} is left out: {problem}")
         with summary.step("report"):
-            write_report(folder / "report.html", scene, results, summary, page="" if missing else PAGE)
+            write_report(folder / "report.html", scene, results, summary, page="" if problem else PAGE)
     screen.print(f"{out}/report.html is the report; {out}/room is a scene folder for the other commands")
 
 
@@ -108,10 +108,10 @@ def write_page(path: Path, scene: Scene, one: TeacherResult, words: TextTable, c
         bundle = load_bundle()
     except InputError as error:
         return str(error)
-    shown = replace(scene, features={one.features.space.name: one.features})
+    page_scene = replace(scene, features={one.features.space.name: one.features})
     page = fitting_page(
         bundle,
-        [(shown, one.title, words)],
+        [(page_scene, one.title, words)],
         config,
         scene.objects,
         PAGE_OPTIONS,

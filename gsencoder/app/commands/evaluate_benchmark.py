@@ -55,14 +55,14 @@ def run_benchmark(
                 folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
             classes, class_names, labeled = _classes(config)
             _check_names(protocol, classes, words)
-            named = {scene_name(path) for path in find_scenes(config.paths)}
-            others = _other_sentences(protocol, named, warn=process.is_first)
+            scene_names = {scene_name(path) for path in find_scenes(config.paths)}
+            others = _other_sentences(protocol, scene_names, warn=process.is_first)
             raw_ids = None
             if isinstance(protocol, ReferringProtocol) and config.label_map:
                 raw_ids = read_label_map(Path(config.label_map), COLUMNS["scannet20"])
         shared = Path(value_of_first(str(folder)))
         with fail_together():
-            done = write_predictions(
+            predictions = write_predictions(
                 scenes_of(config, part=(process.rank, process.world_size)),
                 source,
                 words,
@@ -76,7 +76,7 @@ def run_benchmark(
                 seeds=config.seeds,
                 localization=config.localize,
             )
-        every = sorted((scene for part in values_of_all(done) for scene in part), key=lambda scene: scene.scene)
+        every = sorted((scene for part in values_of_all(predictions) for scene in part), key=lambda scene: scene.scene)
         if folder is None:
             return
         merge_lists(folder, protocol, parts=process.world_size)

@@ -72,8 +72,8 @@ def naming(
         summary.add_seconds(scene.seconds)
     each = []
     for scene in scenes:
-        counted = {name: count for name, count in scene.total.items() if name in scores["names"]}
-        scene_scores = naming_scores([replace(scene, total=counted)]) if counted else {}
+        totals = {name: count for name, count in scene.total.items() if name in scores["names"]}
+        scene_scores = naming_scores([replace(scene, total=totals)]) if totals else {}
         each.append({"scene": scene.scene, "gaussians": sum(scene.total.values()), **scene_scores})
     summary.results.update(protocol="naming", **scores, names_table="names.csv", scenes=each)
     rows = [{"name": name, **row} for name, row in scores["names"].items()]

@@ -43,13 +43,13 @@ def scores_line(results: dict) -> str:
             f"{results['boxed_present']:.3f} of the present, {results['boxed_absent']:.3f} of the absent"
         )
     if results["protocol"] == "grounding":
-        broken = f", {counted(results['not_finite'], 'map')} not finite" if results["not_finite"] else ""
+        faults = f", {counted(results['not_finite'], 'map')} not finite" if results["not_finite"] else ""
         return (
             f"{counted(results['pairs'], 'pair')} of a view and a name in "
             f"{counted(len(results['scenes']), 'scene')}: mIoU "
             f"{results['miou']:.3f} (averaged over names {results['miou_names']:.3f}), cIoU {results['ciou']:.3f}, "
             f"P@0.5 {results['p50']:.3f}, P@0.6 {results['p60']:.3f}; {counted(results['small'], 'pair')} too "
-            f"small{broken}"
+            f"small{faults}"
         )
     return (
         f"{counted(results['objects'], 'object')} in {counted(len(results['scenes']), 'scene')}: Acc@0.25 "

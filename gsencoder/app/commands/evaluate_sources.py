@@ -85,9 +85,9 @@ def source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
         encoder = load_encoder(config.weights, config.encode.device)
         source = encoder_source(encoder, config.encode, config.space or heads.space.name)
         return head_source(source, heads, head, words.space.text_encoder), words
-    (own,) = heads_of(config.teacher, [config.head], "head")
-    words = words_of_head(own, table, config.text)
-    return fused_head_source(config.teacher, own, words.space.text_encoder, config.fusion), words
+    (measured_head,) = heads_of(config.teacher, [config.head], "head")
+    words = words_of_head(measured_head, table, config.text)
+    return fused_head_source(config.teacher, measured_head, words.space.text_encoder, config.fusion), words
 
 
 def scenes_of(config: EvaluateConfig, *, part: tuple[int, int] = (0, 1)) -> Iterator[tuple[Scene, float]]:

@@ -109,18 +109,18 @@ def search_from_poses(
 
     field = FeatureField(scene, memory=memory, config=FromPoseConfig(mode=config.mode, threshold=config.threshold))
     for view, name in enumerate(cameras.views):
-        seen = field.at(cameras.cameras, view)
+        frame = field.at(cameras.cameras, view)
         points = [
-            replace(point, visible=point.visible and point.query not in absent) for point in seen.find(words, text)
+            replace(point, visible=point.visible and point.query not in absent) for point in frame.find(words, text)
         ]
-        drawn = []
+        named_pictures = []
         if pictures:
-            rgb = view_picture(seen)
+            rgb = view_picture(frame)
             for number, point in enumerate(points):
-                (relevancy,) = seen.relevancy([point.query], text)
+                (relevancy,) = frame.relevancy([point.query], text)
                 safe = "".join(c if c.isalnum() else "_" for c in point.query)[:60]
-                picture = pose_picture(rgb, seen, point, relevancy)
-                drawn.append((f"pose{view:03d}_{number:02d}_{safe}", Image.fromarray(picture)))
+                picture = pose_picture(rgb, frame, point, relevancy)
+                named_pictures.append((f"pose{view:03d}_{number:02d}_{safe}", Image.fromarray(picture)))
         yield (
             [
                 {
@@ -138,7 +138,7 @@ def search_from_poses(
                 }
                 for point in points
             ],
-            drawn,
+            named_pictures,
         )
 
 
@@ -160,5 +160,5 @@ def describe_point(point: dict[str, Any]) -> str:
     if not point["visible"]:
         return f"{camera}: not visible (relevancy {point['relevancy']:.2f}, threshold {point['threshold']:.2f})"
     x, y = point["pixel"]
-    place = ", ".join(f"{value:.3f}" for value in point["position"])
-    return f"{camera}: pixel ({x:.1f}, {y:.1f}), relevancy {point['relevancy']:.2f}, at ({place})"
+    coordinates = ", ".join(f"{value:.3f}" for value in point["position"])
+    return f"{camera}: pixel ({x:.1f}, {y:.1f}), relevancy {point['relevancy']:.2f}, at ({coordinates})"

@@ -131,10 +131,10 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
                 with one.step("report"):
                     report_fusion(folder, scene, fusion.features, fusion.truncation, config.teacher.name, one)
         shutil.rmtree(work_folder(out), ignore_errors=True)
-        seen, total = one.results["seen"], one.results["gaussians"]
+        with_features, total = one.results["seen"], one.results["gaussians"]
         screen.print(
-            f"{out}: {seen:,} of {counted(total, 'Gaussian')} have features, {one.results['channels']} channels "
-            f"({describe_basis(one.results, 'this scene')}), "
+            f"{out}: {with_features:,} of {counted(total, 'Gaussian')} have features, "
+            f"{one.results['channels']} channels ({describe_basis(one.results, 'this scene')}), "
             f"from {counted(one.results['views'], 'view')}"
         )
         for line in (*promises, *lines):
@@ -211,8 +211,8 @@ def write_features(
     """Writes features, scene and words, and adds the figures of the fusion to the summary."""
     features = fusion.features
     with summary.step("write"):
-        chosen = {"teacher": settings(config.teacher), "fusion": settings(fusion.config)}
-        save_features(folder, scene, features, chosen)
+        recipe = {"teacher": settings(config.teacher), "fusion": settings(fusion.config)}
+        save_features(folder, scene, features, recipe)
         if words is not None:
             save_text_table(folder / WORDS_FILE, words)
     summary.results.update(

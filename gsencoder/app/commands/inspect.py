@@ -61,16 +61,16 @@ def run(config: InspectConfig, summary: Summary) -> None:
             show(_inspect(path, config, summary, None))
         return
     with output_folder(config.out, overwrite=config.overwrite, summary=summary) as folder:
-        shown = [_inspect(path, config, summary, folder) for path in _paths(config.paths)]
+        reports = [_inspect(path, config, summary, folder) for path in _paths(config.paths)]
     # What was written stays, also if nobody reads what is printed.
-    for lines in shown:
+    for lines in reports:
         show(lines)
 
 
-def _paths(given: tuple[str, ...]) -> tuple[Path, ...]:
+def _paths(words: tuple[str, ...]) -> tuple[Path, ...]:
     """Splat files and scenes; a folder of scenes stands for all of them."""
     chosen = DistinctPaths()
-    for path in map(Path, given):
+    for path in map(Path, words):
         if not path.exists():
             # Not after all that stand before it were looked at.
             raise InputError(f"{path}: no such file")

@@ -68,14 +68,14 @@ def check_lines(facts: SceneFacts, depth: DepthCheck | None, matches: EpipolarCh
     """The figures of the checks, a line each."""
     lines = []
     if depth is not None:
-        stated = depth.stated
+        agreement = depth.stated
         if depth.comparable:
             near, far = depth.offsets
             lines.append(
-                f"depth of {len(depth.views)} of {facts.views:,} views carried into each other: {stated.share:.0%} "
+                f"depth of {len(depth.views)} of {facts.views:,} views carried into each other: {agreement.share:.0%} "
                 "agree "
-                f"within 2 % where seen ({stated.compared:,} comparisons); median offset "
-                f"{_percent(stated.offset, sign=True)}"
+                f"within 2 % where seen ({agreement.compared:,} comparisons); median offset "
+                f"{_percent(agreement.offset, sign=True)}"
             )
             lines.append(f"median offset of neighbors {_percent(near)}, of views far apart {_percent(far)}")
         else:
@@ -161,8 +161,11 @@ def save_check_picture(path: Path, views: Views, depth: DepthCheck | None, match
                 pictures.append(views.images[view])
                 titles.append(views.names[view])
             pictures += [depth_picture(depth.depth.depths[index]), _agreement_picture(share)]
-            seen = share[np.isfinite(share)]
-            titles += ["depth", f"agrees with other views: {seen.mean():.0%}" if len(seen) else "no other view sees it"]
+            shares = share[np.isfinite(share)]
+            titles += [
+                "depth",
+                f"agrees with other views: {shares.mean():.0%}" if len(shares) else "no other view sees it",
+            ]
         sheet = contact_sheet(pictures, titles, columns=3 if views.images is not None else 2)
     elif matches is not None and matches.worst is not None and views.images is not None:
         pair, cameras = matches.worst, matches.cameras

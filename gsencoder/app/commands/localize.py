@@ -110,7 +110,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
             with summary.step("from_pose"):
                 # Heads lead into other spaces than the one in which a memory attends.
                 memory = None if config.head else memory_of(folder, queried)
-                for pose_points, drawn in search_from_poses(
+                for pose_points, pose_pictures in search_from_poses(
                     queried,
                     cameras,
                     words,
@@ -121,7 +121,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
                     pictures=config.pictures > 0,
                 ):
                     points += pose_points
-                    for name, picture in drawn:
+                    for name, picture in pose_pictures:
                         write_picture(target / f"{name}.png", picture)
             write_json(target / FROM_POSE, points)
             summary.results["from_pose"] = points

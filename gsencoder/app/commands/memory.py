@@ -134,12 +134,12 @@ def run(config: MemoryCommandConfig, summary: Summary) -> None:
             for names in groups if config.optimize else []:
                 work = state.path / ("queries" if config.joint else f"queries.{names[0]}")
                 work.mkdir(exist_ok=True)
-                chosen = {name: scenes[name] for name in names}
-                made, done = train_memory(
-                    chosen, config.memory, config.train, work=work, process=process, device=device, track=track
+                group_scenes = {name: scenes[name] for name in names}
+                optimized, training = train_memory(
+                    group_scenes, config.memory, config.train, work=work, process=process, device=device, track=track
                 )
-                memories |= made
-                summary.results["steps"] = done.step
+                memories |= optimized
+                summary.results["steps"] = training.step
                 if folder is not None:
                     copyfile(work / LOG_FILE, folder / (LOG_FILE if config.joint else f"log.{names[0]}.csv"))
         if folder is None or scene is None:
@@ -264,10 +264,10 @@ def fit_errors(memory: QueryMemory, scene: MemoryScene, min_alpha: float) -> Ren
 
 
 def _figures(file: Path, memory: QueryMemory, errors: RenderedErrors) -> dict[str, Any]:
-    bank, seen = memory.bank, int((memory.weights > 0).sum())
+    bank, with_features = memory.bank, int((memory.weights > 0).sum())
     return {
         "space": memory.space.describe(),
-        "seen": seen,
+        "seen": with_features,
         "channels": memory.channels,
         "components": len(bank),
         "threshold": bank.threshold,

@@ -129,8 +129,10 @@ def _write_beside(folder: Path, source: Path, scene: Scene, features: GaussianFe
 
 
 def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
-    seen = int(features.seen.sum())
-    summary.results.update(form=config.form, gaussians=len(features), seen=seen, space=features.space.describe())
+    with_features = int(features.seen.sum())
+    summary.results.update(
+        form=config.form, gaussians=len(features), seen=with_features, space=features.space.describe()
+    )
     if config.form == "compact":
         return _write_compact(folder, scene, features, config, summary)
     if config.form == "index":
@@ -139,7 +141,7 @@ def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackC
         save_ply(folder, scene, features, decoded=config.decoded)
     else:
         save_arrays(folder, scene, features, config.form, decoded=config.decoded)
-    return f"the splat, and features of {seen:,} of its {len(features):,} Gaussians as {config.form}"
+    return f"the splat, and features of {with_features:,} of its {len(features):,} Gaussians as {config.form}"
 
 
 def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
@@ -196,15 +198,15 @@ def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config:
 
 
 def _report(
-    scene: Scene, chosen: Mapping[str, int | float], error: float, size: int, config: PackConfig, summary: Summary
+    scene: Scene, knobs: Mapping[str, int | float], error: float, size: int, config: PackConfig, summary: Summary
 ) -> None:
     """Says what a budget chose and what became of it: both are measured over all Gaussians, of the file as it is."""
     budget, megabytes = config.budget, size / MEGABYTE
     if not budget.promised:
         return
-    broken = budget.error is not None and budget.megabytes is not None and megabytes > budget.megabytes
-    notes = [budget.conflict("error", "megabytes", megabytes)] if broken else []
-    report_choice(summary, scene.name, chosen, predicted={}, notes=notes, quiet=config.quiet)
+    over_budget = budget.error is not None and budget.megabytes is not None and megabytes > budget.megabytes
+    notes = [budget.conflict("error", "megabytes", megabytes)] if over_budget else []
+    report_choice(summary, scene.name, knobs, predicted={}, notes=notes, quiet=config.quiet)
     realised = {name: value for name, value in (("error", error), ("megabytes", megabytes)) if name in budget.promised}
     for line in report_promises(summary, budget, realised):
         console(config.quiet).print(f"{scene.name}: {line}")

@@ -1,6 +1,5 @@
 """`gsencoder reconstruct SCENE`: photographs to Gaussians, on a CPU or a GPU."""
 
-import os
 import shutil
 import warnings
 from dataclasses import dataclass, field, fields, replace
@@ -13,7 +12,7 @@ from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_in
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
-from gsencoder.app.runs.work_folder import WorkFolder
+from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import SceneWarning, counted
 from gsencoder.core.files.picture_file import write_picture
@@ -83,9 +82,8 @@ def run(config: ReconstructCommandConfig, summary: Summary) -> None:
 def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, summary: Summary) -> None:
     """Reads a scene or registers photographs, reconstructs, and writes splat, log and pictures into `out`."""
     screen = console(config.quiet)
-    target = Path(os.path.realpath(out))
     with (
-        WorkFolder(target.with_name(f"{target.name}.reconstruction")) as work,
+        WorkFolder(folder_beside(out, "reconstruction")) as work,
         output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
     ):
         refuse_to_replace_inputs(work.path, settings(config))

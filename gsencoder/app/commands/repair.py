@@ -116,9 +116,9 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
         again = _load_back(content, config.out)
         assert again.views is not None
         checked = check_scene(again.views, limit=config.views, track=track)
-        left = [finding for finding in findings_of(*checked) if finding.view is None]
-        if left:
-            raise InputError(f"{path}: still wrong once repaired: {left[0].message}; nothing was written")
+        remaining = [finding for finding in findings_of(*checked) if finding.view is None]
+        if remaining:
+            raise InputError(f"{path}: still wrong once repaired: {remaining[0].message}; nothing was written")
     before, after = fit_of(depth, matches), fit_of(*checked)
     summary.results.update(
         path=str(config.out), changes=list(repair.changes), agreement_before=before, agreement_after=after

@@ -136,11 +136,11 @@ class ScoreConfig(CommonConfig):
             raise InputError(f"min_iou: expected a share in [0, 1], got {self.min_iou}")
         if self.distractors < 0:
             raise InputError(f"distractors: expected 0 or more, got {self.distractors}")
-        taken = TAKEN[self.paths[0]]
+        options = TAKEN[self.paths[0]]
         defaults = type(self).__dataclass_fields__
         for name in dict.fromkeys(each for names in TAKEN.values() for each in names):
-            if name not in taken and getattr(self, name) != defaults[name].default:
-                raise InputError(f"{name}: {self.paths[0]} has no such setting; it takes {', '.join(taken)}")
+            if name not in options and getattr(self, name) != defaults[name].default:
+                raise InputError(f"{name}: {self.paths[0]} has no such setting; it takes {', '.join(options)}")
 
 
 def run(config: ScoreConfig, summary: Summary) -> None:

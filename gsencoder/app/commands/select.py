@@ -160,11 +160,11 @@ def _holes(scene: Scene, selection: Selection, config: SelectConfig, track: Prog
 
     assert scene.gaussians is not None
     assert scene.views is not None
-    chosen = sampling(scene.views.cameras, views=config.views, pixels=config.pixels)
-    holes = find_holes(scene.gaussians, scene.views.cameras, ~selection.rest, chosen, track=track)
+    samples = sampling(scene.views.cameras, views=config.views, pixels=config.pixels)
+    holes = find_holes(scene.gaussians, scene.views.cameras, ~selection.rest, samples, track=track)
     rows = [asdict(hole) | {"view": scene.views.names[hole.view]} for hole in holes if hole.pixels]
     return {
-        "views": len(chosen.views),
+        "views": len(samples.views),
         "views_with_objects": len(holes),
         "views_with_holes": len(rows),
         "pixels": sum(hole.pixels for hole in holes),
@@ -180,8 +180,8 @@ def _describe(selection: Selection, number: int, absent: dict[str, float], files
         word = selection.words[number]
         return describe_absent(absent[word]) if word in absent else "no Gaussians"
     seeds = int(np.count_nonzero(selection.seeds == number + 1))
-    named = f", {files[number + 1]}" if number + 1 in files else ""
-    return f"{count:,} Gaussians, from {seeds:,} to start with{named}"
+    in_file = f", {files[number + 1]}" if number + 1 in files else ""
+    return f"{count:,} Gaussians, from {seeds:,} to start with{in_file}"
 
 
 def _listing(

@@ -26,9 +26,9 @@ def queried_through_head(
     """A scene with the outputs of a head as its only features, and the words that they are compared with; arguments and
     errors are those of `gsencoder.app.commands.query_words.queried_scene`."""
     heads = heads_of_folder(folder, head)
-    chosen = find_head(heads, head)
-    words = words_of_head(chosen.head, words_file, text)
-    return scene_through_head(scene, heads, chosen, space=space, text_encoder=words.space.text_encoder), words
+    measured_head = find_head(heads, head)
+    words = words_of_head(measured_head.head, words_file, text)
+    return scene_through_head(scene, heads, measured_head, space=space, text_encoder=words.space.text_encoder), words
 
 
 def packed_through_head(
@@ -40,11 +40,11 @@ def packed_through_head(
         InputError: see `queried_through_head`.
     """
     heads = heads_of_folder(folder, head)
-    chosen = find_head(heads, head)
+    measured_head = find_head(heads, head)
     if isinstance(text, TableTextConfig):
-        return scene_through_head(scene, heads, chosen, space=space), None
-    words = closed_table(words_of_head(chosen.head, "", text))
-    return scene_through_head(scene, heads, chosen, space=space, text_encoder=words.space.text_encoder), words
+        return scene_through_head(scene, heads, measured_head, space=space), None
+    words = closed_table(words_of_head(measured_head.head, "", text))
+    return scene_through_head(scene, heads, measured_head, space=space, text_encoder=words.space.text_encoder), words
 
 
 def heads_of_folder(folder: Path, name: str, option: str = "head") -> HeadSet:

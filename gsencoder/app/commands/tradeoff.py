@@ -12,7 +12,7 @@ from rich.table import Table
 from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
-from gsencoder.app.runs.work_folder import WorkFolder
+from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files.csv_text import csv_text
@@ -117,10 +117,9 @@ def run(config: TradeoffConfig, summary: Summary) -> None:
     paths = [Path(os.path.realpath(path)) for path in find_scenes(config.paths)]
     _check_names(paths)
     out = config.out or Path("outputs") / "tradeoff"
-    target = Path(os.path.realpath(out))
     track = Progress(quiet=config.quiet)
     with (
-        WorkFolder(target.with_name(f"{target.name}.tradeoff")) as work,
+        WorkFolder(folder_beside(out, "tradeoff")) as work,
         output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
     ):
         refuse_to_replace_inputs(work.path, settings(config))
@@ -198,11 +197,11 @@ def _advice(results: Sequence[StageResult], budget: LimitConfig) -> str:
     if not fusion or (budget.seconds is None and budget.error is None):
         return ""
     try:
-        chosen = pick_within(fusion[0].results, budget.seconds, budget.error)
+        setting = pick_within(fusion[0].results, budget.seconds, budget.error)
     except InputError as error:
         return str(error)
-    options = options_of_setting(fusion[0], chosen)
-    return f"budget: {options or 'the defaults'} ({chosen.seconds:.3g} s a scene, error {chosen.score('error'):.3g})"
+    options = options_of_setting(fusion[0], setting)
+    return f"budget: {options or 'the defaults'} ({setting.seconds:.3g} s a scene, error {setting.score('error'):.3g})"
 
 
 def options_of_setting(result: StageResult, setting: SettingResult) -> str:
@@ -232,10 +231,10 @@ def _score(result: SettingResult, name: str) -> str:
     if name not in result.scores:
         return ""
     value, error, _ = result.scores[name]
-    shown = "" if math.isnan(value) else f"{value:.4g}"
+    text = "" if math.isnan(value) else f"{value:.4g}"
     if name not in result.differences:
-        return shown + ("" if math.isnan(error) else f" ± {error:.2g}")
+        return text + ("" if math.isnan(error) else f" ± {error:.2g}")
     difference, error, _ = result.differences[name]
     if math.isnan(difference):
-        return shown
-    return f"{shown} ({difference:+.2g}" + (")" if math.isnan(error) else f" ± {error:.2g})")
+        return text
+    return f"{text} ({difference:+.2g}" + (")" if math.isnan(error) else f" ± {error:.2g})")

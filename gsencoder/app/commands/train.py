@@ -1,7 +1,6 @@
 """`gsencoder train SCENE… out=FOLDER`: distil a teacher into an encoder that needs neither photographs nor the
 teacher."""
 
-import os
 import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -12,12 +11,11 @@ from typing import ClassVar, Literal
 
 from gsencoder.app.commands.basis_figures import basis_figures, describe_basis
 from gsencoder.app.commands.head_figures import describe_heads, head_figures
-from gsencoder.app.runs.output_folder import lies_in, output_folder, refuse_to_replace_inputs
+from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
-from gsencoder.app.runs.work_folder import WorkFolder
+from gsencoder.app.runs.work_folder import WorkFolder, folder_beside, prepared_folder
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.errors import InputError
 from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
@@ -87,11 +85,8 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
     """Prepares scenes, trains, and writes weights, log and scores into out=."""
     retain_freed_memory()
     out = config.out or Path("outputs") / "train"
-    real = Path(os.path.realpath(out))
-    work, prepared = real.with_name(f"{real.name}.training"), config.prepared or real.with_name(f"{real.name}.prepared")
-    for name, taken in (("out", real), ("the state of the run", work)):
-        if lies_in(prepared, taken):
-            raise InputError(f"prepared={prepared}: is in the folder of {name}, {taken}; give another folder")
+    work = folder_beside(out, "training")
+    prepared = prepared_folder(config.prepared, out, work)
     training, held_out = split_scenes(find_scenes(config.paths), config.holdout, config.split, config.holdout_split)
     words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
     with (
@@ -135,7 +130,7 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
                 state.take(anew=not config.resume)
         encoding = EncodeConfig(precision=config.train.precision, device=config.device)
         with summary.step("train"):
-            done = fit(
+            result = fit(
                 datasets,
                 names(training),
                 names(held_out),
@@ -150,15 +145,15 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
         if folder is None:
             return
         figures = {
-            name: encoder_basis_figures(done.outputs[name], dataset.scenes(names(held_out)))
+            name: encoder_basis_figures(result.outputs[name], dataset.scenes(names(held_out)))
             for name, dataset in datasets.items()
         }
         heads = dataset_heads(with_heads, heads_asked)
-        write_results(folder, state.path, done, figures, heads, config, summary)
-    scores = ", ".join(f"{name} {value:.3f}" for name, value in done.scores.items()) or "not validated"
-    minutes = done.state.seconds / 60
+        write_results(folder, state.path, result, figures, heads, config, summary)
+    scores = ", ".join(f"{name} {value:.3f}" for name, value in result.scores.items()) or "not validated"
+    minutes = result.state.seconds / 60
     screen = console(config.quiet)
-    screen.print(f"{out}: {done.state.step} steps in {minutes:.1f} minutes; {scores}")
+    screen.print(f"{out}: {result.state.step} steps in {minutes:.1f} minutes; {scores}")
     for name, of_teacher in figures.items():
         of = f" for {name}" if len(figures) > 1 else ""
         screen.print(f"{out}: basis{of}: {describe_basis(of_teacher, 'held-out scenes')}")
@@ -182,7 +177,7 @@ def encoder_basis_figures(outputs: OutputSpace, held_out: Sequence[PreparedScene
 def write_results(
     folder: Path,
     work: Path,
-    done: Training,
+    result: Training,
     figures: dict[str, dict[str, int | float]],
     heads: HeadSet,
     config: TrainCommandConfig,
@@ -190,11 +185,11 @@ def write_results(
 ) -> None:
     """Writes weights, words, heads, log and pictures; scores and the figures of each basis go into weights and
     summary."""
-    steps, seconds = done.state.step, done.state.seconds
-    made_by = {"settings": settings(config), "steps": steps, "seconds": seconds, "validation": done.scores}
-    made_by["basis"] = figures if len(figures) > 1 else next(iter(figures.values()))
-    save_weights(folder / WEIGHTS_FILE, done.encoder, done.outputs, made_by, dtype=config.store)
-    save_tables(folder, done.tables, done.outputs, dtype=config.store)
+    steps, seconds = result.state.step, result.state.seconds
+    provenance = {"settings": settings(config), "steps": steps, "seconds": seconds, "validation": result.scores}
+    provenance["basis"] = figures if len(figures) > 1 else next(iter(figures.values()))
+    save_weights(folder / WEIGHTS_FILE, result.encoder, result.outputs, provenance, dtype=config.store)
+    save_tables(folder, result.tables, result.outputs, dtype=config.store)
     if heads.heads:
         save_heads(folder / HEADS_FILE, heads)
     shutil.copy(work / LOG_FILE, folder / LOG_FILE)
@@ -204,9 +199,9 @@ def write_results(
     summary.results.update(
         steps=steps,
         seconds=seconds,
-        parameters=sum(value.numel() for value in done.encoder.parameters()),
-        validation=done.scores,
-        basis=made_by["basis"],
+        parameters=sum(value.numel() for value in result.encoder.parameters()),
+        validation=result.scores,
+        basis=provenance["basis"],
         heads=head_figures(heads),
         weights=WEIGHTS_FILE,
         log=LOG_FILE,

@@ -1,7 +1,6 @@
 """`gsencoder tune DATASET model=FOLDER features=FOLDER`: low-rank adapters of a vision-language model, trained on
 questions about scenes and their answers."""
 
-import os
 import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -11,10 +10,10 @@ from typing import Literal
 
 from gsencoder.app.commands.tuning_prompts import PromptRecipe, prepare_prompts, read_dataset, tuning_pairs
 from gsencoder.app.commands.words_options import WordsOptions
-from gsencoder.app.runs.output_folder import lies_in, output_folder, refuse_to_replace_inputs
+from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
-from gsencoder.app.runs.work_folder import WorkFolder
+from gsencoder.app.runs.work_folder import WorkFolder, folder_beside, prepared_folder
 from gsencoder.app.settings.config import settings
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files.model_files import find_file
@@ -114,15 +113,12 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
     """Prepares prompts, trains adapters on their answers, and writes these as peft does."""
     check_peft()
     out = config.out or Path("outputs") / "tune"
-    real = Path(os.path.realpath(out))
-    work, prepared = real.with_name(f"{real.name}.training"), config.prepared or real.with_name(f"{real.name}.prepared")
-    for name, taken in (("out", real), ("the state of the run", work)):
-        if lies_in(prepared, taken):
-            raise InputError(f"prepared={prepared}: is in the folder of {name}, {taken}; give another folder")
+    work = folder_beside(out, "training")
+    prepared = prepared_folder(config.prepared, out, work)
     questions = read_dataset(Path(config.paths[0]), config.split, config.scenes)
     model, features = find_file(config.model, "model", folder=True), Path(config.features)
-    stated, _, layout = open_processor(model, with_tokens=bool(config.tokens))
-    check_targets(stated, config.lora.targets)
+    model_config, _, layout = open_processor(model, with_tokens=bool(config.tokens))
+    check_targets(model_config, config.lora.targets)
     recipe = PromptRecipe(
         words=config.words,
         space=config.space,
@@ -160,7 +156,7 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
         store = PromptStore(prepared)
         pairs = tuning_pairs(questions, features, config.photos, recipe, store)
         with summary.step("train"):
-            done = tune(
+            result = tune(
                 pairs,
                 store,
                 model,
@@ -175,7 +171,7 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
         if folder is None:
             return
         with summary.step("write"):
-            save_tuned(folder, done)
+            save_tuned(folder, result)
             if not config.tokens:
                 # A server has no rendered features to give.
                 link_served(folder, model)
@@ -183,12 +179,12 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
             if (state.path / EVENTS_FOLDER).is_dir():
                 shutil.copytree(state.path / EVENTS_FOLDER, folder / EVENTS_FOLDER)
         losses = [float(row["loss"]) for row in read_log(folder / LOG_FILE) if row.get("loss")]
-        parameters = list(done.network.parameters())
+        parameters = list(result.network.parameters())
         summary.results.update(
             questions=len(questions),
             scenes=len({each.scene for each in questions}),
-            steps=done.state.step,
-            seconds=done.state.seconds,
+            steps=result.state.step,
+            seconds=result.state.seconds,
             parameters=sum(each.numel() for each in parameters),
             trained=sum(each.numel() for each in parameters if each.requires_grad),
             first_loss=losses[0],
@@ -199,7 +195,7 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
     screen = console(config.quiet)
     trained = summary.results["trained"]
     screen.print(
-        f"{out}: {counted(done.state.step, 'step')} on {counted(len(questions), 'question')}, "
+        f"{out}: {counted(result.state.step, 'step')} on {counted(len(questions), 'question')}, "
         f"{counted(trained, 'parameter')} of adapters; {_told_losses(losses, config.train.log_every)}"
     )
     if not config.tokens:

@@ -148,7 +148,7 @@ def prepare_prompts(
         SceneWarning: questions that name nothing, once with their number.
     """
     folders = scene_folders(questions, features, "features")
-    shown = scene_folders(questions, Path(photos), "photos") if photos else {}
+    photo_folders = scene_folders(questions, Path(photos), "photos") if photos else {}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not (folder / PROMPTS_FILE).is_file() and any(
@@ -163,15 +163,15 @@ def prepare_prompts(
     try:
         store = PromptStore(folder)
         keys = prompt_keys(questions, features, photos, recipe)
-        opened: tuple[str, Asker, GaussianFeatures | None] | None = None
+        current: tuple[str, Asker, GaussianFeatures | None] | None = None
         messages: list[str] = []
         for each, key in track(list(zip(questions, keys, strict=True)), "preparing prompts"):
             if key in store.prompts:
                 continue
             with about(f"question {each.id}"):
-                if opened is None or opened[0] != each.scene:
-                    opened = (each.scene, *_asker(folders[each.scene], str(shown.get(each.scene, "")), recipe))
-                messages += _store(store, key, opened[1], each, opened[2], recipe)
+                if current is None or current[0] != each.scene:
+                    current = (each.scene, *_asker(folders[each.scene], str(photo_folders.get(each.scene, "")), recipe))
+                messages += _store(store, key, current[1], each, current[2], recipe)
         if messages:
             warnings.warn(f"{len(messages)} of {len(questions)} questions: {messages[0]}", SceneWarning, stacklevel=2)
     finally:
@@ -216,11 +216,11 @@ def _state(folder: Path) -> list[list[Any]]:
 def _asker(folder: Path, photos: str, recipe: PromptRecipe) -> tuple[Asker, GaussianFeatures | None]:
     """What asks about a scene, and the features that are rendered as tokens."""
     scene = shown_scene(folder, photos, recipe.data)
-    given = None
+    features = None
     if recipe.tokens:
         with about(f"tokens={recipe.tokens}"):
-            given = select_features(scene, recipe.tokens)[1]
-    return asker_of(recipe, scene, folder), given
+            features = select_features(scene, recipe.tokens)[1]
+    return asker_of(recipe, scene, folder), features
 
 
 def _store(

@@ -31,12 +31,12 @@ def add_views(report: HtmlReport, scene: Scene, features: Mapping[str, GaussianF
     gaussians, views = scene.gaussians, scene.views
     assert gaussians is not None
     assert views is not None
-    shown = even_indices(len(views), SHOWN_VIEWS).tolist()
+    numbers = even_indices(len(views), SHOWN_VIEWS).tolist()
     colors = {title: fit_pca_colors(each.stored(each.seen)) for title, each in features.items()}
     rendered, depths = [], []
     stored = {title: torch.from_numpy(each.stored()) for title, each in features.items()}
     fields: dict[str, list[np.ndarray]] = {title: [] for title in features}
-    for view in shown:
+    for view in numbers:
         b = blend(gaussians, views.cameras, view)
         rendered.append(render_image(gaussians, views.cameras, view, blended=b))
         depths.append(depth_picture(depth_image(b)))
@@ -44,10 +44,10 @@ def add_views(report: HtmlReport, scene: Scene, features: Mapping[str, GaussianF
         for title, rows in stored.items():
             values = b.render(rows).reshape(*b.shape, -1).numpy()
             fields[title].append(pca_picture(values, colors[title], alpha))
-    captions = [f"view {view}" for view in shown]
+    captions = [f"view {view}" for view in numbers]
     if views.images is not None:
         report.section("Input", "Photographs with known poses.")
-        report.pictures([views.images[view] for view in shown], captions, cell=MIN_CELL)
+        report.pictures([views.images[view] for view in numbers], captions, cell=MIN_CELL)
     report.section("Gaussians")
     report.pictures(rendered, [f"{caption}, rendered" for caption in captions], cell=MIN_CELL)
     report.pictures(depths, [f"{caption}, depth, bright is near" for caption in captions], cell=MIN_CELL)
@@ -97,9 +97,9 @@ def add_words(
         boxes[box.query].append(box)
     if scene.views is not None:
         # Names begin with the number of the word.
-        named = dict(relevancy_pictures(scene, localization, per_word=1))
+        pictures = dict(relevancy_pictures(scene, localization, per_word=1))
         captions = [_caption(word, len(boxes[word]), None if ious is None else ious[word]) for word in words]
-        report.pictures([np.asarray(named[name]) for name in sorted(named)], captions, cell=PAIR_CELL)
+        report.pictures([np.asarray(pictures[name]) for name in sorted(pictures)], captions, cell=PAIR_CELL)
         marks = set(localization.thresholds.tolist())
         mark = marks.pop() if len(marks) == 1 else None
         report.pictures([color_bar(640, 0.0, 1.0, mark=mark)], ["relevancy, with the threshold"], lossless=True)

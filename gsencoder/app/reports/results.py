@@ -28,8 +28,8 @@ def report_fusion(
     """
     report = HtmlReport(f"Features of {scene.name}", f"Maps of the teacher {teacher}, lifted from all views.")
     assert scene.views is not None
-    seen = int(features.seen.sum())
-    _facts(report, {"Gaussians": len(features), "with features": seen, "views": len(scene.views)}, summary)
+    with_features = int(features.seen.sum())
+    _facts(report, {"Gaussians": len(features), "with features": with_features, "views": len(scene.views)}, summary)
     add_views(report, scene, {teacher: features})
     add_features(report, {teacher: features}, {teacher: truncation})
     _timings(report, summary)

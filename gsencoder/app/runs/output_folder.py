@@ -116,19 +116,19 @@ def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
         raise InputError(f"{path}: holds the results of an earlier run; give another out= or overwrite=true")
 
 
-def refuse_to_replace_inputs(out: Path | None, given: Mapping[str, Any]) -> None:
+def refuse_to_replace_inputs(out: Path | None, values: Mapping[str, Any]) -> None:
     """Checks that a folder that is about to be replaced holds none of the inputs, and that a file is none.
 
     Args:
         out: the folder or file.
-        given: the settings of the run; every text in them that names an existing file or folder is an input.
+        values: the settings of the run; every text in them that names an existing file or folder is an input.
 
     Raises:
         InputError: it holds one, or is one.
     """
     if out is None or not os.path.exists(out):
         return
-    for key, name in _texts({key: value for key, value in given.items() if key != "out"}):
+    for key, name in _texts({key: value for key, value in values.items() if key != "out"}):
         if os.path.exists(name) and lies_in(name, out):
             holds = "holds" if os.path.isdir(out) else "is"
             raise InputError(f"{out}: {holds} the input {key}={name}, so it cannot be replaced; give another out=")
@@ -257,14 +257,14 @@ def _refusal(error: Exception, partial: Path, target: Path, path: str | Path) ->
     if not isinstance(error, OSError):
         return None
     # A file that is copied has the second name; an error of copying a folder lists such errors.
-    names, said = [str(each) for each in (error.filename2, error.filename) if each is not None], error.strerror
+    names, reason = [str(each) for each in (error.filename2, error.filename) if each is not None], error.strerror
     if isinstance(error, shutil.Error) and error.args and error.args[0] and not isinstance(error.args[0], str):
-        source, copy, said = map(str, error.args[0][0])
+        source, copy, reason = map(str, error.args[0][0])
         names = [copy, source]
-        said = said.partition("] ")[2].partition(": ")[0] or said
-    for named in names:
-        if named.startswith(str(partial)):
-            return f"{named.replace(str(partial), str(path))}: cannot write: {said or error}"
+        reason = reason.partition("] ")[2].partition(": ")[0] or reason
+    for name in names:
+        if name.startswith(str(partial)):
+            return f"{name.replace(str(partial), str(path))}: cannot write: {reason or error}"
     if str(target) in names:
         return f"{path}: cannot be replaced by the results: {error.strerror or error}"
     if str(target.parent) in names:

@@ -74,13 +74,13 @@ class Progress:
     def _in_lines(self, items: Iterable[T], label: str, total: int | None) -> Iterator[T]:
         start = last = time.monotonic()
         of = f"/{total}" if total is not None else ""
-        done = 0
+        count = 0
         for item in items:
             yield item
-            done += 1
+            count += 1
             now = time.monotonic()
             if now - last >= self._every:
                 last = now
-                print(f"{label}: {done}{of} after {now - start:.0f} s", file=self._stream, flush=True)
+                print(f"{label}: {count}{of} after {now - start:.0f} s", file=self._stream, flush=True)
         if last > start:
-            print(f"{label}: {done} done in {time.monotonic() - start:.0f} s", file=self._stream, flush=True)
+            print(f"{label}: {count} done in {time.monotonic() - start:.0f} s", file=self._stream, flush=True)

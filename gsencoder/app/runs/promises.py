@@ -14,7 +14,7 @@ from gsencoder.core.promises import Budget
 def report_choice(
     summary: Summary,
     scene: str,
-    chosen: Mapping[str, Any],
+    knobs: Mapping[str, Any],
     *,
     predicted: Mapping[str, float | None],
     notes: Sequence[str],
@@ -27,7 +27,7 @@ def report_choice(
     Args:
         summary: of the run.
         scene: its name.
-        chosen: values of knobs.
+        knobs: values of knobs.
         predicted: of the setting, by promise; None = not predicted.
         notes: what budgets in conflict do not keep.
         quiet: see `CommonConfig`.
@@ -35,12 +35,12 @@ def report_choice(
         more: further entries of `results.budget`.
     """
     summary.results["budget"] = {
-        "chosen": dict(chosen),
+        "chosen": dict(knobs),
         "predicted": {name: value for name, value in predicted.items() if value is not None},
         "notes": list(notes),
         **more,
     }
-    console(quiet).print(f"{scene}: budget: {describe_values(chosen)}{of}")
+    console(quiet).print(f"{scene}: budget: {describe_values(knobs)}{of}")
     for note in notes:
         warnings.warn(note, SceneWarning, stacklevel=3)
 

@@ -7,12 +7,32 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
+from gsencoder.app.runs.output_folder import lies_in
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.atomic import atomic_file, lock_folder
 
 MARKER_FILE, DISCARDED_FILE = "unfinished.txt", "discarded.txt"
 """The marker of a state that can be continued, and its name while the state is removed."""
 _PARTIAL_MARKER = re.compile(re.escape(f".{MARKER_FILE}.") + "([0-9a-f]+[.])?tmp")
+
+
+def folder_beside(out: Path, suffix: str) -> Path:
+    """The folder OUT.suffix beside an output folder; behind a symbolic link, beside the folder that it leads to."""
+    target = Path(os.path.realpath(out))
+    return target.with_name(f"{target.name}.{suffix}")
+
+
+def prepared_folder(prepared: Path | None, out: Path, work: Path) -> Path:
+    """Where a training finds what it has prepared, or prepares it: `prepared`, or OUT.prepared where that is None.
+
+    Raises:
+        InputError: it is in the output folder or in that of the state, which are replaced and removed.
+    """
+    prepared = prepared or folder_beside(out, "prepared")
+    for name, folder in (("out", Path(os.path.realpath(out))), ("the state of the run", work)):
+        if lies_in(prepared, folder):
+            raise InputError(f"prepared={prepared}: is in the folder of {name}, {folder}; give another folder")
+    return prepared
 
 
 class WorkFolder:
@@ -115,11 +135,11 @@ class WorkFolder:
                 error.add_note(
                     f"{self.path} holds what was computed; a run with the same out= and settings continues it"
                 )
-        except OSError as refused:
+        except OSError as failure:
             raise InputError(
                 f"{self.path}: the run is finished and its results are written, but the state that it saved here "
                 "cannot be "
-                f"removed: {refused.strerror or refused}; remove it"
-            ) from refused
+                f"removed: {failure.strerror or failure}; remove it"
+            ) from failure
         finally:
             self._release()

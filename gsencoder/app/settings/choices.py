@@ -36,15 +36,15 @@ def conf_folder() -> Path:
 
 def choices_of(cls: type[CommonConfig], conf: Path | None = None) -> Choices:
     """The options and choices of a command, including the members of choices that are YAML files in `conf`."""
-    folder, groups, chosen = conf or conf_folder(), {}, {}
+    folder, groups, defaults = conf or conf_folder(), {}, {}
     for group in groups_of(cls):
         files = (path.stem for path in (folder / group.key).glob("*.yaml"))
         groups[group.key] = tuple(sorted({*group.members, *files}))
-        chosen[group.key] = group.default
+        defaults[group.key] = group.default
     members: dict[str, tuple[str, ...]] = {}
     for option in options_of(cls):
         members[option.key] = (*members.get(option.key, ()), option.member) if option.member else ()
-    return Choices(options=options_by_key(cls), members=members, groups=groups, chosen=chosen)
+    return Choices(options=options_by_key(cls), members=members, groups=groups, chosen=defaults)
 
 
 def option_of_several(key: str, choices: Choices) -> Option | None:
@@ -57,10 +57,10 @@ def option_of_several(key: str, choices: Choices) -> Option | None:
 
 def full_key(key: str, choices: Choices) -> str | None:
     """The option or choice that `key` stands for, or None."""
-    known = [*choices.options, *choices.groups]
-    if key in known or option_of_several(key, choices) is not None:
+    keys = [*choices.options, *choices.groups]
+    if key in keys or option_of_several(key, choices) is not None:
         return key
-    ends = [name for name in known if re.split(r"[./]", name)[-1] == key]
+    ends = [name for name in keys if re.split(r"[./]", name)[-1] == key]
     # An option of a section within a section gives way to one that is less deep.
     depths = [len(re.split(r"[./]", name)) for name in ends]
     ends = [name for name, depth in zip(ends, depths, strict=True) if depth == min(depths)]

@@ -79,7 +79,7 @@ def read_words(
         InputError: a word that is neither, a setting given twice, or paths for a command without paths.
     """
     paths: list[str] = []
-    given: dict[str, str] = {}
+    texts: dict[str, str] = {}
     only_paths = False
     for word in words:
         key, equals, value = word.partition("=")
@@ -103,9 +103,9 @@ def read_words(
             check_removed_option(removed, value)
         elif full is None:
             raise InputError(_unknown(word, key, choices))
-        elif full in given:
+        elif full in texts:
             secret = full in choices.options and choices.options[full].secret
-            values = "" if secret else f", as {given[full]!r} and {value!r}"
+            values = "" if secret else f", as {texts[full]!r} and {value!r}"
             raise InputError(f"{full}: given twice{values}; give it once")
         elif sweep and full in choices.options and choices.options[full].secret:
             raise InputError(f"{full}: is not accepted with -m, which writes its values to a file")
@@ -113,33 +113,33 @@ def read_words(
             # A variable of a script that is not set would write to the usual folder without a word.
             raise InputError("out: is empty; name where the results go, or leave it out")
         else:
-            given[full] = value
+            texts[full] = value
     if paths and "paths" not in choices.options:
-        known = [*choices.options, *choices.groups]
+        keys = [*choices.options, *choices.groups]
         first = without_value(paths[0])
-        raise InputError(f"{first}: this command takes no path{near(first, known)}")
-    if paths and "paths" in given:
+        raise InputError(f"{first}: this command takes no path{near(first, keys)}")
+    if paths and "paths" in texts:
         raise InputError(f"paths: given both as paths= and as the word {without_value(paths[0])!r}; give one of them")
-    return tuple(paths), given
+    return tuple(paths), texts
 
 
 def _unknown(word: str, key: str, choices: Choices) -> str:
-    known, shown = [*choices.options, *choices.groups], without_value(word)
+    keys, bare_word = [*choices.options, *choices.groups], without_value(word)
     single = key.partition(".")[0].removesuffix("s")
     only_one = not any(option.several for option in choices.options.values())
     if only_one and single in choices.groups and key.startswith(f"{single}s"):
         return f"{key}: this command takes a single {single}; give {single}= and its options as {single}.OPTION="
-    sections = [name for name in known if name.startswith(key + ".")]
+    sections = [name for name in keys if name.startswith(key + ".")]
     if sections:
         return f"{key}: is a section; set its options one by one: {', '.join(f'{name}=' for name in sections[:4])}"
     if not re.fullmatch(r"[A-Za-z_][\w.]*", key):
-        return f"{shown}: is neither an option (KEY=VALUE) nor an existing file"
+        return f"{bare_word}: is neither an option (KEY=VALUE) nor an existing file"
     if key.startswith("hydra"):
         return f"{key}: settings of Hydra itself are accepted only with -m"
-    return f"{shown.removesuffix('=…')}: no such option, and no file has this name{near(shown, known)}"
+    return f"{bare_word.removesuffix('=…')}: no such option, and no file has this name{near(bare_word, keys)}"
 
 
-def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False) -> list[str]:
+def overrides(texts: Mapping[str, str], choices: Choices, *, sweep: bool = False) -> list[str]:
     """The settings in Hydra's grammar, with text encoded; each is parsed separately, so that errors name it.
 
     Raises:
@@ -150,42 +150,42 @@ def overrides(given: Mapping[str, str], choices: Choices, *, sweep: bool = False
 
     parser = OverridesParser.create()
     hydra_overrides = []
-    check_options_of_one(given, choices)
-    for key, value in given.items():
+    check_options_of_one(texts, choices)
+    for key, value in texts.items():
         option = choices.options.get(key) or option_of_several(key, choices)
         if option is not None and option.several:
             hydra_overrides += members_of(key, value, option.several, choices.groups[option.several])
             continue
-        written = value
+        text = value
         if key in choices.groups:
             names = choices.groups[key]
             # Hydra merges several experiments in the order in which they are listed.
             several = re.fullmatch(r"\[(.*)\]", value) if key == EXPERIMENT else None
             secret = any(name.startswith(f"{key}.") and each.secret for name, each in choices.options.items())
-            listed = several[1].replace(" ", "").split(",") if several else [value]
-            if repeated := [name for name in listed if listed.count(name) > 1]:
+            members = several[1].replace(" ", "").split(",") if several else [value]
+            if repeated := [name for name in members if members.count(name) > 1]:
                 raise InputError(f"{key}: {repeated[0]} is given twice in {value}; give it once")
-            unknown = [name for name in listed if name not in names]
+            unknown = [name for name in members if name not in names]
             if unknown and (secret or not sweep):
-                got = "" if secret else f", got {unknown[0]!r}{near(unknown[0], names)}"
-                raise InputError(f"{key}: expected one of {', '.join(names)}{got}")
+                actual = "" if secret else f", got {unknown[0]!r}{near(unknown[0], names)}"
+                raise InputError(f"{key}: expected one of {', '.join(names)}{actual}")
         elif option is not None and option.kind != "value":
             if not (sweep and SWEPT_TEXT.fullmatch(value)):
                 # Users of Hydra write brackets around a list; text may begin with one, names do not.
                 bracketed = option.names and re.fullmatch(r"\[(.*)\]", value)
-                written = seal(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
+                text = seal(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
         elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
-            written = f"[{value}]"
+            text = f"[{value}]"
         name = option.hydra_key if option is not None and option.like_group and key not in choices.groups else key
         try:
-            parsed = parser.parse_override(f"{name}={written}")
+            parsed = parser.parse_override(f"{name}={text}")
             swept = parsed.is_sweep_override()
         except HydraException as error:
             message = wrong_value(option, value) if option else f"{key}={value}: {str(error).partition(chr(10))[0]}"
             raise InputError(message) from error
         if swept and not sweep and option is not None:
             raise InputError(f"{wrong_value(option, value)}; several values, one run each, need -m")
-        hydra_overrides.append(f"{name}={written}")
+        hydra_overrides.append(f"{name}={text}")
     return hydra_overrides
 
 
@@ -205,17 +205,17 @@ def compose(
     from hydra.types import RunMode
 
     choices = choices or choices_of(cls, conf)
-    paths, given = read_words(words, choices)
+    paths, texts = read_words(words, choices)
     if paths:
-        given["paths"] = join_list(paths)
-    written = overrides(given, choices)
+        texts["paths"] = join_list(paths)
+    lines = overrides(texts, choices)
     with open_hydra(command, cls, conf) as hydra:
         try:
-            composed = hydra.compose_config(command, written, RunMode.RUN, from_shell=False)
+            composed = hydra.compose_config(command, lines, RunMode.RUN, from_shell=False)
         except HydraException as error:
-            raise InputError(hydra_error(error, given, choices)) from error
+            raise InputError(hydra_error(error, texts, choices)) from error
         data = plain_settings(composed)
-        check_single(data, given, choices)
+        check_single(data, texts, choices)
         return typed(cls, data)
 
 

@@ -64,15 +64,15 @@ class CommonConfig:
     quiet: bool = field(default=False, metadata={"help": "print nothing but warnings and errors"})
 
 
-def _strict(wanted: type, accepted: tuple[type, ...]) -> Any:
-    """A dacite hook that converts values of the accepted types to `wanted`, and refuses all others."""
+def _strict(target: type, accepted: tuple[type, ...]) -> Any:
+    """A dacite hook that converts values of the accepted types to `target`, and refuses all others."""
     from dacite.exceptions import WrongTypeError
 
     def convert(value: Any) -> Any:
         # NaN passes here, for `typed` to say what the class expects of it.
         if not isinstance(value, accepted) or isinstance(value, bool):
-            raise WrongTypeError(field_type=wanted, value=value)
-        return wanted(value)
+            raise WrongTypeError(field_type=target, value=value)
+        return target(value)
 
     return convert
 
@@ -126,8 +126,8 @@ def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
             check_removed_option(f"{prefix}{name}", value)
             continue
         if name not in types:
-            known = [prefix + known for known in types]
-            raise InputError(f"{prefix}{name}: no such option{near(f'{prefix}{name}', known)}")
+            options = [prefix + option for option in types]
+            raise InputError(f"{prefix}{name}: no such option{near(f'{prefix}{name}', options)}")
         values[name] = _prepare(_section(types[name], value, prefix + name), types[name])
     hooks: dict[Any, Any] = {
         int: _strict(int, (int,)),

@@ -33,7 +33,7 @@ def _job(
     cls: type[CommonConfig],
     run: Callable[[Any], str],
     swept: Sequence[str],
-    given: Mapping[str, str],
+    texts: Mapping[str, str],
     choices: Choices,
 ) -> str:
     """Runs one job in its folder and returns its error, so that a failed run does not stop the others."""
@@ -42,7 +42,7 @@ def _job(
     job = HydraConfig.get()
     try:
         data = plain_settings(composed)
-        check_single(data, given, choices)
+        check_single(data, texts, choices)
         config = typed(cls, data)
     except InputError as error:
         message = f"run {job.job.num}: {error}"
@@ -80,36 +80,36 @@ def run_many(
     from hydra.errors import HydraException
 
     choices = choices_of(cls, conf)
-    paths, given = read_words(words, choices, sweep=True)
+    paths, texts = read_words(words, choices, sweep=True)
     if paths:
-        given["paths"] = join_list(paths)
-    _check_out(command, given, choices)
+        texts["paths"] = join_list(paths)
+    _check_out(command, texts, choices)
     hydra_settings = {
         "hydra.mode": "MULTIRUN",
         "hydra.output_subdir": "null",
-        "hydra.sweep.dir": seal(given["out"]),
+        "hydra.sweep.dir": seal(texts["out"]),
         "hydra.sweep.subdir": ".",
         "hydra/job_logging": "none",
         "hydra/hydra_logging": "none",
     }
-    requested = overrides(given, choices, sweep=True)
-    written = [f"{key}={value}" for key, value in hydra_settings.items() if key not in given] + requested
+    requested = overrides(texts, choices, sweep=True)
+    lines = [f"{key}={value}" for key, value in hydra_settings.items() if key not in texts] + requested
     parsed = OverridesParser.create().parse_overrides(requested)
     swept = tuple(override.get_key_element() for override in parsed if override.is_sweep_override())
-    launcher = given.get("hydra/launcher", "basic")
-    job = partial(_job, cls=cls, run=run, swept=swept, given=given, choices=choices)
+    launcher = texts.get("hydra/launcher", "basic")
+    job = partial(_job, cls=cls, run=run, swept=swept, texts=texts, choices=choices)
     with open_hydra(command, cls, conf) as hydra:
         try:
-            batches = hydra.multirun(command, job, written, with_log_configuration=False)
+            batches = hydra.multirun(command, job, lines, with_log_configuration=False)
         except HydraException as error:
-            raise InputError(hydra_error(error, given, choices)) from error
+            raise InputError(hydra_error(error, texts, choices)) from error
         except Exception as error:
             # The basic launcher returns the exceptions of a run; others raise their own, of many types.
             if launcher == "basic":
                 raise
             raise InputError(
                 f"hydra/launcher={launcher}: {error}; the logs of the jobs are in "
-                f"{given['out']}/.submitit unless hydra.launcher.submitit_folder= says otherwise"
+                f"{texts['out']}/.submitit unless hydra.launcher.submitit_folder= says otherwise"
             ) from error
     errors = [str(result.return_value) for batch in batches for result in batch]
     failed = [error for error in errors if error]
@@ -122,10 +122,10 @@ def run_many(
     return 2 if failed else 0
 
 
-def _check_out(command: str, given: dict[str, str], choices: Choices) -> None:
+def _check_out(command: str, texts: dict[str, str], choices: Choices) -> None:
     if choices.options["out"].metavar == "FILE":
         raise InputError(f"-m: {command} writes a file, and several runs need a folder")
-    if not given.get("out"):
+    if not texts.get("out"):
         raise InputError("-m: out= is missing: the folder in which run k writes to OUT/k")
-    if SWEPT_TEXT.fullmatch(given["out"]):
+    if SWEPT_TEXT.fullmatch(texts["out"]):
         raise InputError("out: cannot be swept; run k writes to OUT/k")

@@ -71,13 +71,13 @@ def without_value(word: str) -> str:
     return key[:MAX_WORD] + ("=…" if equals else "")
 
 
-def near(word: str, known: Iterable[str]) -> str:
+def near(word: str, names: Iterable[str]) -> str:
     """`; did you mean …?` if the last component of a known name is close to that of `word`, else nothing."""
 
     def distance(name: str) -> float:
         return -difflib.SequenceMatcher(None, word.rpartition(".")[2], name.rpartition(".")[2]).ratio()
 
-    close = sorted((distance(name), name) for name in set(known) if distance(name) <= -0.6)
+    close = sorted((distance(name), name) for name in set(names) if distance(name) <= -0.6)
     best = [name for score, name in close if score <= close[0][0] + 0.15][:3]
     return f"; did you mean {' or '.join(best)}?" if best else ""
 
@@ -169,15 +169,15 @@ def split_list(text: str) -> tuple[str, ...]:
 
 def join_list(items: Iterable[str]) -> str:
     """The text that `split_list` splits into these items (a single empty item cannot be written)."""
-    written = []
+    parts = []
     for number, item in enumerate(items := tuple(items)):
         pieces = item.split(",")
         for index, piece in enumerate(pieces):
             if index < len(pieces) - 1 or number < len(items) - 1:
                 piece += "\\" * (len(piece) - len(piece.rstrip("\\")))
             pieces[index] = piece
-        written.append("\\,".join(pieces))
-    return ",".join(written)
+        parts.append("\\,".join(pieces))
+    return ",".join(parts)
 
 
 @cached

@@ -57,9 +57,9 @@ def preset_values(cls: type, preset: str) -> dict[str, Any]:
         cls: the settings class of the command.
         preset: its name.
     """
-    known = options_by_key(cls)
-    chosen = {each.key: getattr(each, preset, None) for each in PRESET_OPTIONS}
-    return {key: value for key, value in chosen.items() if value is not None and key in known}
+    options = options_by_key(cls)
+    values = {each.key: getattr(each, preset, None) for each in PRESET_OPTIONS}
+    return {key: value for key, value in values.items() if value is not None and key in options}
 
 
 def preset_node(cls: type, preset: str) -> dict[str, Any]:

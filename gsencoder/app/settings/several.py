@@ -10,15 +10,15 @@ from gsencoder.app.settings.options import near
 from gsencoder.core.errors import InputError
 
 
-def check_options_of_one(given: Mapping[str, str], choices: Choices) -> None:
+def check_options_of_one(texts: Mapping[str, str], choices: Choices) -> None:
     """Checks that with several members of a choice no options are given for the only one.
 
     Raises:
         InputError: there are such options, or no members.
     """
-    for key, value in given.items():
+    for key, value in texts.items():
         several = choices.options[key].several if key in choices.options else ""
-        unused = [name for name in given if name == several or name.startswith(f"{several}.")] if several else []
+        unused = [name for name in texts if name == several or name.startswith(f"{several}.")] if several else []
         if unused:
             option = unused[0].partition(".")[2]
             hint = f"{key}.NAME.{option}=… is that of one of them" if option else f"leave out {several}= or {key}="
@@ -51,7 +51,7 @@ def named_members(value: str) -> list[tuple[str, str]]:
     return [(word.partition(":")[0], word.partition(":")[2] or word) for word in words]
 
 
-def check_single(data: Mapping[str, Any], given: Mapping[str, str], choices: Choices) -> None:
+def check_single(data: Mapping[str, Any], texts: Mapping[str, str], choices: Choices) -> None:
     """Checks that nothing was given for a single member of a choice of which an experiment gives several.
 
     Raises:
@@ -59,10 +59,10 @@ def check_single(data: Mapping[str, Any], given: Mapping[str, str], choices: Cho
     """
     for key, option in choices.options.items():
         single = option.several
-        unused = [name for name in given if single and (name == single or name.startswith(f"{single}."))]
+        unused = [name for name in texts if single and (name == single or name.startswith(f"{single}."))]
         if unused and data.get(key):
             raise InputError(
-                f"{unused[0]}: is for a single {single}, and {EXPERIMENT}={given.get(EXPERIMENT, '')} gives several, "
+                f"{unused[0]}: is for a single {single}, and {EXPERIMENT}={texts.get(EXPERIMENT, '')} gives several, "
                 f"{', '.join(data[key])}; options of one of them are {key}.NAME.OPTION=…, others need another "
                 f"{EXPERIMENT}="
             )

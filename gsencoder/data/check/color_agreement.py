@@ -9,15 +9,13 @@ from gsencoder.types import Views
 from gsencoder.types.cameras import project_points
 
 
-def grey_pictures(
-    views: Views, chosen: Int64[np.ndarray, " V"], shape: tuple[int, int]
-) -> Float32[np.ndarray, "V h w"]:
+def grey_pictures(views: Views, rows: Int64[np.ndarray, " V"], shape: tuple[int, int]) -> Float32[np.ndarray, "V h w"]:
     """Photographs in grey, 0 to 1, at the size of the small depth images."""
     from PIL import Image
 
     assert views.images is not None
     pictures = []
-    for view in chosen:
+    for view in rows:
         grey = Image.fromarray(views.images[int(view)]).convert("L").resize(shape[::-1], Image.Resampling.BOX)
         pictures.append(np.asarray(grey, np.float32) / 255)
     return np.stack(pictures)
@@ -37,9 +35,9 @@ def color_correlations(
     """
     result = np.full((len(views), len(views)), np.nan)
     for view, other, here, there in shared_samples(views, MIN_SAMPLES):
-        ours, seen = _intensities(grey[view], Ks[view], here)
-        theirs, seen_there = _intensities(grey[other], Ks[other], there)
-        pair = ours[seen & seen_there], theirs[seen & seen_there]
+        intensities, in_view = _intensities(grey[view], Ks[view], here)
+        other_intensities, in_other_view = _intensities(grey[other], Ks[other], there)
+        pair = intensities[in_view & in_other_view], other_intensities[in_view & in_other_view]
         if len(pair[0]) >= MIN_SAMPLES and min(values.std() for values in pair) > 1e-3:
             result[view, other] = np.corrcoef(*pair)[0, 1]
     return result
@@ -51,9 +49,9 @@ def _intensities(
     """The intensity where points in camera axes project, and whether that is in the picture."""
     height, width = grey.shape
     pixels = project_points(local, K)
-    seen = np.asarray((pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1))
-    columns, rows = np.floor(np.where(seen[:, None], pixels, 0)).astype(np.int64).T
-    return grey[rows, columns], seen
+    in_view = np.asarray((pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1))
+    columns, rows = np.floor(np.where(in_view[:, None], pixels, 0)).astype(np.int64).T
+    return grey[rows, columns], in_view
 
 
 def view_correlations(correlations: Float64[np.ndarray, "V V"]) -> Float64[np.ndarray, " V"]:

@@ -67,21 +67,21 @@ class DepthViews:
         return replace(self, depths=(self.depths / lengths).astype(np.float32), values=self.values / at_samples)
 
 
-def depth_views(views: Views, chosen: Int64[np.ndarray, " V"], *, seed: int = 0) -> DepthViews:
+def depth_views(views: Views, numbers: Int64[np.ndarray, " V"], *, seed: int = 0) -> DepthViews:
     """Small depth images of some views and samples on their surfaces.
 
     Args:
         views: with depth.
-        chosen: their row numbers.
+        numbers: their row numbers.
         seed: of the choice of samples.
     """
     assert views.depths is not None
     rng = np.random.default_rng(seed)
-    cameras = views.cameras.select(chosen)
+    cameras = views.cameras.select(numbers)
     shrink = min(1.0, MAX_SIDE / int(max(cameras.widths[0], cameras.heights[0])))
     width, height = (max(3, round(shrink * int(size[0]))) for size in (cameras.widths, cameras.heights))
     maps, pixels, values = [], [], []
-    for view in chosen:
+    for view in numbers:
         full = views.depths[int(view)]
         rows, columns = (
             ((np.arange(n) + 0.5) * size / n).astype(np.int64)
@@ -90,13 +90,13 @@ def depth_views(views: Views, chosen: Int64[np.ndarray, " V"], *, seed: int = 0)
         depth = full[rows][:, columns]
         maps.append(depth)
         rows, columns = np.nonzero(on_surface(depth))
-        picked = rng.permutation(len(rows))[:SAMPLES]
+        sample = rng.permutation(len(rows))[:SAMPLES]
         at, value = np.zeros((SAMPLES, 2)), np.zeros(SAMPLES)
-        at[: len(picked)] = np.stack((columns[picked], rows[picked]), axis=1) + 0.5
-        value[: len(picked)] = depth[rows[picked], columns[picked]]
+        at[: len(sample)] = np.stack((columns[sample], rows[sample]), axis=1) + 0.5
+        value[: len(sample)] = depth[rows[sample], columns[sample]]
         pixels.append(at)
         values.append(value)
-    small = cameras.resized_to(np.full(len(chosen), width, np.int32), np.full(len(chosen), height, np.int32))
+    small = cameras.resized_to(np.full(len(numbers), width, np.int32), np.full(len(numbers), height, np.int32))
     return DepthViews(
         depths=np.stack(maps),
         pixels=np.stack(pixels),
@@ -152,28 +152,28 @@ def agreement_map(views: DepthViews, view: int) -> Float32[np.ndarray, "h w"]:
             Ks=views.Ks[here],
         )
     )[0]
-    agree, seen = np.zeros(len(points)), np.zeros(len(points))
+    agree, comparisons = np.zeros(len(points)), np.zeros(len(points))
     measured = views.depths[view].reshape(-1) > 0
     for other in range(count):
         if other == view:
             continue
         ratio = _depth_ratio(views, other, points, measured)
         compared = np.isfinite(ratio) & (ratio < 1 + CLIP)
-        seen += compared
+        comparisons += compared
         agree += compared & (np.abs(ratio - 1) <= TOLERANCE)
-    share = np.divide(agree, seen, out=np.full(len(points), np.nan), where=seen > 0)
+    share = np.divide(agree, comparisons, out=np.full(len(points), np.nan), where=comparisons > 0)
     return share.reshape(height, width).astype(np.float32)
 
 
 def _depth_ratio(
-    views: DepthViews, other: int, points: Float64[np.ndarray, "n 3"], known: Bool[np.ndarray, " n"]
+    views: DepthViews, other: int, points: Float64[np.ndarray, "n 3"], valid: Bool[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:
     """The depth of world points in a view, divided by the view's own depth there; NaN where there is none."""
     height, width = views.depths.shape[1:]
     local = transform(views.cam_from_world[other], points)
     pixels = project_points(local, views.Ks[other])
     with np.errstate(invalid="ignore"):
-        inside = known & (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+        inside = valid & (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
     columns, rows = np.floor(pixels[inside]).astype(np.int64).T
     measured = views.depths[other][rows, columns].astype(np.float64) * views.scale
     ratio = np.full(len(points), np.nan)

@@ -90,9 +90,9 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
     """
     rows = _spread_triples(len(views), limit)
     cameras = views.cameras.select(rows).resized(PICTURE_SIZE, enlarge=False)
-    chosen = views.select(rows)
+    subset = views.select(rows)
     pairs = [(first, second) for first in range(len(rows)) for second in range(first + 1, len(rows))]
-    matches = consistent_matches(match_photographs(chosen, cameras, pairs, features=FEATURES, track=track))
+    matches = consistent_matches(match_photographs(subset, cameras, pairs, features=FEATURES, track=track))
     if not matches:
         nan = float("nan")
         return EpipolarCheck(
@@ -107,23 +107,23 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
             cameras=cameras,
         )
     errors = pair_errors(cameras, matches)
-    stated = float(np.mean(errors))
+    error_as_stated = float(np.mean(errors))
     findings: list[Finding] = []
-    best, best_error = cameras, stated
-    if stated > BAD:
+    best, best_error = cameras, error_as_stated
+    if error_as_stated > BAD:
         cause, factor, other, error = _best_reading(cameras, views.cameras, rows, matches)
         # One view astray among few raises the mean of all pairs, and no reading of all poses mends that.
-        if error < BETTER * stated:
+        if error < BETTER * error_as_stated:
             findings.append(
                 Finding(
                     cause=cause,
-                    message=f"{ADVICE[cause].format(factor=factor)} (matches lie {stated:.1f} pixels from their "
-                    f"epipolar lines, {error:.1f} if so read)",
+                    message=f"{ADVICE[cause].format(factor=factor)} (matches lie {error_as_stated:.1f} pixels "
+                    f"from their epipolar lines, {error:.1f} if so read)",
                     factor=factor,
                 )
             )
             best, best_error = other, error
-    stray = _stray_views(pair_errors(best, matches), matches, chosen.names)
+    stray = _stray_views(pair_errors(best, matches), matches, subset.names)
     findings += stray
     if best_error > UNFIT and not stray and not findings:
         findings.append(
@@ -138,7 +138,7 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
         views=rows,
         pairs=len(matches),
         matches=len(distances),
-        error=stated,
+        error=error_as_stated,
         share=float((distances <= TOLERANCE).mean()),
         best_error=best_error,
         findings=tuple(findings),
@@ -202,8 +202,8 @@ def _best_reading(
             Ks = cameras.Ks.copy()
             Ks[:, :2, :2] *= np.float32(factor)
             readings.append(("focal length", float(factor), replace(cameras, Ks=Ks)))
-    tried = [(*reading, float(pair_errors(reading[2], matches).mean())) for reading in readings]
-    return min(tried, key=lambda reading: reading[3])
+    candidates = [(*reading, float(pair_errors(reading[2], matches).mean())) for reading in readings]
+    return min(candidates, key=lambda reading: reading[3])
 
 
 def _stray_views(
@@ -212,13 +212,13 @@ def _stray_views(
     """Views whose pairs have clearly larger errors than those of the others; of fewer than four views it cannot be said
     which one it is."""
     findings: list[Finding] = []
-    left = np.ones(len(matches), bool)
+    remaining = np.ones(len(matches), bool)
     pair_views = np.array([(pair.first, pair.second) for pair in matches])
     while True:
         worst = None
-        for view in np.unique(pair_views[left]):
-            of_view = left & (pair_views == view).any(axis=1)
-            others = left & ~of_view
+        for view in np.unique(pair_views[remaining]):
+            of_view = remaining & (pair_views == view).any(axis=1)
+            others = remaining & ~of_view
             if of_view.sum() < 2 or others.sum() < 3:
                 continue
             error, usual = float(np.median(errors[of_view])), float(np.median(errors[others]))
@@ -232,4 +232,4 @@ def _stray_views(
             f"those of the other views {usual:.1f}"
         )
         findings.append(Finding(cause="stray view", message=message, view=names[view]))
-        left &= ~(pair_views == view).any(axis=1)
+        remaining &= ~(pair_views == view).any(axis=1)

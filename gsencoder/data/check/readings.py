@@ -42,13 +42,13 @@ def stated_reading(views: DepthViews) -> Reading:
 
 
 def other_readings(
-    views: DepthViews, chosen: Int64[np.ndarray, " V"], all_poses: Float[np.ndarray, "n 4 4"]
+    views: DepthViews, rows: Int64[np.ndarray, " V"], all_poses: Float[np.ndarray, "n 4 4"]
 ) -> list[Reading]:
     """Every other reading, those with a factor at the factor where depths agree best.
 
     Args:
         views: the depth images that are compared.
-        chosen: their rows among all views.
+        rows: their rows among all views.
         all_poses: cam_from_world of all views.
     """
     fixed: list[tuple[str, float | None, DepthViews]] = [
@@ -56,7 +56,7 @@ def other_readings(
         for cause, poses in other_poses(views.cam_from_world).items()
     ]
     fixed += [
-        ("order", float(places), replace(views, cam_from_world=poses[chosen].astype(np.float64)))
+        ("order", float(places), replace(views, cam_from_world=poses[rows].astype(np.float64)))
         for places, poses in other_orders(all_poses)
     ]
     fixed.append(("ray length", None, views.of_rays()))
@@ -74,16 +74,16 @@ def _best_factor(cause: str, apply: Callable[[float], DepthViews], factors: Sequ
 
     def spread(factor: float) -> float:
         measured = agreement(residuals(apply(factor)))
-        return measured.spread if measured.compared >= needed else np.inf
+        return measured.spread if measured.compared >= min_compared else np.inf
 
-    needed = MIN_COMPARED * len(apply(1.0)) * (len(apply(1.0)) - 1) * apply(1.0).values.shape[1]
-    tried = {factor: spread(factor) for factor in sorted(factors)}
-    best = min(tried, key=lambda factor: tried[factor])
+    min_compared = MIN_COMPARED * len(apply(1.0)) * (len(apply(1.0)) - 1) * apply(1.0).values.shape[1]
+    spreads = {factor: spread(factor) for factor in sorted(factors)}
+    best = min(spreads, key=lambda factor: spreads[factor])
     step = 1.02
     for _ in range(REFINEMENTS):
         for factor in (best / step, best * step):
-            tried.setdefault(factor, spread(factor))
-        best = min(tried, key=lambda factor: tried[factor])
+            spreads.setdefault(factor, spread(factor))
+        best = min(spreads, key=lambda factor: spreads[factor])
         step = step**0.5
-    chosen = apply(best)
-    return Reading(cause=cause, views=chosen, agreement=agreement(residuals(chosen)), factor=best)
+    corrected = apply(best)
+    return Reading(cause=cause, views=corrected, agreement=agreement(residuals(corrected)), factor=best)

@@ -65,12 +65,12 @@ class _Pair:
     points: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
 
 
-def fit_registration(views: Views, chosen: Int64[np.ndarray, " V"], depth: DepthViews) -> RegistrationFit:
+def fit_registration(views: Views, rows: Int64[np.ndarray, " V"], depth: DepthViews) -> RegistrationFit:
     """The color camera under which photographs show the same details where their depth agrees.
 
     Args:
         views: with photographs and depth.
-        chosen: the rows of the views that are compared.
+        rows: the rows of the views that are compared.
         depth: their depth images, under the reading that fits best.
     """
     pairs = _shared_samples(depth)
@@ -79,7 +79,7 @@ def fit_registration(views: Views, chosen: Int64[np.ndarray, " V"], depth: Depth
     )
     if not pairs:
         return nothing
-    samples = [_samples_of_view(pairs, view, views, chosen) for view in range(len(chosen))]
+    samples = [_samples_of_view(pairs, view, views, rows) for view in range(len(rows))]
     samples = [each for each in samples if len(each.points)]
 
     def score(factor: float, shift: Float64[np.ndarray, "2"]) -> float:
@@ -90,8 +90,8 @@ def fit_registration(views: Views, chosen: Int64[np.ndarray, " V"], depth: Depth
 
     typical = float(np.median(np.concatenate([pair.points[0][:, 2] for pair in pairs])))
     scores: dict[tuple[float, ...], float] = {}
-    stated = score(1.0, np.zeros(2))
-    if not np.isfinite(stated):
+    score_as_stated = score(1.0, np.zeros(2))
+    if not np.isfinite(score_as_stated):
         return nothing
     best = max(
         ((factor, np.array((shift * typical, 0.0))) for factor in FOCAL_FACTORS for shift in SHIFTS),
@@ -105,7 +105,9 @@ def fit_registration(views: Views, chosen: Int64[np.ndarray, " V"], depth: Depth
             around += [(factor, shift + sign * steps[1] * axis) for axis in np.eye(2) for sign in (-1, 1)]
             best = max([best, *around], key=lambda candidate: score(*candidate))
         steps = steps[0] ** 0.5, steps[1] / 2
-    return RegistrationFit(focal_factor=best[0], shift=best[1], stated=stated, best=score(*best), pairs=len(pairs))
+    return RegistrationFit(
+        focal_factor=best[0], shift=best[1], stated=score_as_stated, best=score(*best), pairs=len(pairs)
+    )
 
 
 def _shared_samples(depth: DepthViews) -> list[_Pair]:
@@ -135,7 +137,7 @@ class _ViewSamples(NamedTuple):
     pairs: Int64[np.ndarray, " n"]
 
 
-def _samples_of_view(pairs: list[_Pair], view: int, views: Views, chosen: Int64[np.ndarray, " V"]) -> _ViewSamples:
+def _samples_of_view(pairs: list[_Pair], view: int, views: Views, rows: Int64[np.ndarray, " V"]) -> _ViewSamples:
     sizes = np.array([len(pair.points[0]) for pair in pairs])
     starts = np.concatenate(([0], np.cumsum(sizes)))
     points, entries, numbers = [np.empty((0, 3))], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
@@ -145,7 +147,7 @@ def _samples_of_view(pairs: list[_Pair], view: int, views: Views, chosen: Int64[
                 points.append(pair.points[side])
                 entries.append(side * starts[-1] + np.arange(starts[number], starts[number + 1]))
                 numbers.append(np.full(sizes[number], number))
-    row = int(chosen[view])
+    row = int(rows[view])
     small = views.cameras.select([row]).resized(PICTURE_SIZE, enlarge=False)
     everything = np.concatenate(points)
     details = _details(views, row, int(small.widths[0]), int(small.heights[0])) if len(everything) else np.zeros((1, 1))
@@ -174,9 +176,9 @@ def _correlation(positions: list[_ViewSamples], pairs: int, factor: float, shift
         focal = K.copy()
         focal[0, 0] *= factor
         focal[1, 1] *= factor
-        moved = points.copy()
-        moved[:, :2] += shift
-        columns, rows = project_points(moved, focal).T - 0.5
+        shifted_points = points.copy()
+        shifted_points[:, :2] += shift
+        columns, rows = project_points(shifted_points, focal).T - 0.5
         height, width = details.shape
         inside = (columns >= 0) & (rows >= 0) & (columns <= width - 1) & (rows <= height - 1)
         values[entries[inside]] = map_coordinates(details, (rows[inside], columns[inside]), order=1, mode="nearest")

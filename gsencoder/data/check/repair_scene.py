@@ -51,10 +51,10 @@ def repair_posed(
         images, change = _mend(images, finding, registration, posed.source)
         changes.append(change)
     astray = {finding.view for finding in findings if finding.cause in LEFT_OUT}
-    left = [image for image in images if image.name not in astray]
+    remaining = [image for image in images if image.name not in astray]
     if astray:
         changes.append(f"left out, since they do not fit: {', '.join(sorted(map(str, astray)))}")
-    return Repair(posed=replace(posed, images=tuple(left)), changes=tuple(changes))
+    return Repair(posed=replace(posed, images=tuple(remaining)), changes=tuple(changes))
 
 
 def _mend(

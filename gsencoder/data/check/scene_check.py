@@ -147,9 +147,9 @@ def plain_photographs(views: Views) -> tuple[list[str], int]:
     """The names of photographs whose pixels all have one color, of up to four, and how many were looked at."""
     if views.images is None or not len(views):
         return [], 0
-    chosen = even_indices(len(views), PHOTOGRAPHS)
-    plain = [int(view) for view in chosen if (views.images[int(view)] == views.images[int(view)][:1, :1]).all()]
-    return [views.names[view] for view in plain], len(chosen)
+    rows = even_indices(len(views), PHOTOGRAPHS)
+    plain = [int(view) for view in rows if (views.images[int(view)] == views.images[int(view)][:1, :1]).all()]
+    return [views.names[view] for view in plain], len(rows)
 
 
 def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
@@ -159,11 +159,11 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
         views: with depth.
         limit: largest number of views to look at, evenly spaced.
     """
-    chosen = even_indices(len(views), limit)
-    names = tuple(views.names[int(view)] for view in chosen)
-    small = depth_views(views, chosen)
+    rows = even_indices(len(views), limit)
+    names = tuple(views.names[int(view)] for view in rows)
+    small = depth_views(views, rows)
     stated = stated_reading(small)
-    best = _best_reading(stated, small, chosen, views)
+    best = _best_reading(stated, small, rows, views)
     comparable = best.agreement.compared >= _needed(small)
     findings = _reading_findings(stated, best) if comparable else []
     fits = comparable and best.agreement.share >= UNFIT
@@ -171,9 +171,9 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
     color, registration = float("nan"), None
     other: list[Finding] = []
     if views.images is not None and fits:
-        registration = fit_registration(views, chosen, best.views)
+        registration = fit_registration(views, rows, best.views)
         findings = _with_registration(findings, registration)
-        grey = grey_pictures(views, chosen, small.depths.shape[1:])
+        grey = grey_pictures(views, rows, small.depths.shape[1:])
         Ks = small.Ks.copy()
         if registration.differs:
             Ks[:, :2, :2] *= registration.focal_factor
@@ -187,7 +187,7 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
                 else [Finding(cause="photographs", message=UNRELATED_MESSAGE.format(color=color))]
             )
     return DepthCheck(
-        views=chosen,
+        views=rows,
         stated=stated.agreement,
         best=best.agreement,
         offsets=pair_offsets(residuals(best.views)),
@@ -205,12 +205,12 @@ def suspicious_depth(views: Views, *, limit: int = 10) -> tuple[Agreement, Findi
         views: with depth, two or more.
         limit: largest number of views to look at.
     """
-    chosen = even_indices(len(views), limit)
-    small = depth_views(views, chosen)
+    rows = even_indices(len(views), limit)
+    small = depth_views(views, rows)
     stated = stated_reading(small)
     if stated.agreement.compared >= _needed(small) and stated.agreement.share >= SUSPICIOUS:
         return stated.agreement, None
-    best = _best_reading(stated, small, chosen, views)
+    best = _best_reading(stated, small, rows, views)
     if best.agreement.compared < _needed(small):
         return stated.agreement, None
     return stated.agreement, next(iter(_reading_findings(stated, best)), None)
@@ -221,11 +221,11 @@ def _needed(views: DepthViews) -> float:
     return COMPARABLE * len(views) * (len(views) - 1) * views.values.shape[1]
 
 
-def _best_reading(stated: Reading, depth: DepthViews, chosen: Int64[np.ndarray, " V"], views: Views) -> Reading:
+def _best_reading(stated: Reading, depth: DepthViews, rows: Int64[np.ndarray, " V"], views: Views) -> Reading:
     """The files' own reading, or another one that fits clearly better."""
     candidates = [
         reading
-        for reading in other_readings(depth, chosen, views.cameras.cam_from_world)
+        for reading in other_readings(depth, rows, views.cameras.cam_from_world)
         if reading.agreement.compared >= _needed(depth)
         and (reading.cause == "order" or reading.factor is None or _differs(reading.factor))
     ]

@@ -74,7 +74,7 @@ def fit_pose(views: DepthViews, view: int, normals: list[Float64[np.ndarray, "h 
     height, width = views.depths.shape[1:]
     for reach in REACHES:
         here = transform(motion, points)
-        left, right = np.zeros((6, 6)), np.zeros(6)
+        normal_matrix, normal_vector = np.zeros((6, 6)), np.zeros(6)
         for other in range(len(views)):
             if other == view:
                 continue
@@ -87,17 +87,21 @@ def fit_pose(views: DepthViews, view: int, normals: list[Float64[np.ndarray, "h 
             good = (measured > 0) & (np.abs(z - measured) <= reach * measured)
             normal = normals[other][rows[good], columns[good]]
             finite = np.isfinite(normal).all(axis=1)
-            normal, moved = normal[finite], here[inside][good][finite]
+            normal, observed = normal[finite], here[inside][good][finite]
             # Along the ray of the pixel the surface lies at the measured depth.
             eye = invert_rigid(views.cam_from_world[other])[:3, 3]
-            target = eye + (moved - eye) * (measured[good] / z[good])[finite, None]
-            distance = np.einsum("ni,ni->n", moved - target, normal)
+            target = eye + (observed - eye) * (measured[good] / z[good])[finite, None]
+            distance = np.einsum("ni,ni->n", observed - target, normal)
             scale = HUBER * measured[good][finite]
             weight = np.minimum(1, scale / np.maximum(np.abs(distance), 1e-12)) / np.square(scale)
-            jacobian = np.hstack((np.cross(moved - center, normal), normal))
-            left += (jacobian * weight[:, None]).T @ jacobian
-            right -= jacobian.T @ (weight * distance)
-        step = np.linalg.solve(left + 1e-6 * np.trace(left) / 6 * np.eye(6), right) if left.any() else np.zeros(6)
+            jacobian = np.hstack((np.cross(observed - center, normal), normal))
+            normal_matrix += (jacobian * weight[:, None]).T @ jacobian
+            normal_vector -= jacobian.T @ (weight * distance)
+        step = (
+            np.linalg.solve(normal_matrix + 1e-6 * np.trace(normal_matrix) / 6 * np.eye(6), normal_vector)
+            if normal_matrix.any()
+            else np.zeros(6)
+        )
         turn = np.eye(4)
         turn[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
         turn[:3, 3] = center + step[3:] - turn[:3, :3] @ center

@@ -72,10 +72,10 @@ def find_background(paths: Sequence[Path]) -> Background | None:
     Raises:
         InputError: a file that is damaged.
     """
-    chosen = [paths[int(row)] for row in even_indices(len(paths), LOOKED_AT)]
-    if len(chosen) < MIN_PICTURES:
+    sample = [paths[int(row)] for row in even_indices(len(paths), LOOKED_AT)]
+    if len(sample) < MIN_PICTURES:
         return None
-    return _find(tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in chosen))
+    return _find(tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in sample))
 
 
 @lru_cache(maxsize=64)
@@ -179,5 +179,5 @@ def outline(path: Path, background: Background | None) -> tuple[Bool[np.ndarray,
     if background is None:
         return np.ones(picture.shape[:2], bool), np.zeros(picture.shape[:2], bool)
     region = background_pixels(picture, background.color, path)
-    used = ~ndimage.binary_dilation(region, iterations=SEAM)
-    return used, np.asarray(ndimage.binary_erosion(region, iterations=1, border_value=1))
+    foreground = ~ndimage.binary_dilation(region, iterations=SEAM)
+    return foreground, np.asarray(ndimage.binary_erosion(region, iterations=1, border_value=1))

@@ -68,10 +68,10 @@ def _camera(
     entry: dict[str, Any], where: str
 ) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "3 3"], tuple[int, int]]:
     """Pose, intrinsics and size (width, height)."""
-    known = (*POSES, *(name for names in INTRINSICS for name in names))
-    unknown = [str(key)[:40] for key in entry if key not in known]
+    keys = (*POSES, *(name for names in INTRINSICS for name in names))
+    unknown = [str(key)[:40] for key in entry if key not in keys]
     if unknown:
-        raise InputError(f"{where}: unknown keys {listed(unknown)}; expected {', '.join(known)}")
+        raise InputError(f"{where}: unknown keys {listed(unknown)}; expected {', '.join(keys)}")
     pose_key = _key(entry, POSES, where)
     pose = rigid_pose(read_matrix(entry, pose_key, where), f"{where}: {pose_key}")
     if pose_key == "transform_matrix":
@@ -96,8 +96,8 @@ def _key(entry: dict[str, Any], names: tuple[str, ...], where: str) -> str:
     """The one of these names that an object has."""
     there = [name for name in names if entry.get(name) is not None]
     if len(there) != 1:
-        wanted = " or ".join(names)
-        raise InputError(f"{where}: {wanted} is missing" if not there else f"{where}: expected {wanted}, got both")
+        expected = " or ".join(names)
+        raise InputError(f"{where}: {expected} is missing" if not there else f"{where}: expected {expected}, got both")
     return there[0]
 
 

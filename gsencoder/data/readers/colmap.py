@@ -151,8 +151,8 @@ def _load(model: Path) -> Any:
 
 def _check_text_counts(model: Path, reconstruction: Any) -> None:
     """Compares what was read with the counts in the files' comments: a text file cut short has no other sign."""
-    read = {"cameras": reconstruction.cameras, "images": reconstruction.images, "points3D": reconstruction.points3D}
-    for name, values in read.items():
+    entries = {"cameras": reconstruction.cameras, "images": reconstruction.images, "points3D": reconstruction.points3D}
+    for name, values in entries.items():
         with (model / f"{name}.txt").open(encoding="utf-8", errors="replace") as lines:
             for line in itertools.takewhile(lambda line: line.startswith("#"), lines):
                 promised = re.match(r"# Number of \w+: (\d{1,15})\b", line)

@@ -66,9 +66,9 @@ class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
         if path is None:
             return np.zeros((grid.height, grid.width), np.float32)
         if path.suffix.lower() == ".npy":
-            read = load_npy(path)
+            array = load_npy(path)
             with np.errstate(over="ignore"):
-                values = np.where(np.isfinite(read), read, 0).astype(np.float64)
+                values = np.where(np.isfinite(array), array, 0).astype(np.float64)
             if values.size and values.min() < 0:
                 raise InputError(f"{path}: depth has negative values")
         else:

@@ -151,8 +151,8 @@ def read_rgba(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray,
     Raises:
         InputError: unreadable, damaged, too large, or of a kind that is not color.
     """
-    with open_picture(path) as opened:
-        picture = _decode(path, opened)
+    with open_picture(path) as file:
+        picture = _decode(path, file)
         try:
             if picture.mode.startswith("I"):
                 wide = np.asarray(picture).astype(np.int64)
@@ -180,10 +180,10 @@ def read_small(path: Path, side: int) -> UInt8[np.ndarray, "h w 3"]:
     Raises:
         InputError: as `read_rgba`.
     """
-    with open_picture(path) as opened:
-        if opened.format == "JPEG":
-            opened.draft("RGB", (side, side))
-            picture = np.asarray(_decode(path, opened).convert("RGB"))
+    with open_picture(path) as file:
+        if file.format == "JPEG":
+            file.draft("RGB", (side, side))
+            picture = np.asarray(_decode(path, file).convert("RGB"))
         else:
             picture = read_rgba(path)[0]
     step = max(1, min(picture.shape[:2]) // side)
@@ -196,8 +196,8 @@ def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
     Raises:
         InputError: unreadable or damaged.
     """
-    with open_picture(path) as opened:
-        picture = _decode(path, opened)
+    with open_picture(path) as file:
+        picture = _decode(path, file)
         values, bands = np.asarray(picture), picture.getbands()
     if values.ndim == 2:
         return np.asarray(values != 0)
@@ -209,14 +209,14 @@ def read_integers(path: Path, what: str, *, wide: bool, data: io.BytesIO | None 
 
     With `data`, the content of the file is there already, and `path` names it in messages.
     """
-    with open_picture(path, data) as opened:
-        if opened.format == "JPEG":
+    with open_picture(path, data) as file:
+        if file.format == "JPEG":
             raise InputError(f"{path}: {what} was saved as JPEG, which changes values; expected PNG")
         allowed = DEEP_GREY + (() if wide else ("L", "P", "1"))
-        if opened.mode not in allowed:
+        if file.mode not in allowed:
             kind = "16-bit" if wide else "8- or 16-bit"
-            raise InputError(f"{path}: {what} must be a {kind} picture with one channel, got mode {opened.mode}")
-        values = np.asarray(_decode(path, opened)).astype(np.int32)
+            raise InputError(f"{path}: {what} must be a {kind} picture with one channel, got mode {file.mode}")
+        values = np.asarray(_decode(path, file)).astype(np.int32)
     if values.size and values.min() < 0:
         raise InputError(f"{path}: {what} has negative values")
     return values

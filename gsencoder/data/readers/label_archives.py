@@ -37,8 +37,8 @@ def members_by_stem(archive: Path) -> dict[str, Path]:
         InputError: it cannot be read as .zip, or two files have one stem.
     """
     try:
-        with zipfile.ZipFile(archive) as opened:
-            names = [name for name in opened.namelist() if name.lower().endswith(".png")]
+        with zipfile.ZipFile(archive) as file:
+            names = [name for name in file.namelist() if name.lower().endswith(".png")]
     except (zipfile.BadZipFile, OSError, ValueError) as error:
         raise InputError(f"{archive}: cannot be read as .zip: {' '.join(str(error).split())[:120]}") from error
     members: dict[str, Path] = {}
@@ -74,11 +74,11 @@ def member_bytes(path: Path) -> io.BytesIO:
     archive = archive_of(path)
     name = path.relative_to(archive).as_posix()
     try:
-        with zipfile.ZipFile(archive) as opened:
-            size = opened.getinfo(name).file_size
+        with zipfile.ZipFile(archive) as file:
+            size = file.getinfo(name).file_size
             if size > MAX_MEMBER_BYTES:
                 raise InputError(f"{path}: {size:,} bytes; a label image has at most {MAX_MEMBER_BYTES:,}")
-            return io.BytesIO(opened.read(name))
+            return io.BytesIO(file.read(name))
     except InputError:
         raise
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, KeyError, RuntimeError, NotImplementedError) as error:

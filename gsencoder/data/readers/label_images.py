@@ -108,5 +108,5 @@ def _load_safetensors(path: Path) -> np.ndarray:
                 return np.asarray(stored.get_tensor(names[0]))
     except (OSError, SafetensorError, ValueError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: cannot be read as .safetensors: {' '.join(str(error).split())[:120]}") from error
-    got = f"the shape {list(shape)}" if len(names) == 1 else f"{len(names)} arrays"
-    raise InputError(f"{path}: expected one array [H, W] of labels, got {got}")
+    actual = f"the shape {list(shape)}" if len(names) == 1 else f"{len(names)} arrays"
+    raise InputError(f"{path}: expected one array [H, W] of labels, got {actual}")

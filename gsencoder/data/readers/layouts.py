@@ -109,9 +109,9 @@ def _read_tum(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
     return posed, root
 
 
-def _reader_of(read: Callable[..., PosedImages]) -> Callable[[Path, ReadOptions], tuple[PosedImages, Path]]:
+def _reader_of(reader: Callable[..., PosedImages]) -> Callable[[Path, ReadOptions], tuple[PosedImages, Path]]:
     return lambda root, options: (
-        read(root, allow_outside=options.allow_outside, depth_scale=options.depth_scale),
+        reader(root, allow_outside=options.allow_outside, depth_scale=options.depth_scale),
         root,
     )
 

@@ -48,9 +48,9 @@ class _OutlineFiles(PictureFiles[Bool[np.ndarray, "H W"]]):
         if path is None:
             return None
         state = path.stat()
-        used, empty = _last_outline(path, self._background, state.st_mtime_ns, state.st_size)
-        self.check_size(view, used.shape)
-        return used, empty
+        foreground, empty = _last_outline(path, self._background, state.st_mtime_ns, state.st_size)
+        self.check_size(view, foreground.shape)
+        return foreground, empty
 
     def _fitted(self, view: int, pixels: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "h w"]:
         """Pixels of the file as pixels of the view."""

@@ -53,11 +53,11 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
                 max_pixels=_count(row, "max_pixels", where, 0),
             )
         )
-    seen: set[int] = set()
+    ids: set[int] = set()
     for item in objects:
-        if item.id in seen:
+        if item.id in ids:
             raise InputError(f"{path}: id {item.id} belongs to several objects")
-        seen.add(item.id)
+        ids.add(item.id)
     return tuple(objects)
 
 

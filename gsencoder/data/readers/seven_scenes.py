@@ -49,8 +49,8 @@ def read_seven_scenes(root: Path, *, allow_outside: bool = False, depth_scale: f
     """
     matches = sorted((match, path) for path in root.iterdir() if (match := _frame_of(path)))
     skipped = SkippedFrames(str(root), len(matches))
-    stated = root / INTRINSICS_FILE
-    K = read_numbers(stated, (3, 3), (4, 4))[:3, :3] if stated.is_file() else None
+    intrinsics_file = root / INTRINSICS_FILE
+    K = read_numbers(intrinsics_file, (3, 3), (4, 4))[:3, :3] if intrinsics_file.is_file() else None
     images: list[PosedImage] = []
     without_depth: list[str] = []
     for stem, color in matches:
@@ -71,7 +71,7 @@ def read_seven_scenes(root: Path, *, allow_outside: bool = False, depth_scale: f
                 f"{root}: no {INTRINSICS_FILE} with K of the depth camera, and the pictures are no Kinect's"
             )
         depth_K = np.array([[KINECT_DEPTH_FOCAL, 0, 320], [0, KINECT_DEPTH_FOCAL, 240], [0, 0, 1]]) if K is None else K
-        camera = pinhole_of(depth_K[0, 0], depth_K[1, 1], depth_K[0, 2], depth_K[1, 2], color, str(stated))
+        camera = pinhole_of(depth_K[0, 0], depth_K[1, 1], depth_K[0, 2], depth_K[1, 2], color, str(intrinsics_file))
         pose = invert_rigid(rigid_pose(matrix, str(pose_file)))
         depth_camera, depth_from_color = None, None
         if depth_K[0, 0] == KINECT_DEPTH_FOCAL and picture_size(color) == KINECT_SIZE:

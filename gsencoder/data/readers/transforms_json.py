@@ -122,25 +122,25 @@ def read_transforms(
             ("mask", ("mask_path",)),
             ("instance", ("instance_file_path",)),
         ):
-            listed = next((frame[key] for key in keys if frame.get(key) is not None), None)
+            file_name = next((frame[key] for key in keys if frame.get(key) is not None), None)
             beside[kind] = None
-            if listed is None:
+            if file_name is None:
                 continue
-            if not isinstance(listed, str):
-                raise InputError(f"{where}: {keys[0]} must be a path, got {str(listed)[:40]!r}")
+            if not isinstance(file_name, str):
+                raise InputError(f"{where}: {keys[0]} must be a path, got {str(file_name)[:40]!r}")
             home = masks if kind == "mask" and masks is not None else root
-            file = inside(home, listed, where, allow_outside=allow_outside)
+            file = inside(home, file_name, where, allow_outside=allow_outside)
             if file.is_file():
                 beside[kind] = file
             else:
-                missing[kind].append(listed)
+                missing[kind].append(file_name)
         camera = _camera(data, frame, image, where)
-        stated = number(data | frame, "depth_unit_scale_factor", where)
+        file_scale = number(data | frame, "depth_unit_scale_factor", where)
         if frame.get("depth_file_path") is None:
-            stated = number(data | frame, "integer_depth_scale", where) if frame.get("depth_path") else None
-        elif stated is not None:
+            file_scale = number(data | frame, "integer_depth_scale", where) if frame.get("depth_path") else None
+        elif file_scale is not None:
             metric_depth = True
-        scale = next(value for value in (depth_scale, stated, NERFSTUDIO_DEPTH_SCALE) if value is not None)
+        scale = next(value for value in (depth_scale, file_scale, NERFSTUDIO_DEPTH_SCALE) if value is not None)
         if not 0 < scale < math.inf:
             raise InputError(f"{where}: the depth scale must be positive, got {scale}")
         pose = rigid_pose(read_matrix(frame, "transform_matrix", where), where)
@@ -201,11 +201,11 @@ def _depth_sensor(
     """The camera of the depth map and where it stands, from `depth_camera` and `depth_from_color`; None = as the
     photograph's."""
     camera = None
-    stated = values.get("depth_camera")
-    if stated is not None and depth is not None:
-        if not isinstance(stated, dict):
+    camera_keys = values.get("depth_camera")
+    if camera_keys is not None and depth is not None:
+        if not isinstance(camera_keys, dict):
             raise InputError(f"{where}: depth_camera must be an object with fl_x, fl_y, cx and cy")
-        camera = _camera({}, stated, depth, f"{where}: depth_camera")
+        camera = _camera({}, camera_keys, depth, f"{where}: depth_camera")
     if values.get("depth_from_color") is None:
         return camera, None
     return camera, rigid_pose(read_matrix(values, "depth_from_color", where), f"{where}: depth_from_color")
@@ -248,10 +248,10 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
     both = data | {key: value for key, value in frame.items() if value is not None}
     size = []
     for key, actual in zip(("w", "h"), picture_size(image), strict=True):
-        stated = number(both, key, where)
-        if stated is not None and stated != actual:
+        pixels = number(both, key, where)
+        if pixels is not None and pixels != actual:
             raise InputError(
-                f"{where}: {key} is {stated:g} but the image {image} has {actual} pixels; give the images at the size "
+                f"{where}: {key} is {pixels:g} but the image {image} has {actual} pixels; give the images at the size "
                 "of the intrinsics (image_scale makes them smaller on load)"
             )
         size.append(actual)

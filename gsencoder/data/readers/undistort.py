@@ -159,7 +159,7 @@ def _project(
 ) -> tuple[Float64[np.ndarray, "P 2"], Bool[np.ndarray, " P"]]:
     """Where pixels of the pinhole K lie in the distorted picture, and which of them are usable."""
     rays = unproject_points(pixels, np.ones(len(pixels)), K)
-    used = np.hypot(rays[:, 0], rays[:, 1]) <= math.tan(MAX_HALF_FIELD)
+    valid = np.hypot(rays[:, 0], rays[:, 1]) <= math.tan(MAX_HALF_FIELD)
     if camera.is_pinhole:
         where = np.ascontiguousarray(project_points(rays, intrinsic_matrix(*camera.pinhole_params())))
     else:
@@ -167,10 +167,10 @@ def _project(
         where = np.asarray(converted.img_from_cam(rays), dtype=np.float64)
         back = np.asarray(converted.cam_from_img(np.nan_to_num(where)), dtype=np.float64)
         with np.errstate(invalid="ignore", over="ignore"):
-            used &= (np.abs(back - rays[:, :2]) * (K[0, 0], K[1, 1])).max(axis=1) <= PIXEL_TOLERANCE
+            valid &= (np.abs(back - rays[:, :2]) * (K[0, 0], K[1, 1])).max(axis=1) <= PIXEL_TOLERANCE
     with np.errstate(invalid="ignore"):
-        used &= (where >= 0).all(axis=1) & (where <= (camera.width, camera.height)).all(axis=1)
-    return where, used
+        valid &= (where >= 0).all(axis=1) & (where <= (camera.width, camera.height)).all(axis=1)
+    return where, valid
 
 
 def pinhole_for(camera: CameraModel, where: str) -> Pinhole:
@@ -201,10 +201,10 @@ def pinhole_for(camera: CameraModel, where: str) -> Pinhole:
                 low, high = (low, middle) if covered(middle) else (middle, high)
             zoom = high
         coarse = np.stack(np.meshgrid(np.linspace(0.5, w - 0.5, 33), np.linspace(0.5, h - 0.5, 33)), -1).reshape(-1, 2)
-        used = _project(camera, intrinsic_matrix(fx * zoom, fy * zoom, cx, cy), coarse)[1].mean()
-        if used < MIN_USED:
+        share = _project(camera, intrinsic_matrix(fx * zoom, fy * zoom, cx, cy), coarse)[1].mean()
+        if share < MIN_USED:
             raise InputError(
-                f"{where}: {camera.model} with {list(camera.params)} can be inverted on only {used:.0%} of its pixels "
+                f"{where}: {camera.model} with {list(camera.params)} can be inverted on only {share:.0%} of its pixels "
                 "within 170°; check the calibration, or undistort the images yourself"
             )
     return Pinhole(fx=fx * zoom, fy=fy * zoom, cx=cx, cy=cy, width=w, height=h)
@@ -259,8 +259,8 @@ class Remap:
 def build_remap(target: Pinhole, source: CameraModel) -> Remap:
     """The exact map from the pixels of `target` to those of `source`, both looking from the same place."""
     pixels = pixel_centers(target.width, target.height).reshape(-1, 2)
-    where, used = _project(source, target.matrix(target.width, target.height), pixels)
-    where[~used] = np.nan
+    where, valid = _project(source, target.matrix(target.width, target.height), pixels)
+    where[~valid] = np.nan
     grid = where.astype(np.float32).reshape(target.height, target.width, 2)
     return Remap(x=np.ascontiguousarray(grid[..., 0]), y=np.ascontiguousarray(grid[..., 1]))
 
@@ -290,9 +290,9 @@ class RemapCache:
             if remap is None:
                 remap = build_remap(target, source)
                 size = remap.x.nbytes + remap.y.nbytes
-                held = sum(r.x.nbytes + r.y.nbytes for r in self._remaps.values())
-                while self._remaps and held + size > self._budget:
-                    dropped = self._remaps.pop(next(iter(self._remaps)))
-                    held -= dropped.x.nbytes + dropped.y.nbytes
+                size_of_all = sum(r.x.nbytes + r.y.nbytes for r in self._remaps.values())
+                while self._remaps and size_of_all + size > self._budget:
+                    oldest = self._remaps.pop(next(iter(self._remaps)))
+                    size_of_all -= oldest.x.nbytes + oldest.y.nbytes
             self._remaps[(target, source)] = remap
             return remap

@@ -98,16 +98,16 @@ def covered_share(photographs: Photographs, views: Sequence[int], points: Float3
         width, height = int(cameras.widths[view]), int(cameras.heights[view])
         cell, mask = max(1.0, CELL * max(width, height)), photographs.mask(view)
         across, down = math.ceil(width / cell), math.ceil(height / cell)
-        used, reached = np.ones((down, across), bool), np.zeros((down, across), bool)
+        in_mask, covered = np.ones((down, across), bool), np.zeros((down, across), bool)
         if mask is not None:
-            used[:] = False
+            in_mask[:] = False
             rows, columns = (mask.nonzero().numpy() / cell).astype(np.int64).T
-            used[rows, columns] = True
+            in_mask[rows, columns] = True
         pixels, depths = cameras.project(points.astype(np.float64), view)
         columns, rows = (pixels[cameras.in_image(pixels, depths, view)] / cell).astype(np.int64).T
-        reached[rows, columns] = True
-        if used.any():
-            shares.append(float(reached[used].mean()))
+        covered[rows, columns] = True
+        if in_mask.any():
+            shares.append(float(covered[in_mask].mean()))
     return float(np.mean(shares)) if shares else 0.0
 
 

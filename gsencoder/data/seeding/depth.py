@@ -114,8 +114,8 @@ def read_rgbd(views: Views, view: int) -> tuple[Float32[np.ndarray, "H W"], UInt
     size = (int(views.cameras.heights[view]), int(views.cameras.widths[view]))
     for kind, array in (("depth", depth), ("image", image)):
         if array.shape[:2] != size:
-            got, expected = "×".join(map(str, array.shape[1::-1])), f"{size[1]}×{size[0]}"
-            raise InputError(f"view {views.names[view]!r}: the {kind} is {got}, but its camera says {expected}")
+            actual, expected = "×".join(map(str, array.shape[1::-1])), f"{size[1]}×{size[0]}"
+            raise InputError(f"view {views.names[view]!r}: the {kind} is {actual}, but its camera says {expected}")
     bad = np.count_nonzero(~np.isfinite(depth) | (depth < 0))
     if bad:
         raise InputError(
@@ -162,11 +162,11 @@ def _smooth(inverse, valid, step):
                 left, inner = abs(dx), width - 2 * abs(dx)
                 # Slices that start at 0 are added without a test of each index, eight pixels at a time.
                 ahead, behind = inverse[y + dy, left + dx :], inverse[y - dy, left - dx :]
-                known, too = valid[y + dy, left + dx :], valid[y - dy, left - dx :]
+                valid_ahead, valid_behind = valid[y + dy, left + dx :], valid[y - dy, left - dx :]
                 middle, sums, weights = center[left:], total[left:], weight[left:]
                 for x in range(inner):
                     pair = ahead[x] + behind[x]
-                    fits = known[x] & too[x] & (abs(pair - (middle[x] + middle[x])) < step)
+                    fits = valid_ahead[x] & valid_behind[x] & (abs(pair - (middle[x] + middle[x])) < step)
                     sums[x] += pair * fits
                     weights[x] += fits + fits
         for x in range(width):
@@ -185,17 +185,17 @@ def _gradient(inverse, valid, step):
     height, width = inverse.shape
     gradient, astray = np.zeros_like(inverse), np.zeros(inverse.shape, np.bool_)
     steps = np.zeros(width + 3, inverse.dtype)
-    known = np.zeros(width + 3, np.bool_)
+    has_step = np.zeros(width + 3, np.bool_)
     occlusion, flatter = np.float32(OCCLUSION), np.float32(BETWEEN)
     for y in range(height):
         # steps[x + 1] and steps[x + 2] lead to pixel x and on from it; there are none beyond the border.
         for x in range(1, width):
-            known[x + 1] = valid[y, x] & valid[y, x - 1]
-            steps[x + 1] = inverse[y, x] - inverse[y, x - 1] if known[x + 1] else 0
+            has_step[x + 1] = valid[y, x] & valid[y, x - 1]
+            steps[x + 1] = inverse[y, x] - inverse[y, x - 1] if has_step[x + 1] else 0
         for x in range(width):
             before, after = steps[x + 1], steps[x + 2]
-            if not (known[x + 1] and known[x + 2]):
-                gradient[y, x] = before if known[x + 1] else after
+            if not (has_step[x + 1] and has_step[x + 2]):
+                gradient[y, x] = before if has_step[x + 1] else after
                 continue
             smaller = min(abs(before), abs(after))
             steep = smaller > step

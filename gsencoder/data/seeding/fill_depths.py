@@ -109,9 +109,9 @@ def splat_depths(
 
 def interpolate(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """Fills depths of 0 with means of ever larger surroundings (push–pull), in 1/depth, in which planes are linear."""
-    known = (depth > 0).float()
+    has_depth = (depth > 0).float()
     inverse = torch.where(depth > 0, 1 / depth.clamp(min=1e-9), 0)
-    levels: list[tuple[Tensor, Tensor]] = [(inverse, known)]
+    levels: list[tuple[Tensor, Tensor]] = [(inverse, has_depth)]
     while max(levels[-1][0].shape) > 1:
         value, weight = (
             torch.nn.functional.avg_pool2d(part[None], 2, ceil_mode=True)[0]

@@ -110,7 +110,7 @@ def seed_from_tsdf(
         block_count=10_000,
         device=core.Device("CPU:0"),
     )
-    used = 0
+    count = 0
     for view in range(len(views)):
         depth, image = read_rgbd(views, view)
         if views.masks is not None:
@@ -118,7 +118,7 @@ def seed_from_tsdf(
         far = float(depth.max(initial=0)) if max_depth is None else max_depth
         if not (depth > 0).any():
             continue
-        used += 1
+        count += 1
         z = geometry.Image(core.Tensor(np.ascontiguousarray(depth)))
         rgb = geometry.Image(core.Tensor(np.ascontiguousarray(image, np.float32) / np.float32(255)))
         # open3d's pixel centers lie on whole numbers.
@@ -127,7 +127,7 @@ def seed_from_tsdf(
         intrinsic, pose = core.Tensor(K), core.Tensor(views.cameras.cam_from_world[view].astype(np.float64))
         touched = blocks.compute_unique_block_coordinates(z, intrinsic, pose, 1.0, far, truncation)
         blocks.integrate(touched, z, rgb, intrinsic, intrinsic, pose, 1.0, far, truncation)
-    if not used:
+    if not count:
         raise InputError(f"seeds: none of the {len(views)} views has a depth above 0")
     mesh = blocks.extract_triangle_mesh(min_weight)
     vertices = mesh.vertex.positions.numpy().astype(np.float32)
@@ -191,10 +191,10 @@ def _lattices(mesh: Any, vertices: np.ndarray, voxel: float, path: str | Path) -
     step = LATTICE * voxel
     columns = np.ceil(length / step)
     rows = np.ceil(np.divide(double_area, length, out=np.zeros_like(length), where=length > 0) / step)
-    needed = float((columns + 1) @ (rows + 1))
-    if needed > MAX_SAMPLES:
+    samples = float((columns + 1) @ (rows + 1))
+    if samples > MAX_SAMPLES:
         raise InputError(
-            f"{path}: covering the mesh every {step:g} units takes {needed:.3g} samples; its unit is not the voxel's: "
+            f"{path}: covering the mesh every {step:g} units takes {samples:.3g} samples; its unit is not the voxel's: "
             "give a larger voxel, or the scene's metres_per_unit"
         )
     columns, rows = columns.astype(np.int64), rows.astype(np.int64)

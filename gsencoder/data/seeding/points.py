@@ -123,6 +123,6 @@ def sheet_normals(
         variances, axes = np.linalg.eigh(around.transpose(0, 2, 1) @ around)
         normals[part] = axes[:, :, 0]
         thin, middle, wide = np.maximum(variances, 0).T
-        known = middle > 1e-9 * np.maximum(wide, 1e-300)
-        flatness[part] = np.where(known, np.sqrt(thin / np.where(known, middle, 1)), 1)
+        has_width = middle > 1e-9 * np.maximum(wide, 1e-300)
+        flatness[part] = np.where(has_width, np.sqrt(thin / np.where(has_width, middle, 1)), 1)
     return normals, flatness

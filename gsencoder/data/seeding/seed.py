@@ -135,8 +135,8 @@ def seed(scene: Scene, config: SeedConfig = SeedConfig(), *, track: Track = untr
         )
         return seed_from_mesh(mesh, voxel=voxel, origin=scene.origin)
     if views is None:
-        needed = "photographs" if source == "photographs" else "RGB-D frames"
-        raise InputError(f"seeds: scene {scene.name!r} has no views; source={source} needs posed {needed}")
+        inputs = "photographs" if source == "photographs" else "RGB-D frames"
+        raise InputError(f"seeds: scene {scene.name!r} has no views; source={source} needs posed {inputs}")
     if source == "photographs":
         # Sweeps need torch, which seeding from depth does without.
         from gsencoder.data.seeding.from_photographs import seed_from_photographs

@@ -25,17 +25,17 @@ def scene_spacing(means: Float32[np.ndarray, "N 3"]) -> float:
 
     if len(means) < 2:
         return 0.0
-    asking = means
+    queries = means
     every = len(means) // SPACING_SAMPLE
     if every > 1:
         # -0.0 and 0.0 are one place and must hash alike, hence the addition.
         bits = (means + np.float32(0)).view(np.uint32).astype(np.uint64)
         mixed = bits @ np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-        chosen = (mixed >> np.uint64(33)) % np.uint64(every) == 0
-        asking = means[chosen] if chosen.any() else means
+        sample = (mixed >> np.uint64(33)) % np.uint64(every) == 0
+        queries = means[sample] if sample.any() else means
     # Column 0 is the point itself.
     tree = cKDTree(means, balanced_tree=False, compact_nodes=False)
-    distances = np.asarray(tree.query(asking, k=min(NEIGHBOR, len(means) - 1) + 1, workers=thread_count())[0])
+    distances = np.asarray(tree.query(queries, k=min(NEIGHBOR, len(means) - 1) + 1, workers=thread_count())[0])
     if (distances[:, 1] == 0).any():
         distinct = np.unique(means, axis=0)
         return scene_spacing(distinct) if len(distinct) < len(means) else 0.0

@@ -47,7 +47,7 @@ class DepthMap(NamedTuple):
 
 
 def source_views(
-    cameras: Cameras, points: Float32[np.ndarray, "P 3"], chosen: Sequence[int], count: int
+    cameras: Cameras, points: Float32[np.ndarray, "P 3"], rows: Sequence[int], count: int
 ) -> dict[int, list[int]]:
     """For each of the chosen views the others to compare it with: those that share many points at a good angle.
 
@@ -55,12 +55,12 @@ def source_views(
     over a half.
     """
     exact = points.astype(np.float64)
-    inside = {view: cameras.in_image(*cameras.project(exact, view), view) for view in chosen}
+    inside = {view: cameras.in_image(*cameras.project(exact, view), view) for view in rows}
     centers = cameras.centers
     sources: dict[int, list[int]] = {}
-    for view in chosen:
+    for view in rows:
         ranked = []
-        for other in chosen:
+        for other in rows:
             both = np.flatnonzero(inside[view] & inside[other])
             if other == view or not both.size:
                 continue
@@ -105,8 +105,8 @@ def _planes(
             project_points(transform(source_from_reference, depth * corners), source.K, min_depth=1e-3 * near)
             for depth in (near, far)
         ]
-        moved = (ends[0] - ends[1]).norm(dim=-1)
-        longest = max(longest, float(moved.median()))
+        distances = (ends[0] - ends[1]).norm(dim=-1)
+        longest = max(longest, float(distances.median()))
     count = int(np.clip(np.ceil(longest / PLANE_STEP), 16, max_planes))
     return 1 / torch.linspace(1 / near, 1 / far, count)
 
@@ -268,7 +268,7 @@ def back_project(
     """The points and colors (RGB) of the pixels of all views whose depth is known (above 0)."""
     points, colors = [np.empty((0, 3), np.float32)], [np.empty((0, 3), np.uint8)]
     for view, depth in depths.items():
-        known = depth > 0
-        points.append(world_points(depth, photos[view], poses[view])[known].numpy())
-        colors.append((photos[view].image[known] * 255 + 0.5).to(torch.uint8).numpy())
+        has_depth = depth > 0
+        points.append(world_points(depth, photos[view], poses[view])[has_depth].numpy())
+        colors.append((photos[view].image[has_depth] * 255 + 0.5).to(torch.uint8).numpy())
     return np.concatenate(points), np.concatenate(colors)

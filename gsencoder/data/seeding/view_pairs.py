@@ -70,11 +70,11 @@ def overlaps(cameras: Cameras, distance: float) -> Float64[np.ndarray, "V V"]:
         rays = cameras.rays(view, np.stack([columns.ravel(), rows.ravel()], axis=1))
         points = (centers[view] + distance * np.array(DEPTHS)[:, None, None] * rays).reshape(-1, 3)
         pixels, depths = cameras.project(points)
-        seen = cameras.in_image(pixels, depths)
-        ours, theirs = points - centers[view], points - centers[:, None]
-        norms = np.linalg.norm(ours, axis=1) * np.linalg.norm(theirs, axis=2)
-        seen &= np.einsum("pi,vpi->vp", ours, theirs) > np.cos(MAX_ANGLE) * norms
-        shares[view] = seen.mean(axis=1)
+        in_view = cameras.in_image(pixels, depths)
+        directions, other_directions = points - centers[view], points - centers[:, None]
+        norms = np.linalg.norm(directions, axis=1) * np.linalg.norm(other_directions, axis=2)
+        in_view &= np.einsum("pi,vpi->vp", directions, other_directions) > np.cos(MAX_ANGLE) * norms
+        shares[view] = in_view.mean(axis=1)
     np.fill_diagonal(shares, 0)
     return shares
 

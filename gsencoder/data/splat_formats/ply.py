@@ -234,9 +234,9 @@ def _ascii_rows(path: Path, stream: BinaryIO, header: PlyHeader, vertex: PlyElem
     except ValueError as error:
         raise InputError(f"{path}: a row of the ascii .ply cannot be read: {str(error)[:120]}") from error
     if table.shape != (vertex.count, len(names)):
-        got = f"{table.shape[0]:,} rows of {table.shape[1]} numbers"
+        actual = f"{table.shape[0]:,} rows of {table.shape[1]} numbers"
         raise InputError(
-            f"{path}: expected {vertex.count:,} rows of {len(names)} numbers, got {got}; the file is truncated"
+            f"{path}: expected {vertex.count:,} rows of {len(names)} numbers, got {actual}; the file is truncated"
         )
     # Columns get names again; numbers stay float64, so that text with many digits keeps them.
     return table.view(np.dtype([(name, np.float64) for name in names])).reshape(-1)

@@ -91,12 +91,12 @@ def quats_from_smallest_three(
     The left-out component is √(1 − Σ others²), taken positive; the order of components is the caller's.
     """
     values = others.astype(np.float64)
-    missing = np.sqrt(np.maximum(0, 1 - np.square(values).sum(axis=1)))
+    largest_values = np.sqrt(np.maximum(0, 1 - np.square(values).sum(axis=1)))
     quats = np.empty((len(values), 4), np.float32)
     for column in range(4):
         before = values[:, column - 1] if column > 0 else values[:, 0]
         after = values[:, column] if column < 3 else values[:, 2]
-        quats[:, column] = np.where(largest == column, missing, np.where(largest < column, before, after))
+        quats[:, column] = np.where(largest == column, largest_values, np.where(largest < column, before, after))
     return quats
 
 
@@ -120,18 +120,18 @@ def unusable_rows(raw: RawSplat) -> dict[str, Bool[np.ndarray, " N"]]:
         bad_scales = ~((scales >= tiny) & np.isfinite(scales)).all(axis=1)
     defects = {"nonfinite": nonfinite, "quats": norms < 1e-24, "scales": bad_scales}
     defects["opacities"] = np.isinf(raw.logit_opacities)
-    seen = nonfinite
+    reported_rows = nonfinite
     for name in ("quats", "scales", "opacities"):
-        defects[name] = defects[name] & ~seen
-        seen = seen | defects[name]
+        defects[name] = defects[name] & ~reported_rows
+        reported_rows = reported_rows | defects[name]
     return defects
 
 
-def check_expansion(path: Path, wanted: int, size: int) -> None:
+def check_expansion(path: Path, unpacked: int, size: int) -> None:
     """Refuses a file that claims to unpack to far more than any real one does."""
     allowed = max(MAX_EXPANSION * size, ALWAYS_ALLOWED)
-    if wanted > allowed:
+    if unpacked > allowed:
         raise InputError(
-            f"{path}: claims to unpack to {wanted:,} bytes from {size:,}, more than {MAX_EXPANSION} times its size; "
+            f"{path}: claims to unpack to {unpacked:,} bytes from {size:,}, more than {MAX_EXPANSION} times its size; "
             "the file is damaged or made to exhaust memory"
         )

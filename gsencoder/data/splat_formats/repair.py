@@ -170,8 +170,10 @@ def _mend(fix: str, raw: RawSplat) -> tuple[RawSplat, list[RepairChange]]:
     if fix == "scales":
         with np.errstate(over="ignore"):
             endless = rows & np.isinf(np.exp(raw.log_scales)).any(axis=1)
-        raised = np.where(rows[:, None], np.maximum(raw.log_scales, np.float32(np.log(SMALLEST_SCALE))), raw.log_scales)
-        return replace(raw, log_scales=raised).select(~endless), [
+        log_scales = np.where(
+            rows[:, None], np.maximum(raw.log_scales, np.float32(np.log(SMALLEST_SCALE))), raw.log_scales
+        )
+        return replace(raw, log_scales=log_scales).select(~endless), [
             RepairChange(fix=fix, count=count - int(endless.sum()), action="scales raised to 1e-9"),
             RepairChange(fix=fix, count=int(endless.sum()), action="dropped, scale infinite"),
         ]

@@ -61,19 +61,19 @@ def read_spz(path: Path, stream: BinaryIO, size: int) -> RawSplat:
     import imagecodecs
 
     parts = []
-    for number, wanted in enumerate(sizes):
+    for number, expected_size in enumerate(sizes):
         packed, unpacked = struct.unpack_from("<QQ", data, table + 16 * number)
-        if unpacked != wanted or offset + packed > size:
+        if unpacked != expected_size or offset + packed > size:
             raise InputError(
                 f"{path}: stream {number} claims {packed:,} bytes that unpack to {unpacked:,}; {count:,} rows need "
-                f"{wanted:,}, and the file has {size - offset:,} left; it is truncated or damaged"
+                f"{expected_size:,}, and the file has {size - offset:,} left; it is truncated or damaged"
             )
         try:
-            part = imagecodecs.zstd_decode(data[offset : offset + packed], out=wanted)
+            part = imagecodecs.zstd_decode(data[offset : offset + packed], out=expected_size)
         except imagecodecs.ZstdError as error:
             raise InputError(f"{path}: stream {number} cannot be unpacked: {error}") from error
-        if len(part) != wanted:
-            raise InputError(f"{path}: stream {number} unpacks to {len(part):,} bytes, expected {wanted:,}")
+        if len(part) != expected_size:
+            raise InputError(f"{path}: stream {number} unpacks to {len(part):,} bytes, expected {expected_size:,}")
         parts.append(part)
         offset += packed
     return _decode(b"".join(parts), count, degree, bits, version)

@@ -75,7 +75,7 @@ def plan_room(seed: int = 0, *, objects: int = 8) -> tuple[PlannedObject, ...]:
     furniture = _furniture()
     names = [list(_CATALOGUE)[row] for row in rng.permutation(len(_CATALOGUE))[:objects]]
     colors = [OBJECT_COLORS[row % len(OBJECT_COLORS)] for row in _shuffled(rng, objects)]
-    placed: list[tuple[float, np.ndarray]] = []
+    circles: list[tuple[float, np.ndarray]] = []
     things = []
     # Wide things first: small ones fit between them.
     order = sorted(range(objects), key=lambda row: -_radius(_CATALOGUE[names[row]][1]()))
@@ -83,7 +83,7 @@ def plan_room(seed: int = 0, *, objects: int = 8) -> tuple[PlannedObject, ...]:
     for row in order:
         on_floor, build = _CATALOGUE[names[row]]
         parts = build()
-        homes[row] = _find_home(rng, _radius(parts), on_floor, placed)
+        homes[row] = _find_home(rng, _radius(parts), on_floor, circles)
     for row in range(objects):
         parts = _CATALOGUE[names[row]][1]()
         yaw = float(rng.uniform(-np.pi, np.pi))
@@ -99,7 +99,7 @@ def _shuffled(rng: np.random.Generator, count: int) -> list[int]:
 
 
 def _find_home(
-    rng: np.random.Generator, radius: float, on_floor: bool, placed: list[tuple[float, np.ndarray]]
+    rng: np.random.Generator, radius: float, on_floor: bool, circles: list[tuple[float, np.ndarray]]
 ) -> Float64[np.ndarray, "3"]:
     """A free spot of a support, where a disc of `radius` touches no other and does not stick out."""
     table = (np.zeros(2), np.array(TABLE[:2]), TABLE[2])
@@ -118,9 +118,9 @@ def _find_home(
         if (room < 0).any():
             continue
         spot = np.append(center + rng.uniform(-room, room), height)
-        clear = all(np.hypot(*(spot - other)[:2]) > radius + reach + GAP for reach, other in placed)
+        clear = all(np.hypot(*(spot - other)[:2]) > radius + reach + GAP for reach, other in circles)
         if clear:
-            placed.append((radius, spot))
+            circles.append((radius, spot))
             return spot
     raise InputError("synthetic room: no free place for all objects; ask for fewer")
 

@@ -61,16 +61,16 @@ def make_room(
     plan = plan_room(seed, objects=objects)
     cameras = _cameras(seed, views, width, height)
     surfaces = [_Surface(part, thing) for thing in plan for part in thing.parts]
-    seen = [_cast(surfaces, cameras, view) for view in range(views)]
-    instances = [labels for _, _, labels in seen]
+    pictures = [_cast(surfaces, cameras, view) for view in range(views)]
+    instances = [labels for _, _, labels in pictures]
     return Scene(
         name=f"room_{seed:03d}",
         gaussians=_gaussians(surfaces, spacing),
         views=Views(
             cameras=cameras,
             names=tuple(f"images/{view:03d}.png" for view in range(views)),
-            images=[image for image, _, _ in seen],
-            depths=[depth for _, depth, _ in seen],
+            images=[image for image, _, _ in pictures],
+            depths=[depth for _, depth, _ in pictures],
             instances=instances,
         ),
         metres_per_unit=1.0,

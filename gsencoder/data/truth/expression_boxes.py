@@ -48,12 +48,12 @@ def boxes_from_labels(expressions: Iterable[Expression], labels: MeshLabels) -> 
         InputError: an object that the labels do not have.
     """
     boxes = labels.boxes(aligned=True)
-    known = {number for number, _ in labels.objects}
+    ids = {number for number, _ in labels.objects}
     result = []
     for each in expressions:
         # Labels have objectId + 1, so that 0 is none.
         number = each.object_id + 1
-        if number not in known:
+        if number not in ids:
             raise InputError(f"{each.scene}: its labels have no object with the objectId {each.object_id}")
         if each.aabb is None and number in boxes:
             (x0, y0, z0), (x1, y1, z1) = (corner.tolist() for corner in boxes[number])

@@ -126,8 +126,8 @@ def ids_of_names(names: Iterable[str], mapping: Mapping[str, int], classes: Clas
     ids = {name: mapping.get(name, 0) for name in unique}
     if classes is None:
         return ids
-    known = set(classes.ids)
-    return {name: number if number in known else 0 for name, number in ids.items()}
+    numbers = set(classes.ids)
+    return {name: number if number in numbers else 0 for name, number in ids.items()}
 
 
 def vertex_classes(

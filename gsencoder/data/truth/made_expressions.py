@@ -81,8 +81,8 @@ def _of_scene(scene: SeenScene, seed: int, per_object: int, per_scene: int) -> l
     expressions = []
     for row in sorted(shuffled[:per_scene] if per_scene else shuffled):
         thing, ways = described[row]
-        chosen = [ways[way] for way in rng.permutation(len(ways))[:per_object]]
-        for number, (text, others) in enumerate(chosen):
+        wordings = [ways[way] for way in rng.permutation(len(ways))[:per_object]]
+        for number, (text, others) in enumerate(wordings):
             expressions.append(_made(scene, thing, text, others, number))
     return expressions
 

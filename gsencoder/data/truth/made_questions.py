@@ -79,13 +79,13 @@ def make_questions(scenes: Iterable[SeenScene], config: QuestionsConfig = Questi
     if len({scene.name for scene in scenes}) < len(scenes):
         raise InputError("questions: two scenes have one name")
     units = {scene.name: scene_units(scene, config) for scene in scenes}
-    chosen = balanced(units, config.balance)
-    if not chosen:
+    questions = balanced(units, config.balance)
+    if not questions:
         raise InputError(
             f"questions: nothing can be asked about {len(scenes)} scenes: no named object is shown by "
             f"{config.min_pixels} pixels and is clear"
         )
-    return chosen
+    return questions
 
 
 def scene_rng(seed: int, scene: str, part: int) -> np.random.Generator:
@@ -121,15 +121,15 @@ def balanced(units: Mapping[str, Mapping[Kind, Sequence[Unit]]], equal: bool) ->
     }
     counts = [sum(len(unit) for _, _, unit in one) for one in by_kind.values() if one]
     most = min(counts, default=0)
-    chosen: list[Question] = []
+    numbered: list[Question] = []
     for kind, ranked in by_kind.items():
         selected = ranked[: -(-most // len(ranked[0][2]))] if equal and ranked else ranked
         numbers: dict[str, int] = {}
         for _, name, unit in sorted(selected, key=lambda one: (one[1], one[0])):
             for question in unit:
                 numbers[name] = numbers.get(name, -1) + 1
-                chosen.append(replace(question, id=f"{name}-{kind}-{numbers[name]}"))
-    return tuple(chosen)
+                numbered.append(replace(question, id=f"{name}-{kind}-{numbers[name]}"))
+    return tuple(numbered)
 
 
 def kind_of(question: Question) -> Kind | None:
@@ -188,12 +188,12 @@ def _where(scene: SeenScene, thing: SeenObject, things: Sequence[SeenObject]) ->
     """Where a thing is: on what, and beside what, as far as this is clear; the first of both is what must be seen."""
     on, beside = supporter(thing, things), neighbor(thing, things)
     answers: list[str] = []
-    needed: list[SeenObject] = []
+    objects: list[SeenObject] = []
     for word, other in (("on", on), ("next to", beside)):
         if other is not None and scene.shown(other):
             answers.append(f"{word} the {other.name}")
-            needed = needed or [thing, other]
-    return _question(scene, f"Where {_be(thing)} the {thing.name}?", answers, needed) if answers else None
+            objects = objects or [thing, other]
+    return _question(scene, f"Where {_be(thing)} the {thing.name}?", answers, objects) if answers else None
 
 
 def _there(name: str) -> str:
@@ -204,15 +204,15 @@ def _be(thing: SeenObject) -> str:
     return "are" if thing.name and is_plural(thing.name) else "is"
 
 
-def _question(scene: SeenScene, text: str, answers: Sequence[str], needed: Sequence[SeenObject]) -> Question:
+def _question(scene: SeenScene, text: str, answers: Sequence[str], objects: Sequence[SeenObject]) -> Question:
     return Question(
         dataset="scanqa",
         id="",
         scene=scene.name,
         text=text,
         answers=tuple(answers),
-        object_ids=tuple(thing.id for thing in needed),
-        object_names=tuple(thing.name or "" for thing in needed),
+        object_ids=tuple(thing.id for thing in objects),
+        object_names=tuple(thing.name or "" for thing in objects),
     )
 
 

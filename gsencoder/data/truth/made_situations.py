@@ -65,8 +65,8 @@ def _of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
             continue
         if clearly_nearer(first, second) and second - first >= CLEAR_DISTANCE:
             pairs.add((at.id, one.id))
-            named = sorted((one, other), key=lambda thing: str(thing.name))
-            text = f"Which is closer to me, the {named[0].name} or the {named[1].name}?"
+            pair = sorted((one, other), key=lambda thing: str(thing.name))
+            text = f"Which is closer to me, the {pair[0].name} or the {pair[1].name}?"
             # What one faces must not tell which is the nearer one.
             facing, aside = (one, other) if number % 2 else (other, one)
             nearer.append(_question(scene, at, facing, [aside], text, str(one.name)))
@@ -108,15 +108,15 @@ def _question(
     position = at.center - middle
     ahead = facing.center - at.center
     turn = float(np.arctan2(ahead[1], ahead[0]))
-    needed = [at, facing, *others]
+    objects = [at, facing, *others]
     return Question(
         dataset="sqa3d",
         id="",
         scene=scene.name,
         text=text,
         answers=(answer,),
-        object_ids=tuple(thing.id for thing in needed),
-        object_names=tuple(str(thing.name) for thing in needed),
+        object_ids=tuple(thing.id for thing in objects),
+        object_names=tuple(str(thing.name) for thing in objects),
         situation=f"I am standing at the {at.name} and facing the {facing.name}.",
         position=(float(position[0]), float(position[1]), 0.0),
         rotation=(float(np.cos(turn / 2)), 0.0, 0.0, float(np.sin(turn / 2))),

@@ -107,8 +107,8 @@ def _read_triangles(
                 "or its faces are not triangles"
             )
         stream.seek(start)
-        read = np.fromfile(stream, faces.triangle, faces.count)
-        counts, rows = read["n"], read["v"].astype(np.int64)
+        records = np.fromfile(stream, faces.triangle, faces.count)
+        counts, rows = records["n"], records["v"].astype(np.int64)
     if (counts != 3).any():
         row = int(np.flatnonzero(counts != 3)[0])
         raise InputError(f"{path}: face {row:,} has {counts[row]} vertices; expected triangles")

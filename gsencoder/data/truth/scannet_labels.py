@@ -133,15 +133,15 @@ def read_axis_alignment(path: Path) -> Float64[np.ndarray, "4 4"] | None:
         InputError: unreadable, or a line that is not a rigid transform.
     """
     lines = read_checked_text(path, max_bytes=MAX_META_BYTES).splitlines()
-    stated = [words for words in (line.partition("=") for line in lines) if words[0].strip() == "axisAlignment"]
-    if not stated:
+    entries = [words for words in (line.partition("=") for line in lines) if words[0].strip() == "axisAlignment"]
+    if not entries:
         return None
     try:
-        values = np.array(stated[-1][2].split(), np.float64)
+        values = np.array(entries[-1][2].split(), np.float64)
     except ValueError:
         values = np.zeros(0)
     if len(values) != 16:
-        raise InputError(f"{path}: axisAlignment: expected 16 numbers, got {stated[-1][2].strip()[:60]!r}")
+        raise InputError(f"{path}: axisAlignment: expected 16 numbers, got {entries[-1][2].strip()[:60]!r}")
     rigid_pose(values.reshape(4, 4), f"{path}: axisAlignment")
     # As it is written, as benchmarks apply it, and not the nearest rotation.
     return values.reshape(4, 4)

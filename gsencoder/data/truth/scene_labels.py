@@ -197,21 +197,21 @@ def with_counted_views(scene: Scene) -> Scene:
         )
     ids = np.array([each.id for each in scene.objects], np.int64)
     order = np.argsort(ids)
-    shown, largest = np.zeros(len(ids), np.int64), np.zeros(len(ids), np.int64)
+    view_counts, largest = np.zeros(len(ids), np.int64), np.zeros(len(ids), np.int64)
     for view in range(len(scene.views)):
         instances = scene.views.instances[view]
         if scene.views.masks is not None:
             instances = instances[scene.views.masks[view]]
         values, counts = np.unique(instances, return_counts=True)
         rows = np.minimum(np.searchsorted(ids[order], values), len(ids) - 1)
-        known = ids[order][rows] == values
-        rows, counts = order[rows[known]], counts[known]
-        shown[rows] += 1
+        has_row = ids[order][rows] == values
+        rows, counts = order[rows[has_row]], counts[has_row]
+        view_counts[rows] += 1
         largest[rows] = np.maximum(largest[rows], counts)
     return replace(
         scene,
         objects=tuple(
             replace(each, views=int(views), max_pixels=int(pixels))
-            for each, views, pixels in zip(scene.objects, shown, largest, strict=True)
+            for each, views, pixels in zip(scene.objects, view_counts, largest, strict=True)
         ),
     )

@@ -111,10 +111,10 @@ class SegmentVertices:
             InputError: it names a segment that no vertex of the mesh belongs to.
         """
         rows = np.searchsorted(self._numbers, group.segments)
-        missing = self._numbers[np.minimum(rows, len(self._numbers) - 1)] != group.segments
-        if missing.any():
+        unknown = self._numbers[np.minimum(rows, len(self._numbers) - 1)] != group.segments
+        if unknown.any():
             raise InputError(
-                f"{path}: objectId {group.id} ({group.label[:40]!r}) names segment {group.segments[missing][0]}, which "
+                f"{path}: objectId {group.id} ({group.label[:40]!r}) names segment {group.segments[unknown][0]}, which "
                 f"no vertex has in {self._path}; expected both of one scan"
             )
         return np.concatenate(

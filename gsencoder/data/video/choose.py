@@ -58,9 +58,9 @@ def follow(pictures: Iterable[UInt8[np.ndarray, "H W"]]) -> Course:
             positions.append(positions[-1] if positions else 0.0)
             base = positions[-1]
             continue
-        moved = median_motion(reference, half)
-        positions.append(max(positions[-1], base + moved / half.shape[1]))
-        if moved >= MOVED:
+        motion = median_motion(reference, half)
+        positions.append(max(positions[-1], base + motion / half.shape[1]))
+        if motion >= MOVED:
             reference, base = half, positions[-1]
     return Course(np.array(positions, np.float64), np.array(sharpness, np.float64))
 

@@ -66,9 +66,9 @@ class Video:
         self._av = load_av()
         with self._open() as container:
             stream = container.streams.video[0]
-            stated = stream.duration * stream.time_base if stream.duration else (container.duration or 0) / TIME_BASE
+            duration = stream.duration * stream.time_base if stream.duration else (container.duration or 0) / TIME_BASE
             self.pixel_aspect = float(stream.sample_aspect_ratio or 1)
-        self.seconds, self.decoded = float(stated), 0.0
+        self.seconds, self.decoded = float(duration), 0.0
         self.failure: str | None = None
 
     def _open(self) -> Any:

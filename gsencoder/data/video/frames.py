@@ -90,24 +90,24 @@ def take_frames(
             stacklevel=2,
         )
     try:
-        chosen = choose_frames(course, motion=config.motion, most=config.frames, least=min(FEWEST, config.frames))
+        numbers = choose_frames(course, motion=config.motion, most=config.frames, least=min(FEWEST, config.frames))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    apart = float(course.positions[-1]) / max(1, len(chosen) - 1)
+    apart = float(course.positions[-1]) / max(1, len(numbers) - 1)
     if apart > THIN:
         warnings.warn(
-            f"{path}: {len(chosen)} frames are {apart:.0%} of the picture's width apart, and overlap little; "
+            f"{path}: {len(numbers)} frames are {apart:.0%} of the picture's width apart, and overlap little; "
             f"video.frames={int(course.positions[-1] / config.motion)} takes them closer together",
             SceneWarning,
             stacklevel=2,
         )
     names: list[str] = []
-    selected = set(chosen.tolist())
-    for index, frame in track(enumerate(video.frames()), f"taking {len(chosen)} frames"):
+    selected = set(numbers.tolist())
+    for index, frame in track(enumerate(video.frames()), f"taking {len(numbers)} frames"):
         if index in selected:
             names.append(f"frame_{index:06d}.jpg")
             _write(folder / names[-1], color_picture(frame, config.pixels, video.pixel_aspect))
-        if index == chosen[-1]:
+        if index == numbers[-1]:
             break
     digests = {name: sha256_of(folder / name) for name in names}
     with atomic_file(folder / RECORD_FILE) as stream:

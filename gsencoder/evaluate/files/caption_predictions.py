@@ -91,15 +91,15 @@ def write_named_captions(
         InputError: captions of other objects, two of one, or the file cannot be written.
     """
     names = {(each.scene, each.object_id): each.object_name for each in objects}
-    written: dict[str, list[str]] = {}
+    captions_of: dict[str, list[str]] = {}
     for each in captions:
         if (each.scene, each.object_id) not in names:
             raise InputError(f"{path}: object {each.object_id} of {each.scene} is captioned and is not in the truth")
         key = f"{each.scene}|{each.object_id}|{names[each.scene, each.object_id]}"
-        if key in written:
+        if key in captions_of:
             raise InputError(f"{path}: {key[:80]} has two captions; expected one")
-        written[key] = [wrapped_caption(each.caption)]
-    write_json(path, written)
+        captions_of[key] = [wrapped_caption(each.caption)]
+    write_json(path, captions_of)
 
 
 def _box(row: Entry, scene: str) -> CaptionedBox:

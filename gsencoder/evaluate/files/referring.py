@@ -163,8 +163,8 @@ def _boxes(row: Entry) -> Float64[np.ndarray, "K 2 3"]:
         boxes = single
     else:
         if not isinstance(several, list) or len(several) > MAX_BOXES:
-            got = f"{len(several):,}" if isinstance(several, list) else shown(several)
-            raise InputError(f"{where}: bboxes must be a list of at most {MAX_BOXES:,} boxes, got {got}")
+            actual = f"{len(several):,}" if isinstance(several, list) else shown(several)
+            raise InputError(f"{where}: bboxes must be a list of at most {MAX_BOXES:,} boxes, got {actual}")
         boxes = [corner_bounds(box, where, f"bboxes[{index}]") for index, box in enumerate(several)]
         if single and single != boxes[:1]:
             raise InputError(f"{where}: bbox is not the first of bboxes")

@@ -73,14 +73,14 @@ def scene_files(
     if foreign:
         some = listed(sorted(true_files), 3)
         raise InputError(f"{predicted[foreign[0]]}: there is no truth of this scene in {truth}; it has {some}")
-    chosen = sorted(true_files if scenes is None else set(scenes))
-    unknown = [scene for scene in chosen if scene not in true_files]
+    names = sorted(true_files if scenes is None else set(scenes))
+    unknown = [scene for scene in names if scene not in true_files]
     if unknown:
         raise InputError(f"{truth}: no truth of {counted(len(unknown), 'scene')} to score: {listed(unknown)}")
-    missing = [scene for scene in chosen if scene not in predicted]
+    missing = [scene for scene in names if scene not in predicted]
     if missing:
         raise InputError(f"{predictions}: no prediction of {counted(len(missing), 'scene')}: {listed(missing)}")
-    return tuple(SceneFiles(scene=s, prediction=predicted[s], truth=true_files[s]) for s in chosen)
+    return tuple(SceneFiles(scene=s, prediction=predicted[s], truth=true_files[s]) for s in names)
 
 
 def _true_files(truth: Path, scans: bool) -> dict[str, Path]:

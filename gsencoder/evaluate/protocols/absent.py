@@ -91,9 +91,9 @@ def words_to_ask(
         min_views: smallest number of views in which an object is seen.
         min_pixels: smallest number of pixels that an object has in the view that shows it best.
     """
-    named = [each for each in objects if each.name]
-    present = {each.name for each in named if is_seen(each, min_views=min_views, min_pixels=min_pixels)}
-    return sorted(name for name in present if name), sorted(set(vocabulary) - {each.name for each in named})
+    with_names = [each for each in objects if each.name]
+    present = {each.name for each in with_names if is_seen(each, min_views=min_views, min_pixels=min_pixels)}
+    return sorted(name for name in present if name), sorted(set(vocabulary) - {each.name for each in with_names})
 
 
 def evaluate_absent(
@@ -127,9 +127,9 @@ def evaluate_absent(
     for loaded_scene, load_seconds in scenes:
         scene, features, seconds = with_features(with_counted_views(loaded_scene), source, seeds)
         start = time.perf_counter()
-        asked = ask_words(scene, features, words, vocabulary, protocol, localization)
+        outcomes = ask_words(scene, features, words, vocabulary, protocol, localization)
         seconds = {"load": load_seconds, **seconds, "localize": time.perf_counter() - start}
-        results.append(SceneWords(scene=scene.name, words=tuple(asked), seconds=seconds))
+        results.append(SceneWords(scene=scene.name, words=tuple(outcomes), seconds=seconds))
     return results
 
 
@@ -152,14 +152,14 @@ def ask_words(
         # That words have no box is the result here, not a fault.
         warnings.filterwarnings("ignore", ".*words have no box", SceneWarning)
         result = localize(replace(scene, features={features.space.name: features}), names, words, localization)
-    missing = result.absent
+    absent_names = result.absent
     return [
         AskedWord(
             scene=scene.name,
             word=name,
             present=number < len(present),
             probability=float(result.probabilities[number]),
-            boxed=name not in missing,
+            boxed=name not in absent_names,
         )
         for number, name in enumerate(names)
     ]
@@ -263,8 +263,8 @@ def probabilities_by_word(scenes: Sequence[SceneWords]) -> dict[str, dict[str, A
     """For each word the numbers of scenes in which it is present and absent, and its mean probability in both; the
     words that these tell least apart come first. Means without scenes are NaN."""
     words: dict[str, tuple[list[float], list[float]]] = {}
-    for asked in (word for scene in scenes for word in scene.words):
-        words.setdefault(asked.word, ([], []))[0 if asked.present else 1].append(asked.probability)
+    for outcome in (word for scene in scenes for word in scene.words):
+        words.setdefault(outcome.word, ([], []))[0 if outcome.present else 1].append(outcome.probability)
     table = {
         word: {
             "present": len(present),

@@ -87,10 +87,10 @@ def predict_instances(
     else:
         numbers = list(points.named_ids())
         cosines = class_cosines(features, [points.rows_of(number) for number in numbers], classes.names, text)
-        seen = np.flatnonzero(np.isfinite(cosines).all(axis=1))
-        shares = np.exp((cosines[seen] - cosines[seen].max(axis=1, keepdims=True, initial=-1)) / TEMPERATURE)
+        rows = np.flatnonzero(np.isfinite(cosines).all(axis=1))
+        shares = np.exp((cosines[rows] - cosines[rows].max(axis=1, keepdims=True, initial=-1)) / TEMPERATURE)
         shares /= shares.sum(axis=1, keepdims=True)
-        masks = [points.objects == numbers[row] for row in seen]
+        masks = [points.objects == numbers[row] for row in rows]
         labels = [classes.ids[number] for number in shares.argmax(axis=1)]
         scores = [float(each) for each in shares.max(axis=1, initial=0)]
     return prediction_of_masks(scene.name, masks, labels, scores, num_vertices=len(points))

@@ -157,12 +157,12 @@ def naming_scores(scenes: Sequence[NamingCounts], protocol: NamingProtocol = Nam
         raise InputError(
             f"naming: no name has {protocol.min_gaussians} Gaussians or more; lower protocol.min_gaussians"
         )
-    named = [accuracy for name, accuracy in accuracies.items() if name != "other"]
+    of_names = [accuracy for name, accuracy in accuracies.items() if name != "other"]
     gaussians = sum(total[name] for name in accuracies)
     order = sorted(accuracies, key=lambda name: (accuracies[name], name))
     return {
         "accuracy": float(np.mean(list(accuracies.values()))),
-        "accuracy_named": float(np.mean(named)) if named else float("nan"),
+        "accuracy_named": float(np.mean(of_names)) if of_names else float("nan"),
         "accuracy_gaussians": sum(correct[name] for name in accuracies) / gaussians,
         "cosine": float(np.mean([scene.cosine for scene in scenes])),
         "names": {name: {"gaussians": total[name], "accuracy": accuracies[name]} for name in order},

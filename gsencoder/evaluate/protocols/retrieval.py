@@ -159,11 +159,11 @@ def score_views(
     for row, view in enumerate(views):
         b = blend(scene.gaussians, scene.views.cameras, view, stride=protocol.stride)
         pixels = pixel_features(products, b, memory=memory, mode=protocol.mode)
-        shown = pixels.alpha > 0
-        if not shown.any():
+        covered = pixels.alpha > 0
+        if not covered.any():
             continue
         for start in range(0, len(directions), BLOCK_TEXTS):
             block = slice(start, start + BLOCK_TEXTS)
-            cosines = np.clip(pixels.cosines(directions[block])[:, shown], -1, 1)
+            cosines = np.clip(pixels.cosines(directions[block])[:, covered], -1, 1)
             scores[row, block] = cosines.max(axis=1) if protocol.pooling == "max" else cosines.mean(axis=1)
     return scores

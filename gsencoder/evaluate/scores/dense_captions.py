@@ -181,10 +181,10 @@ def score_named_captions(
     """
     _check(objects, {each.scene for each in captions})
     caption_of: dict[tuple[str, int], str] = {}
-    known = {(each.scene, each.object_id) for each in objects}
+    keys = {(each.scene, each.object_id) for each in objects}
     for each in captions:
         key = each.scene, each.object_id
-        if key in caption_of or key not in known:
+        if key in caption_of or key not in keys:
             wrong = "has two captions" if key in caption_of else "is no object of the truth"
             raise InputError(f"object {each.object_id} of {each.scene} {wrong}")
         caption_of[key] = each.caption

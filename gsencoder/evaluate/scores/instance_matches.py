@@ -110,7 +110,7 @@ def match_instances(
     number = 1 if class_agnostic else len(classes.names)
     void = instance_rows < 0
     instance_rows = np.where(ids == 0, -1, instance_rows)
-    counted = (instance_rows >= 0) & (ids >= IDS_PER_CLASS) & (sizes >= min_region)
+    in_score = (instance_rows >= 0) & (ids >= IDS_PER_CLASS) & (sizes >= min_region)
     other_classes = int((rows < 0).sum())
     large = np.flatnonzero((rows >= 0) & (np.diff(prediction.offsets) >= min_region))
     rows, scores, areas = rows[large], prediction.scores[large], np.diff(prediction.offsets)[large]
@@ -127,14 +127,14 @@ def match_instances(
     groups = same & (ids < IDS_PER_CLASS)
     ignored = (common * (void + small.astype(np.int64) + groups)).sum(axis=1) / np.maximum(areas, 1)
 
-    outcomes = [_outcomes(pairs, counted, scores, ignored, overlap) for overlap in OVERLAPS]
+    outcomes = [_outcomes(pairs, in_score, scores, ignored, overlap) for overlap in OVERLAPS]
     of_instance = np.concatenate([owners for owners, _, _ in outcomes])
     hits = np.concatenate([right for _, right, _ in outcomes])
-    multiple = np.bincount(pairs.predictions[(pairs.ious > OVERLAPS.min()) & counted[pairs.instances]], minlength=1)
+    multiple = np.bincount(pairs.predictions[(pairs.ious > OVERLAPS.min()) & in_score[pairs.instances]], minlength=1)
     return SceneMatches(
         scene=truth.scene,
         class_agnostic=class_agnostic,
-        truths=np.bincount(instance_rows[counted], minlength=number),
+        truths=np.bincount(instance_rows[in_score], minlength=number),
         predictions=np.bincount(rows, minlength=number),
         scores=scores,
         shared=int((multiple > 1).sum()),
@@ -163,22 +163,22 @@ def _distinct(
 
 def _outcomes(
     pairs: _Pairs,
-    counted: Bool[np.ndarray, " I"],
+    in_score: Bool[np.ndarray, " I"],
     scores: Float64[np.ndarray, " M"],
     ignored: Float64[np.ndarray, " M"],
     overlap: float,
 ) -> tuple[Int64[np.ndarray, " K"], Bool[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
     """The outcomes at one threshold: a prediction of the class of each, whether it is a match, and its score."""
     above = pairs.ious > overlap
-    candidates = np.flatnonzero(above & counted[pairs.instances])
+    candidates = np.flatnonzero(above & in_score[pairs.instances])
     candidates = candidates[np.lexsort((pairs.predictions[candidates], pairs.instances[candidates]))]
-    taken: set[int] = set()
+    used_predictions: set[int] = set()
     matched: dict[int, tuple[int, float]] = {}
     wrong: list[tuple[int, float]] = []
     for prediction, instance in zip(
         pairs.predictions[candidates].tolist(), pairs.instances[candidates].tolist(), strict=True
     ):
-        if prediction in taken:
+        if prediction in used_predictions:
             continue
         score = float(scores[prediction])
         if instance in matched:
@@ -187,7 +187,7 @@ def _outcomes(
             matched[instance] = owner, max(best, score)
             wrong.append((prediction, min(best, score)))
         else:
-            taken.add(prediction)
+            used_predictions.add(prediction)
             matched[instance] = prediction, score
     alone = np.ones(len(scores), bool)
     alone[pairs.predictions[above]] = False

@@ -76,20 +76,20 @@ def ptb_tokens(texts: Sequence[str], tools: JavaTools) -> list[str]:
         InputError: Java fails, or takes too long.
     """
     lines = [" ".join(_BREAKS.sub(" ", text).split()) for text in texts]
-    sent = [row for row, line in enumerate(lines) if line]
+    rows = [row for row, line in enumerate(lines) if line]
     tokens = [""] * len(texts)
-    if not sent:
+    if not rows:
         return tokens
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "sentences.txt"
-        file.write_bytes("\n".join(lines[row] for row in sent).encode("utf-8", "replace"))
+        file.write_bytes("\n".join(lines[row] for row in rows).encode("utf-8", "replace"))
         command = [tools.java, *ENCODING, "-cp", str(tools.folder / TOKENIZER)]
         command += ["edu.stanford.nlp.process.PTBTokenizer", "-preserveLines", "-lowerCase", str(file)]
         output = _run(command, "the PTB tokenizer")
     cut = output.removesuffix("\n").split("\n")
-    if len(cut) != len(sent):
-        raise InputError(f"the PTB tokenizer gave {len(cut):,} lines for {len(sent):,} texts; expected as many")
-    for row, line in zip(sent, cut, strict=True):
+    if len(cut) != len(rows):
+        raise InputError(f"the PTB tokenizer gave {len(cut):,} lines for {len(rows):,} texts; expected as many")
+    for row, line in zip(rows, cut, strict=True):
         tokens[row] = " ".join(token for token in line.rstrip().split(" ") if token not in PUNCTUATION)
     return tokens
 
@@ -181,16 +181,16 @@ class _Conversation:
 def _run(command: Sequence[str], what: str) -> str:
     """What a program writes."""
     try:
-        done = subprocess.run(
+        process = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, timeout=SECONDS, env=_environment(), check=False
         )
     except subprocess.TimeoutExpired:
         raise InputError(f"{what}: Java did not end within {SECONDS:,} seconds; score fewer samples at once") from None
     except OSError as error:
         raise InputError(f"{what}: Java cannot be started: {error.strerror or error}") from error
-    if done.returncode:
-        raise InputError(f"{what}: Java ended with code {done.returncode}: {_end(done.stderr)}")
-    return done.stdout.decode("utf-8", "replace")
+    if process.returncode:
+        raise InputError(f"{what}: Java ended with code {process.returncode}: {_end(process.stderr)}")
+    return process.stdout.decode("utf-8", "replace")
 
 
 def _environment() -> dict[str, str]:

@@ -119,9 +119,9 @@ def recognize(
     """
     _refuse_repeated([item.key for item in truth], "truth")
     _refuse_repeated([item.key for item in predictions], "predictions")
-    known, names = {item.key for item in truth}, set(classes)
+    keys, names = {item.key for item in truth}, set(classes)
     for item in predictions:
-        if item.key not in known:
+        if item.key not in keys:
             raise InputError(f"{described(item.key)} is predicted, and not in the truth")
         wrong = next((name for name in item.names if name not in names), None)
         if wrong is not None:

@@ -157,8 +157,8 @@ def compare_boxes(
     _refuse_repeated([item.key for item in truth], "is there twice in the truth; expected each once")
     _refuse_repeated([item.key for item in predictions], "is predicted twice; expected each once")
     prediction_of = {prediction.key: prediction for prediction in predictions}
-    known = {item.key for item in truth}
-    unknown = next((key for key in prediction_of if key not in known), None)
+    keys = {item.key for item in truth}
+    unknown = next((key for key in prediction_of if key not in keys), None)
     if unknown is not None:
         raise InputError(f"{described(unknown)} is predicted, and not in the truth")
     results, skipped = [], 0
@@ -216,10 +216,12 @@ def _refuse_repeated(keys: Sequence[tuple[str, str, str]], problem: str) -> None
         raise InputError(f"{described(repeated[0])} {problem}")
 
 
-def _agreed(true: bool | None, said: bool | None, what: str, key: tuple[str, str, str]) -> bool | None:
-    if true is not None and said is not None and true != said:
-        raise InputError(f"{described(key)}: {what} is {int(said)} in the prediction, and {int(true)} in the truth")
-    return said if true is None else true
+def _agreed(true: bool | None, predicted: bool | None, what: str, key: tuple[str, str, str]) -> bool | None:
+    if true is not None and predicted is not None and true != predicted:
+        raise InputError(
+            f"{described(key)}: {what} is {int(predicted)} in the prediction, and {int(true)} in the truth"
+        )
+    return predicted if true is None else true
 
 
 def _table(ious: Float64[np.ndarray, " n"], results: Sequence[ReferringResult]) -> ReferringTable:

@@ -126,11 +126,11 @@ def count_labels(
         )
     number = len(classes.names)
     true_rows, rows = classes.rows(truth), classes.rows(predicted)
-    counted = true_rows >= 0
+    with_class = true_rows >= 0
     columns = np.where(rows < 0, number, rows)
-    cells = np.bincount(true_rows[counted] * (number + 1) + columns[counted], minlength=number * (number + 1))
+    cells = np.bincount(true_rows[with_class] * (number + 1) + columns[with_class], minlength=number * (number + 1))
     return LabelCounts(
-        scene=scene, confusion=cells.reshape(number, number + 1), ignored=int(len(truth) - counted.sum())
+        scene=scene, confusion=cells.reshape(number, number + 1), ignored=int(len(truth) - with_class.sum())
     )
 
 

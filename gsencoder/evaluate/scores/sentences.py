@@ -78,12 +78,12 @@ def score_sentences(
         raise InputError(f"PTB tokens need Java and its archives: {tools}; or take tokens=python")
     ptb = tokens in ("auto", "ptb") and not isinstance(tools, str)
     if tokens == "given":
-        spoken, written = list(hypotheses), [list(sentences) for sentences in references]
+        candidates, truths = list(hypotheses), [list(sentences) for sentences in references]
     else:
-        spoken, written = _tokenized(hypotheses, references, tools if ptb else None)
-    each_bleu = bleu(spoken, written)
-    each_rouge, each_cider = rouge_l(spoken, written), cider(spoken, written)
-    whole, each = (None, None) if isinstance(tools, str) else meteor(spoken, written, tools)
+        candidates, truths = _tokenized(hypotheses, references, tools if ptb else None)
+    each_bleu = bleu(candidates, truths)
+    each_rouge, each_cider = rouge_l(candidates, truths), cider(candidates, truths)
+    whole, each = (None, None) if isinstance(tools, str) else meteor(candidates, truths, tools)
     b1, b2, b3, b4 = each_bleu[0].tolist()
     return SentenceScores(
         tokens=GIVEN_TOKENS if tokens == "given" else PTB_TOKENS if ptb else PYTHON_TOKENS,

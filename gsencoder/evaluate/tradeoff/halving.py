@@ -63,11 +63,11 @@ def draw_settings(values: Mapping[str, Sequence[Any]], count: int, seed: int) ->
     total = math.prod(len(values[name]) for name in names)
     if total <= count:
         return [dict(zip(names, combination, strict=True)) for combination in product(*values.values())]
-    chosen = np.random.default_rng(seed).choice(total, size=count, replace=False)
+    numbers = np.random.default_rng(seed).choice(total, size=count, replace=False)
     shape = [len(values[name]) for name in names]
     return [
         {name: values[name][index] for name, index in zip(names, np.unravel_index(number, shape), strict=True)}
-        for number in np.sort(chosen)
+        for number in np.sort(numbers)
     ]
 
 
@@ -86,14 +86,14 @@ def successive_halving(
         config: settings.
     """
     rungs: list[Rung] = []
-    current, used = list(settings), min(config.first, scenes)
+    current, count = list(settings), min(config.first, scenes)
     while current:
-        costs = np.asarray(evaluate(current, used), np.float64).reshape(len(current), -1)
+        costs = np.asarray(evaluate(current, count), np.float64).reshape(len(current), -1)
         order = [current[index] for index in best_first(costs)]
-        last = used == scenes
+        last = count == scenes
         survivors = order if last else order[: max(LEAST, math.ceil(config.keep * len(order) - 1e-9))]
-        rungs.append(Rung(scenes=used, settings=tuple(current), survivors=tuple(survivors)))
+        rungs.append(Rung(scenes=count, settings=tuple(current), survivors=tuple(survivors)))
         if last:
             break
-        current, used = survivors, min(scenes, max(used + 1, round(used / config.keep)))
+        current, count = survivors, min(scenes, max(count + 1, round(count / config.keep)))
     return rungs

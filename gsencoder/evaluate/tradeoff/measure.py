@@ -60,10 +60,10 @@ def measure(
     """
     complete = [(with_knobs(stage.base, stage.knobs, knobs), knobs) for knobs in settings]
     for path in track(list(paths), f"{stage.name}: scenes"):
-        missing = [each for each in complete if not records.get(stage.name, path.name, each[1]).is_complete(rounds)]
-        if missing:
+        unfinished = [each for each in complete if not records.get(stage.name, path.name, each[1]).is_complete(rounds)]
+        if unfinished:
             with stage.open(path) as scene:
-                _measure_scene(stage, scene, path.name, missing, records, rounds, seed, track)
+                _measure_scene(stage, scene, path.name, unfinished, records, rounds, seed, track)
     return [[records.get(stage.name, path.name, knobs) for path in paths] for _, knobs in complete]
 
 

@@ -43,14 +43,14 @@ class PackageScene:
         return target
 
     def judge(self, product: Path, settings: PackageSettings) -> Judged:
-        written = sum(file.stat().st_size for file in product.iterdir() if file.name != SPLAT_FILE)
+        size = sum(file.stat().st_size for file in product.iterdir() if file.name != SPLAT_FILE)
         # Arrays for other programs hold the features as they are.
         features: GaussianFeatures = self._features
         if settings.form in ("compact", "index"):
             features = select_features(load_package(product), None)[1]
         error = field_error(features, self._features)
         scores = {"error": Score(error.total), **hit_scores(self._taught.hits(features))}
-        return Judged(scores=scores, bytes=written)
+        return Judged(scores=scores, bytes=size)
 
 
 def packages_stage(inputs: Inputs) -> Stage:

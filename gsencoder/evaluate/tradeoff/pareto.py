@@ -19,8 +19,8 @@ def non_dominated_ranks(costs: Float64[np.ndarray, "n k"]) -> Int64[np.ndarray, 
     ranks = np.full(len(values), -1, np.int64)
     rank = 0
     while (ranks < 0).any():
-        left = ranks < 0
-        front = left & ~dominates[left].any(axis=0)
+        unranked = ranks < 0
+        front = unranked & ~dominates[unranked].any(axis=0)
         ranks[front] = rank
         rank += 1
     return ranks

@@ -82,10 +82,10 @@ def picture(stages: Sequence[StageResult]) -> bytes:
 
 def _panel(axes: Any, stage: StageResult) -> None:
     accuracy = stage.stage.accuracy
-    shown = _measured(stage)
-    colors = {name: f"C{number}" for number, name in enumerate(dict.fromkeys(map(_group, shown)))}
+    settings = _measured(stage)
+    colors = {name: f"C{number}" for number, name in enumerate(dict.fromkeys(map(_group, settings)))}
     labeled: set[str] = set()
-    for each in shown:
+    for each in settings:
         group, point = _group(each), (each.cost(stage.cost), each.score(accuracy))
         is_base = each.phase == "base"
         axes.scatter(
@@ -107,7 +107,7 @@ def _panel(axes: Any, stage: StageResult) -> None:
     axes.xaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "235" else "")
     axes.grid(alpha=0.3)
     axes.set_axisbelow(True)
-    if shown:
+    if settings:
         axes.legend(fontsize=7)
 
 

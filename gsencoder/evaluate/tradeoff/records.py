@@ -90,9 +90,9 @@ class Records:
         if folder is None:
             return
         self._identity = json.dumps(plain(dict(identity)), sort_keys=True).encode()
-        written = folder / IDENTITY_FILE
-        with readable(written):
-            other = written.is_file() and written.read_bytes() != self._identity
+        path = folder / IDENTITY_FILE
+        with readable(path):
+            other = path.is_file() and path.read_bytes() != self._identity
         if other and (folder / RECORDS_FILE).is_file():
             raise InputError(
                 f"{folder}: holds measurements of a sweep with other settings; give resume=false to begin anew, or "

@@ -103,21 +103,21 @@ class DenseTeacher:
         self.space: FeatureSpace = replace(teacher.space, channels=channels, text_encoder="")
         self._maps = {view: self._dense(teacher.feature_map(views, view)) for view in range(len(views))}
 
-    def _dense(self, made: FeatureMap) -> FeatureMap:
+    def _dense(self, coded: FeatureMap) -> FeatureMap:
         channels = self.space.channels
-        if made.features is not None:
-            features = made.features[..., :channels]
+        if coded.features is not None:
+            features = coded.features[..., :channels]
         else:
-            assert made.table is not None
-            table = made.table[:, :channels]
-            if made.codes is not None:
-                features = np.where((made.codes < 0)[..., None], np.float32(np.nan), table[made.codes])
+            assert coded.table is not None
+            table = coded.table[:, :channels]
+            if coded.codes is not None:
+                features = np.where((coded.codes < 0)[..., None], np.float32(np.nan), table[coded.codes])
             else:
-                assert made.shares is not None
-                features = made.shares @ table
+                assert coded.shares is not None
+                features = coded.shares @ table
         return FeatureMap(
             features=np.ascontiguousarray(features, np.float32),
-            grid_from_image=made.grid_from_image,
+            grid_from_image=coded.grid_from_image,
             space=self.space,
         )
 

@@ -97,20 +97,20 @@ def values_of(stage: Stage, sweep: SweepConfig) -> dict[str, tuple[Any, ...]]:
         InputError: a value of another type, or one that the stage refuses.
     """
     values = dict(_given(text) for text in sweep.values)
-    chosen: dict[str, tuple[Any, ...]] = {}
+    by_name: dict[str, tuple[Any, ...]] = {}
     for knob in stage.knobs:
         if sweep.knobs and knob.name not in sweep.knobs:
             continue
-        tried = knob.values
+        candidates = knob.values
         if knob.name in values:
-            tried = tuple(read_value(stage.base, knob, text) for text in values[knob.name])
-        chosen[knob.name] = tuple(dict.fromkeys((value_at(stage.base, knob.key), *tried)))
-    return chosen
+            candidates = tuple(read_value(stage.base, knob, text) for text in values[knob.name])
+        by_name[knob.name] = tuple(dict.fromkeys((value_at(stage.base, knob.key), *candidates)))
+    return by_name
 
 
 def _given(text: str) -> tuple[str, list[str]]:
-    name, colon, listed = text.partition(":")
-    values = [value for value in listed.split("/") if value]
+    name, colon, text_of_values = text.partition(":")
+    values = [value for value in text_of_values.split("/") if value]
     if not colon or not values:
         raise InputError(f"sweep.values: expected KNOB:VALUE/VALUE, got {text!r}")
     return name, values
@@ -127,8 +127,8 @@ def check_sweep(stages: Sequence[Stage], sweep: SweepConfig) -> None:
     names = [_given(text)[0] for text in sweep.values]
     if (repeated := first_repeated(names)) is not None:
         raise InputError(f"sweep.values: {repeated[0]} is given twice; give all of its values at once")
-    for option, listed in (("knobs", sweep.knobs), ("values", names)):
-        for name in listed:
+    for option, names_of_option in (("knobs", sweep.knobs), ("values", names)):
+        for name in names_of_option:
             if name not in knob_names:
                 raise InputError(
                     f"sweep.{option}: {name!r} is no knob of {', '.join(stage.name for stage in stages)}; expected "
@@ -152,9 +152,9 @@ def settings_of(stage: Stage, sweep: SweepConfig) -> list[Knobs]:
         return [changed_knobs(stage.base, stage.knobs, each) for each in draw_settings(values, count, sweep.seed)]
     changes: list[Knobs] = [{}]
     for knob in stage.knobs:
-        needed = changed_knobs(stage.base, stage.knobs, knob.needs)
-        tried = [{**needed, knob.name: value} for value in values.get(knob.name, ())[1:]]
-        changes += [each for each in ([needed] if tried else []) + tried if each not in changes]
+        base_changes = changed_knobs(stage.base, stage.knobs, knob.needs)
+        alternatives = [{**base_changes, knob.name: value} for value in values.get(knob.name, ())[1:]]
+        changes += [each for each in ([base_changes] if alternatives else []) + alternatives if each not in changes]
     return changes
 
 
@@ -189,11 +189,11 @@ def sweep_stage(
     matter = tuple(knobs_that_matter(stage.knobs, rows, base, cost))
     rungs: list[Rung] = []
     if halving.settings and matter:
-        values = {name: tried for name, tried in values_of(stage, sweep).items() if name in matter}
-        drawn = [
+        values = {name: candidates for name, candidates in values_of(stage, sweep).items() if name in matter}
+        samples = [
             changed_knobs(stage.base, stage.knobs, each) for each in draw_settings(values, halving.settings, sweep.seed)
         ]
-        drawn = [each for each in drawn if _is_accepted(stage, each)]
+        samples = [each for each in samples if _is_accepted(stage, each)]
         last: dict[str, list[Record]] = {}
 
         def costs(settings: Sequence[Knobs], scenes: int) -> list[tuple[float, float]]:
@@ -202,7 +202,7 @@ def sweep_stage(
             last.update({summary.label: row for summary, row in zip(summaries, measurements, strict=True)})
             return [(summary.cost(cost), summary.loss(stage.accuracy)) for summary in summaries]
 
-        rungs = successive_halving(drawn, len(paths), costs, halving)
+        rungs = successive_halving(samples, len(paths), costs, halving)
         measured_labels = {result.label for result in results}
         joint = [row for label, row in last.items() if label not in measured_labels]
         results += [summarize(row, base, "joint") for row in joint]
@@ -232,15 +232,15 @@ def knobs_that_matter(
 ) -> list[str]:
     """Knobs of which a value, changed alone or beside what it needs, moves cost or a score by more than noise."""
     by_label = {row[0].label: row for row in rows}
-    moved = set()
+    with_effect = set()
     for knob in knobs:
         for row in rows:
             others = {name: value for name, value in row[0].knobs.items() if name != knob.name}
             beside = by_label.get(describe_values(others), base)
             changes_one = knob.name in row[0].knobs and (not others or others == dict(beside[0].knobs))
             if changes_one and (_moves_cost(row, beside, cost) or _moves_score(row, beside)):
-                moved.add(knob.name)
-    return [knob.name for knob in knobs if knob.name in moved]
+                with_effect.add(knob.name)
+    return [knob.name for knob in knobs if knob.name in with_effect]
 
 
 def _moves_cost(row: Sequence[Record], base: Sequence[Record], cost: Cost) -> bool:
@@ -251,8 +251,8 @@ def _moves_cost(row: Sequence[Record], base: Sequence[Record], cost: Cost) -> bo
         if cost == "bytes":
             logs.append(math.log(max(record.bytes, 1) / max(reference.bytes, 1)))
             continue
-        for ours, theirs in zip(record.timings, reference.timings, strict=False):
-            logs.append(math.log(max(getattr(ours, cost), 1e-9) / max(getattr(theirs, cost), 1e-9)))
+        for timing, reference_timing in zip(record.timings, reference.timings, strict=False):
+            logs.append(math.log(max(getattr(timing, cost), 1e-9) / max(getattr(reference_timing, cost), 1e-9)))
     return _is_effect(logs, LEAST_EFFECT)
 
 

@@ -67,20 +67,22 @@ class ViewsScene:
         self._pairs = [pairs[index] for index in even_indices(len(pairs), MAX_OBJECTS)]
 
     def run(self, settings: ViewsConfig) -> list[ChosenViews]:
-        chosen = []
+        selections = []
         for target, _ in self._pairs:
             views = choose_views(self._scene, [target], settings)
-            chosen.append(ChosenViews(views, view_pictures(self._scene, views)[0]))
-        return chosen
+            selections.append(ChosenViews(views, view_pictures(self._scene, views)[0]))
+        return selections
 
     def judge(self, product: list[ChosenViews], settings: ViewsConfig) -> Judged:  # noqa: ARG002
         assert self._scene.gaussians is not None
         share = visible = 0.0
         for (_, truth), each in zip(self._pairs, product, strict=True):
             near = replace(BlendConfig(), near=min(BlendConfig().near, each.views.near))
-            (seen,) = score_views(self._scene.gaussians, each.views.cameras, [truth], side=JUDGED_SIDE, config=near)
-            share += float(seen.share.mean())
-            visible += float((seen.visible * seen.inside).mean())
+            (box_scores,) = score_views(
+                self._scene.gaussians, each.views.cameras, [truth], side=JUDGED_SIDE, config=near
+            )
+            share += float(box_scores.share.mean())
+            visible += float((box_scores.visible * box_scores.inside).mean())
         count = len(product)
         scores = {
             "object_share": Score(share, count),

@@ -97,10 +97,10 @@ def test_a_caption_is_of_one_box_that_words_or_corners_give(features: Path, tmp_
         low, high = (ORIGIN + np.array(corner) for corner in ((0.1, 0.0, 0.6), (0.5, 0.4, 1.0)))
         corners = ",".join(map(str, (*low, *high)))
         assert ask(features, tmp_path / "corners", "task=caption", f"aabb=[{corners}]", url) == 0
-    (found,) = json.loads((tmp_path / "words" / "answer.json").read_text())["targets"]
-    assert (found["query"], found["rank"]) == ("crate", 0)
-    (given,) = json.loads((tmp_path / "corners" / "answer.json").read_text())["targets"]
-    np.testing.assert_allclose([*given["aabb_min"], *given["aabb_max"]], [*low, *high])
+    (target,) = json.loads((tmp_path / "words" / "answer.json").read_text())["targets"]
+    assert (target["query"], target["rank"]) == ("crate", 0)
+    (corner_target,) = json.loads((tmp_path / "corners" / "answer.json").read_text())["targets"]
+    np.testing.assert_allclose([*corner_target["aabb_min"], *corner_target["aabb_max"]], [*low, *high])
     prompt = (tmp_path / "words" / "prompt.txt").read_text()
     assert "The thing is the crate.\nIt carries the mark 1" in prompt
     assert "The thing is" not in (tmp_path / "corners" / "prompt.txt").read_text()
@@ -123,7 +123,7 @@ def test_a_question_that_names_nothing_is_shown_even_frames_and_says_so(features
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "problem"),
     [
         (("question=What is the cube?",), "say where the model's server is"),
         (("question=What is the cube?", "vlm.base_url=http://127.0.0.1:9/v1"), "no server answers there"),
@@ -139,12 +139,12 @@ def test_a_question_that_names_nothing_is_shown_even_frames_and_says_so(features
     ],
 )
 def test_what_cannot_be_asked_ends_in_one_line(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: str
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], problem: str
 ) -> None:
     assert ask(features, tmp_path / "out", *words) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1
-    assert told in lines[0]
+    assert problem in lines[0]
     assert not (tmp_path / "out").exists()
 
 

@@ -53,13 +53,13 @@ def test_a_batch_that_a_fault_ends_keeps_its_answers_and_goes_on(
     with serving(fails_at_the_third) as server:
         words = (f"questions={file}", f"vlm.base_url={server.url}")
         assert ask(features, out, *words) == 2
-        told = capsys.readouterr().err
-        assert "question 7: the server" in told
-        assert "fell over" in told
-        assert "2 of 3 answers are kept in" in told
+        output = capsys.readouterr().err
+        assert "question 7: the server" in output
+        assert "fell over" in output
+        assert "2 of 3 answers are kept in" in output
         assert not out.exists()
-        kept = read_answers(tmp_path / "answers.answers" / "answers.jsonl")
-        assert [row["answer"] for row in kept.values()] == ["1", "2"]
+        answers = read_answers(tmp_path / "answers.answers" / "answers.jsonl")
+        assert [row["answer"] for row in answers.values()] == ["1", "2"]
         # A line that was cut off is asked again.
         with (tmp_path / "answers.answers" / "answers.jsonl").open("ab") as stream:
             stream.write(b'{"id": "7", "answ')
@@ -87,9 +87,9 @@ def test_an_answer_that_is_nested_too_deep_is_an_error_in_one_line(
         answers.write_text(row[:-1] + ', "x": ' + "[" * depth + "]" * depth + "}\n")
         capsys.readouterr()
         assert ask(features, tmp_path / "out", *words) == 2
-    told = capsys.readouterr().err
-    assert "Traceback" not in told
-    assert "give resume=false to ask anew" in told
+    output = capsys.readouterr().err
+    assert "Traceback" not in output
+    assert "give resume=false to ask anew" in output
 
 
 def crate_refused(handler: Handler, body: Any) -> None:
@@ -110,9 +110,9 @@ def test_a_question_that_is_refused_keeps_no_other_from_its_answer(
         words = (f"questions={file}", f"vlm.base_url={server.url}")
         batch(file, cube, crate, lost, wall)
         assert ask(features, out, *words) == 2
-        told = capsys.readouterr().err
-        assert "2 of 4 questions have no answer: question crate: the server" in told
-        assert "no crates" in told
+        output = capsys.readouterr().err
+        assert "2 of 4 questions have no answer: question crate: the server" in output
+        assert "no crates" in output
         assert len(server.requests) == 3
         # The file is mended and its lines change places: nothing is asked twice, nothing takes another's folder.
         server.behave = answer("now it is fine")
@@ -125,8 +125,8 @@ def test_a_question_that_is_refused_keeps_no_other_from_its_answer(
     assert [row["folder"] for row in rows] == ["00001", "00002", "00003"]
     for row in rows:
         assert f"the {row['id']}?" in (out / row["folder"] / "prompt.txt").read_text()
-        kept = json.loads((out / row["folder"] / "answer.json").read_text())
-        assert kept["answer"] == row["answer"]
+        stored = json.loads((out / row["folder"] / "answer.json").read_text())
+        assert stored["answer"] == row["answer"]
 
 
 def test_an_answer_that_was_begun_with_other_settings_leaves_nothing_behind(features: Path, tmp_path: Path) -> None:
@@ -145,18 +145,18 @@ def test_an_answer_that_was_begun_with_other_settings_leaves_nothing_behind(feat
 
 def test_features_that_were_replaced_are_asked_anew(features: Path, tmp_path: Path) -> None:
     file = batch(tmp_path / "q.jsonl", {"question": "Where is the cube?"}, {"question": "Where is the crate?"})
-    place = tmp_path / "features"
-    save_room(place)
+    folder = tmp_path / "features"
+    save_room(folder)
     with serving(crate_refused) as server:
         words = (f"questions={file}", f"vlm.base_url={server.url}")
-        assert ask(place, tmp_path / "out", *words) == 2
+        assert ask(folder, tmp_path / "out", *words) == 2
         server.behave = answer("x")
-        shutil.rmtree(place)
-        save_room(place, shift=(0.4, 0, 0))
-        assert ask(place, tmp_path / "out", *words) == 0
+        shutil.rmtree(folder)
+        save_room(folder, shift=(0.4, 0, 0))
+        assert ask(folder, tmp_path / "out", *words) == 0
         assert len(server.requests) == 4
         # The same room in another place is the same scene.
-        assert ask(place, tmp_path / "out", *words, "overwrite=true") == 0
+        assert ask(folder, tmp_path / "out", *words, "overwrite=true") == 0
 
 
 def test_warnings_of_a_batch_name_the_question(
@@ -164,9 +164,9 @@ def test_warnings_of_a_batch_name_the_question(
 ) -> None:
     file = batch(tmp_path / "q.jsonl", {"id": "a", "question": "How large?"}, {"id": "b", "question": "How high?"})
     assert ask(features, tmp_path / "out", f"questions={file}", "dry_run=true") == 0
-    told = capsys.readouterr().err
+    output = capsys.readouterr().err
     for name in ("a", "b"):
-        assert f"warning: question {name}: the question names nothing to look for" in told
+        assert f"warning: question {name}: the question names nothing to look for" in output
     rows = [json.loads(line) for line in (tmp_path / "out" / "answers.jsonl").read_text().splitlines()]
     assert all("names nothing to look for" in row["warnings"][0] for row in rows)
 
@@ -176,9 +176,9 @@ def test_pictures_are_rendered_once_for_questions_about_one_thing(
 ) -> None:
     rendered: list[int] = []
 
-    def counted(*given: Any, **named: Any) -> Any:
+    def counted(*arguments: Any, **named: Any) -> Any:
         rendered.append(1)
-        return view_pictures(*given, **named)
+        return view_pictures(*arguments, **named)
 
     monkeypatch.setattr(ask_module, "view_pictures", counted)
     config = ViewsConfig(source="frames", candidates=4, count=2)
@@ -223,7 +223,7 @@ def test_other_settings_ask_anew(features: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "told"),
+    ("content", "problem"),
     [
         (b"", "holds none"),
         (b"\n\n", "holds none"),
@@ -245,12 +245,12 @@ def test_other_settings_ask_anew(features: Path, tmp_path: Path) -> None:
     ],
 )
 def test_files_of_questions_that_are_wrong_say_where(
-    tmp_path: Path, content: bytes, told: str, no_jaxtyping: None
+    tmp_path: Path, content: bytes, problem: str, no_jaxtyping: None
 ) -> None:
     (tmp_path / "q.jsonl").write_bytes(content)
     with pytest.raises(InputError) as caught:
         read_questions(tmp_path / "q.jsonl")
-    assert told in str(caught.value)
+    assert problem in str(caught.value)
     with pytest.raises(InputError, match="no such file"):
         read_questions(tmp_path / "other.jsonl")
 

@@ -86,7 +86,7 @@ def test_a_key_that_a_server_repeats_reaches_neither_disk_nor_screen(
 ) -> None:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     (tmp_path / "q.jsonl").write_text('{"question": "Where is the cube?"}\n{"question": "the left one"}\n')
-    asked = f"questions={tmp_path / 'q.jsonl'}" if many else "question=Where is the cube?"
+    question = f"questions={tmp_path / 'q.jsonl'}" if many else "question=Where is the cube?"
     words = ["vlm.model=m", "vlm.retries=0", "choose.source=frames", "choose.candidates=2", "choose.count=1"]
     escaped = quote(KEY, safe="")
     cases = [(200, "answer", KEY), (200, "answer", escaped), (200, "broken", KEY), (200, "page", KEY)]
@@ -96,7 +96,7 @@ def test_a_key_that_a_server_repeats_reaches_neither_disk_nor_screen(
         with serving(echo(status, spelling, form)) as server:
             server.listing = listing(spelling)
             where = [f"vlm.base_url={server.url}", f"out={tmp_path / f'out{number}'}", f"vlm.stream={number % 2 == 0}"]
-            codes.add(cli.main(["ask", str(features), asked, *where, *words, *debug]))
+            codes.add(cli.main(["ask", str(features), question, *where, *words, *debug]))
             assert server.requests[0][0]["authorization"] == f"Bearer {KEY}"
     assert codes == {0, 2}
     screen = "".join(capsys.readouterr())

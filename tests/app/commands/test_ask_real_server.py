@@ -74,6 +74,6 @@ def test_a_real_server_refuses_another_model_in_its_own_words(
 ) -> None:
     url, _ = real_server
     assert ask(features, tmp_path / "out", f"vlm.base_url={url}", "vlm.model=other", "question=Is it the cube?") == 2
-    told = capsys.readouterr().err
-    assert "refuses the request" in told or "has no model of that name" in told
-    assert "other" in told
+    output = capsys.readouterr().err
+    assert "refuses the request" in output or "has no model of that name" in output
+    assert "other" in output

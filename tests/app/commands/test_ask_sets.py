@@ -192,7 +192,7 @@ def test_a_set_and_folders_that_do_not_fit_end_in_one_line(
     other = tmp_path / "other.json"
     other.write_text(json.dumps([{"scene_id": "hall", "question_id": "1", "question": "What?"}]))
     shutil.copytree(home / "features" / ROOMS[0], tmp_path / "again" / ROOMS[0])
-    for words, told in (
+    for words, problem in (
         ((str(tmp_path / "none"), file), "no such folder of features"),
         ((str(tmp_path / "empty"), file), "holds no features"),
         ((features, f"questions={lines}", "proposals=localize"), "questions about one scene"),
@@ -203,6 +203,6 @@ def test_a_set_and_folders_that_do_not_fit_end_in_one_line(
         ((features, str(tmp_path / "again"), "question=What?"), "expected one folder of features"),
     ):
         out = f"out={tmp_path / 'out'}"
-        assert told in refusal(capsys, "ask", *words, "dry_run=true", out, *QUICK)
+        assert problem in refusal(capsys, "ask", *words, "dry_run=true", out, *QUICK)
         assert not (tmp_path / "out").exists()
         shutil.rmtree(tmp_path / "out.answers", ignore_errors=True)

@@ -23,9 +23,9 @@ def test_the_report_links_to_the_page_where_there_is_one(
     for name, load in (("with", built), ("without", unbuilt)):
         monkeypatch.setattr("gsencoder.app.commands.demo.load_bundle", load)
         assert cli.main([*SMALL, f"out={tmp_path / name}"]) == 0
-        said = capsys.readouterr().out
+        output = capsys.readouterr().out
         assert (tmp_path / name / "page.html").is_file() == (load is built)
         assert ('<a href="page.html">' in (tmp_path / name / "report.html").read_text()) == (load is built)
-        assert ("page.html is left out: view: the page's script is missing" in " ".join(said.split())) == (
+        assert ("page.html is left out: view: the page's script is missing" in " ".join(output.split())) == (
             load is unbuilt
         )

@@ -43,8 +43,8 @@ def asked_scene(count: int = 200) -> Scene:
 )
 def test_points_are_those_of_the_mode_and_the_threshold_that_are_asked_for(config: LocalizeConfig) -> None:
     scene, cameras = asked_scene(), front_camera()
-    asked = RequestedCameras(cameras=cameras, views=(None,))
-    ((points, drawn),) = search_from_poses(scene, asked, WORDS, TEXT, config, pictures=False)
+    requested = RequestedCameras(cameras=cameras, views=(None,))
+    ((points, drawn),) = search_from_poses(scene, requested, WORDS, TEXT, config, pictures=False)
     expected = from_pose(scene, cameras, WORDS, TEXT, FromPoseConfig(mode=config.mode, threshold=config.threshold))
     assert [(each["relevancy"], each["threshold"], each["visible"]) for each in points] == [
         (each.relevancy, each.threshold, each.visible) for each in expected

@@ -51,19 +51,19 @@ def test_what_is_no_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
 
 def test_words_that_are_given_are_those_trained_on_that_the_folder_of_the_features_states(tmp_path: Path) -> None:
     table = make_text_table(["mug", "ball"], np.eye(2, dtype=np.float32), "toy")
-    given = make_text_table(["mug", "cup"], np.eye(2, dtype=np.float32), "toy")
+    words_table = make_text_table(["mug", "cup"], np.eye(2, dtype=np.float32), "toy")
     save_text_table(tmp_path / WORDS_FILE, table.trained_on(["mug", "ball"]))
-    save_text_table(tmp_path / "given.safetensors", given)
+    save_text_table(tmp_path / "given.safetensors", words_table)
     path = str(tmp_path / "given.safetensors")
 
     def trained(folder: Path) -> tuple[str, ...] | None:
         return closed_table(load_words(folder, table.space, path)).trained
 
     assert trained(tmp_path) == ("mug",)
-    save_text_table(tmp_path / "given.safetensors", replace(given, trained=("cup",)))
+    save_text_table(tmp_path / "given.safetensors", replace(words_table, trained=("cup",)))
     assert trained(tmp_path) == ("cup",)
     # Where the folder states none, or its table is lost or damaged, the words that are given are taken as they are.
-    save_text_table(tmp_path / "given.safetensors", given)
+    save_text_table(tmp_path / "given.safetensors", words_table)
     (tmp_path / "without").mkdir()
     assert trained(tmp_path / "without") is None
     (tmp_path / WORDS_FILE).write_bytes(b"damaged")

@@ -90,8 +90,8 @@ def test_objects_are_boxed_from_a_memory_as_from_fused_features(
     boxes = []
     for folder, space in ((tmp_path / "fused", ()), (made, ("space=labels",))):
         out = tmp_path / f"boxes_{folder.name}"
-        asked = ["localize", str(folder), f"query={','.join(named[:3])}", *space, f"out={out}", "pictures=0"]
-        assert cli.main([*asked, "quiet=true"]) == 0
+        arguments = ["localize", str(folder), f"query={','.join(named[:3])}", *space, f"out={out}", "pictures=0"]
+        assert cli.main([*arguments, "quiet=true"]) == 0
         boxes.append({box["query"]: box for box in reversed(json.loads((out / "boxes.json").read_text()))})
     assert set(boxes[0]) == set(boxes[1])
     for word, box in boxes[0].items():

@@ -72,9 +72,9 @@ def test_a_run_that_isinterrupted_goes_on_to_the_same_splat(
     assert {name: results[name] for name in ("seeds", "source")} == {
         name: summary_of(built)["results"][name] for name in ("seeds", "source")
     }
-    found, whole = load_splat(out / "splat.ply"), load_splat(built / "splat.ply")
+    splat, whole = load_splat(out / "splat.ply"), load_splat(built / "splat.ply")
     for name in ("means", "quats", "scales", "opacities", "sh"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
+        np.testing.assert_array_equal(getattr(splat, name), getattr(whole, name))
     with monkeypatch.context() as patched:
         patched.setattr(reconstruct.Optimizer, "advance", stop_at_five)
         assert cli.main([*words, "overwrite=true"]) == 130
@@ -94,8 +94,8 @@ def test_photographs_alone_are_placed_or_refused_in_words(
 
     for number in range(4):
         Image.new("RGB", (80, 60), (60 * number, 90, 20)).save(alone / f"{number}.png")
-    told = refusal(capsys, str(alone), f"out={tmp_path / 'out'}")
-    assert "could be placed" in told or "cannot place these photographs" in told
+    problem = refusal(capsys, str(alone), f"out={tmp_path / 'out'}")
+    assert "could be placed" in problem or "cannot place these photographs" in problem
     assert not (tmp_path / "out").exists()
 
 
@@ -193,9 +193,9 @@ def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(
     log = out.with_name("out.reconstruction") / "log.csv"
     text = log.read_text()
     log.write_text(text.replace(".", "x"))
-    told = refusal(capsys, *words)
-    assert "log.csv: damaged: could not convert" in told
-    assert told.endswith("give resume=false to begin anew")
+    problem = refusal(capsys, *words)
+    assert "log.csv: damaged: could not convert" in problem
+    assert problem.endswith("give resume=false to begin anew")
     log.write_text(text)
     first, second = sorted((scene / "images").iterdir())[:2]
     shutil.copy(second, first)
@@ -223,7 +223,7 @@ def test_a_held_out_photograph_that_is_masked_all_over_is_named_and_not_judged_b
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "problem"),
     [
         (["holdout=1"], "holdout: expected 0 (none) or 2 and more"),
         (["data.max_views=2", "holdout=2"], "expected at least 2 photographs to fit"),
@@ -236,17 +236,17 @@ def test_a_held_out_photograph_that_is_masked_all_over_is_named_and_not_judged_b
     ],
 )
 def test_what_cannot_be_is_told(
-    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], told: str
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], problem: str
 ) -> None:
-    assert told in refusal(capsys, str(room), f"out={tmp_path / 'out'}", *words)
+    assert problem in refusal(capsys, str(room), f"out={tmp_path / 'out'}", *words)
     assert not (tmp_path / "out").exists()
 
 
 def test_a_bare_splat_cannot_be_fitted_to_anything(
     built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = refusal(capsys, str(built / "splat.ply"), f"out={tmp_path / 'out'}")
-    assert "a splat without photographs" in told
+    problem = refusal(capsys, str(built / "splat.ply"), f"out={tmp_path / 'out'}")
+    assert "a splat without photographs" in problem
 
 
 def test_every_eighth_photograph_is_kept() -> None:

@@ -22,9 +22,9 @@ def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(
 ) -> None:
     out, score, calls = tmp_path / "out", reconstruct.score, []
 
-    def cut_off_at_the_last(*given: object) -> object:
-        calls.append(given)
-        return interrupt() if len(calls) == 2 else score(*given)
+    def cut_off_at_the_last(*arguments: object) -> object:
+        calls.append(arguments)
+        return interrupt() if len(calls) == 2 else score(*arguments)
 
     words = ["reconstruct", str(room), f"out={out}", *QUICK]
     with monkeypatch.context() as patched:
@@ -33,8 +33,8 @@ def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(
     with monkeypatch.context() as patched:
         patched.setattr(reconstruct.Optimizer, "advance", never)
         assert cli.main(words) == 0
-    found, whole = (summary_of(folder)["results"] for folder in (out, built))
-    assert [found[name] for name in ("psnr", "ssim")] == [whole[name] for name in ("psnr", "ssim")]
+    results, whole = (summary_of(folder)["results"] for folder in (out, built))
+    assert [results[name] for name in ("psnr", "ssim")] == [whole[name] for name in ("psnr", "ssim")]
     steps = [line.split(",")[0] for line in (out / "log.csv").read_text().splitlines()]
     assert steps == ["step", "0", "12"]
 
@@ -71,10 +71,10 @@ def test_photographs_that_are_masked_all_over_are_not_fitted(
         picture = Image.open(path).convert("RGBA")
         picture.putalpha(0)
         picture.save(path.with_suffix(".png"))
-    told = refusal(
+    problem = refusal(
         capsys, str(scene), f"out={tmp_path / 'out'}", *QUICK, "seeds.source=mesh", f"seeds.mesh={_floor(scene)}"
     )
-    assert "4 of 4 photographs to fit are masked all over" in told
+    assert "4 of 4 photographs to fit are masked all over" in problem
 
 
 def _floor(folder: Path) -> Path:
@@ -100,15 +100,15 @@ def test_photographs_are_placed_whatever_lies_in_folders_beside_them(
 ) -> None:
     folder = shutil.copytree(ten, tmp_path / "photographs")
     shutil.copytree(room, folder / "room")
-    asked = []
+    calls = []
 
     def remembered(pictures: Path, *_: object, **__: object) -> None:
-        asked.append(pictures)
+        calls.append(pictures)
         raise InputError("stop")
 
     monkeypatch.setattr("gsencoder.reconstruct.open_scene.register_photographs", remembered)
     assert "stop" in refusal(capsys, str(folder), f"out={folder / 'result'}", "quiet=true")
-    assert asked == [folder]
+    assert calls == [folder]
 
 
 def test_a_disk_without_room_for_the_database_is_told_before_it_fills(
@@ -116,8 +116,8 @@ def test_a_disk_without_room_for_the_database_is_told_before_it_fills(
 ) -> None:
     room_left = shutil.disk_usage(tmp_path)._replace(free=1 << 20)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: room_left)
-    told = refusal(capsys, str(ten), f"out={tmp_path / 'out'}", "quiet=true")
-    assert "placing 11 photographs may take 14 MiB, and 1 are free on this disk; make room" in told
+    problem = refusal(capsys, str(ten), f"out={tmp_path / 'out'}", "quiet=true")
+    assert "placing 11 photographs may take 14 MiB, and 1 are free on this disk; make room" in problem
 
 
 def test_a_signal_is_ours_after_pycolmap_came(tmp_path: Path, ten: Path) -> None:

@@ -39,12 +39,12 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def folder_run(video: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int, str]:
     """A folder with a video and a damaged one: out=, the exit code, and what was said."""
-    folder, said = tmp_path_factory.mktemp("folder"), StringIO()
+    folder, output = tmp_path_factory.mktemp("folder"), StringIO()
     (folder / "walk.mp4").symlink_to(video)
     (folder / "broken.mov").write_bytes(b"no video")
-    with redirect_stderr(said):
+    with redirect_stderr(output):
         code = cli.main(["reconstruct", str(folder), f"out={folder / 'out'}", *QUICK])
-    return folder / "out", code, said.getvalue()
+    return folder / "out", code, output.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -72,12 +72,12 @@ def test_cameras_of_a_video_stand_where_they_stood(built: Path) -> None:
     scene = load_scene(built, splat="splat.ply")
     assert scene.views is not None
     numbers = [int(name[6:12]) for name in scene.views.names]
-    found, truth = scene.views.cameras.centers, box_cameras(FRAMES).centers[numbers]
-    found, truth = found - found.mean(0), truth - truth.mean(0)
+    centers, truth = scene.views.cameras.centers, box_cameras(FRAMES).centers[numbers]
+    centers, truth = centers - centers.mean(0), truth - truth.mean(0)
     # Up to the similarity that photographs leave open (Umeyama, 1991).
-    left, stretch, right = np.linalg.svd(truth.T @ found)
+    left, stretch, right = np.linalg.svd(truth.T @ centers)
     left[:, 2] *= np.linalg.det(left) * np.linalg.det(right)
-    fitted = stretch.sum() / (found**2).sum() * found @ (left @ right).T
+    fitted = stretch.sum() / (centers**2).sum() * centers @ (left @ right).T
     errors = np.linalg.norm(fitted - truth, axis=1)
     assert np.median(errors) < 0.03 * np.linalg.norm(truth, axis=1).mean()
 
@@ -111,12 +111,12 @@ def test_a_run_that_was_cut_off_takes_up_its_frames_and_poses(
 def test_videos_of_a_folder_are_scenes_of_their_own_and_one_that_is_damaged_stops_no_other(
     folder_run: tuple[Path, int, str],
 ) -> None:
-    out, code, said = folder_run
+    out, code, output = folder_run
     assert code == 2
     assert (out / "walk" / "splat.ply").is_file()
     assert not (out / "broken").exists()
-    assert "1 of 2 scenes failed" in said
-    assert "broken.mov: not a video that can be decoded" in said
+    assert "1 of 2 scenes failed" in output
+    assert "broken.mov: not a video that can be decoded" in output
 
 
 @pytest.mark.parametrize("command", ["inspect", "fuse"])

@@ -45,8 +45,8 @@ def boxes(room: Path, out: Path, *options: str) -> list[dict[str, Any]]:
     assert cli.main(["fuse", str(room), f"teacher.words={words}", *options, f"out={out}", "quiet=true"]) == 0
     query = ",".join(load_text_table(words).names)
     assert cli.main(["localize", str(out), f"query={query}", f"out={out}/boxes", "pictures=0", "quiet=true"]) == 0
-    found: list[dict[str, Any]] = json.loads((out / "boxes/boxes.json").read_text())
-    return found
+    rows: list[dict[str, Any]] = json.loads((out / "boxes/boxes.json").read_text())
+    return rows
 
 
 @pytest.mark.slow
@@ -73,9 +73,17 @@ def test_scenes_are_prepared_for_training_from_regions(room: Path, tmp_path: Pat
         "map": [f"teacher.model={tmp_path / 'colors.onnx'}", "teacher.onnx.layout=grid", "teacher.onnx.patch=4"],
     }[vector]
     prepared = tmp_path / "prepared"
-    given = ["teacher=regions", "teacher.masks=instances", f"teacher.vector={vector}", *options]
+    teacher = ["teacher=regions", "teacher.masks=instances", f"teacher.vector={vector}", *options]
     done = cli.main(
-        ["train", str(room), *given, "prepare_only=true", f"prepared={prepared}", f"out={tmp_path / 'o'}", "quiet=true"]
+        [
+            "train",
+            str(room),
+            *teacher,
+            "prepare_only=true",
+            f"prepared={prepared}",
+            f"out={tmp_path / 'o'}",
+            "quiet=true",
+        ]
     )
     assert done == 0
     with open_archive(prepared / "scenes/room.safetensors") as file:
@@ -125,8 +133,8 @@ def test_names_of_objects_through_minilm_are_those_of_labels(
     for teacher in (["teacher=labels"], ["teacher=regions", "teacher.masks=instances"]):
         out = tmp_path / teacher[0].partition("=")[2]
         tower = ["text=minilm", f"text.model={shared / 'models/minilm_l6'}"]
-        given = [*teacher, *tower, "data.max_views=3", "data.image_scale=0.5", f"out={out}", "quiet=true"]
-        assert cli.main(["fuse", str(scene), *given]) == 0
+        options = [*teacher, *tower, "data.max_views=3", "data.image_scale=0.5", f"out={out}", "quiet=true"]
+        assert cli.main(["fuse", str(scene), *options]) == 0
         (features,) = load_features(out).features.values()
         fields.append(features)
         words = load_text_table(out / "words.safetensors")

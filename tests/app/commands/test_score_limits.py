@@ -132,7 +132,7 @@ def test_scenes_without_captions_are_refused_or_count_as_empty(
     boxes = [{"caption": "a red mug", "box": corners, "sem_prob": [1.0], "obj_prob": [0.0, 1.0]}]
     (tmp_path / "predictions.json").write_text(json.dumps({"a": boxes}))
     files = [f"{name}={tmp_path / name}.json" for name in ("predictions", "truth")]
-    asked = ["score", "captions", *files, "java=false", f"out={tmp_path / 'out'}"]
-    assert "1 scene without a prediction, first b" in refusal(capsys, *asked)
-    assert cli.main([*asked, "allow_missing=true", "quiet=true"]) == 0
+    arguments = ["score", "captions", *files, "java=false", f"out={tmp_path / 'out'}"]
+    assert "1 scene without a prediction, first b" in refusal(capsys, *arguments)
+    assert cli.main([*arguments, "allow_missing=true", "quiet=true"]) == 0
     assert results_of(tmp_path / "out")["missing"] == 1

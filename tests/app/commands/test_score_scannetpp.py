@@ -37,9 +37,9 @@ def test_scans_and_the_files_that_evaluate_writes_have_one_truth(
 ) -> None:
     lists = [f"classes={home / 'top100.txt'}", f"label_map={home / 'map_benchmark.csv'}"]
     words = f"teacher.words={home / 'words.safetensors'}"
-    given = [f"protocol.{option}" for option in options]
+    arguments = [f"protocol.{option}" for option in options]
     seeds = ["seeds.source=mesh", f"seeds.mesh={home / 'scans' / 'room' / 'scans' / 'mesh_aligned_0.05.ply'}"]
-    command = ["evaluate", str(home / "scans" / "room"), f"protocol={protocol}", words, *lists, *given, *seeds]
+    command = ["evaluate", str(home / "scans" / "room"), f"protocol={protocol}", words, *lists, *arguments, *seeds]
     assert cli.main([*command, f"out={tmp_path / 'a'}", "quiet=true"]) == 0
     first = results_of(tmp_path / "a")
     del first["gaussians"]

@@ -39,8 +39,8 @@ def write(path: Path, value: Any) -> Path:
 def answer_files(folder: Path, answers: dict[str, list[str]]) -> list[str]:
     scenes = {each["question_id"]: each["scene_id"] for each in QUESTIONS}
     rows = [
-        {"scene_id": scenes.get(name, "s0"), "question_id": name, "answer_top10": given}
-        for name, given in answers.items()
+        {"scene_id": scenes.get(name, "s0"), "question_id": name, "answer_top10": texts}
+        for name, texts in answers.items()
     ]
     truth, predictions = write(folder / "truth.json", QUESTIONS), write(folder / "predictions.json", rows)
     return ["score", "answers", f"predictions={predictions}", f"truth={truth}", "java=false"]
@@ -63,7 +63,7 @@ def test_answers_are_scored_by_question_kind_and_scene(tmp_path: Path) -> None:
 
 
 def test_the_best_of_ten_is_absent_where_no_question_has_several_answers(tmp_path: Path) -> None:
-    first = {name: given[:1] for name, given in ANSWERS.items()}
+    first = {name: texts[:1] for name, texts in ANSWERS.items()}
     assert cli.main([*answer_files(tmp_path, first), f"out={tmp_path / 'out'}", "quiet=true"]) == 0
     results = results_of(tmp_path / "out")
     assert "EM@10" in results["absent"]

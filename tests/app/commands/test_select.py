@@ -86,9 +86,9 @@ def test_the_parts_that_are_asked_for_are_written(
 
 def test_a_threshold_takes_what_is_relevant_wherever_it_is(features: Path, tmp_path: Path) -> None:
     run(features, tmp_path / "a", "query=table", "threshold=0.9", "select.grow=false", "write=labels")
-    taken = read_labels(tmp_path / "a").labels == 1
-    assert (KINDS[taken] == 2).all()
-    assert taken.sum() > 2000
+    mask = read_labels(tmp_path / "a").labels == 1
+    assert (KINDS[mask] == 2).all()
+    assert mask.sum() > 2000
 
 
 def test_packages_and_memories_are_selected_from_like_features(features: Path, tmp_path: Path) -> None:
@@ -98,14 +98,14 @@ def test_packages_and_memories_are_selected_from_like_features(features: Path, t
         assert cli.main(["pack", str(features), f"form={form}", f"out={packed}", "quiet=true"]) == 0
         expected[form] = packed
     memory = tmp_path / "memory"
-    given = SCENE.features["names"]
+    field = SCENE.features["names"]
     bank = MemoryBank(
-        components=EMBEDDINGS, sources=np.zeros((4, 3), np.int32), threshold=0.9, mean=given.mean,
+        components=EMBEDDINGS, sources=np.zeros((4, 3), np.int32), threshold=0.9, mean=field.mean,
         grid_from_image=np.tile(np.eye(2, 3), (4, 1, 1)), coverage=1.0, cosine=1.0, space=SPACE,
     )  # fmt: skip
     queries = QueryMemory(
-        queries=given.features - given.mean, weights=given.weights, projection=np.eye(8, dtype=np.float32), bank=bank,
-        scoring="centered", temperature=0.1, mean=given.mean,
+        queries=field.features - field.mean, weights=field.weights, projection=np.eye(8, dtype=np.float32), bank=bank,
+        scoring="centered", temperature=0.1, mean=field.mean,
     )  # fmt: skip
     memory.mkdir()
     save_memories(memory, replace(SCENE, features={}), {"labels": queries})
@@ -182,8 +182,8 @@ def test_nothing_is_replaced_unless_it_is_asked_for(
     assert (out / "mug.ply").read_bytes() == before
     run(features, out, "query=book", "write=objects", "overwrite=true")
     assert names_in(out) == ["book.ply", "summary.json"]
-    for place in (features, features.parent):
-        refusal(capsys, "select", str(features), f"out={place}", "query=mug", "overwrite=true")
+    for folder in (features, features.parent):
+        refusal(capsys, "select", str(features), f"out={folder}", "query=mug", "overwrite=true")
     assert WORDS_FILE in names_in(features)
     (tmp_path / "file").write_text("mine")
     assert "is a file" in refusal(capsys, "select", str(features), f"out={tmp_path / 'file'}", "query=mug")

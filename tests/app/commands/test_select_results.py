@@ -42,7 +42,7 @@ def test_seeds_and_labels_are_counted_for_each_word(
     features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run(features, "query=mug,book", "threshold=0.9", f"out={tmp_path / 'out'}", "write=[objects,labels]")
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     expected, _ = select(SCENE, ("mug", "book"), words(), threshold=0.9)
     seeds = [int((expected.seeds == label).sum()) for label in (1, 2)]
     counts = [int((expected.labels == label).sum()) for label in (1, 2)]
@@ -52,7 +52,7 @@ def test_seeds_and_labels_are_counted_for_each_word(
     assert [row["count"] for row in results["selection"]["labels"][1:]] == counts
     assert results["metres_per_unit"] == 1.0
     for name, seed, count in zip(("mug", "book"), seeds, counts, strict=True):
-        assert f"{name}: {count:,} Gaussians, from {seed:,} to start with, {name}.ply" in said
+        assert f"{name}: {count:,} Gaussians, from {seed:,} to start with, {name}.ply" in output
     part = load_splat(tmp_path / "out" / "mug.ply", origin=SCENE.origin)
     assert SCENE.gaussians is not None
     np.testing.assert_allclose(part.means, SCENE.gaussians.means[expected.labels == 1], atol=1e-4)
@@ -76,7 +76,7 @@ def test_holes_are_those_of_the_objects_in_each_view(
     scene, _ = selected_room(under=under)
     folder = stored(tmp_path / "features", scene)
     run(folder, "query=mug", f"out={tmp_path / 'out'}")
-    said = " ".join(capsys.readouterr().out.split())
+    output = " ".join(capsys.readouterr().out.split())
     made = json.loads((tmp_path / "out" / "holes.json").read_text())
     assert scene.gaussians is not None
     assert scene.views is not None
@@ -94,16 +94,16 @@ def test_holes_are_those_of_the_objects_in_each_view(
             for hole in holes if hole.pixels
         ],
     }  # fmt: skip
-    assert f"nothing is behind {pixels / removed:.0%} of the removed pixels in {len(holes)} views" in said
+    assert f"nothing is behind {pixels / removed:.0%} of the removed pixels in {len(holes)} views" in output
 
 
 def test_a_box_that_is_asked_for_and_settings_of_boxes_reach_the_selection(
     features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = SCENE.features["names"]
-    vectors = given.features.copy()
+    scene_features = SCENE.features["names"]
+    vectors = scene_features.features.copy()
     vectors[KINDS == 1] = 0.8 * EMBEDDINGS[0] + 0.2 * EMBEDDINGS[2]
-    folder = stored(tmp_path / "two", replace(SCENE, features={"names": replace(given, features=vectors)}))
+    folder = stored(tmp_path / "two", replace(SCENE, features={"names": replace(scene_features, features=vectors)}))
     run(folder, "query=mug", "box=1", f"out={tmp_path / 'out'}", "write=labels", "quiet=true")
     assert ((read_labels(tmp_path / "out").labels == 1) == (KINDS == 1)).mean() > 0.99
     common = ("select", str(features), "query=mug", f"out={tmp_path / 'none'}")
@@ -137,6 +137,6 @@ def test_words_are_printed_on_one_line_in_their_own_direction(
     word = "\u202egum"
     folder = stored(tmp_path / "features", table=make_text_table((word, "book", "table", "lamp"), EMBEDDINGS, "table"))
     run(folder, f"query={word}", f"out={tmp_path / 'out'}", "write=objects")
-    said = capsys.readouterr().out
-    assert "gum" in said
-    assert "\u202e" not in said
+    output = capsys.readouterr().out
+    assert "gum" in output
+    assert "\u202e" not in output

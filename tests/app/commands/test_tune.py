@@ -68,8 +68,8 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def words(given: Path, out: Path, *more: str, dataset: Path | None = None) -> list[str]:
     usual = [f"model={given / 'model'}", f"features={given / 'features'}", f"out={out}", *QUICK]
     changed = {word.partition("=")[0] for word in more}
-    kept = [word for word in usual if word.partition("=")[0] not in changed]
-    return ["tune", str(dataset or given / "ScanQA_v1.0_train.json"), *kept, *more]
+    defaults = [word for word in usual if word.partition("=")[0] not in changed]
+    return ["tune", str(dataset or given / "ScanQA_v1.0_train.json"), *defaults, *more]
 
 
 def test_adapters_a_log_and_figures_are_written_and_prompts_are_kept(given: Path, tmp_path: Path) -> None:
@@ -94,16 +94,16 @@ def test_prompts_are_those_that_ask_sends(given: Path, tmp_path: Path) -> None:
     store = PromptStore(tmp_path / "out.prepared")
     question = QUESTIONS[0][1]
     (prompt,) = (each for each in store.prompts.values() if question in each.text)
-    asked = ["ask", str(given / "features" / "room_a"), f"question={question}", f"out={tmp_path / 'asked'}"]
+    arguments = ["ask", str(given / "features" / "room_a"), f"question={question}", f"out={tmp_path / 'asked'}"]
     vlm = ["vlm.image_side=64", "vlm.image_format=png", "dry_run=true"]
-    assert cli.main([*asked, *vlm, *QUICK[:3], "quiet=true"]) == 0
+    assert cli.main([*arguments, *vlm, *QUICK[:3], "quiet=true"]) == 0
     parts = json.loads((tmp_path / "asked" / "request.json").read_text())["messages"][0]["content"]
     assert parts[-1]["text"] == prompt.text
     import base64
 
     sent = [base64.b64decode(part["image_url"]["url"].partition(",")[2]) for part in parts[:-1]]
-    kept = [(tmp_path / "out.prepared" / "pictures" / name).read_bytes() for name in prompt.pictures]
-    assert sent == kept
+    pictures = [(tmp_path / "out.prepared" / "pictures" / name).read_bytes() for name in prompt.pictures]
+    assert sent == pictures
     assert len(sent) == 2
 
 
@@ -193,8 +193,8 @@ def test_situations_of_sqa3d_stand_before_their_questions(given: Path, tmp_path:
 
 def test_bad_input_is_refused_in_a_line(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def refused(*more: str, dataset: Path | None = None) -> str:
-        asked = words(given, tmp_path / "out", *more, dataset=dataset)
-        return refusal(capsys, *(word for word in asked if word != "quiet=true"))
+        arguments = words(given, tmp_path / "out", *more, dataset=dataset)
+        return refusal(capsys, *(word for word in arguments if word != "quiet=true"))
 
     elsewhere = scanqa(tmp_path / "other.json", *QUESTIONS, ("scene0000_00", "What?", ["this"]))
     assert "has no folder for 1 of 3 scenes that are asked about: scene0000_00" in refused(dataset=elsewhere)
@@ -226,16 +226,18 @@ def test_bad_input_is_refused_in_a_line(given: Path, tmp_path: Path, capsys: pyt
 def test_layers_that_the_model_does_not_have_are_refused_before_prompts_are_prepared(
     given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked = words(given, tmp_path / "out", "lora.targets=[q_proj,fc9]")
-    line = refusal(capsys, *(word for word in asked if word != "quiet=true"))
+    arguments = words(given, tmp_path / "out", "lora.targets=[q_proj,fc9]")
+    line = refusal(capsys, *(word for word in arguments if word != "quiet=true"))
     assert "lora.targets: no linear layer outside the vision tower is called fc9; there are " in line
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("log_every", "told"), [(1, "went from "), (3, "in the log's only row (train.log_every=3)")])
+@pytest.mark.parametrize(
+    ("log_every", "problem"), [(1, "went from "), (3, "in the log's only row (train.log_every=3)")]
+)
 def test_a_loss_of_one_row_went_nowhere(
-    log_every: int, told: str, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    log_every: int, problem: str, given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    asked = words(given, tmp_path / "out", f"train.log_every={log_every}", "quiet=false")
-    assert cli.main(asked) == 0
-    assert told in " ".join(capsys.readouterr().out.split())
+    arguments = words(given, tmp_path / "out", f"train.log_every={log_every}", "quiet=false")
+    assert cli.main(arguments) == 0
+    assert problem in " ".join(capsys.readouterr().out.split())

@@ -42,9 +42,9 @@ def built(monkeypatch: pytest.MonkeyPatch) -> None:
 def written(out: Path, *arguments: str | Path) -> tuple[list[Container], dict[str, Any]]:
     """The scenes of the page that a run writes, and the results in its summary."""
     assert cli.main(["view", *map(str, arguments), f"out={out}", "quiet=true"]) == 0
-    found = re.findall(r'id="scene-\d+">([^<]+)<', out.read_text())
+    matches = re.findall(r'id="scene-\d+">([^<]+)<', out.read_text())
     results: dict[str, Any] = json.loads(Path(f"{out}.summary.json").read_text())["results"]
-    return [read_container(gzip.decompress(b64decode(blob))) for blob in found], results
+    return [read_container(gzip.decompress(b64decode(blob))) for blob in matches], results
 
 
 def test_photographs_and_labeled_objects_come_from_the_scene_that_was_fused(folder: Path, tmp_path: Path) -> None:
@@ -186,16 +186,16 @@ def test_the_server_gets_the_scene_as_it_is_to_be_searched(
 def test_options_of_the_photographs_reach_their_scene(
     folder: Path, served: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[int] = []
+    sides: list[int] = []
     load = view.load_scene
 
     def loading(path: str, *, options: SceneConfig = SceneConfig()) -> Scene:
-        asked.append(options.max_views)
+        sides.append(options.max_views)
         return load(path, options=replace(options, max_views=0))
 
     monkeypatch.setattr(view, "load_scene", loading)
     assert cli.main(["view", str(folder / "features"), f"photos={folder / 'room'}", "data.max_views=3"]) == 0
-    assert asked == [3]
+    assert sides == [3]
 
 
 @pytest.mark.parametrize(

@@ -58,9 +58,9 @@ def test_a_word_that_is_absent_is_said_to_be(
     assert cli.main(["views", str(features), words, f"out={tmp_path / 'views'}", *loud]) == 0
     assert "pen holder: absent (probability 0.0" in capsys.readouterr().out
     assert cli.main(["localize", str(features), words, "pictures=0", f"out={tmp_path / 'boxes'}"]) == 0
-    told = capsys.readouterr().out
-    assert "pen holder: absent (probability 0.0" in told
-    assert "probability 1.00" in told or "probability 0.9" in told
+    output = capsys.readouterr().out
+    assert "pen holder: absent (probability 0.0" in output
+    assert "probability 1.00" in output or "probability 0.9" in output
     listed = json.loads((tmp_path / "boxes" / "boxes.json").read_text())
     assert {box["query"] for box in listed} == {"cube"}
     assert all(0.9 < box["probability"] <= 1 for box in listed)
@@ -88,7 +88,7 @@ def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "problem"),
     [
         ((), "query= is missing"),
         (("query=cube", "boxes=0"), "boxes: expected 1 or more"),
@@ -104,10 +104,10 @@ def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_done_ends_in_one_line(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: str
+    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], problem: str
 ) -> None:
     assert cli.main(["views", str(features), *words, f"out={tmp_path / 'out'}"]) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(lines) == 1
-    assert told in lines[0]
+    assert problem in lines[0]
     assert not (tmp_path / "out").exists()

@@ -84,12 +84,12 @@ def test_surfaces_end_at_steps_at_missing_pixels_and_at_the_border() -> None:
 
 
 def test_a_summary_of_residuals_counts_what_is_not_hidden() -> None:
-    found = agreement(np.array([np.nan, 0.0, 0.01, -0.02, 0.04, -0.3, 0.06, 9.0]))
-    assert found.compared == 7
+    summary = agreement(np.array([np.nan, 0.0, 0.01, -0.02, 0.04, -0.3, 0.06, 9.0]))
+    assert summary.compared == 7
     # Two lie further away than what is seen there.
-    assert found.share == pytest.approx(3 / 5)
-    assert found.spread == pytest.approx((0 + 0.01 + 0.02 + 0.04 + 3 * CLIP) / 7)
-    assert found.offset == pytest.approx(np.median([0, 0.01, -0.02, 0.04]))
+    assert summary.share == pytest.approx(3 / 5)
+    assert summary.spread == pytest.approx((0 + 0.01 + 0.02 + 0.04 + 3 * CLIP) / 7)
+    assert summary.offset == pytest.approx(np.median([0, 0.01, -0.02, 0.04]))
     nothing = agreement(np.array([np.nan]))
     assert nothing.compared == 0
     assert np.isnan([nothing.share, nothing.spread, nothing.offset]).all()
@@ -174,8 +174,8 @@ def test_colors_are_compared_where_both_photographs_show_the_place(small: DepthV
 
 def test_the_correlation_of_a_view_is_its_median_in_both_directions() -> None:
     nan = np.nan
-    found = view_correlations(np.array([[nan, 0.1, 0.2], [0.3, nan, nan], [nan, nan, nan]]))
-    np.testing.assert_allclose(found, (0.2, 0.2, 0.2))
+    correlations = view_correlations(np.array([[nan, 0.1, 0.2], [0.3, nan, nan], [nan, nan, nan]]))
+    np.testing.assert_allclose(correlations, (0.2, 0.2, 0.2))
     assert np.isnan(view_correlations(np.full((2, 2), nan))).all()
 
 
@@ -191,10 +191,10 @@ def test_orders_move_every_pose_by_one_or_two_places_either_way() -> None:
 def test_a_depth_scale_that_is_off_by_any_usual_factor_is_read_right(small: DepthViews, factor: float) -> None:
     wrong = replace(small, depths=(small.depths / factor).astype(np.float32), values=small.values / factor)
     readings = {reading.cause: reading for reading in other_readings(wrong, np.arange(COUNT), small.cam_from_world)}
-    found = readings["depth scale"]
-    assert found.factor == pytest.approx(factor, rel=2e-3)
-    assert found.views.scale == found.factor
-    assert found.agreement.share > 0.99
+    depth_reading = readings["depth scale"]
+    assert depth_reading.factor == pytest.approx(factor, rel=2e-3)
+    assert depth_reading.views.scale == depth_reading.factor
+    assert depth_reading.agreement.share > 0.99
 
 
 def test_the_focal_length_of_the_depth_is_refined_between_the_factors_that_are_tried(small: DepthViews) -> None:
@@ -208,8 +208,8 @@ def test_a_factor_under_which_hardly_anything_is_compared_says_nothing(small: De
     wrong = small.with_focal_times(1.2)
     few = replace(small, values=np.where(np.arange(SAMPLES) < 5, small.values, 0))
     assert agreement(residuals(few)).spread < agreement(residuals(wrong)).spread
-    found = _best_factor("depth scale", lambda factor: few if factor == 2.0 else wrong, (1.0, 2.0))
-    assert found.factor != 2.0
+    reading = _best_factor("depth scale", lambda factor: few if factor == 2.0 else wrong, (1.0, 2.0))
+    assert reading.factor != 2.0
 
 
 def test_normals_of_a_box_are_those_of_its_walls_and_there_are_none_beside_missing_depth(small: DepthViews) -> None:

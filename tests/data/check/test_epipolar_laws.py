@@ -76,8 +76,8 @@ def test_poses_that_were_exchanged_are_read_back(cameras: Cameras, matches: list
         # The inverse of a turned inverse: what the reading of that name undoes.
         flip = np.diag([1.0, -1, -1, 1])
         wrong = with_poses(cameras, np.linalg.inv(flip @ cameras.cam_from_world.astype(np.float64)))
-    found, factor, best, error = _best_reading(wrong, wrong, np.arange(6), matches)
-    assert (found, factor) == (cause, None)
+    reading, factor, best, error = _best_reading(wrong, wrong, np.arange(6), matches)
+    assert (reading, factor) == (cause, None)
     assert error < 0.05
     np.testing.assert_allclose(best.cam_from_world, cameras.cam_from_world, atol=1e-5)
 
@@ -85,8 +85,8 @@ def test_poses_that_were_exchanged_are_read_back(cameras: Cameras, matches: list
 @pytest.mark.parametrize("places", [-2, -1, 1, 2])
 def test_poses_of_the_next_photographs_are_read_back(cameras: Cameras, matches: list[PairMatches], places: int) -> None:
     wrong = with_poses(cameras, np.roll(cameras.cam_from_world, -places, axis=0))
-    found, factor, _, error = _best_reading(wrong, wrong, np.arange(6), matches)
-    assert (found, factor) == ("order", places)
+    cause, factor, _, error = _best_reading(wrong, wrong, np.arange(6), matches)
+    assert (cause, factor) == ("order", places)
     assert error < 0.01
 
 
@@ -95,8 +95,8 @@ def test_another_focal_length_is_read_back(cameras: Cameras, matches: list[PairM
     Ks = cameras.Ks.copy()
     Ks[:, :2, :2] /= np.float32(factor)
     wrong = replace(cameras, Ks=Ks)
-    found, read, best, error = _best_reading(wrong, wrong, np.arange(6), matches)
-    assert (found, read) == ("focal length", factor)
+    cause, read, best, error = _best_reading(wrong, wrong, np.arange(6), matches)
+    assert (cause, read) == ("focal length", factor)
     assert error < 0.01
     np.testing.assert_allclose(best.Ks, cameras.Ks, rtol=1e-5)
 
@@ -158,14 +158,14 @@ def test_matches_that_fit_no_fundamental_matrix_are_left_out(matches: list[PairM
     pair = matches[0]
     noisy = pair.second_pixels.copy()
     noisy[:15] = made.uniform(0, 240, (15, 2))
-    (found,) = consistent_matches([replace(pair, second_pixels=noisy)])
-    assert 45 <= len(found.first_pixels) <= 50
+    (pair_matches,) = consistent_matches([replace(pair, second_pixels=noisy)])
+    assert 45 <= len(pair_matches.first_pixels) <= 50
     few = slice(0, MIN_MATCHES - 1)
     assert consistent_matches([replace(pair, first_pixels=pair.first_pixels[few], second_pixels=noisy[few])]) == []
     exactly = slice(60 - MIN_MATCHES, 60)
     again = replace(pair, first_pixels=pair.first_pixels[exactly], second_pixels=pair.second_pixels[exactly])
     assert len(consistent_matches([again])) == 1
-    for right, wrong, kept in ((40, 40, True), (30, 70, False)):
+    for right, wrong, stays in ((40, 40, True), (30, 70, False)):
         first = np.concatenate((pair.first_pixels[:right], made.uniform(0, 240, (wrong, 2))))
         second = np.concatenate((pair.second_pixels[:right], made.uniform(0, 240, (wrong, 2))))
-        assert bool(consistent_matches([replace(pair, first_pixels=first, second_pixels=second)])) == kept
+        assert bool(consistent_matches([replace(pair, first_pixels=first, second_pixels=second)])) == stays

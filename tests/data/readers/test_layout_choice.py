@@ -37,11 +37,11 @@ def read_of(folder: Path, **options: str) -> tuple[Path, Path]:
     return posed.images[0].image, home
 
 
-@pytest.mark.parametrize("place", COLMAP_FOLDERS)
-def test_a_model_is_found_where_tools_put_it(tmp_path: Path, place: str) -> None:
-    model(tmp_path / place)
+@pytest.mark.parametrize("subfolder", COLMAP_FOLDERS)
+def test_a_model_is_found_where_tools_put_it(tmp_path: Path, subfolder: str) -> None:
+    model(tmp_path / subfolder)
     photograph(tmp_path / "images")
-    assert colmap_model_in(tmp_path) == tmp_path / place
+    assert colmap_model_in(tmp_path) == tmp_path / subfolder
     assert read_of(tmp_path) == (tmp_path / "images" / "a.png", tmp_path)
 
 

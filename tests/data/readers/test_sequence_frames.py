@@ -1,4 +1,4 @@
-"""What single frames of RGB-D sequences become: cameras, poses, depth carried over, and what is left out."""
+"""What single frames of RGB-D sequences become: cameras, poses, and what is left out."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.posed import MAX_COORDINATE, choose_origin, inside, number, rigid_pose
-from gsencoder.data.readers.registration import register_depth
 from gsencoder.data.readers.replica import DEFAULT_PARAMETERS, read_replica
 from gsencoder.data.readers.scannetpp import device_folder, read_scannetpp
 from gsencoder.data.readers.seven_scenes import is_seven_scenes, read_seven_scenes
@@ -145,9 +144,13 @@ def test_the_kinects_of_the_benchmark_are_known_by_the_folder(tmp_path: Path, nu
 
 def test_a_list_needs_a_time_and_a_file_in_every_row(tmp_path: Path) -> None:
     tum(tmp_path)
-    for text, said in (("1.0 a\nx b\n", "row 2 is not a time and a file"), ("1.0\n", "row 1 is"), ("# x\n", "no file")):
+    for text, problem in (
+        ("1.0 a\nx b\n", "row 2 is not a time and a file"),
+        ("1.0\n", "row 1 is"),
+        ("# x\n", "no file"),
+    ):
         (tmp_path / "rgb.txt").write_text(text)
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=problem):
             read_tum(tmp_path, intrinsics=(1.0, 1.0, 1.0, 1.0))
 
 
@@ -239,65 +242,6 @@ def test_files_may_not_lead_out_of_the_folder_of_a_device(tmp_path: Path) -> Non
     assert read_scannetpp(iphone, allow_outside=True).images[0].depth is not None
 
 
-def test_registered_depth_follows_a_turned_and_shifted_sensor_pixel_by_pixel() -> None:
-    """The oracle: each depth pixel as a point, projected; a plane that faces no camera has a depth everywhere."""
-    height, width = 60, 80
-    depth_K = np.array([[70.0, 0, 41], [0, 74, 29], [0, 0, 1]])
-    color_K = np.array([[55.0, 0, 45], [0, 52, 33], [0, 0, 1]])
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec([0.05, -0.08, 0.02]).as_matrix()
-    matrix[:3, 3] = 0.06, -0.04, 0.1
-    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack(((columns - 41) / 70, (rows - 29) / 74, np.ones((height, width))), axis=2)
-    normal, offset = np.array([0.3, -0.2, 1.0]), 2.0
-    depth = (offset / (rays @ normal)).astype(np.float32)
-    seen = register_depth(depth, depth_K, matrix, color_K, 90, 64)
-    columns, rows = np.meshgrid(np.arange(90) + 0.5, np.arange(64) + 0.5)
-    rays = np.stack(((columns - 45) / 55, (rows - 33) / 52, np.ones((64, 90))), axis=2)
-    turned = matrix[:3, :3] @ normal
-    exact = (offset + turned @ matrix[:3, 3]) / (rays @ turned)
-    covered = seen > 0
-    assert 0.3 < covered.mean() < 1
-    assert np.abs(seen[covered] / exact[covered] - 1).max() < 0.02
-    # The corners of the sensor's picture are the corners of what is covered, and inside there are no holes.
-    corners = (
-        depth[[0, 0, -1, -1], [0, -1, 0, -1], None]
-        * np.stack([((u - 41) / 70, (v - 29) / 74, 1) for v in (0.5, 59.5) for u in (0.5, 79.5)])
-    ) @ matrix[:3, :3].T + matrix[:3, 3]
-    pixels = corners[:, :2] / corners[:, 2:] * (55, 52) + (45, 33)
-    edges = [(pixels[a], pixels[b]) for a, b in ((0, 1), (1, 3), (3, 2), (2, 0))]
-    sides = np.stack([
-        (end - start)[0] * (rows - start[1]) - (end - start)[1] * (columns - start[0])
-        for start, end in edges
-    ]) / np.array([np.linalg.norm(end - start) for start, end in edges])[:, None, None]  # fmt: skip
-    within = sides.min(axis=0)
-    assert covered[within > 0].all()
-    assert not covered[within < -1.5].any()
-
-
-def test_a_pixel_of_depth_covers_its_own_square_a_tenth_wider() -> None:
-    depth = np.zeros((3, 4), np.float32)
-    depth[1, 2] = 2.0
-    sensor = np.array([[10.0, 0, 2], [0, 10, 1.5], [0, 0, 1]])
-    # Its center is at (2.5, 1.5), twenty small pixels wide: 40 to 60 and 20 to 40, and a pixel more on each side.
-    wide = register_depth(depth, sensor, np.eye(4), np.array([[200.0, 0, 40], [0, 200, 30], [0, 0, 1]]), 80, 60)
-    assert set(np.flatnonzero(wide.any(axis=0))) == set(range(39, 61))
-    assert set(np.flatnonzero(wide.any(axis=1))) == set(range(19, 41))
-
-
-@pytest.mark.parametrize(("row", "column"), [(0, 0), (0, 3), (2, 0), (2, 3)])
-def test_squares_that_leave_the_picture_are_cut_off(row: int, column: int) -> None:
-    depth = np.zeros((3, 4), np.float32)
-    depth[row, column] = 1.0
-    K = np.array([[10.0, 0, 2], [0, 10, 1.5], [0, 0, 1]])
-    aside = np.eye(4)
-    aside[:2, 3] = (-0.05 if column == 0 else 0.05), (-0.05 if row == 0 else 0.05)
-    seen = register_depth(depth, K, aside, K, 4, 3)
-    assert np.argwhere(seen > 0).tolist() == [[row, column]]
-    aside[:2, 3] *= 30
-    assert not register_depth(depth, K, aside, K, 4, 3).any()
-
-
 def test_poses_with_rounded_numbers_are_made_rigid_and_others_refused() -> None:
     exact = pose(3)
     np.testing.assert_allclose(rigid_pose(np.round(exact, 4), "x"), exact, atol=2e-4)
@@ -313,10 +257,10 @@ def test_poses_with_rounded_numbers_are_made_rigid_and_others_refused() -> None:
         r"singular values 1\.1, 1, 1": lambda m: m.__setitem__((slice(3), 0), 1.1 * m[:3, 0]),
         "mirrors": lambda m: m.__setitem__((slice(3), 0), -m[:3, 0]),
     }
-    for said, change in changes.items():
+    for problem, change in changes.items():
         wrong = exact.copy()
         change(wrong)
-        with pytest.raises(InputError, match=f"^x: .*{said}"):
+        with pytest.raises(InputError, match=f"^x: .*{problem}"):
             rigid_pose(wrong, "x")
     nearly = exact.copy()
     nearly[:3, :3] *= 1.0009
@@ -333,8 +277,8 @@ def test_the_origin_is_a_round_offset() -> None:
 def test_numbers_of_files_are_finite_numbers_or_missing() -> None:
     values = {"a": 2, "b": True, "c": "1", "d": float("inf"), "e": 10**400, "f": None}
     assert (number(values, "a", "x"), number(values, "f", "x"), number(values, "g", "x")) == (2.0, None, None)
-    for key, said in (("b", "a number"), ("c", "a number"), ("d", "finite"), ("e", "finite")):
-        with pytest.raises(InputError, match=f"x: {key} must be {said}"):
+    for key, problem in (("b", "a number"), ("c", "a number"), ("d", "finite"), ("e", "finite")):
+        with pytest.raises(InputError, match=f"x: {key} must be {problem}"):
             number(values, key, "x")
 
 

@@ -108,9 +108,9 @@ class TestDepth:
     def test_a_wire_of_one_pixel_is_kept(self):
         depth = np.full((240, 320), 2.0, np.float32)
         depth[:, 150] = 1.0
-        found = surface_pixels(depth, K)
-        assert found.use[:, 150].all()
-        assert np.abs(found.depth[:, 150] - 1).max() < 1e-6
+        surface = surface_pixels(depth, K)
+        assert surface.use[:, 150].all()
+        assert np.abs(surface.depth[:, 150] - 1).max() < 1e-6
 
     def test_normals_survive_the_noise_and_the_rounding_of_sensors(self, rng):
         view = camera()
@@ -119,11 +119,11 @@ class TestDepth:
             (np.round(clean * 1000) / 1000, 6),
             (clean + 0.003 * rng.standard_normal(clean.shape), 12),
         ):
-            found = surface_pixels(noisy.astype(np.float32), K)
-            cos = np.abs(found.normals[found.use] @ TILTED)
+            surface = surface_pixels(noisy.astype(np.float32), K)
+            cos = np.abs(surface.normals[surface.use] @ TILTED)
             assert np.degrees(np.arccos(np.median(cos))) < limit
-            assert found.use.mean() > 0.95
-            errors = (found.depth - clean)[5:-5, 5:-5]
+            assert surface.use.mean() > 0.95
+            errors = (surface.depth - clean)[5:-5, 5:-5]
             assert errors.std() < 0.6 * max((noisy - clean)[5:-5, 5:-5].std(), 1e-4)
 
     def test_surfaces_seen_at_a_slant_are_not_taken(self):
@@ -239,10 +239,10 @@ class TestDepth:
             grid.add(points[start:stop], normals[start:stop], colors[start:stop])
         expected = {}
         for point, normal, color in zip(points, normals, colors, strict=True):
-            place = point / np.float32(0.1)
+            cell = point / np.float32(0.1)
             axis = int(np.abs(normal).argmax())
-            layer = np.clip(np.rint(float((place - np.floor(place) - 0.5) @ normal) / LAYER), -4, 3)
-            key = (*np.floor(place).astype(int).tolist(), axis, bool(normal[axis] > 0), int(layer))
+            layer = np.clip(np.rint(float((cell - np.floor(cell) - 0.5) @ normal) / LAYER), -4, 3)
+            key = (*np.floor(cell).astype(int).tolist(), axis, bool(normal[axis] > 0), int(layer))
             expected.setdefault(key, []).append([*point, *normal, *color, 1])
         rows = grid._sums[np.argsort(grid._keys[: grid._rows])]
         sums = np.array([np.sum(expected[key], axis=0) for key in sorted(expected)])

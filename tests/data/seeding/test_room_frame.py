@@ -77,6 +77,6 @@ def test_depth_without_surfaces_has_no_frame() -> None:
     assert views.depths is not None
     for value in (0.0, np.nan, np.inf, 1e-30):
         depths = [np.full_like(depth, value) for depth in views.depths]
-        found = room_frame(replace(views, depths=depths))
-        assert found is None or np.isfinite(found).all()
+        frame = room_frame(replace(views, depths=depths))
+        assert frame is None or np.isfinite(frame).all()
     assert room_frame(replace(views, depths=[np.zeros_like(depth) for depth in views.depths])) is None

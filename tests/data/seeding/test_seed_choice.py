@@ -104,7 +104,7 @@ class TestSeed:
         """Seeds inside an object's box, on its surface by the instance maps, span at least half of its volume."""
         scene = load_scene(shared / "scenes/house/train_012")
         g = seed(scene)
-        votes = np.zeros((len(g), max(found.id for found in scene.objects) + 1), np.int32)
+        votes = np.zeros((len(g), max(thing.id for thing in scene.objects) + 1), np.int32)
         for view in range(len(scene.views)):
             pose, M = scene.views.cameras.cam_from_world[view], scene.views.cameras.Ks[view]
             local = g.means @ pose[:3, :3].T + pose[:3, 3]
@@ -117,12 +117,12 @@ class TestSeed:
             np.add.at(votes, (rows[seen], labels[y[seen], x[seen]]), 1)
         owner = np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), 0)
         overlaps = []
-        for found in scene.objects:
-            if found.placed and found.views >= 5 and found.max_pixels >= 60:
-                mine = g.means[owner == found.id].astype(np.float64) + scene.origin
+        for thing in scene.objects:
+            if thing.placed and thing.views >= 5 and thing.max_pixels >= 60:
+                mine = g.means[owner == thing.id].astype(np.float64) + scene.origin
                 lower, upper = mine.min(axis=0), mine.max(axis=0)
-                common = np.clip(np.minimum(upper, found.aabb_max) - np.maximum(lower, found.aabb_min), 0, None).prod()
-                both = (upper - lower).prod() + (found.aabb_max - found.aabb_min).prod()
+                common = np.clip(np.minimum(upper, thing.aabb_max) - np.maximum(lower, thing.aabb_min), 0, None).prod()
+                both = (upper - lower).prod() + (thing.aabb_max - thing.aabb_min).prod()
                 overlaps.append(common / (both - common))
         assert len(overlaps) >= 5
         assert min(overlaps) > 0.5

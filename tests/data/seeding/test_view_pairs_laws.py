@@ -115,9 +115,9 @@ def test_distances_between_neighbors_count_each_place_once() -> None:
 def test_neighbors_of_a_sweep_stand_an_eighth_of_the_distance_apart_if_they_can() -> None:
     """Along an arc of 1.8° steps, an eighth is 7.2°: the fourth camera to each side comes first, the next one last."""
     cameras = arc(21, 1.8)
-    found = _spread_neighbors(cameras, np.ones(21), 10)
-    assert set(found[:2]) == {6, 14}
-    assert set(found[2:]) == {5, 15}
+    neighbors = _spread_neighbors(cameras, np.ones(21), 10)
+    assert set(neighbors[:2]) == {6, 14}
+    assert set(neighbors[2:]) == {5, 15}
     hidden = np.where(np.arange(21) < 10, 0.5, 1.0)
     assert _spread_neighbors(cameras, hidden, 10)[:2] == [14, 15]
     assert _spread_neighbors(cameras, np.zeros(21), 10) == []

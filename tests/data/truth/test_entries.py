@@ -71,10 +71,10 @@ def test_the_eight_corners_go_around_the_top_and_then_around_the_bottom() -> Non
 def test_bounds_are_those_of_all_corners_in_any_order_or_of_a_lower_and_an_upper_one() -> None:
     lower, upper = (0.0, -2.0, 5.0), (1.0, 3.0, 5.0)
     corners = box_corners(lower, upper)
-    for given in (corners, corners[::-1], corners[3:] + corners[:3], [list(lower), list(upper)]):
-        assert corner_bounds(given, HERE, "bbox") == (lower, upper)
-    said = refused(corner_bounds, [[0, 0, 1], [1, 1, 0]], HERE, "bbox")
-    assert said == f"{HERE}: bbox: the lower corner [0.0, 0.0, 1.0] is not below the upper [1.0, 1.0, 0.0]"
+    for bounds in (corners, corners[::-1], corners[3:] + corners[:3], [list(lower), list(upper)]):
+        assert corner_bounds(bounds, HERE, "bbox") == (lower, upper)
+    problem = refused(corner_bounds, [[0, 0, 1], [1, 1, 0]], HERE, "bbox")
+    assert problem == f"{HERE}: bbox: the lower corner [0.0, 0.0, 1.0] is not below the upper [1.0, 1.0, 0.0]"
     for wrong in ([], corners[:7], [*corners, corners[0]], "box", None, 8):
         assert "bbox must be a list of 8 corners [x, y, z]" in refused(corner_bounds, wrong, HERE, "bbox")
     assert "bbox[1] must be a corner" in refused(corner_bounds, [[0, 0, 0], [1, 1]], HERE, "bbox")
@@ -141,8 +141,8 @@ def test_entries_have_their_number_and_their_key_in_messages() -> None:
 def test_two_entries_of_one_key_are_named_with_their_numbers(tmp_path: Any) -> None:
     path = tmp_path / "f.json"
     refuse_repeated(path, ["a", "b", "c"], str)
-    said = refused(refuse_repeated, path, ["a", "b", "c", "b"], lambda key: f"<{key}>", what="question_id")
-    assert said == f"{path}: entries 1 and 3 have one question_id: <b>; expected each once"
+    problem = refused(refuse_repeated, path, ["a", "b", "c", "b"], lambda key: f"<{key}>", what="question_id")
+    assert problem == f"{path}: entries 1 and 3 have one question_id: <b>; expected each once"
 
 
 def test_what_is_shown_of_a_value_is_short_and_on_one_line() -> None:

@@ -32,15 +32,15 @@ def write_scan(folder: Path, alignment: np.ndarray | None = ALIGNMENT) -> Path:
 
 def test_the_box_is_that_of_the_meant_objects_vertices_in_the_aligned_axes(tmp_path: Path) -> None:
     labels = read_scannet_labels(write_scan(tmp_path / "s0"))
-    found = boxes_from_labels([meaning(2), meaning(0), meaning(1), meaning(5), meaning(2, aabb=STATED)], labels)
-    assert [each.aabb for each in found] == [
+    boxes = boxes_from_labels([meaning(2), meaning(0), meaning(1), meaning(5), meaning(2, aabb=STATED)], labels)
+    assert [each.aabb for each in boxes] == [
         ((4.0, 1.0, 2.0), (8.0, 4.0, 7.0)),
         ((10.0, 0.0, -1.0), (10.0, 0.0, -1.0)),
         None,  # All of its vertices belong to object 5.
         ((1.0, 7.0, 6.0), (3.0, 9.0, 8.0)),
         STATED,
     ]
-    assert [each.object_id for each in found] == [2, 0, 1, 5, 2]
+    assert [each.object_id for each in boxes] == [2, 0, 1, 5, 2]
     with pytest.raises(InputError, match="s0: its labels have no object with the objectId 3"):
         boxes_from_labels([meaning(3)], labels)
 
@@ -48,10 +48,16 @@ def test_the_box_is_that_of_the_meant_objects_vertices_in_the_aligned_axes(tmp_p
 def test_expressions_of_several_scans_stay_in_order_and_scans_that_nothing_needs_are_not_read(tmp_path: Path) -> None:
     write_scan(tmp_path / "s0")
     write_scan(tmp_path / "s1", alignment=None)
-    asked = [meaning(0, "s1"), meaning(2, "s0"), meaning(0, "nowhere", aabb=STATED), meaning(2, "s1"), meaning(0, "s0")]
-    found = boxes_from_scans(asked, tmp_path)
-    assert [(each.scene, each.object_id) for each in found] == [(each.scene, each.object_id) for each in asked]
-    assert [each.aabb and each.aabb[0] for each in found] == [
+    expressions = [
+        meaning(0, "s1"),
+        meaning(2, "s0"),
+        meaning(0, "nowhere", aabb=STATED),
+        meaning(2, "s1"),
+        meaning(0, "s0"),
+    ]
+    boxes = boxes_from_scans(expressions, tmp_path)
+    assert [(each.scene, each.object_id) for each in boxes] == [(each.scene, each.object_id) for each in expressions]
+    assert [each.aabb and each.aabb[0] for each in boxes] == [
         (0.0, 0.0, 0.0),
         (4.0, 1.0, 2.0),
         (0.0, 0.0, 0.0),

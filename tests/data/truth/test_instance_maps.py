@@ -66,8 +66,8 @@ def test_views_and_areas_are_counted_by_id_in_any_order_of_objects() -> None:
             for number in (9, 2, 11, 5)
         ),
     )
-    found = [(each.id, each.views, each.max_pixels) for each in with_counted_views(scene).objects]
-    assert found == [(9, 1, 3), (2, 2, 1), (11, 0, 0), (5, 2, 3)]
+    counts = [(each.id, each.views, each.max_pixels) for each in with_counted_views(scene).objects]
+    assert counts == [(9, 1, 3), (2, 2, 1), (11, 0, 0), (5, 2, 3)]
 
 
 def test_each_pixel_has_the_object_of_the_vertex_that_is_nearest_on_the_triangle_itself() -> None:

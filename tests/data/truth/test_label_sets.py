@@ -73,7 +73,7 @@ def test_raw_names_have_the_ids_of_each_benchmark(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("rows", "column", "said"),
+    ("rows", "column", "problem"),
     [
         (("1\twall\twall\t1\tone\tx",), "nyu40id", "line 2: nyu40id must be a whole number, got 'one'"),
         (("1\twall\twall\t1\t\tx",), "nyu40id", "line 2: nyu40id must be a whole number, got ''"),
@@ -85,10 +85,10 @@ def test_raw_names_have_the_ids_of_each_benchmark(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_label_map_is_refused_with_its_line(
-    tmp_path: Path, rows: tuple[str, ...], column: str, said: str
+    tmp_path: Path, rows: tuple[str, ...], column: str, problem: str
 ) -> None:
     path = write_map(tmp_path / "map.tsv", *rows)
-    with pytest.raises(InputError, match=said) as error:
+    with pytest.raises(InputError, match=problem) as error:
         read_label_map(path, column)
     assert str(error.value).startswith(str(path))
     assert "\n" not in str(error.value)
@@ -130,7 +130,7 @@ def test_a_split_is_one_name_a_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "problem"),
     [
         ("a\nb\na\n", "line 3: 'a' is already on line 1"),
         ("../a\n", "line 1: expected the name of a scene, got '../a'"),
@@ -140,10 +140,10 @@ def test_a_split_is_one_name_a_line(tmp_path: Path) -> None:
         ("\n\n", "lists no scene"),
     ],
 )
-def test_a_wrong_split_is_refused_with_its_line(tmp_path: Path, content: str, said: str) -> None:
+def test_a_wrong_split_is_refused_with_its_line(tmp_path: Path, content: str, problem: str) -> None:
     path = tmp_path / "val.txt"
     path.write_text(content)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=problem):
         read_split(path)
 
 

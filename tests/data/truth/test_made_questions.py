@@ -142,27 +142,27 @@ def test_questions_about_a_scene_do_not_depend_on_the_others(seen: list[SeenScen
 
 
 def test_several_of_a_name_are_counted_and_nothing_else_is_asked_about_them() -> None:
-    asked = texts(thing(1, "mug", (0, 0, 0)), thing(2, "mug", (1, 0, 0)), thing(3, "book", (1.15, 0, 0)))
-    assert asked["How many mugs are there in the room?"] == ("2", "two")
-    assert asked["What is next to the book?"] == ("mug",)
-    assert not any("the mug" in text for text in asked)
+    questions = texts(thing(1, "mug", (0, 0, 0)), thing(2, "mug", (1, 0, 0)), thing(3, "book", (1.15, 0, 0)))
+    assert questions["How many mugs are there in the room?"] == ("2", "two")
+    assert questions["What is next to the book?"] == ("mug",)
+    assert not any("the mug" in text for text in questions)
 
 
 def test_a_name_one_of_whose_objects_is_hardly_shown_is_not_asked_about() -> None:
-    asked = texts(thing(1, "mug", (0, 0, 0)), thing(2, "mug", (1, 0, 0), pixels=199), thing(3, "ball", (3, 0, 0)))
-    assert not any("mug" in text for text in asked)
+    questions = texts(thing(1, "mug", (0, 0, 0)), thing(2, "mug", (1, 0, 0), pixels=199), thing(3, "ball", (3, 0, 0)))
+    assert not any("mug" in text for text in questions)
     # What no photograph shows is not in the recorded place, but "the mug" might still be that one.
-    asked = texts(thing(1, "mug", (0, 0, 0)), thing(2, "mug", (1, 0, 0), pixels=0), thing(3, "ball", (0.15, 0, 0)))
-    assert asked["How many mugs are there in the room?"] == ("1", "one")
-    assert "What is next to the mug?" not in asked
-    assert "What is next to the ball?" in asked
+    questions = texts(thing(1, "mug", (0, 0, 0)), thing(2, "mug", (1, 0, 0), pixels=0), thing(3, "ball", (0.15, 0, 0)))
+    assert questions["How many mugs are there in the room?"] == ("1", "one")
+    assert "What is next to the mug?" not in questions
+    assert "What is next to the ball?" in questions
 
 
 def test_names_that_may_mean_the_same_are_not_asked_about() -> None:
-    asked = texts(thing(1, "mug", (0, 0, 0)), thing(2, "cup", (1, 0, 0)), thing(3, "ball", (3, 0, 0)))
-    assert not any(re.search("mug|cup", text) for text in asked)
-    asked = texts(thing(1, "table", (0, 0, 0)), thing(2, "coffee table", (1, 0, 0)), thing(3, "ball", (3, 0, 0)))
-    assert not any("table" in text for text in asked)
+    questions = texts(thing(1, "mug", (0, 0, 0)), thing(2, "cup", (1, 0, 0)), thing(3, "ball", (3, 0, 0)))
+    assert not any(re.search("mug|cup", text) for text in questions)
+    questions = texts(thing(1, "table", (0, 0, 0)), thing(2, "coffee table", (1, 0, 0)), thing(3, "ball", (3, 0, 0)))
+    assert not any("table" in text for text in questions)
 
 
 @pytest.mark.parametrize(
@@ -170,10 +170,12 @@ def test_names_that_may_mean_the_same_are_not_asked_about() -> None:
 )
 def test_a_neighbor_is_clear_only_where_the_next_kind_of_thing_is_farther(second: float, clear: bool) -> None:
     # Boxes of 0.1 m along a line: the gaps to the mug are 0.05 m and `second`.
-    asked = texts(thing(1, "mug", (0, 0, 0)), thing(2, "ball", (0.15, 0, 0)), thing(3, "book", (-0.1 - second, 0, 0)))
-    assert ("What is next to the mug?" in asked) is clear
+    questions = texts(
+        thing(1, "mug", (0, 0, 0)), thing(2, "ball", (0.15, 0, 0)), thing(3, "book", (-0.1 - second, 0, 0))
+    )
+    assert ("What is next to the mug?" in questions) is clear
     if clear:
-        assert asked["What is next to the mug?"] == ("ball",)
+        assert questions["What is next to the mug?"] == ("ball",)
 
 
 def test_a_neighbor_may_be_one_of_several_of_its_name_and_not_more_than_half_a_meter_away() -> None:
@@ -183,15 +185,15 @@ def test_a_neighbor_may_be_one_of_several_of_its_name_and_not_more_than_half_a_m
 
 
 def test_a_nearer_thing_without_a_name_leaves_no_neighbor() -> None:
-    asked = texts(thing(1, "mug", (0, 0, 0)), thing(2, None, (0.11, 0, 0)), thing(3, "ball", (0.25, 0, 0)))
-    assert "What is next to the mug?" not in asked
+    questions = texts(thing(1, "mug", (0, 0, 0)), thing(2, None, (0.11, 0, 0)), thing(3, "ball", (0.25, 0, 0)))
+    assert "What is next to the mug?" not in questions
 
 
 def test_what_a_thing_stands_on_is_where_it_is_and_not_next_to_it() -> None:
     table = thing(1, "table", (-0.5, -0.5, -1.0), size=1.0)
-    asked = texts(table, thing(2, "mug", (0, 0, 0.02)), thing(3, "ball", (0.2, 0, 0)))
-    assert asked["Where is the mug?"] == ("on the table", "next to the ball")
-    assert asked["What is next to the mug?"] == ("ball",)
+    questions = texts(table, thing(2, "mug", (0, 0, 0.02)), thing(3, "ball", (0.2, 0, 0)))
+    assert questions["Where is the mug?"] == ("on the table", "next to the ball")
+    assert questions["What is next to the mug?"] == ("ball",)
     inside = thing(4, "bed", (-0.5, -0.5, -0.5), size=1.0)
     assert (
         texts(table, inside, thing(2, "mug", (0, 0, 0.02)), thing(3, "ball", (3, 0, 0))).get("Where is the mug?")
@@ -207,10 +209,10 @@ def test_absent_names_are_those_that_no_label_may_mean() -> None:
 
 
 def test_plural_names_are_asked_about_as_such() -> None:
-    asked = texts(thing(1, "scissors", (0, 0, 0)), thing(2, "apple", (0.15, 0, 0)))
-    assert asked["Are there any scissors in the room?"] == ("yes",)
-    assert asked["Where are the scissors?"] == ("next to the apple",)
-    assert not any(text.startswith("How many sci") for text in asked)
+    questions = texts(thing(1, "scissors", (0, 0, 0)), thing(2, "apple", (0.15, 0, 0)))
+    assert questions["Are there any scissors in the room?"] == ("yes",)
+    assert questions["Where are the scissors?"] == ("next to the apple",)
+    assert not any(text.startswith("How many sci") for text in questions)
 
 
 def test_no_answer_has_more_than_half_of_a_kind_in_a_scene() -> None:
@@ -257,7 +259,7 @@ def test_inner_pixels_have_all_four_neighbors() -> None:
 def test_scenes_without_labels_are_refused(rooms: list[Scene]) -> None:
     room = rooms[0]
     assert room.views is not None
-    for broken, told in (
+    for broken, problem in (
         (replace(room, objects=()), "no labeled objects"),
         (replace(room, views=replace(room.views, instances=None)), "no instance maps"),
         (replace(room, views=replace(room.views, images=None)), "no photographs"),
@@ -266,7 +268,7 @@ def test_scenes_without_labels_are_refused(rooms: list[Scene]) -> None:
         (replace(room, up=np.array([0.0, 1.0, 0.0])), "up is"),
         (replace(room, objects=tuple(replace(each, name=None) for each in room.objects)), "has a name"),
     ):
-        with pytest.raises(InputError, match=told):
+        with pytest.raises(InputError, match=problem):
             see_objects(broken)
     with pytest.raises(InputError, match="nothing can be asked"):
         make_questions([scene_of(thing(1, "mug", (0, 0, 0), pixels=3))], replace(ALL, absent=()))

@@ -78,11 +78,11 @@ def test_a_scan_without_objects_has_labels_that_are_all_none(tmp_path: Path) -> 
 def test_files_are_found_in_the_folder_or_above_exported_frames(tmp_path: Path) -> None:
     folder = scan(tmp_path)
     (folder / f"{NAME}_vh_clean.aggregation.json").write_text("{}")
-    found = find_scannet_files(folder)
-    assert found is not None
-    assert found.name == NAME
+    files = find_scannet_files(folder)
+    assert files is not None
+    assert files.name == NAME
     (folder / "exported").mkdir()
-    assert find_scannet_files(folder / "exported") == found
+    assert find_scannet_files(folder / "exported") == files
     assert find_scannet_files(tmp_path) is None
     renamed = folder.rename(tmp_path / "room")
     assert find_scannet_files(renamed) is not None
@@ -124,7 +124,7 @@ def error_of(folder: Path) -> str:
 
 
 @pytest.mark.parametrize(
-    ("changes", "file", "said"),
+    ("changes", "file", "problem"),
     [
         ({"groups": [group(0, "a", [7]), group(1, "b", [8])]}, "anno", "objectId 1 ('b') names segment 8, which no"),
         ({"groups": [group(0, "a", [7]), group(0, "b", [9])]}, "anno", "segGroups[1]: objectId 0 is already that of"),
@@ -154,12 +154,12 @@ def error_of(folder: Path) -> str:
     ],
 )
 def test_a_wrong_entry_is_one_line_that_names_file_and_entry(
-    tmp_path: Path, changes: dict[str, Any], file: str, said: str
+    tmp_path: Path, changes: dict[str, Any], file: str, problem: str
 ) -> None:
     folder = scan(tmp_path, **changes)
     message = error_of(folder)
     assert message.startswith(str(folder / f"{NAME}{SUFFIXES[file]}"))
-    assert said in message
+    assert problem in message
 
 
 @pytest.mark.parametrize(
@@ -236,7 +236,7 @@ def test_meshes_of_other_polygons_and_other_files_are_refused(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "problem"),
     [
         ("axisAlignment = 1 0 0", "expected 16 numbers, got '1 0 0'"),
         ("axisAlignment = " + "x " * 16, "expected 16 numbers"),
@@ -244,10 +244,10 @@ def test_meshes_of_other_polygons_and_other_files_are_refused(tmp_path: Path) ->
         ("axisAlignment = " + " ".join(map(str, np.diag([2.0, 2, 2, 1]).ravel())), "uniform scale of 2"),
     ],
 )
-def test_a_wrong_alignment_is_refused(tmp_path: Path, line: str, said: str) -> None:
+def test_a_wrong_alignment_is_refused(tmp_path: Path, line: str, problem: str) -> None:
     path = tmp_path / "s.txt"
     path.write_text(f"colorWidth = 1296\n{line}\n")
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=problem):
         read_axis_alignment(path)
     path.write_text("colorWidth = 1296\n")
     assert read_axis_alignment(path) is None

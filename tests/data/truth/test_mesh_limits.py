@@ -49,15 +49,15 @@ def test_faces_keep_the_order_of_their_vertices_and_name_vertices_that_are_there
 
 
 @pytest.mark.parametrize(
-    ("number", "taken"), [(2**31 - 2, True), (2**31 - 1, False), (-1, False), (True, False), (1.0, False)]
+    ("number", "fits"), [(2**31 - 2, True), (2**31 - 1, False), (-1, False), (True, False), (1.0, False)]
 )
-def test_the_objectId_and_the_number_after_it_fit_into_int32(tmp_path: Path, number: Any, taken: bool) -> None:
+def test_the_objectId_and_the_number_after_it_fit_into_int32(tmp_path: Path, number: Any, fits: bool) -> None:
     groups = [group(0, "couch", [7]), group(number, "lamp", [9])]
-    if taken:
+    if fits:
         assert read_scannet_labels(scan(tmp_path, groups=groups)).instances.max() == number + 1
         return
-    said = error_of(scan(tmp_path, groups=groups))
-    assert f"segGroups[1]: objectId must be a whole number from 0, got {number}" in said
+    problem = error_of(scan(tmp_path, groups=groups))
+    assert f"segGroups[1]: objectId must be a whole number from 0, got {number}" in problem
 
 
 @pytest.mark.parametrize("number", [2**63 - 1, -(2**63)])
@@ -67,8 +67,8 @@ def test_segments_are_numbers_of_64_bits(tmp_path: Path, number: int) -> None:
     labels = read_scannet_labels(scan(tmp_path, segments=segments, groups=groups))
     assert labels.instances.tolist() == [1, 1, 0, 0, 1, 0]
     beyond = number + (1 if number > 0 else -1)
-    said = error_of(scan(tmp_path, segments=[7, 7, 2, 9, beyond, 4], groups=groups))
-    assert "segIndices[4]: expected a whole number, got " in said
+    problem = error_of(scan(tmp_path, segments=[7, 7, 2, 9, beyond, 4], groups=groups))
+    assert "segIndices[4]: expected a whole number, got " in problem
 
 
 def test_names_of_objects_have_at_most_a_thousand_characters(tmp_path: Path) -> None:

@@ -16,20 +16,20 @@ def points(rng: np.random.Generator, count: int) -> np.ndarray:
 def test_a_gaussian_has_the_label_of_the_nearest_vertex_within_the_distance(rng: np.random.Generator) -> None:
     means, vertices = points(rng, 300), points(rng, 200)
     labels = rng.integers(0, 9, 200).astype(np.int32)
-    found = labels_of_gaussians(means, vertices, labels, max_distance=0.1, none=-7)
+    nearest_labels = labels_of_gaussians(means, vertices, labels, max_distance=0.1, none=-7)
     distances = np.linalg.norm(means[:, None].astype(float) - vertices[None], axis=2)
     near = distances.min(axis=1) <= 0.1
     assert 0 < near.sum() < 300
-    assert np.array_equal(found.vertices, np.where(near, distances.argmin(axis=1), -1))
-    assert np.array_equal(found.labels, np.where(near, labels[distances.argmin(axis=1)], -7))
-    assert found.far == (~near).sum()
+    assert np.array_equal(nearest_labels.vertices, np.where(near, distances.argmin(axis=1), -1))
+    assert np.array_equal(nearest_labels.labels, np.where(near, labels[distances.argmin(axis=1)], -7))
+    assert nearest_labels.far == (~near).sum()
 
 
 def test_the_distance_itself_is_near_enough() -> None:
     vertices = np.array([[0, 0, 0]], np.float32)
     means = np.array([[0.25, 0, 0], [0.2500001, 0, 0]], np.float32)
-    found = labels_of_gaussians(means, vertices, np.array([4]), max_distance=0.25)
-    assert found.labels.tolist() == [4, 0]
+    labels = labels_of_gaussians(means, vertices, np.array([4]), max_distance=0.25)
+    assert labels.labels.tolist() == [4, 0]
 
 
 def test_the_nearest_row_is_that_of_brute_force_and_minus_one_where_none_is_near(rng: np.random.Generator) -> None:
@@ -58,13 +58,13 @@ def test_chunks_change_nothing(rng: np.random.Generator, monkeypatch: pytest.Mon
     means, vertices = points(rng, 300), points(rng, 257)
     labels = rng.integers(0, 40, 300)
     whole = labels_of_vertices(vertices, means, labels)
-    found = labels_of_gaussians(means, vertices, np.arange(257), max_distance=0.1)
+    nearest_labels = labels_of_gaussians(means, vertices, np.arange(257), max_distance=0.1)
     rows = nearest_rows(vertices, means)
     monkeypatch.setattr(nearest_vertices, "CHUNK", 16)
     monkeypatch.setattr(nearest_vertices, "MAX_VOTES", 300)
     assert np.array_equal(labels_of_vertices(vertices, means, labels), whole)
     again = labels_of_gaussians(means, vertices, np.arange(257), max_distance=0.1)
-    assert np.array_equal(again.labels, found.labels)
+    assert np.array_equal(again.labels, nearest_labels.labels)
     assert np.array_equal(nearest_rows(vertices, means), rows)
 
 
@@ -93,8 +93,8 @@ def test_nothing_gives_no_labels(rng: np.random.Generator) -> None:
     assert labels_of_vertices(some, none, empty).tolist() == [-1, -1, -1]
     assert labels_of_vertices(none, some, np.arange(3)).shape == (0,)
     assert labels_of_vertices(some, some, np.arange(3), voters=np.zeros(3, bool)).tolist() == [-1, -1, -1]
-    found = labels_of_gaussians(some, none, empty)
-    assert (found.labels.tolist(), found.far) == ([0, 0, 0], 3)
+    labels = labels_of_gaussians(some, none, empty)
+    assert (labels.labels.tolist(), labels.far) == ([0, 0, 0], 3)
     assert labels_of_gaussians(none, some, np.arange(3)).far == 0
 
 

@@ -87,10 +87,10 @@ def test_beside_is_neither_on_nor_in_nor_wholly_above_or_below_and_the_nearest_c
         box(4, (0.2, 0, 0)),  # In it.
         box(8, (2, 0, 1)),  # Above it, and aside.
     ]
-    found = beside(thing, [*around, thing])
+    neighbors = beside(thing, [*around, thing])
     # Of equal distances the smaller id.
-    assert ids(other for _, other in found) == [5, 6, 7]
-    assert [distance for distance, _ in found] == pytest.approx([0.5, 0.5, 2])
+    assert ids(other for _, other in neighbors) == [5, 6, 7]
+    assert [distance for distance, _ in neighbors] == pytest.approx([0.5, 0.5, 2])
 
 
 @pytest.mark.parametrize(
@@ -113,8 +113,8 @@ def test_one_distance_is_clearly_smaller_by_a_tenth_of_a_meter_and_by_half(
 def test_the_neighbor_is_near_named_and_nearer_than_all_of_another_name() -> None:
     def of(*others: SeenObject) -> int | None:
         thing = box(1, (0, 0, 0), name="mug")
-        found = neighbor(thing, [thing, *others])
-        return None if found is None else found.id
+        nearest = neighbor(thing, [thing, *others])
+        return None if nearest is None else nearest.id
 
     assert of(box(2, (1.5, 0, 0), name="box")) == 2
     assert of(box(2, (1.501, 0, 0), name="box")) is None
@@ -137,8 +137,8 @@ def test_a_thing_is_supported_by_the_only_named_thing_under_it_unless_it_is_in_s
 
 def test_the_largest_is_longer_across_by_three_tenths_than_any_other() -> None:
     def of(*sizes: float) -> int | None:
-        found = largest([box(number, (0, 0, 0), (size, size, size)) for number, size in enumerate(sizes)])
-        return None if found is None else found.id
+        thing = largest([box(number, (0, 0, 0), (size, size, size)) for number, size in enumerate(sizes)])
+        return None if thing is None else thing.id
 
     assert (of(1, 1.301, 0.5), of(1, 1.299), of(1.4, 1, 1), of(2)) == (1, None, 0, None)
     flat, cube = box(1, (0, 0, 0), (3, 4, 0)), box(2, (0, 0, 0), (2, 2, 2))

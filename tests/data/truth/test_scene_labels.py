@@ -38,16 +38,16 @@ def scan(room: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_objects_of_a_scan_have_the_boxes_of_the_room(room: Scene, scan: Path) -> None:
     scene = load_scene(scan)
-    found, true = ({each.id: each for each in objects} for objects in (scene.objects, room.objects))
-    assert set(found) == set(true)
-    assert (found[1].name, found[2].name, found[1].placed, found[2].placed) == ("floor", "wall", False, False)
+    things, true = ({each.id: each for each in objects} for objects in (scene.objects, room.objects))
+    assert set(things) == set(true)
+    assert (things[1].name, things[2].name, things[1].placed, things[2].placed) == ("floor", "wall", False, False)
     for number, thing in true.items():
-        assert found[number].name == (thing.name or found[number].name)
+        assert things[number].name == (thing.name or things[number].name)
         # A scan has what views see of a surface, to half a vertex: inside the true box, and most of it.
         inside = thing.aabb_max - thing.aabb_min
-        assert (found[number].aabb_min >= thing.aabb_min - 0.01).all()
-        assert (found[number].aabb_max <= thing.aabb_max + 0.01).all()
-        assert (found[number].aabb_max - found[number].aabb_min >= inside - np.maximum(0.5 * inside, 0.12)).all()
+        assert (things[number].aabb_min >= thing.aabb_min - 0.01).all()
+        assert (things[number].aabb_max <= thing.aabb_max + 0.01).all()
+        assert (things[number].aabb_max - things[number].aabb_min >= inside - np.maximum(0.5 * inside, 0.12)).all()
 
 
 def test_instance_maps_drawn_from_the_mesh_are_those_of_the_room(room: Scene, scan: Path) -> None:
@@ -122,14 +122,14 @@ def test_a_scannetpp_scene_without_depth_has_objects_in_the_world_of_its_scan(ro
     agree = [np.mean(scene.views.instances[view] == room.views.instances[view]) for view in range(VIEWS)]
     assert min(agree) > 0.95
     true = {each.id: each for each in room.objects}
-    found = {each.id: each for each in scene.objects}
+    things = {each.id: each for each in scene.objects}
     # The floor claims every vertex, and keeps those that no smaller object claims.
-    assert set(found) == set(true)
+    assert set(things) == set(true)
     for number, thing in true.items():
-        np.testing.assert_array_less(thing.aabb_min - 0.01, found[number].aabb_min)
-        np.testing.assert_array_less(found[number].aabb_max, thing.aabb_max + 0.01)
+        np.testing.assert_array_less(thing.aabb_min - 0.01, things[number].aabb_min)
+        np.testing.assert_array_less(things[number].aabb_max, thing.aabb_max + 0.01)
     dslr = load_scene(folder / "dslr")
-    assert [each.id for each in dslr.objects] == list(found)
+    assert [each.id for each in dslr.objects] == list(things)
 
 
 def test_a_scene_far_from_zero_has_the_same_maps_and_boxes_there(tmp_path: Path) -> None:
@@ -182,16 +182,16 @@ def test_archives_of_instances_come_before_maps_of_the_mesh_and_the_filtered_one
     assert scene.views is not None
     assert scene.views.instances is not None
     assert np.unique(scene.views.instances[2]).tolist() == [7]
-    given = [room.views.instances[view] for view in range(VIEWS)]
-    pack(folder / "scene0000_00_2d-instance-filt.zip", "instance-filt", given)
+    pictures = [room.views.instances[view] for view in range(VIEWS)]
+    pack(folder / "scene0000_00_2d-instance-filt.zip", "instance-filt", pictures)
     assert source_of_maps(folder) == "pictures in scene0000_00_2d-instance-filt.zip"
     scene = load_scene(folder)
     assert scene.views is not None
     assert scene.views.instances is not None
     for view in range(VIEWS):
-        np.testing.assert_array_equal(scene.views.instances[view], given[view])
+        np.testing.assert_array_equal(scene.views.instances[view], pictures[view])
     half = scene.views.instances[1:2]
-    np.testing.assert_array_equal(half[0], given[1])
+    np.testing.assert_array_equal(half[0], pictures[1])
     # Unpacked ones come first.
     (folder / "instance-filt").mkdir()
     for view in range(VIEWS):
@@ -200,18 +200,18 @@ def test_archives_of_instances_come_before_maps_of_the_mesh_and_the_filtered_one
 
 
 @pytest.mark.parametrize(
-    ("maps", "told"),
+    ("maps", "problem"),
     [
         ([np.ones((72, 96))] * (VIEWS - 1), f"has no picture of 1 view of {VIEWS} \\(first: {VIEWS - 1}.png\\)"),
         ([np.ones((36, 48))] * VIEWS, "has pictures of 48×36 pixels, and photographs have 96×72"),
     ],
 )
 def test_an_archive_that_does_not_fit_is_named_and_maps_are_drawn(
-    maps: list[np.ndarray], told: str, room: Scene, tmp_path: Path
+    maps: list[np.ndarray], problem: str, room: Scene, tmp_path: Path
 ) -> None:
     folder = write_scannet_scan(room, tmp_path / "scene0000_00")
     pack(folder / "scene0000_00_2d-instance-filt.zip", "instance-filt", maps)
-    with pytest.warns(SceneWarning, match=f"{told}, so that instance maps are drawn from the labeled mesh"):
+    with pytest.warns(SceneWarning, match=f"{problem}, so that instance maps are drawn from the labeled mesh"):
         assert source_of_maps(folder) == "drawn from the labeled mesh"
 
 

@@ -106,8 +106,8 @@ def test_the_color_is_that_of_the_photographs_that_show_most_of_a_thing() -> Non
 def test_hue_saturation_and_value_are_those_of_the_hexagon(
     rgb: tuple[int, int, int], expected: tuple[float, float, float]
 ) -> None:
-    found = hsv(np.array([rgb], np.uint8))
-    assert [float(each[0]) for each in found] == pytest.approx(expected)
+    values = hsv(np.array([rgb], np.uint8))
+    assert [float(each[0]) for each in values] == pytest.approx(expected)
 
 
 def test_reds_lie_on_both_sides_of_zero() -> None:
@@ -149,12 +149,16 @@ def test_the_largest_means_the_largest_and_words_of_names_are_joined_in_files() 
     boxes = [thing(1, "card box", (0, 0, 0)), thing(2, "card box", (5, 0, 0)), thing(3, "card box", (9, 0, 0), 0.2)]
     made = {each.expression.text: each for each in make_expressions([scene_of(*boxes, unit=0.5)])}
     assert set(made) == {"the largest card box"}
-    found = made["the largest card box"]
-    assert (found.expression.object_id, found.expression.object_name, found.unique) == (3, "card_box", False)
-    assert found.needed == (3, 1, 2)
+    expression = made["the largest card box"]
+    assert (expression.expression.object_id, expression.expression.object_name, expression.unique) == (
+        3,
+        "card_box",
+        False,
+    )
+    assert expression.needed == (3, 1, 2)
     # Files have units of half a metre.
-    np.testing.assert_allclose(found.expression.aabb, [[18, 0, 0], [18.4, 0.4, 0.4]])
-    assert (found.expression.multiple, found.expression.tokens) == (True, ("the", "largest", "card", "box"))
+    np.testing.assert_allclose(expression.expression.aabb, [[18, 0, 0], [18.4, 0.4, 0.4]])
+    assert (expression.expression.multiple, expression.expression.tokens) == (True, ("the", "largest", "card", "box"))
 
 
 # Situations
@@ -162,9 +166,9 @@ def test_the_largest_means_the_largest_and_words_of_names_are_joined_in_files() 
 
 def test_a_side_needs_twenty_degrees_from_straight_ahead_and_from_straight_behind() -> None:
     def of(degrees: float) -> str | None:
-        place = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0]) * 10
+        position = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0]) * 10
         return side_of(
-            thing(1, "a", (0, 0, 0), 1e-6), thing(2, "b", (10, 0, 0), 1e-6), thing(3, "c", tuple(place), 1e-6)
+            thing(1, "a", (0, 0, 0), 1e-6), thing(2, "b", (10, 0, 0), 1e-6), thing(3, "c", tuple(position), 1e-6)
         )
 
     assert [of(angle) for angle in (19.9, 20.1, 90, 159.9, 160.1)] == [None, "left", "left", "left", None]

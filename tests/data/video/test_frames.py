@@ -54,12 +54,12 @@ def numbers(names: tuple[str, ...]) -> np.ndarray:
 def test_sharp_frames_are_written_with_their_number_in_the_video(video: Path, tmp_path: Path) -> None:
     names = take_frames(video, tmp_path / "images")
     assert sorted(path.name for path in (tmp_path / "images").iterdir()) == [*names, RECORD_FILE]
-    taken = numbers(names)
-    assert (taken % 3 == 0).all()
+    frame_numbers = numbers(names)
+    assert (frame_numbers % 3 == 0).all()
     # 60 steps of 6 pixels are 0.94 of the width, and the fewest frames are closer together than video.motion.
-    assert 8 <= len(taken) <= 16
+    assert 8 <= len(frame_numbers) <= 16
     stored = np.stack(pan()).astype(np.float32)
-    for name, number in zip(names, taken, strict=True):
+    for name, number in zip(names, frame_numbers, strict=True):
         with Image.open(tmp_path / "images" / name) as file:
             picture = np.asarray(file.convert("L"), np.float32)
         assert np.abs(stored - picture).mean(axis=(1, 2)).argmin() == number

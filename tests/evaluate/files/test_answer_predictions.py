@@ -49,13 +49,13 @@ def test_scanqas_submission_is_read_with_and_without_boxes(tmp_path: Path) -> No
 
 def test_sqa3ds_answers_are_found_by_situation_and_place(tmp_path: Path) -> None:
     row = {"scene_id": "s0", "situation": "I stand.", "question": "Which?", "answer": "right"}
-    place = {"agent_pos": {"x": 1.0, "y": 0.5, "z": 0}, "agent_rot": {"_x": 0, "_y": 0, "_z": 0.6, "_w": 0.8}}
-    assert read_answer_predictions(written(tmp_path, [row | place]), SQA3D) == {"1": ("right",)}
+    pose = {"agent_pos": {"x": 1.0, "y": 0.5, "z": 0}, "agent_rot": {"_x": 0, "_y": 0, "_z": 0.6, "_w": 0.8}}
+    assert read_answer_predictions(written(tmp_path, [row | pose]), SQA3D) == {"1": ("right",)}
     assert read_answer_predictions(written(tmp_path, [row]), SQA3D[:1]) == {"0": ("right",)}
     with pytest.raises(InputError, match="entry 0: scene, situation, question and place are those of 2 questions"):
         read_answer_predictions(written(tmp_path, [row]), SQA3D)
     with pytest.raises(InputError, match="those of no question of the truth: 'Which\\?'"):
-        read_answer_predictions(written(tmp_path, [row | place | {"situation": "I sit."}]), SQA3D)
+        read_answer_predictions(written(tmp_path, [row | pose | {"situation": "I sit."}]), SQA3D)
     assert read_answer_predictions(written(tmp_path, [{"question_id": 1, "answer": ""}]), SQA3D) == {"1": ("",)}
 
 
@@ -123,16 +123,16 @@ def test_scanqas_pickles_are_refused(tmp_path: Path) -> None:
 def test_situations_at_one_place_are_told_apart_by_where_one_faces(tmp_path: Path) -> None:
     turned = replace(SQA3D[0], id="7", rotation=(0.6, 0.0, 0.0, 0.8))
     row = {"scene_id": "s0", "situation": "I stand.", "question": "Which?", "answer": "right"}
-    place = {"agent_pos": {"x": 0.0, "y": 0.5, "z": 0}}
+    pose = {"agent_pos": {"x": 0.0, "y": 0.5, "z": 0}}
     for question in (SQA3D[0], turned):
         w, x, y, z = question.rotation or ()
         faced = {"agent_rot": {"_x": x, "_y": y, "_z": z, "_w": w}}
-        found = read_answer_predictions(written(tmp_path, [row | place | faced]), (SQA3D[0], turned))
-        assert found == {question.id: ("right",)}
+        predictions = read_answer_predictions(written(tmp_path, [row | pose | faced]), (SQA3D[0], turned))
+        assert predictions == {question.id: ("right",)}
     with pytest.raises(InputError, match="are those of 2 questions; give its question_id"):
-        read_answer_predictions(written(tmp_path, [row | place]), (SQA3D[0], turned))
+        read_answer_predictions(written(tmp_path, [row | pose]), (SQA3D[0], turned))
     write_answer_predictions(tmp_path / "p.json", (turned,), {"7": ("right", "left")})
-    (said,) = json.loads((tmp_path / "p.json").read_text())
-    assert said["agent_rot"] == {"_x": 0.0, "_y": 0.0, "_z": 0.8, "_w": 0.6}
-    assert said["agent_pos"] == {"x": 0.0, "y": 0.5, "z": 0.0}
-    assert (said["answer"], said["situation"], said["question"]) == ("right", "I stand.", "Which?")
+    (entry,) = json.loads((tmp_path / "p.json").read_text())
+    assert entry["agent_rot"] == {"_x": 0.0, "_y": 0.0, "_z": 0.8, "_w": 0.6}
+    assert entry["agent_pos"] == {"x": 0.0, "y": 0.5, "z": 0.0}
+    assert (entry["answer"], entry["situation"], entry["question"]) == ("right", "I stand.", "Which?")

@@ -129,11 +129,11 @@ def test_boxes_are_written_by_scene_with_the_probability_of_nothing_before_that_
 
 
 def test_captions_of_objects_are_written_under_their_names_and_once_each(tmp_path: Path) -> None:
-    said = [NamedCaption(scene="s1", object_id=3, caption="a"), NamedCaption(scene="s0", object_id=3, caption="b.")]
-    write_named_captions(tmp_path / "p.json", OBJECTS, said)
+    captions = [NamedCaption(scene="s1", object_id=3, caption="a"), NamedCaption(scene="s0", object_id=3, caption="b.")]
+    write_named_captions(tmp_path / "p.json", OBJECTS, captions)
     content = json.loads((tmp_path / "p.json").read_text())
     assert content == {"s1|3|office_chair": ["sos a eos"], "s0|3|office_chair": ["sos b . eos"]}
     with pytest.raises(InputError, match="has two captions; expected one"):
-        write_named_captions(tmp_path / "p.json", OBJECTS, [said[0], said[0]])
+        write_named_captions(tmp_path / "p.json", OBJECTS, [captions[0], captions[0]])
     with pytest.raises(InputError, match="object 4 of s1 is captioned and is not in the truth"):
         write_named_captions(tmp_path / "p.json", OBJECTS, [NamedCaption(scene="s1", object_id=4, caption="a")])

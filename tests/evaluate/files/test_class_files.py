@@ -45,7 +45,7 @@ def test_the_benchmarks_leave_out_wall_and_floor_where_instances_are_scored() ->
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "problem"),
     [
         ("id,name\n1,bed\nx,lamp\n", r"line 3: expected a whole number and a name, got 'x', 'lamp'"),
         ("id,name\n-1,bed\n", "line 2: expected a whole number"),
@@ -62,9 +62,9 @@ def test_the_benchmarks_leave_out_wall_and_floor_where_instances_are_scored() ->
         ("id,name\n1,bed\n1,lamp\n", "the id 1 is there twice"),
     ],
 )
-def test_a_wrong_table_is_refused_with_its_line(tmp_path: Path, text: str, said: str) -> None:
+def test_a_wrong_table_is_refused_with_its_line(tmp_path: Path, text: str, problem: str) -> None:
     path = written(tmp_path / "c.csv", text)
-    with pytest.raises(InputError, match=said) as error:
+    with pytest.raises(InputError, match=problem) as error:
         load_classes(path)
     assert str(error.value).startswith(path)
 

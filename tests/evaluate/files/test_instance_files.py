@@ -79,9 +79,9 @@ def test_files_of_other_tools_are_read(folders: tuple[Path, Path]) -> None:
     (folders[0] / "masks" / "m.txt").write_bytes(b"\r\n".join(b"17" if own else b"0" for own in IDS == 4001))
     (folders[0] / "scene0011_00.txt").write_bytes(b"./masks/m.txt 4.0 1e-1\r\n")
     assert [files.scene for files in scene_files(*folders)] == ["scene0011_00"]
-    found = read_instance_prediction(folders[0] / "scene0011_00.txt", num_vertices=SIZE)
-    assert np.array_equal(found.mask(0), np.flatnonzero(IDS == 4001))
-    assert (found.labels[0], found.scores[0]) == (4, 0.1)
+    prediction = read_instance_prediction(folders[0] / "scene0011_00.txt", num_vertices=SIZE)
+    assert np.array_equal(prediction.mask(0), np.flatnonzero(IDS == 4001))
+    assert (prediction.labels[0], prediction.scores[0]) == (4, 0.1)
 
 
 @pytest.mark.parametrize(

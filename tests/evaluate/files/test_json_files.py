@@ -175,9 +175,10 @@ def test_swapped_files_of_sentences_are_told(tmp_path: Path) -> None:
     truth = written(tmp_path / "t.json", [TRUTH])
     with pytest.raises(InputError, match="t.json: entry 0: unexpected key 'description'.*swapped"):
         read_referring_predictions(truth)
-    for boxes, said in (({"bboxes": []}, ", got bboxes: these are predictions"), ({"bbox": CORNERS}, "")):
+    for boxes, problem in (({"bboxes": []}, ", got bboxes: these are predictions"), ({"bbox": CORNERS}, "")):
         with pytest.raises(
-            InputError, match=f"p.json: entry 0: expected an expression with a description{said}; predictions and truth"
+            InputError,
+            match=f"p.json: entry 0: expected an expression with a description{problem}; predictions and truth",
         ):
             read_referring_truth(written(tmp_path / "p.json", [KEY | boxes]))
 
@@ -317,8 +318,8 @@ def test_an_object_without_a_prediction_is_refused_unless_it_may_be_missing(tmp_
     write_recognition_predictions(tmp_path / "p.json", [])
     with pytest.raises(InputError, match=r"p\.json: object 1 of s has no prediction"):
         recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"])
-    found, others = recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"], allow_missing=True)
-    assert ([(each.rank, each.first) for each in found], others) == ([(0, None)], 0)
+    results, others = recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"], allow_missing=True)
+    assert ([(each.rank, each.first) for each in results], others) == ([(0, None)], 0)
 
 
 def test_bbox_is_the_first_of_bboxes_and_no_other_of_them(tmp_path: Path) -> None:

@@ -189,9 +189,9 @@ def test_without_nltk_or_its_data_the_reason_is_named(monkeypatch: pytest.Monkey
     stem.WordNetLemmatizer = WordNetLemmatizer  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "nltk", ModuleType("nltk"))
     monkeypatch.setitem(sys.modules, "nltk.stem", stem)
-    found = wordnet_lemmatizer()
-    assert not isinstance(found, str)
-    assert found("chairs") == "chair"
+    lemmatizer = wordnet_lemmatizer()
+    assert not isinstance(lemmatizer, str)
+    assert lemmatizer("chairs") == "chair"
     WordNetLemmatizer.data = False
     assert "no data of WordNet" in str(wordnet_lemmatizer())
 

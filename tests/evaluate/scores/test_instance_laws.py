@@ -32,10 +32,13 @@ def matched(ids: list[tuple[int, int]], masks: list[tuple[int, int, int, float]]
 
 def test_a_truth_of_a_smaller_id_chooses_first_whatever_the_scores_are() -> None:
     # P lies on both beds by 120 / 240 at least: a third of 160 and 100 vertices more.
-    found = matched([(4001, 100), (4002, 100), (0, 50)], [(40, 160, 4, 0.1), (0, 100, 4, 0.9)])
-    quarter = found.thresholds == 9  # type: ignore[attr-defined]
+    pairs = matched([(4001, 100), (4002, 100), (0, 50)], [(40, 160, 4, 0.1), (0, 100, 4, 0.9)])
+    quarter = pairs.thresholds == 9  # type: ignore[attr-defined]
     # The first bed takes P, which is listed first, and the higher score is that of the match; the other is wrong.
-    assert sorted(zip(found.outcome_scores[quarter], found.hits[quarter], strict=True)) == [(0.1, False), (0.9, True)]  # type: ignore[attr-defined]
+    assert sorted(zip(pairs.outcome_scores[quarter], pairs.hits[quarter], strict=True)) == [
+        (0.1, False),
+        (0.9, True),
+    ]  # type: ignore[attr-defined]
 
 
 def test_groups_that_are_small_and_of_no_class_are_counted_twice_as_in_scannets_script() -> None:
@@ -44,9 +47,9 @@ def test_groups_that_are_small_and_of_no_class_are_counted_twice_as_in_scannets_
     classes = ClassTable(names=("wall", "bed"), ids=(0, 4))
     truth = np.concatenate([np.full(60, 7), np.full(140, 4001), np.full(300, 4002)])
     made = prediction_of_masks("s", [np.arange(500) < 200], [0], [0.9], num_vertices=500)
-    found = match_instances(InstanceTruth(scene="s", ids=truth), made, classes)
+    matches = match_instances(InstanceTruth(scene="s", ids=truth), made, classes)
     # False from 0.6 on, the third of nine thresholds: 0.5 and 0.55 ignore it, and so does 0.25.
-    assert found.thresholds[~found.hits].tolist() == [2, 3, 4, 5, 6, 7, 8]
+    assert matches.thresholds[~matches.hits].tolist() == [2, 3, 4, 5, 6, 7, 8]
 
 
 def test_ids_far_apart_are_counted_as_those_that_are_near() -> None:
@@ -85,7 +88,7 @@ def test_precision_is_taken_at_each_score_from_the_lowest() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "problem"),
     [
         ({"offsets": [1, 2]}, "do not divide their 2 vertices"),
         ({"offsets": [0, 1]}, "do not divide"),
@@ -96,10 +99,10 @@ def test_precision_is_taken_at_each_score_from_the_lowest() -> None:
         ({"scores": [-math.inf]}, "prediction 0 has the score -inf"),
     ],
 )
-def test_masks_that_contradict_themselves_are_refused(changes: dict[str, list[float]], said: str) -> None:
+def test_masks_that_contradict_themselves_are_refused(changes: dict[str, list[float]], problem: str) -> None:
     parts = {"vertices": [0, 2], "offsets": [0, 2], "labels": [4], "scores": [0.5]} | changes
     arrays = {name: np.array(part, np.float64 if name == "scores" else np.int64) for name, part in parts.items()}
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=problem):
         InstancePrediction(scene="s", num_vertices=3, **arrays)
 
 
@@ -116,12 +119,12 @@ def test_masks_begin_anew_and_may_be_empty() -> None:
 
 def test_places_count_from_one_and_other_classes_are_counted_beside() -> None:
     truth = [NamedInstance(scene="s", object=str(k), name=name) for k, name in enumerate(("a", "b", "a", "z"))]
-    said = [("b", "a"), (), ("a",)]
-    ranked = [RankedNames(scene="s", object=str(k), names=names) for k, names in enumerate(said)]
-    found, others = recognize(ranked, truth, ["a", "b"])
-    assert [(each.rank, each.first) for each in found] == [(2, "b"), (0, None), (1, "a")]
+    ranked_names = [("b", "a"), (), ("a",)]
+    ranked = [RankedNames(scene="s", object=str(k), names=names) for k, names in enumerate(ranked_names)]
+    results, others = recognize(ranked, truth, ["a", "b"])
+    assert [(each.rank, each.first) for each in results] == [(2, "b"), (0, None), (1, "a")]
     assert others == 1
-    scores = recognition_scores(found, ["b", "a"], ks=(1, 2))
+    scores = recognition_scores(results, ["b", "a"], ks=(1, 2))
     assert scores.overall == {1: pytest.approx(1 / 3), 2: pytest.approx(2 / 3)}
     assert (scores.classes[2], scores.mean[2], scores.unanswered) == ({"b": 0, "a": 1}, 1 / 2, 1)
     with pytest.raises(InputError, match="object 1 of s has no prediction"):
@@ -131,8 +134,8 @@ def test_places_count_from_one_and_other_classes_are_counted_beside() -> None:
 
 def test_the_ceiling_is_of_the_background_and_no_class_is_of_none() -> None:
     classes = ClassTable(names=("ceiling", "bed", "floor", "lamp"), ids=(22, 4, 2, 9))
-    truth, said = np.array([22, 4, 4, 2, 9]), np.array([22, 4, 22, 2, 77])
-    scores = semantic_scores([count_labels("s", truth, said, classes)], classes)
+    truth, labels = np.array([22, 4, 4, 2, 9]), np.array([22, 4, 22, 2, 77])
+    scores = semantic_scores([count_labels("s", truth, labels, classes)], classes)
     assert scores.excluded == ("ceiling", "floor")
     assert scores.foreground.miou == pytest.approx((1 / 2 + 0) / 2)
     assert {name: (each.truths, each.predictions) for name, each in scores.classes.items()} == {

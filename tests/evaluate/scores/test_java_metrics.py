@@ -56,11 +56,11 @@ def test_meteor_is_told_references_first_and_asked_for_all_samples_at_the_end(tm
 
 
 @pytest.mark.parametrize(
-    ("program", "said"),
+    ("program", "problem"),
     [("import sys; sys.exit('no heap')", "no heap"), ("print('nonsense')", "PTB tokenizer gave 1 lines for 2 texts")],
 )
-def test_what_java_says_when_it_fails_is_told(tmp_path: Path, program: str, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_what_java_says_when_it_fails_is_told(tmp_path: Path, program: str, problem: str) -> None:
+    with pytest.raises(InputError, match=problem):
         ptb_tokens(["a", "b"], stand_in(tmp_path, program))
 
 

@@ -34,25 +34,25 @@ TRUTH = [instance(1, "bed"), instance(2, "bed"), instance(3, "bed"), instance(4,
 def test_scores_are_those_worked_out_by_hand() -> None:
     # Beds: first, second, and not named: top-1 1/3, top-2 2/3. Chair: first. Sofas: there is none.
     answers = [answer(4, "chair"), answer(2, "sofa", "bed"), answer(1, "bed", "sofa"), answer(3, "chair")]
-    found, others = recognize(answers, TRUTH, CLASSES)
-    scores = recognition_scores(found, CLASSES, ks=(1, 2))
+    results, others = recognize(answers, TRUTH, CLASSES)
+    scores = recognition_scores(results, CLASSES, ks=(1, 2))
     assert others == 0
     assert scores.classes[1] == pytest.approx({"bed": 1 / 3, "chair": 1, "sofa": math.nan}, nan_ok=True)
     assert scores.mean == pytest.approx({1: (1 / 3 + 1) / 2, 2: (2 / 3 + 1) / 2})
     assert scores.overall == pytest.approx({1: 2 / 4, 2: 3 / 4})
     assert scores.counts == {"bed": 3, "chair": 1, "sofa": 0}
-    assert [item.rank for item in found] == [1, 2, 0, 1]
+    assert [item.rank for item in results] == [1, 2, 0, 1]
 
 
 def test_the_mean_of_the_papers_row_is_the_mean_of_its_classes() -> None:
     # Table 1, PointCLIP: 0 but for table 0.7, bookshelf 91.8 and curtain 15.0, of 17 classes; the paper prints 6.3.
     shares = {"table": 7, "bookshelf": 918, "curtain": 150} | {f"class {number}": 0 for number in range(14)}
-    found = [
+    instances = [
         RecognizedInstance(scene=name, object=str(number), name=name, rank=int(number < right), first=name)
         for name, right in shares.items()
         for number in range(1000)
     ]
-    assert round(100 * recognition_scores(found, list(shares)).mean[1], 1) == 6.3
+    assert round(100 * recognition_scores(instances, list(shares)).mean[1], 1) == 6.3
 
 
 def test_instances_of_other_classes_are_not_scored_and_counted() -> None:
@@ -63,8 +63,8 @@ def test_instances_of_other_classes_are_not_scored_and_counted() -> None:
 
 
 def test_no_answer_is_wrong() -> None:
-    found, _ = recognize([answer(1), answer(2, "bed"), answer(3, "bed"), answer(4, "chair")], TRUTH, CLASSES)
-    scores = recognition_scores(found, CLASSES)
+    results, _ = recognize([answer(1), answer(2, "bed"), answer(3, "bed"), answer(4, "chair")], TRUTH, CLASSES)
+    scores = recognition_scores(results, CLASSES)
     assert scores.overall[1] == scores.overall[5] == 3 / 4
     assert scores.unanswered == 1
 
@@ -72,8 +72,8 @@ def test_no_answer_is_wrong() -> None:
 def test_a_missing_prediction_is_refused_or_wrong() -> None:
     with pytest.raises(InputError, match="object 2 of a has no prediction"):
         recognize([answer(1, "bed")], TRUTH, CLASSES)
-    found, _ = recognize([answer(1, "bed")], TRUTH, CLASSES, allow_missing=True)
-    assert recognition_scores(found, CLASSES).unanswered == 3
+    results, _ = recognize([answer(1, "bed")], TRUTH, CLASSES, allow_missing=True)
+    assert recognition_scores(results, CLASSES).unanswered == 3
 
 
 def test_no_instances_have_no_scores() -> None:
@@ -88,8 +88,8 @@ RANKINGS = st.lists(st.tuples(st.sampled_from(CLASSES), st.permutations(CLASSES)
 @given(RANKINGS)
 def test_scores_are_those_of_scikit_learn(rows: list[tuple[str, list[str]]]) -> None:
     truth = [instance(number, name) for number, (name, _) in enumerate(rows)]
-    found, _ = recognize([answer(number, *names) for number, (_, names) in enumerate(rows)], truth, CLASSES)
-    scores = recognition_scores(found, CLASSES, ks=(1, 2, 3))
+    results, _ = recognize([answer(number, *names) for number, (_, names) in enumerate(rows)], truth, CLASSES)
+    scores = recognition_scores(results, CLASSES, ks=(1, 2, 3))
     names = [name for name, _ in rows]
     points = np.array([[-ranked.index(name) for name in CLASSES] for _, ranked in rows])
     assert scores.overall[2] == pytest.approx(top_k_accuracy_score(names, points, k=2, labels=CLASSES))
@@ -128,10 +128,10 @@ def test_predictions_that_do_not_belong_to_the_truth_are_refused(
 
 
 def test_instances_are_scored_once_and_of_the_classes() -> None:
-    found, _ = recognize([answer(1, "bed")], TRUTH[:1], CLASSES)
+    results, _ = recognize([answer(1, "bed")], TRUTH[:1], CLASSES)
     with pytest.raises(InputError, match="twice among the instances"):
-        recognition_scores([*found, *found], CLASSES)
+        recognition_scores([*results, *results], CLASSES)
     with pytest.raises(InputError, match="'bed', which is no class"):
-        recognition_scores(found, ("chair",))
+        recognition_scores(results, ("chair",))
     with pytest.raises(InputError, match="k of 1 or more, got 0"):
-        recognition_scores(found, CLASSES, ks=(1, 0))
+        recognition_scores(results, CLASSES, ks=(1, 0))

@@ -75,12 +75,15 @@ def test_thirty_tokens_of_a_reference_are_taken_unless_all_are() -> None:
 
 def test_a_caption_belongs_to_its_object_and_scene() -> None:
     objects = [boxed(1, 0, "s"), boxed(1, 0, "t"), boxed(2, 0, "t")]
-    said = [NamedCaption(scene="t", object_id=2, caption="thing 2"), NamedCaption(scene="s", object_id=1, caption="no")]
-    scores = score_named_captions(objects, said, tools=NO_JAVA)
+    captions = [
+        NamedCaption(scene="t", object_id=2, caption="thing 2"),
+        NamedCaption(scene="s", object_id=1, caption="no"),
+    ]
+    scores = score_named_captions(objects, captions, tools=NO_JAVA)
     assert scores.sentences.rouge_l_each[2] == pytest.approx(1)
     assert (scores.missing, scores.predictions, scores.ious) == (1, 2, None)
     with pytest.raises(InputError, match="object 1 of s has two captions"):
-        score_named_captions(objects, [said[1], said[1]], tools=NO_JAVA)
+        score_named_captions(objects, [captions[1], captions[1]], tools=NO_JAVA)
     assert wrapped_caption("sos a. b") == "sos sos a . b eos"
 
 
@@ -92,12 +95,12 @@ def test_answers_are_cleaned_before_blanks_are_counted_and_the_first_match_decid
     assert match_cleaned("a wooden chair", ["chair"]) == (False, True)
     assert clean_answer("23 and 24") == "twenty-three and 24"
     assert clean_answer("20 0 10") == "twenty zero ten"
-    asked = [
+    arguments = [
         Question(dataset="scanqa", id=str(number), scene="s", text="What is it?", answers=("no", "yes"))
         for number in range(3)
     ]
     scores = score_answers(
-        asked, {"0": ["?!"], "1": ["yes"], "2": ["."]}, sentences=False, lemmatize="no WordNet", tools=NO_JAVA
+        arguments, {"0": ["?!"], "1": ["yes"], "2": ["."]}, sentences=False, lemmatize="no WordNet", tools=NO_JAVA
     )
     assert (scores.blank, scores.overall.em1, scores.overall.f_value) == (2, 1 / 3, None)
     assert scores.absent == {
@@ -158,7 +161,7 @@ def test_sentences_and_references_stay_with_their_samples() -> None:
     assert set(scores.columns()) == {
         f"{name} (Python tokens)" for name in ("BLEU-1", "BLEU-2", "BLEU-3", "BLEU-4", "METEOR", "ROUGE-L", "CIDEr")
     }
-    given = score_sentences(["A chair."], [["a chair"]], tokens="given", tools=NO_JAVA)
-    assert (given.official, given.tokens, given.rouge_l) == (True, "tokens as given", 0)
+    as_given = score_sentences(["A chair."], [["a chair"]], tokens="given", tools=NO_JAVA)
+    assert (as_given.official, as_given.tokens, as_given.rouge_l) == (True, "tokens as given", 0)
     with pytest.raises(InputError, match="PTB tokens need Java and its archives: no Java here"):
         score_sentences(["a"], [["a"]], tokens="ptb", tools=NO_JAVA)

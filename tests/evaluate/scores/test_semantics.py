@@ -79,12 +79,12 @@ LABELS = st.lists(st.tuples(st.sampled_from([1, 4, 5, 6, 0]), st.sampled_from([1
 @given(LABELS)
 def test_scores_are_those_of_scikit_learn(pairs: list[tuple[int, int]]) -> None:
     scores = scored([true for true, _ in pairs], [predicted for _, predicted in pairs])
-    kept = [(true, predicted) for true, predicted in pairs if true]
-    if not kept:
+    with_class = [(true, predicted) for true, predicted in pairs if true]
+    if not with_class:
         assert math.isnan(scores.overall.miou)
         return
-    truth, predicted = zip(*kept, strict=True)
-    seen = sorted({label for pair in kept for label in pair if label})
+    truth, predicted = zip(*with_class, strict=True)
+    seen = sorted({label for pair in with_class for label in pair if label})
     there = sorted(set(truth))
     iou = jaccard_score(truth, predicted, labels=seen, average="macro", zero_division=0)
     present = jaccard_score(truth, predicted, labels=there, average="macro", zero_division=0)

@@ -39,9 +39,9 @@ def table_of(out: Path) -> dict[tuple[str, str], dict[str, str]]:
 
 
 def data_of(page: Path) -> dict[str, Any]:
-    found = re.search(r'<script id="data" type="application/json">(.*?)</script>', page.read_text(), re.DOTALL)
-    assert found
-    data = json.loads(found[1])
+    match = re.search(r'<script id="data" type="application/json">(.*?)</script>', page.read_text(), re.DOTALL)
+    assert match
+    data = json.loads(match[1])
     assert isinstance(data, dict)
     return data
 
@@ -87,9 +87,9 @@ def test_words_packages_and_views_have_scores_of_their_own(scene: Path, tmp_path
     sweep += ["choose.candidates=8", "choose.count=2", "choose.width=64", "choose.height=48", "quiet=true"]
     stages = "stages=[localization,packages,views]"
     assert cli.main(words_of(scene, stages, "preset=exact", *sweep, f"out={out}")) == 0
-    given = json.loads((out / "summary.json").read_text())["settings"]
-    assert given["preset"] == "exact"
-    assert (given["fusion"]["max_rank"], given["choose"]["candidates"]) == (0, 8)
+    settings = json.loads((out / "summary.json").read_text())["settings"]
+    assert settings["preset"] == "exact"
+    assert (settings["fusion"]["max_rank"], settings["choose"]["candidates"]) == (0, 8)
     rows = table_of(out)
     assert set(rows) == {
         ("localization", "defaults"), ("localization", "relative=0.9"), ("packages", "defaults"),

@@ -39,16 +39,16 @@ def test_with_one_cost_the_best_wins_from_any_start() -> None:
 
 
 def test_rungs_grow_in_scenes_and_shrink_in_settings() -> None:
-    asked: list[tuple[int, int]] = []
+    calls: list[tuple[int, int]] = []
 
     def evaluate(some: object, scenes: int) -> list[tuple[float]]:
-        asked.append((len(some), scenes))  # type: ignore[arg-type]
+        calls.append((len(some), scenes))  # type: ignore[arg-type]
         return [(float(number),) for number in range(len(some))]  # type: ignore[arg-type]
 
     rungs = successive_halving(
         [{"n": number} for number in range(27)], 12, evaluate, HalvingConfig(settings=27, keep=1 / 3)
     )
-    assert asked == [(27, 1), (9, 3), (4, 9), (4, 12)]
+    assert calls == [(27, 1), (9, 3), (4, 9), (4, 12)]
     assert [rung.scenes for rung in rungs] == [1, 3, 9, 12]
     assert rungs[-1].survivors == tuple({"n": number} for number in range(4))
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -14,59 +13,26 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from command_runs import refusal
-from named_rooms import write_words
+from short_training import QUICK
 
 from gsencoder.app import cli
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.models.weights import load_weights
-from gsencoder.text.table import load_text_table, make_text_table, save_text_table
+from gsencoder.text.table import load_text_table
 from gsencoder.train import TrainConfig, train
 
 pytestmark = pytest.mark.slow
 
-QUICK = (
-    "quiet=true",
-    "train.steps=6",
-    "train.warmup=2",
-    "train.log_every=2",
-    "sampling.gaussians=3000",
-    "sampling.smallest=500",
-    "model.transformer.encoder_channels=[32,32,32,32,32]",
-    "model.transformer.decoder_channels=[32,32,32,32]",
-)
-
 
 def summary_of(folder: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((folder / "summary.json").read_text())
-    return found
-
-
-@pytest.fixture(scope="module")
-def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three rooms and the words of all that is in them."""
-    folder = tmp_path_factory.mktemp("rooms")
-    made = [make_room(number, objects=4, views=4, width=120, height=90) for number in range(3)]
-    for number, room in enumerate(made):
-        write_room(room, folder / f"room_{number}")
-    write_words(folder / "words.safetensors", *made)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def trained(rooms: Path) -> Path:
-    out = rooms.parent / "encoder"
-    scenes = [str(rooms / f"room_{number}") for number in range(3)]
-    words = f"teacher.words={rooms / 'words.safetensors'}"
-    assert cli.main(["train", *scenes, "holdout=room_2", words, f"out={out}", *QUICK]) == 0
-    return out
+    summary: dict[str, Any] = json.loads((folder / "summary.json").read_text())
+    return summary
 
 
 def test_training_leaves_weights_words_a_log_and_pictures(rooms: Path, trained: Path) -> None:
@@ -126,7 +92,7 @@ def test_a_trained_encoder_encodes_a_scene_that_localize_takes(rooms: Path, trai
     assert scene.gaussians is not None
     assert results["gaussians"] == results["seen"] == len(scene.gaussians)
     word = next(iter(sorted(thing.name for thing in make_room(2, objects=4, views=4).objects if thing.name)))
-    asked = [
+    arguments = [
         "localize",
         str(out),
         f"query={word}",
@@ -135,7 +101,7 @@ def test_a_trained_encoder_encodes_a_scene_that_localize_takes(rooms: Path, trai
         "localize.threshold.fixed=0.0",
         "quiet=true",
     ]
-    assert cli.main(asked) == 0
+    assert cli.main(arguments) == 0
     # In chunks it is nearly the same, and for several scenes each has a folder of its own.
     several = ["encode", str(rooms / "room_1"), str(rooms / "room_2"), f"weights={trained / 'encoder.safetensors'}"]
     assert cli.main([*several, f"out={tmp_path / 'many'}", "encode.chunk=2000", "quiet=true"]) == 0
@@ -149,9 +115,16 @@ def test_an_encoder_is_judged_by_either_protocol(rooms: Path, trained: Path, tmp
     words = f"teacher.words={rooms / 'words.safetensors'}"
     for protocol in ("naming", "localization"):
         out = tmp_path / protocol
-        asked = ["evaluate", str(rooms / "room_2"), f"protocol={protocol}", f"weights={trained}", words, f"out={out}"]
+        arguments = [
+            "evaluate",
+            str(rooms / "room_2"),
+            f"protocol={protocol}",
+            f"weights={trained}",
+            words,
+            f"out={out}",
+        ]
         extra = ["min_views=1", "min_pixels=1"] if protocol == "localization" else []
-        assert cli.main([*asked, *extra, "quiet=true"]) == 0
+        assert cli.main([*arguments, *extra, "quiet=true"]) == 0
     naming = summary_of(tmp_path / "naming")["results"]
     assert 0 <= naming["accuracy"] <= 1
     assert "other" in naming["names"]
@@ -165,8 +138,8 @@ def test_the_names_of_other_rooms_are_absent(rooms: Path, trained: Path, tmp_pat
     scenes = [str(rooms / "room_1"), str(rooms / "room_2")]
     words = [f"teacher.words={rooms / 'words.safetensors'}", "protocol.min_views=1", "protocol.min_pixels=1"]
     for name, weights in (("fused", ()), ("encoded", (f"weights={trained}",))):
-        asked = ["evaluate", *scenes, "protocol=absent", *words, *weights, f"out={tmp_path / name}", "quiet=true"]
-        assert cli.main(asked) == 0
+        arguments = ["evaluate", *scenes, "protocol=absent", *words, *weights, f"out={tmp_path / name}", "quiet=true"]
+        assert cli.main(arguments) == 0
         results = summary_of(tmp_path / name)["results"]
         assert (
             len((tmp_path / name / "words.csv").read_text().splitlines()) == 1 + results["present"] + results["absent"]
@@ -177,84 +150,16 @@ def test_the_names_of_other_rooms_are_absent(rooms: Path, trained: Path, tmp_pat
     assert results["boxed_absent"] == 0
     # A vocabulary that is given stands for the names of the scenes.
     elsewhere = next(name for name, row in results["names"].items() if row["absent"])
-    asked = ["evaluate", *scenes, "protocol=absent", *words, f"protocol.vocabulary={elsewhere}"]
-    assert cli.main([*asked, f"out={tmp_path / 'one'}", "quiet=true"]) == 0
+    arguments = ["evaluate", *scenes, "protocol=absent", *words, f"protocol.vocabulary={elsewhere}"]
+    assert cli.main([*arguments, f"out={tmp_path / 'one'}", "quiet=true"]) == 0
     assert summary_of(tmp_path / "one")["results"]["absent"] == results["names"][elsewhere]["absent"]
 
 
 def test_preparing_alone_trains_nothing(rooms: Path, tmp_path: Path) -> None:
     words = f"teacher.words={rooms / 'words.safetensors'}"
-    asked = ["train", str(rooms / "room_0"), words, f"out={tmp_path / 'out'}", "prepare_only=true", "quiet=true"]
-    assert cli.main(asked) == 0
+    arguments = ["train", str(rooms / "room_0"), words, f"out={tmp_path / 'out'}", "prepare_only=true", "quiet=true"]
+    assert cli.main(arguments) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["out.prepared"]
-
-
-@pytest.mark.usefixtures("no_gpu")
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["holdout=kitchen_*"], "holdout: no scene is called 'kitchen_*'"),
-        (["holdout=room_*"], "matches every scene"),
-        (["train.steps=0"], "train.steps: expected 1 or more"),
-        (["loss.min_kept=2.0"], "loss.min_kept"),
-        (["model.transformer.encoder_depths=[1,1]"], "encoder_channels: expected one entry per level"),
-        (["teacher=radio"], "teacher.model= is missing"),
-        (["device=cuda"], "no GPU"),
-        (["experiment=kitchen"], "experiment: expected one of"),
-    ],
-)
-def test_a_training_that_cannot_be_is_refused_in_one_line(
-    rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-) -> None:
-    table = [] if "teacher=radio" in words else [f"teacher.words={rooms / 'words.safetensors'}"]
-    assert message in refusal(
-        capsys, "train", str(rooms / "room_0"), str(rooms / "room_1"), *table, f"out={tmp_path / 'out'}", *words
-    )
-    assert not (tmp_path / "out").exists()
-
-
-def test_two_scenes_of_one_name_are_refused(rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(rooms / "room_0", tmp_path / "room_0")
-    table = f"teacher.words={rooms / 'words.safetensors'}"
-    line = refusal(capsys, "train", str(rooms / "room_0"), str(tmp_path / "room_0"), table, f"out={tmp_path / 'out'}")
-    assert "two scenes are called 'room_0'" in line
-
-
-@pytest.mark.usefixtures("no_gpu")
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["weights=nowhere"], "weights: no file at nowhere"),
-        (["encode.chunk=-1"], "encode.chunk"),
-        (["encode.device=cuda"], "sees no GPU"),
-    ],
-)
-def test_an_encoding_that_cannot_be_is_refused_in_one_line(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
-) -> None:
-    given = [] if any(word.startswith("weights=") for word in words) else [f"weights={trained}"]
-    line = refusal(capsys, "encode", str(rooms / "room_2"), *given, f"out={tmp_path / 'out'}", *words)
-    assert message in line
-    assert not (tmp_path / "out").exists()
-
-
-def test_features_of_another_space_are_not_judged_by_these_words(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    other = tmp_path / "other.safetensors"
-    table = load_text_table(rooms / "words.safetensors")
-    save_text_table(other, make_text_table(table.names, table.embeddings, "other-words"))
-    line = refusal(
-        capsys,
-        "evaluate",
-        str(rooms / "room_2"),
-        "protocol=naming",
-        f"weights={trained}",
-        f"teacher.words={other}",
-        f"out={tmp_path / 'out'}",
-    )
-    assert "room-words" in line
-    assert "other-words" in line
 
 
 def test_the_papers_setting_composes_and_runs_two_steps_with_a_small_teacher(rooms: Path, tmp_path: Path) -> None:
@@ -262,10 +167,10 @@ def test_the_papers_setting_composes_and_runs_two_steps_with_a_small_teacher(roo
     shape = {"hidden_size": 24, "num_hidden_layers": 1, "num_attention_heads": 2, "patch_size": 8, "image_size": 32}
     transformers.RadioModel(transformers.RadioConfig(**shape, max_img_size=64)).save_pretrained(tmp_path / "radio")
     scenes = [str(rooms / f"room_{number}") for number in range(2)]
-    asked = ["train", *scenes, "experiment=scannet", f"teacher.model={tmp_path / 'radio'}", "holdout=room_1"]
+    arguments = ["train", *scenes, "experiment=scannet", f"teacher.model={tmp_path / 'radio'}", "holdout=room_1"]
     less = ["teacher.size=64", "train.steps=2", "train.warmup=1", "train.workers=0", "sampling.gaussians=300"]
     out = tmp_path / "scannet"
-    assert cli.main([*asked, *less, "tensorboard=false", f"out={out}", "quiet=true"]) == 0
+    assert cli.main([*arguments, *less, "tensorboard=false", f"out={out}", "quiet=true"]) == 0
     encoder, outputs, _ = load_weights(out / "encoder.safetensors")
     assert sum(value.numel() for value in encoder.parameters()) > 40e6
     assert outputs["radio"].space.teacher == "radio"
@@ -274,7 +179,7 @@ def test_the_papers_setting_composes_and_runs_two_steps_with_a_small_teacher(roo
 
 def test_a_sweep_trains_once_for_each_value(rooms: Path, tmp_path: Path) -> None:
     words = f"teacher.words={rooms / 'words.safetensors'}"
-    asked = [
+    arguments = [
         "train",
         "-m",
         str(rooms / "room_0"),
@@ -283,7 +188,7 @@ def test_a_sweep_trains_once_for_each_value(rooms: Path, tmp_path: Path) -> None
         f"out={tmp_path / 'out'}",
     ]
     quick = [word for word in QUICK if not word.startswith("train.steps")]
-    assert cli.main([*asked, *quick, "tensorboard=false", "train.steps=1,2"]) == 0
+    assert cli.main([*arguments, *quick, "tensorboard=false", "train.steps=1,2"]) == 0
     assert [summary_of(tmp_path / "out" / str(run))["results"]["steps"] for run in range(2)] == [1, 2]
 
 
@@ -292,79 +197,12 @@ def test_the_submitit_launcher_runs_a_sweep_as_jobs(rooms: Path, tmp_path: Path)
     pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
     words, quick = f"teacher.words={rooms / 'words.safetensors'}", [word for word in QUICK if "steps" not in word]
     out, prepared = tmp_path / "out", tmp_path / "prepared"
-    asked = ["train", "-m", str(rooms / "room_0"), words, f"prepared={prepared}", f"out={out}", "tensorboard=false"]
+    arguments = ["train", "-m", str(rooms / "room_0"), words, f"prepared={prepared}", f"out={out}", "tensorboard=false"]
     launcher = ["hydra/launcher=submitit_local", "hydra.launcher.timeout_min=10", "hydra.launcher.tasks_per_node=1"]
     # In a process of its own: the launcher sets signal handlers and environment variables for good.
-    command = [sys.executable, "-W", "ignore", "-m", "gsencoder", *asked, *quick, *launcher, "train.steps=1,2"]
+    command = [sys.executable, "-W", "ignore", "-m", "gsencoder", *arguments, *quick, *launcher, "train.steps=1,2"]
     subprocess.run(command, check=True, timeout=500)
     assert [summary_of(out / str(run))["results"]["steps"] for run in range(2)] == [1, 2]
-
-
-def test_two_scenes_of_one_name_are_refused_and_one_scene_named_twice_is_taken_once(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for name in ("a", "b"):
-        shutil.copytree(rooms / "room_0", tmp_path / name / "room")
-    both = [str(tmp_path / "a" / "room"), str(tmp_path / "b" / "room")]
-    told = refusal(capsys, "encode", *both, f"weights={trained}", f"out={tmp_path / 'out'}")
-    assert "are both called 'room'" in told
-    assert not (tmp_path / "out").exists()
-    twice = [str(rooms / "room_0"), str(rooms / "." / ".." / rooms.name / "room_0")]
-    assert cli.main(["encode", *twice, f"weights={trained}", f"out={tmp_path / 'out'}", "quiet=true"]) == 0
-    assert (tmp_path / "out" / "features.safetensors").is_file()
-
-
-def test_weights_are_not_replaced_by_what_they_make(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    own = tmp_path / "encoder"
-    shutil.copytree(trained, own)
-    told = refusal(capsys, "encode", str(rooms / "room_0"), f"weights={own}", f"out={own}", "overwrite=true")
-    assert "holds the input weights=" in told
-    assert (own / "encoder.safetensors").is_file()
-
-
-def test_folders_that_a_training_did_not_make_are_left_alone(
-    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scenes = [str(rooms / f"room_{number}") for number in range(2)]
-    prepared = f"prepared={trained.with_name('encoder.prepared')}"
-    common = ["train", *scenes, f"teacher.words={rooms / 'words.safetensors'}", *QUICK[1:], "tensorboard=false"]
-    notes = tmp_path / "mine.training" / "notes.txt"
-    notes.parent.mkdir()
-    notes.touch()
-    for more in ((), ("resume=false",)):
-        assert "holds something else" in refusal(capsys, *common, prepared, f"out={tmp_path / 'mine'}", *more)
-    assert notes.is_file()
-    for inside in ("run", "run/prepared", "run.training", "run.training/prepared"):
-        told = refusal(capsys, *common, f"prepared={tmp_path / inside}", f"out={tmp_path / 'run'}")
-        assert "give another folder" in told
-    foreign = tmp_path / "foreign"
-    foreign.mkdir()
-    (foreign / "thesis.tex").touch()
-    told = refusal(capsys, *common, f"prepared={foreign}", f"out={tmp_path / 'run'}")
-    assert "something else than prepared scenes" in told
-    assert [path.name for path in foreign.iterdir()] == ["thesis.tex"]
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        "train.seed=99999999999999999999",
-        "model.transformer.mlp_ratio=1e12",
-        "model.transformer.encoder_channels=32,32,32,32,32000000000",
-        "model.transformer.encoder_depths=1,1,1,1,300000",
-        "augment.turn=1e308",
-        "loss.rarity=1000",
-        "loss.cosine=0 loss.smooth_l1=0 loss.contrast_weight=0",
-    ],
-)
-def test_sizes_that_nobody_means_are_refused_before_the_work(
-    rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], setting: str
-) -> None:
-    told = refusal(capsys, "train", str(rooms / "room_0"), *setting.split(), f"out={tmp_path / 'out'}")
-    assert setting.partition("=")[0].rpartition(".")[2] in told
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.alone
@@ -384,7 +222,7 @@ def test_a_signal_to_all_processes_of_a_training_leaves_a_checkpoint(rooms: Path
             break
         time.sleep(0.05)
     os.killpg(running.pid, signal.SIGTERM)
-    _, told = running.communicate(timeout=60)
-    assert running.returncode == 143, told
-    assert "Traceback" not in told
+    _, output = running.communicate(timeout=60)
+    assert running.returncode == 143, output
+    assert "Traceback" not in output
     assert (tmp_path / "run.training" / "checkpoint.safetensors").is_file()

@@ -1,0 +1,188 @@
+"""Settings of segmenters: words, normalization, ranges of probabilities, and what does not fit."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from onnx import TensorProto
+from segmenters import PLAIN, save_graph, teacher_of, views_of, words
+from splats import front_camera
+
+from gsencoder.core.errors import InputError
+from gsencoder.fusion.teachers.build import build_teacher, words_of
+from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig
+from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher, softmax
+from gsencoder.fusion.teachers.segmenter_classes import MAX_CLASSES_BYTES, read_classes
+from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
+from gsencoder.text.onnx_tower import OnnxTextConfig
+from gsencoder.text.table import TextTable, save_text_table
+from gsencoder.types import Scene, Views
+
+
+@pytest.fixture
+def image(rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 4, (8, 12, 3)).astype(np.uint8)
+
+
+def test_probabilities_are_taken_as_they_are_and_logits_are_recognized(
+    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
+) -> None:
+    save_graph(tmp_path / "net.onnx")
+    with pytest.raises(InputError, match=r"expected probabilities.*are these logits"):
+        teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, activation="none")).feature_map(views_of(image), 0)
+
+
+def test_a_segmenter_needs_a_model_words_and_pictures(tmp_path: Path, rng: np.random.Generator) -> None:
+    save_graph(tmp_path / "net.onnx")
+    config = SegmenterConfig(model=str(tmp_path / "net.onnx"))
+    with pytest.raises(InputError, match="its classes need words"):
+        build_teacher(config, Scene(name="s"), None)
+    with pytest.raises(InputError, match="teacher.model= is missing"):
+        build_teacher(SegmenterConfig(), Scene(name="s"), words(rng))
+    blind = Views(cameras=front_camera(12, 8), names=("a",))
+    with pytest.raises(InputError, match="the scene has no pictures"):
+        teacher_of(tmp_path / "net.onnx", words(rng)).feature_map(blind, 0)
+
+
+def test_words_are_those_of_a_table_or_of_the_colors_or_none(tmp_path: Path, rng: np.random.Generator) -> None:
+    table = words(rng)
+    save_text_table(tmp_path / "words.safetensors", table)
+    read = words_of(SegmenterConfig(words=str(tmp_path / "words.safetensors")))
+    assert isinstance(read, TextTable)
+    assert read.names == table.names
+    np.testing.assert_array_equal(read.embeddings, table.embeddings)
+    assert words_of(SegmenterConfig()) is None
+    colors = words_of(PaletteConfig())
+    assert isinstance(colors, TextTable)
+    assert colors.names == COLOR_NAMES
+    np.testing.assert_array_equal(colors.encode(["red"])[0], np.eye(11)[COLOR_NAMES.index("red")])
+    with pytest.raises(InputError, match="text=: teacher=palette has the words of its eleven colors"):
+        words_of(PaletteConfig(), OnnxTextConfig(model="any"))
+
+
+def test_probabilities_may_sum_to_less_than_one_and_be_zero_and_not_negative(
+    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
+) -> None:
+    probable = replace(PLAIN, activation="none", scale=18.0)
+    for least in (0, 1):
+        picture = np.maximum(image, np.uint8(least))
+        save_graph(tmp_path / "net.onnx", fourth=0.5 * least)
+        made = teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(picture), 0)
+        assert made.shares is not None
+        np.testing.assert_allclose(made.shares[..., :3], picture.reshape(4, 2, 6, 2, 3).mean((1, 3)) / 18, atol=1e-6)
+        assert (made.shares[..., 3] == 0.5 * least).all()
+    save_graph(tmp_path / "net.onnx", fourth=-0.01)
+    with pytest.raises(InputError, match="expected probabilities, from 0"):
+        teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(image), 0)
+
+
+def test_probabilities_that_were_rounded_may_sum_to_a_hundredth_more_than_one(
+    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
+) -> None:
+    probable, black = replace(PLAIN, activation="none"), np.zeros_like(image)
+    save_graph(tmp_path / "net.onnx", fourth=1.01)
+    made = teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(black), 0)
+    assert made.shares is not None
+    assert (made.shares == np.float32([0, 0, 0, 1.01])).all()
+    save_graph(tmp_path / "net.onnx", fourth=1.011)
+    with pytest.raises(InputError, match=r"got 0 to 1\.01; are these logits"):
+        teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(black), 0)
+
+
+def test_pictures_are_normalized_as_those_of_imagenet_unless_stated() -> None:
+    from transformers.image_utils import IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD
+
+    usual = OnnxSegmenterOptions()
+    assert (usual.scale, [*usual.mean], [*usual.std]) == (255, IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD)
+
+
+@pytest.mark.parametrize("byte", [False, True])
+def test_settings_tell_how_pictures_are_given_to_the_network(
+    tmp_path: Path, rng: np.random.Generator, byte: bool
+) -> None:
+    """Maps that were made otherwise are not taken up; a network of bytes is not given normalized ones."""
+    save_graph(
+        tmp_path / "net.onnx", input_type=TensorProto.UINT8 if byte else TensorProto.FLOAT, shape=("n", 3, "h", "w")
+    )
+    table = words(rng)
+
+    def settings(**options: Any) -> dict[str, Any]:
+        return teacher_of(tmp_path / "net.onnx", table, replace(PLAIN, **options)).settings()
+
+    for options in ({"scale": 2.0}, {"mean": (0.0, 0.5, 0.0)}, {"std": (1.0, 1.0, 2.0)}):
+        assert (settings(**options) == settings()) is byte
+    assert settings(size=64) != settings()
+    assert settings(activation="none") != settings()
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "most"),
+    [("size", 1, 8192), ("multiple", 1, 1024), ("threads", 0, 1024), ("scale", 1e-6, 1e6), ("temperature", 1e-3, 1e3)],
+)
+def test_settings_may_lie_at_the_ends_of_their_range_and_no_further(name: str, least: float, most: float) -> None:
+    settings: type = SegmenterConfig if name == "temperature" else OnnxSegmenterOptions
+    for value in (least, most):
+        assert getattr(settings(**{name: value}), name) == value
+    for value in (least - 1, most + 1):
+        with pytest.raises(InputError, match=f"{name}: expected"):
+            settings(**{name: value})
+
+
+def test_softmax_holds_at_the_extremes() -> None:
+    logits = np.array([[[1e30, 0.0, -1e30]], [[-3e38, -3e38, -3e38]]], np.float32)
+    np.testing.assert_allclose(softmax(logits, 1e-3), [[[1, 0, 0]], [[1 / 3] * 3]], atol=1e-6)
+
+
+def test_what_does_not_fit_is_one_line(tmp_path: Path, rng: np.random.Generator, image: np.ndarray) -> None:
+    path, table = tmp_path / "net.onnx", words(rng)
+    save_graph(path)
+    with pytest.raises(InputError, match="1 of 96 outputs are not finite"):
+        _nan_teacher(path, table).feature_map(views_of(image), 0)
+    (tmp_path / "classes.json").write_text('["wall", "chair"]')
+    with pytest.raises(InputError, match="gives 4 classes, and there are 2 names for them"):
+        teacher_of(path, table).feature_map(views_of(image), 0)
+    (tmp_path / "classes.json").write_text('["wall", "zeppelin", "chair", "table"]')
+    with pytest.raises(InputError, match="'zeppelin'"):
+        teacher_of(path, table)
+    (tmp_path / "classes.json").write_text('{"0": "wall", "2": "chair"}')
+    with pytest.raises(InputError, match="expected a list of names, in the order of the network's classes"):
+        teacher_of(path, table)
+    with pytest.raises(InputError, match="no file says what its classes are called"):
+        SegmenterTeacher(SegmenterConfig(model=str(path)), table)
+    with pytest.raises(InputError, match=r"net.onnx has inputs \['image'\] and outputs \['scores'\], not 'x'"):
+        SegmenterTeacher(SegmenterConfig(model=str(path), onnx=replace(PLAIN, input="x")), table)
+    path.write_bytes(b"no model")
+    with pytest.raises(InputError, match="is no model that onnxruntime reads"):
+        teacher_of(path, table)
+
+
+def _nan_teacher(path: Path, table: TextTable) -> SegmenterTeacher:
+    teacher = teacher_of(path, table)
+    network = teacher._network
+    outputs = network.outputs
+
+    def broken(image: np.ndarray, num_classes: int) -> Any:
+        scores, probable, affine = outputs(image, num_classes)
+        scores[0, 0, 0] = np.nan
+        return scores, probable, affine
+
+    network.outputs = broken  # type: ignore[method-assign]
+    return teacher
+
+
+def test_names_are_read_from_lists_objects_and_lines(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text('{"1": "b", "0": "a"}')
+    (tmp_path / "b.txt").write_bytes(b"\xef\xbb\xbfa\r\nb\r\n\r\n")
+    assert read_classes(tmp_path / "a.json") == read_classes(tmp_path / "b.txt") == ("a", "b")
+
+
+def test_a_file_of_names_is_no_larger_than_four_megabytes(tmp_path: Path) -> None:
+    assert MAX_CLASSES_BYTES == 4 * 1024**2
+    path = tmp_path / "names.txt"
+    path.write_bytes(b"a\nb\n".ljust(MAX_CLASSES_BYTES))
+    assert read_classes(path) == ("a", "b")
+    path.write_bytes(b"a\nb\n".ljust(MAX_CLASSES_BYTES + 1))
+    with pytest.raises(InputError, match="holds more than 4,194,304 bytes"):
+        read_classes(path)

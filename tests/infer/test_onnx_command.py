@@ -1,0 +1,104 @@
+"""What `export` says and refuses, and its file in an interpreter that has no torch."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsencoder.app import cli
+from gsencoder.data.splats import save_splat
+from gsencoder.infer.onnx.export import TOLERANCE, random_cloud
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def folder(exported: Path) -> Path:
+    return exported
+
+
+def test_the_command_tells_what_it_compared(folder: Path) -> None:
+    results = json.loads((folder / "encoder.onnx.summary.json").read_text())["results"]
+    assert results["onnx"] == str(folder / "encoder.onnx")
+    assert set(results["parity"]) == {"1 random Gaussians", "50 random Gaussians"}
+    assert 0 <= max(results["parity"].values()) < TOLERANCE
+    assert (results["rank"], results["channels"], results["words"]) == (4, 6, 3)
+    assert results["bytes"] == (folder / "encoder.onnx").stat().st_size
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["out=encoder.safetensors"], "expected a file that ends in .onnx"),
+        (["out=encoder.onnx", "sizes=[0]"], "sizes: expected one or more numbers from 1"),
+        (["out=encoder.onnx", "tolerance=0"], "tolerance: expected a share between 0 and 1"),
+        (["out=encoder.onnx", "cosine=2"], "cosine: expected -1 to 1"),
+        (["out=encoder.onnx", "precision=int4"], "precision"),
+        (
+            ["out=encoder.onnx", "precision=int8_static"],
+            "was removed: it was slower and less accurate than int8_dynamic",
+        ),
+        (["out=encoder.onnx", "weights=nothing"], "weights: no file at nothing"),
+        (["out=taken.onnx"], "taken.onnx: exists; give another out= or overwrite=true"),
+        (["out=encoder.onnx", "none.ply"], "none.ply"),
+        ([], "out= is missing"),
+    ],
+)
+def test_the_command_refuses_before_it_begins(
+    words: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "taken.onnx").touch()
+    assert cli.main(["export", *words]) == 2
+    assert message in capsys.readouterr().err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["taken.onnx"]
+
+
+def test_a_word_is_found_in_an_interpreter_that_has_no_torch(folder: Path, tmp_path: Path) -> None:
+    save_splat(tmp_path / "room.ply", random_cloud(500, 0.05))
+    code = (
+        "import sys\n"
+        "class NoTorch:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name.partition('.')[0] == 'torch':\n"
+        "            raise ModuleNotFoundError('no torch here', name=name)\n"
+        "sys.meta_path.insert(0, NoTorch())\n"
+        "from gsencoder.app.cli import main\n"
+        f"splat, weights, out = {str(tmp_path / 'room.ply')!r}, {str(folder / 'encoder.onnx')!r}, {str(tmp_path)!r}\n"
+        "assert main(['encode', splat, f'weights={weights}', f'out={out}/features']) == 0\n"
+        "from gsencoder import load_splat, localize\n"
+        "from gsencoder.fusion.store.folder import load_features\n"
+        "from gsencoder.infer.onnx.runtime import OnnxEncoder\n"
+        "scene = load_features(__import__('pathlib').Path(out) / 'features')\n"
+        "assert len(localize(scene, ['mugs'], OnnxEncoder(weights).words).boxes) > 0\n"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_example_answers_a_word_for_a_splat_without_torch(folder: Path, tmp_path: Path) -> None:
+    cloud = random_cloud(2000, 0.05)
+    # Half of the sheet is white and the other black, so that even an untrained encoder tells them apart.
+    left = cloud.means[:, :1] < 0
+    save_splat(tmp_path / "room.ply", replace(cloud, sh=np.where(left, 1.5, -1.5).repeat(3, 1)[:, None].astype("f4")))
+    example = Path(__file__).parents[2] / "examples" / "05_onnx_without_torch.py"
+    text = example.read_text()
+    assert len(text.splitlines()) <= 30
+    (tmp_path / "torch.py").write_text("raise ModuleNotFoundError('no torch here')")
+    for word, code in (("mug", 0), ("unicorn", 1)):
+        words = [sys.executable, example, folder / "encoder.onnx", tmp_path / "room.ply", word]
+        done = subprocess.run(words, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(tmp_path)})
+        assert done.returncode == code, done.stderr
+        if code:
+            assert done.stderr.startswith("error: not among the 3 words of words-6: 'unicorn'")
+        else:
+            assert done.stdout.startswith("mug at [")

@@ -1,0 +1,44 @@
+"""Truths and masks of instances by runs of vertices, and their scores."""
+
+import numpy as np
+
+from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
+from gsencoder.evaluate.scores.instance_matches import match_instances
+from gsencoder.evaluate.scores.instances import InstanceScores, instance_scores
+
+CLASSES = ClassTable(
+    names=("bed", "chair", "sofa"), ids=(4, 5, 6), groups={"head": ("bed",), "common": ("chair", "sofa"), "tail": ()}
+)
+BED, CHAIR, SOFA = 4, 5, 6
+VERTICES = 2000
+Mask = tuple[int, int, int, float]
+"""First vertex, one past the last, class id, score."""
+
+
+def truth_of(*parts: tuple[int, int, int], scene: str = "a") -> InstanceTruth:
+    """A scene of 2,000 vertices with runs of vertices (first, one past the last, id); the others have the id 0."""
+    ids = np.zeros(VERTICES, np.int64)
+    for first, last, number in parts:
+        ids[first:last] = number
+    return InstanceTruth(scene=scene, ids=ids)
+
+
+def masks_of(*masks: Mask, scene: str = "a") -> InstancePrediction:
+    vertices = np.arange(VERTICES)
+    return prediction_of_masks(
+        scene,
+        [(vertices >= first) & (vertices < last) for first, last, _, _ in masks],
+        [label for _, _, label, _ in masks],
+        [score for _, _, _, score in masks],
+        num_vertices=VERTICES,
+    )
+
+
+def scored(truth: InstanceTruth, *masks: Mask, class_agnostic: bool = False) -> InstanceScores:
+    matches = match_instances(truth, masks_of(*masks), CLASSES, class_agnostic=class_agnostic)
+    return instance_scores([matches], CLASSES)
+
+
+def aps(scores: InstanceScores) -> tuple[float, float, float]:
+    return scores.overall.ap, scores.overall.ap50, scores.overall.ap25

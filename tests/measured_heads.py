@@ -1,0 +1,27 @@
+"""Small adapter heads, as they are measured."""
+
+import numpy as np
+import torch
+from torch import nn
+
+from gsencoder.fusion.heads.layers import Residual
+from gsencoder.fusion.heads.measure import HeadFit, MeasuredHead
+from gsencoder.fusion.heads.radio import Head
+from gsencoder.types import FeatureSpace
+
+SPACE = FeatureSpace(name="radio", channels=6, teacher="radio", weights="abcd", preprocessing="resized")
+FIT = HeadFit(cells=3, cosine=0.5, worst=0.25)
+
+
+def body(channels: int = 4) -> nn.Sequential:
+    torch.manual_seed(channels)
+    block = Residual(nn.LayerNorm(8), nn.GELU(), nn.Linear(8, 8))
+    layers = nn.Sequential(nn.Linear(6, 8), block, nn.LayerNorm(8), nn.ReLU(), nn.Linear(8, channels))
+    for parameter in layers.parameters():
+        nn.init.normal_(parameter)
+    return layers
+
+
+def measured(name: str = "siglip.summary", channels: int = 4, text: str = "siglip") -> MeasuredHead:
+    mean = np.arange(channels, dtype=np.float32)
+    return MeasuredHead(head=Head(name=name, body=body(channels), text=text, model="M"), mean=mean, scale=2.0, fit=FIT)

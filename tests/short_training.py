@@ -1,0 +1,12 @@
+"""Options of a short training."""
+
+QUICK = (
+    "quiet=true",
+    "train.steps=6",
+    "train.warmup=2",
+    "train.log_every=2",
+    "sampling.gaussians=3000",
+    "sampling.smallest=500",
+    "model.transformer.encoder_channels=[32,32,32,32,32]",
+    "model.transformer.decoder_channels=[32,32,32,32]",
+)

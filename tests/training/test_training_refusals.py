@@ -1,0 +1,148 @@
+"""What `train`, `encode` and `evaluate weights=` refuse, and what they leave alone."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from command_runs import refusal
+from short_training import QUICK
+
+from gsencoder.app import cli
+from gsencoder.text.table import load_text_table, make_text_table, save_text_table
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.usefixtures("no_gpu")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["holdout=kitchen_*"], "holdout: no scene is called 'kitchen_*'"),
+        (["holdout=room_*"], "matches every scene"),
+        (["train.steps=0"], "train.steps: expected 1 or more"),
+        (["loss.min_kept=2.0"], "loss.min_kept"),
+        (["model.transformer.encoder_depths=[1,1]"], "encoder_channels: expected one entry per level"),
+        (["teacher=radio"], "teacher.model= is missing"),
+        (["device=cuda"], "no GPU"),
+        (["experiment=kitchen"], "experiment: expected one of"),
+    ],
+)
+def test_a_training_that_cannot_be_is_refused_in_one_line(
+    rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    table = [] if "teacher=radio" in words else [f"teacher.words={rooms / 'words.safetensors'}"]
+    assert message in refusal(
+        capsys, "train", str(rooms / "room_0"), str(rooms / "room_1"), *table, f"out={tmp_path / 'out'}", *words
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_scenes_of_one_name_are_refused(rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(rooms / "room_0", tmp_path / "room_0")
+    table = f"teacher.words={rooms / 'words.safetensors'}"
+    line = refusal(capsys, "train", str(rooms / "room_0"), str(tmp_path / "room_0"), table, f"out={tmp_path / 'out'}")
+    assert "two scenes are called 'room_0'" in line
+
+
+@pytest.mark.usefixtures("no_gpu")
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["weights=nowhere"], "weights: no file at nowhere"),
+        (["encode.chunk=-1"], "encode.chunk"),
+        (["encode.device=cuda"], "sees no GPU"),
+    ],
+)
+def test_an_encoding_that_cannot_be_is_refused_in_one_line(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
+) -> None:
+    options = [] if any(word.startswith("weights=") for word in words) else [f"weights={trained}"]
+    line = refusal(capsys, "encode", str(rooms / "room_2"), *options, f"out={tmp_path / 'out'}", *words)
+    assert message in line
+    assert not (tmp_path / "out").exists()
+
+
+def test_features_of_another_space_are_not_judged_by_these_words(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.safetensors"
+    table = load_text_table(rooms / "words.safetensors")
+    save_text_table(other, make_text_table(table.names, table.embeddings, "other-words"))
+    line = refusal(
+        capsys,
+        "evaluate",
+        str(rooms / "room_2"),
+        "protocol=naming",
+        f"weights={trained}",
+        f"teacher.words={other}",
+        f"out={tmp_path / 'out'}",
+    )
+    assert "room-words" in line
+    assert "other-words" in line
+
+
+def test_two_scenes_of_one_name_are_refused_and_one_scene_named_twice_is_taken_once(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(rooms / "room_0", tmp_path / name / "room")
+    both = [str(tmp_path / "a" / "room"), str(tmp_path / "b" / "room")]
+    problem = refusal(capsys, "encode", *both, f"weights={trained}", f"out={tmp_path / 'out'}")
+    assert "are both called 'room'" in problem
+    assert not (tmp_path / "out").exists()
+    twice = [str(rooms / "room_0"), str(rooms / "." / ".." / rooms.name / "room_0")]
+    assert cli.main(["encode", *twice, f"weights={trained}", f"out={tmp_path / 'out'}", "quiet=true"]) == 0
+    assert (tmp_path / "out" / "features.safetensors").is_file()
+
+
+def test_weights_are_not_replaced_by_what_they_make(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own = tmp_path / "encoder"
+    shutil.copytree(trained, own)
+    problem = refusal(capsys, "encode", str(rooms / "room_0"), f"weights={own}", f"out={own}", "overwrite=true")
+    assert "holds the input weights=" in problem
+    assert (own / "encoder.safetensors").is_file()
+
+
+def test_folders_that_a_training_did_not_make_are_left_alone(
+    rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenes = [str(rooms / f"room_{number}") for number in range(2)]
+    prepared = f"prepared={trained.with_name('encoder.prepared')}"
+    common = ["train", *scenes, f"teacher.words={rooms / 'words.safetensors'}", *QUICK[1:], "tensorboard=false"]
+    notes = tmp_path / "mine.training" / "notes.txt"
+    notes.parent.mkdir()
+    notes.touch()
+    for more in ((), ("resume=false",)):
+        assert "holds something else" in refusal(capsys, *common, prepared, f"out={tmp_path / 'mine'}", *more)
+    assert notes.is_file()
+    for inside in ("run", "run/prepared", "run.training", "run.training/prepared"):
+        problem = refusal(capsys, *common, f"prepared={tmp_path / inside}", f"out={tmp_path / 'run'}")
+        assert "give another folder" in problem
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "thesis.tex").touch()
+    problem = refusal(capsys, *common, f"prepared={foreign}", f"out={tmp_path / 'run'}")
+    assert "something else than prepared scenes" in problem
+    assert [path.name for path in foreign.iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "train.seed=99999999999999999999",
+        "model.transformer.mlp_ratio=1e12",
+        "model.transformer.encoder_channels=32,32,32,32,32000000000",
+        "model.transformer.encoder_depths=1,1,1,1,300000",
+        "augment.turn=1e308",
+        "loss.rarity=1000",
+        "loss.cosine=0 loss.smooth_l1=0 loss.contrast_weight=0",
+    ],
+)
+def test_sizes_that_nobody_means_are_refused_before_the_work(
+    rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], setting: str
+) -> None:
+    problem = refusal(capsys, "train", str(rooms / "room_0"), *setting.split(), f"out={tmp_path / 'out'}")
+    assert setting.partition("=")[0].rpartition(".")[2] in problem
+    assert list(tmp_path.iterdir()) == []
