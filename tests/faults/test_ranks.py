@@ -59,9 +59,12 @@ for how in sys.argv[2:]:
         said = str(error)
     except Exception as error:
         said = f"{type(error).__name__}: {error}"
-    (folder / f"{how}.{rank}").write_text(said)
     if how == "settings":
         torch.distributed.destroy_process_group()
+    (folder / f"{how}.{rank}").write_text(said)
+    # A rank that joins again may not find the store of the group that the other one has not left yet.
+    while how == "settings" and not (folder / f"{how}.{1 - rank}").is_file():
+        time.sleep(0.01)
 os._exit(0)
 """
 

@@ -173,16 +173,16 @@ def test_a_fusion_that_continues_from_its_cache_samples_the_cells_of_all_views(t
         calls = 0
 
         def feature_map(self, views: Any, view: int) -> FeatureMap:
-            Expensive.asked += 1
+            Expensive.calls += 1
             return super().feature_map(views, view)
 
     scene, config = a_scene(0), FuseConfig(basis=False)
     plain = fuse(scene, Expensive(), config, sample_cells=True).sample
     fuse(scene, Expensive(), config, work=tmp_path / "work")
-    Expensive.asked = 0
+    Expensive.calls = 0
     continued = fuse(scene, Expensive(), config, work=tmp_path / "work", sample_cells=True).sample
     assert plain is not None
     assert continued is not None
-    assert Expensive.asked == 0
+    assert Expensive.calls == 0
     np.testing.assert_allclose(continued.vectors(), plain.vectors(), rtol=1e-3, atol=1e-3)
     assert fuse(scene, Expensive(), config).sample is None

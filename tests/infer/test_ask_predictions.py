@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.truth.caption_text import wrapped_caption
 from gsencoder.data.truth.entries import box_corners
 from gsencoder.infer.ask.ask import Question
@@ -92,7 +92,8 @@ def test_each_object_is_captioned_once_in_its_own_box_and_only_in_scenes_that_ar
     assert [each.question.id for each in question_set.of_scene("a")] == ["a/4", "a/2"]
     boxes = tmp_path / "boxes.json"
     boxes.write_text(json.dumps({"c": [{"box": corners(1)}], "b": [{"box": corners(3)}, {"box": corners(8)}]}))
-    proposed = read(tmp_path, rows, task="caption", proposals=str(boxes))
+    with pytest.warns(SceneWarning, match="no captions"):
+        proposed = read(tmp_path, rows, task="caption", proposals=str(boxes))
     assert [(each.question.id, each.question.question.aabb) for each in proposed.questions] == [
         ("b/0", (3.0, 0.0, -1.0, 4.0, 2.0, 3.0)),
         ("b/1", (8.0, 0.0, -1.0, 9.0, 2.0, 3.0)),

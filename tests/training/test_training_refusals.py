@@ -81,7 +81,7 @@ def test_features_of_another_space_are_not_judged_by_these_words(
     assert "other-words" in line
 
 
-def test_two_scenes_of_one_name_are_refused_and_one_scene_named_twice_is_taken_once(
+def test_two_scenes_of_one_name_and_one_scene_named_twice_are_refused(
     rooms: Path, trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("a", "b"):
@@ -91,8 +91,10 @@ def test_two_scenes_of_one_name_are_refused_and_one_scene_named_twice_is_taken_o
     assert "are both called 'room'" in problem
     assert not (tmp_path / "out").exists()
     twice = [str(rooms / "room_0"), str(rooms / "." / ".." / rooms.name / "room_0")]
-    assert cli.main(["encode", *twice, f"weights={trained}", f"out={tmp_path / 'out'}", "quiet=true"]) == 0
-    assert (tmp_path / "out" / "features.safetensors").is_file()
+    problem = refusal(capsys, "encode", *twice, f"weights={trained}", f"out={tmp_path / 'out'}")
+    assert "is the same as" in problem
+    assert "give one of them" in problem
+    assert not (tmp_path / "out").exists()
 
 
 def test_weights_are_not_replaced_by_what_they_make(

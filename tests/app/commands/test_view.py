@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -66,8 +67,9 @@ def test_a_page_that_exists_is_replaced_only_when_told(
 
 def test_two_folders_are_two_scenes_of_one_page(folder: Path, built: Path, tmp_path: Path) -> None:
     out = tmp_path / "page.html"
-    features = str(folder / "features")
-    assert cli.main(["view", features, features, f"out={out}", "max_gaussians=1500", "quiet=true"]) == 0
+    features, copy = folder / "features", tmp_path / "copy"
+    shutil.copytree(features, copy)
+    assert cli.main(["view", str(features), str(copy), f"out={out}", "max_gaussians=1500", "quiet=true"]) == 0
     results = json.loads(Path(f"{out}.summary.json").read_text())["results"]
     assert results["gaussians"] == [1500, 1500]
     assert any("1,500 of 5,156 Gaussians" in note for note in results["left_out"])
