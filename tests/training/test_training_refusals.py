@@ -7,7 +7,6 @@ import pytest
 from command_runs import refusal
 from short_training import QUICK
 
-from gsencoder.app import cli
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 
 pytestmark = pytest.mark.slow
