@@ -9,13 +9,21 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.dense import DenseConfig, average_by_voxel, carve, covered_share, densify
 from gsencoder.data.seeding.fill_depths import interpolate, splat_depths
-from gsencoder.data.seeding.stereo import DepthMap, count_agreeing, source_views, sweep, world_points
+from gsencoder.data.seeding.stereo import DepthMap, count_agreeing, source_views, sweep, window_mean, world_points
 
 SMALL = DenseConfig(spacing=3.0, size=96, sources=3, samples=1)
 
 
 def pose(view: int, count: int = 4) -> torch.Tensor:
     return torch.from_numpy(cameras(count).cam_from_world[view])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (3, 2), (7, 4), (40, 31)])
+@pytest.mark.parametrize("side", [1, 3, 5])
+def test_means_of_windows_are_those_of_pooling(size: tuple[int, int], side: int) -> None:
+    maps = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    pooled = torch.nn.functional.avg_pool2d(maps, side, stride=1, padding=side // 2, count_include_pad=False)
+    torch.testing.assert_close(window_mean(maps, side), pooled)
 
 
 def test_a_sweep_finds_the_depth_of_a_slanted_wall() -> None:
