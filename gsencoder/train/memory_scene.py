@@ -130,7 +130,7 @@ def prepare_memory(
     assert scene.views is not None
     rows = view_rows(scene, source, outputs, prepare, np.arange(len(scene.views)), device)
     _sample_raw(folder, stream, features.space, sample)
-    write_prepared(folder / SCENE_FILE, scene, features, outputs, rows, source=scene.folder or Path())
+    write_prepared(folder / SCENE_FILE, scene, features, outputs, rows)
     _write_bank(folder / BANK_FILE, components, outputs, settings)
     return open_memory_scene(folder, settings)
 

@@ -80,7 +80,7 @@ def prepare_scene(
     outputs: OutputSpace,
     config: PrepareConfig,
     *,
-    source: Path = Path(),
+    source: Path | None = None,
     device: torch.device = torch.device("cpu"),
 ) -> None:
     """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of `config.render_views`.

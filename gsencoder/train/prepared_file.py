@@ -68,7 +68,7 @@ def write_prepared(
     outputs: OutputSpace,
     views: list[ViewRows],
     *,
-    source: Path,
+    source: Path | None = None,
     precision: Precision = "float16",
     projections: ProjectionSums | None = None,
 ) -> None:
@@ -80,7 +80,7 @@ def write_prepared(
         features: fused features, in the basis of `outputs`.
         outputs: output space of the dataset.
         views: matrix and teacher's vectors for each camera.
-        source: the path that the scene was read from.
+        source: the path that the scene was read from, by which the file is recognized; None if nobody looks for it.
         precision: of the targets, and of the teacher's vectors in the rows.
         projections: how well the basis represents the teacher's vectors in this scene; None without a basis.
 
@@ -121,8 +121,8 @@ def write_prepared(
         **camera_arrays(scene.views.cameras),
     }
     header = {
-        "source": str(source.resolve()),
-        "source_files": digest_of_files(source),
+        "source": "" if source is None else str(source.resolve()),
+        "source_files": "" if source is None else digest_of_files(source),
         "views": list(scene.views.names),
         "metres_per_unit": scene.metres_per_unit,
         "up": None if scene.up is None else scene.up.tolist(),
