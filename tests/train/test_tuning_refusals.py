@@ -1,6 +1,8 @@
 """Models, prompts and answers that tuning refuses, each in a line."""
 
+import errno
 import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +13,7 @@ from tuning_runs import Pairs, made, samples
 
 from gsencoder.core.errors import InputError
 from gsencoder.train.tuning.run import tune
-from gsencoder.train.tuning.vlm import load_adapted, load_processor
+from gsencoder.train.tuning.vlm import load_adapted, load_processor, save_adapters
 
 pytest.importorskip("peft")
 pytest.importorskip("transformers")
@@ -90,3 +92,33 @@ def test_without_peft_a_sentence_says_so(model: Path, monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "peft", None)
     with pytest.raises(InputError, match=r"needs the package peft \(pip install 'gsencoder\[tune\]'\)"):
         load_adapted(model, SHORT.lora)
+
+
+class Broken:
+    """Something whose files cannot be written."""
+
+    def __init__(self, error: Exception) -> None:
+        self.error = error
+
+    def save_pretrained(self, folder: str) -> None:
+        raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (OSError(errno.EIO, os.strerror(errno.EIO)), "adapters: cannot write: Input/output error"),
+        (OSError(errno.EACCES, "Permission denied", "x/a.json"), "x/a.json: cannot write: Permission denied"),
+        (Exception("Input/output error (os error 5)"), r"adapters: cannot write: Input/output error \(os error 5\)"),
+    ],
+)
+def test_adapters_that_cannot_be_written_are_a_named_error(tmp_path: Path, error: Exception, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        save_adapters(tmp_path / "adapters", Broken(error), Broken(error))
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), RuntimeError("a defect")])
+def test_other_errors_of_writing_adapters_are_left_to_those_who_know_them(tmp_path: Path, error: Exception) -> None:
+    with pytest.raises(type(error)) as caught:
+        save_adapters(tmp_path / "adapters", Broken(error), Broken(error))
+    assert caught.value is error

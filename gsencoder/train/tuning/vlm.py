@@ -13,6 +13,7 @@ import torch
 from torch import nn
 
 from gsencoder.core.errors import InputError, listed
+from gsencoder.core.files.atomic import is_full_disk
 from gsencoder.core.files.model_files import digest_files
 from gsencoder.core.pretrained import load_companion, load_pretrained, quiet_transformers, read_config, weight_files
 
@@ -191,10 +192,25 @@ def save_adapters(folder: Path, adapted: Any, processor: Any) -> None:
         folder: an existing one.
         adapted: of `load_adapted`.
         processor: of the same model.
+
+    Raises:
+        InputError: they cannot be written.
+        OSError: the disk is full, which the output folder says.
     """
-    with quiet_peft():
-        adapted.save_pretrained(str(folder))
-        processor.save_pretrained(str(folder))
+    try:
+        with quiet_peft():
+            adapted.save_pretrained(str(folder))
+            processor.save_pretrained(str(folder))
+    except OSError as error:
+        if is_full_disk(error):
+            raise
+        # Not every error of a write says which file it was.
+        raise InputError(f"{error.filename or folder}: cannot write: {error.strerror or error}") from error
+    except Exception as error:
+        # Safetensors and tokenizers raise classes of their own for errors of the system.
+        if "(os error " not in str(error):
+            raise
+        raise InputError(f"{folder}: cannot write: {' '.join(str(error).split())}") from error
     # A card with blanks to fill in, which peft writes.
     (folder / "README.md").unlink(missing_ok=True)
 
