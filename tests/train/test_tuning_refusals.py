@@ -109,7 +109,11 @@ class Broken:
     [
         (OSError(errno.EIO, os.strerror(errno.EIO)), "adapters: cannot write: Input/output error"),
         (OSError(errno.EACCES, "Permission denied", "x/a.json"), "x/a.json: cannot write: Permission denied"),
-        (Exception("Input/output error (os error 5)"), r"adapters: cannot write: Input/output error \(os error 5\)"),
+        (Exception("Input/output error (os error 5)"), r"adapters: cannot write: Input/output error \(os error 5\)$"),
+        (
+            Exception("saving: Bad file (os error 9) at /.tmp"),
+            r"adapters: cannot write: Bad file \(os ",
+        ),
     ],
 )
 def test_adapters_that_cannot_be_written_are_a_named_error(tmp_path: Path, error: Exception, message: str) -> None:

@@ -1,6 +1,7 @@
 """A vision-language model of transformers under low-rank adapters of peft: loaded, wrapped and written."""
 
 import os
+import re
 import shutil
 import warnings
 from collections.abc import Iterator
@@ -208,9 +209,10 @@ def save_adapters(folder: Path, adapted: Any, processor: Any) -> None:
         raise InputError(f"{error.filename or folder}: cannot write: {error.strerror or error}") from error
     except Exception as error:
         # Safetensors and tokenizers raise classes of their own for errors of the system.
-        if "(os error " not in str(error):
+        reason = re.search(r"[^:]*\(os error \d+\)", str(error))
+        if reason is None:
             raise
-        raise InputError(f"{folder}: cannot write: {' '.join(str(error).split())}") from error
+        raise InputError(f"{folder}: cannot write: {reason[0].strip()}") from error
     # A card with blanks to fill in, which peft writes.
     (folder / "README.md").unlink(missing_ok=True)
 
