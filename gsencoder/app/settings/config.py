@@ -141,8 +141,8 @@ def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
         name = str(error.field_path).partition(".")[0]
         raise InputError(wrong_value(options_by_key(cls, prefix)[prefix + name], data.get(name))) from error
     except InputError as error:
-        said = nan and str(error).startswith(f"{nan}:") and NOT_FINITE not in str(error)
-        raise InputError(_named(str(error), prefix, types) + (f"; {NOT_FINITE}" if said else "")) from error
+        unexplained = nan and str(error).startswith(f"{nan}:") and NOT_FINITE not in str(error)
+        raise InputError(_named(str(error), prefix, types) + (f"; {NOT_FINITE}" if unexplained else "")) from error
     except (ValueError, OverflowError):
         # A class that counts with a number before it looks at it.
         if not nan:
@@ -161,11 +161,11 @@ def _has_nan(value: Any) -> bool:
 
 def _named(message: str, prefix: str, names: Iterable[str]) -> str:
     """The message of an error of a settings class, with the name of the section before that of each field."""
-    head, _, said = message.partition(":")
+    head, _, problem = message.partition(":")
     named = re.split(r"(, | and )", head)
     if not prefix or any(name.split("[")[0] not in names for name in named[::2]):
         return f"{prefix.rstrip('.')}: {message}" if prefix else message
-    return f"{''.join(prefix + word if index % 2 == 0 else word for index, word in enumerate(named))}:{said}"
+    return f"{''.join(prefix + word if index % 2 == 0 else word for index, word in enumerate(named))}:{problem}"
 
 
 def check_required(cls: type, config: object) -> None:

@@ -140,9 +140,9 @@ def parallel(work: Callable[[int], Result], pieces: Iterable[int]) -> list[Resul
                     return
 
     others = [threading.Thread(target=run) for _ in range(threads - 1)]
-    for thread in others:
-        thread.start()
     try:
+        for thread in others:
+            thread.start()
         run()
         _join(others)
     except BaseException:
@@ -157,21 +157,22 @@ def parallel(work: Callable[[int], Result], pieces: Iterable[int]) -> list[Resul
 
 def _join(threads: Iterable[threading.Thread]) -> None:
     for thread in threads:
-        thread.join()
+        if thread.ident is not None:
+            thread.join()
 
 
 @contextlib.contextmanager
 def _one_thread() -> Iterator[None]:
     """Lets work within the block have no threads but the one that it runs on."""
     before = getattr(_here, "threads", None)
-    _here.threads = 1
+    _limit_threads(1)
     try:
         yield
     finally:
         if before is None:
             del _here.threads
         else:
-            _here.threads = before
+            _limit_threads(before)
 
 
 def ahead(work: Callable[[int], Result], items: Iterable[int], workers: int = 1) -> Iterator[Result]:

@@ -83,17 +83,17 @@ def score_sentences(
         candidates, truths = _tokenized(hypotheses, references, tools if ptb else None)
     each_bleu = bleu(candidates, truths)
     each_rouge, each_cider = rouge_l(candidates, truths), cider(candidates, truths)
-    whole, each = (None, None) if isinstance(tools, str) else meteor(candidates, truths, tools)
+    corpus_meteor, candidate_meteors = (None, None) if isinstance(tools, str) else meteor(candidates, truths, tools)
     b1, b2, b3, b4 = each_bleu[0].tolist()
     return SentenceScores(
         tokens=GIVEN_TOKENS if tokens == "given" else PTB_TOKENS if ptb else PYTHON_TOKENS,
         official=ptb or tokens == "given",
         bleu=(b1, b2, b3, b4),
-        meteor=whole,
+        meteor=corpus_meteor,
         rouge_l=mean_of(each_rouge),
         cider=mean_of(each_cider),
         bleu_each=each_bleu[1],
-        meteor_each=each,
+        meteor_each=candidate_meteors,
         rouge_l_each=each_rouge,
         cider_each=each_cider,
         absent={"METEOR": tools} if isinstance(tools, str) else {},
