@@ -1,13 +1,14 @@
 """Occlusion tests: whether a Gaussian is at the depth of a depth map, or behind it."""
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, no_type_check
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int32, Int64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.runtime.threads import kernel
 from gsencoder.render import Blend
 from gsencoder.render.rays import Lattice
 from gsencoder.types import Views
@@ -103,12 +104,28 @@ def ray_pixels(lattice: Lattice, width: int, height: int) -> tuple[Int32[np.ndar
     return y.astype(np.int32), x.astype(np.int32)
 
 
-def _row_range(depth: np.ndarray, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+def _row_range(
+    depth: Float32[np.ndarray, "H W"], lattice: Lattice
+) -> tuple[Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]]:
+    """The nearest and the farthest depth that was measured on the rays of each row; 0 where none was."""
     y, x = ray_pixels(lattice, depth.shape[1], depth.shape[0])
-    rays = depth[np.ix_(y, x)].reshape(lattice.height, lattice.side, lattice.width, lattice.side)
-    high = rays.max(axis=(1, 3)).ravel()
-    low = np.where(rays > 0, rays, np.inf).min(axis=(1, 3)).ravel()
-    return np.where(high > 0, low, 0), high
+    low, high = np.empty(lattice.rows, np.float32), np.empty(lattice.rows, np.float32)
+    _measured_range(depth, y, x, lattice.width, lattice.side, low, high)
+    return low, high
+
+
+@kernel
+@no_type_check
+def _measured_range(depth, y, x, width, side, low, high):
+    for row in range(len(low)):
+        first_y, first_x = row // width * side, row % width * side
+        nearest, farthest = np.float32(np.inf), np.float32(0)
+        for i in range(first_y, first_y + side):
+            for j in range(first_x, first_x + side):
+                d = depth[y[i], x[j]]
+                if d > 0:
+                    nearest, farthest = min(nearest, d), max(farthest, d)
+        low[row], high[row] = nearest if farthest > 0 else np.float32(0), farthest
 
 
 def row_mask(mask: Bool[np.ndarray, "H W"], lattice: Lattice) -> Float32[np.ndarray, " P"]:

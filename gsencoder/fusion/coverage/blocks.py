@@ -4,15 +4,15 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Int32, Int64
 
 from gsencoder.fusion.coverage.kernels import near_rays
 from gsencoder.geometry import ALPHA_MIN
 from gsencoder.render.rays import Lattice
 from gsencoder.types import Cameras, Gaussians
 
-BLOCKS = 24
-"""Blocks along each axis."""
+BLOCKS, PARTS = 24, 2
+"""Blocks along each axis, and parts of a block along each axis."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -53,12 +53,17 @@ class Blocks:
         # Most means lie between these quantiles; the others count to the blocks at the border.
         some = means[:: max(1, len(means) // 10_000)]
         low, high = np.quantile(some, (0.01, 0.99), axis=0).astype(np.float32)
-        cell = np.clip((means - low) * (BLOCKS / np.maximum(high - low, 1e-12)), 0, BLOCKS - 1).astype(np.int16)
-        codes = (cell[:, 0] * BLOCKS + cell[:, 1]) * BLOCKS + cell[:, 2]
+        fine = BLOCKS * PARTS
+        cell = np.clip((means - low) * (fine / np.maximum(high - low, 1e-12)), 0, fine - 1).astype(np.int32)
+        block, part = np.divmod(cell, PARTS)
+        codes = ((block[:, 0] * BLOCKS + block[:, 1]) * BLOCKS + block[:, 2]) * PARTS**3
+        codes += (part[:, 0] * PARTS + part[:, 1]) * PARTS + part[:, 2]
         self._order = np.argsort(codes, kind="stable")
-        self._starts = np.concatenate(([0], np.flatnonzero(np.diff(codes[self._order])) + 1, [len(means)]))
+        codes = codes[self._order]
+        self._block_starts = _starts(codes // PARTS**3)
         self._block_of = np.empty(len(means), np.int32)
-        self._block_of[self._order] = np.repeat(np.arange(len(self._starts) - 1), np.diff(self._starts))
+        self._block_of[self._order] = np.repeat(np.arange(len(self._block_starts) - 1), np.diff(self._block_starts))
+        self._starts = _starts(codes)
         self._means, self._reaches = means[self._order], reaches[self._order]
         first = np.minimum.reduceat(self._means, self._starts[:-1], axis=0).astype(np.float64)
         last = np.maximum.reduceat(self._means, self._starts[:-1], axis=0).astype(np.float64)
@@ -103,6 +108,11 @@ class Blocks:
     def around(self, row: int, count: int) -> Int64[np.ndarray, " n"]:
         """Up to so many Gaussians of the block of a Gaussian: those nearest to it, itself among them."""
         block = self._block_of[row]
-        rows = self._order[self._starts[block] : self._starts[block + 1]]
+        rows = self._order[self._block_starts[block] : self._block_starts[block + 1]]
         distances = np.square(self.gaussians.means[rows] - self.gaussians.means[row]).sum(axis=1)
         return rows[np.argsort(distances, kind="stable")[:count]]
+
+
+def _starts(codes: Int32[np.ndarray, " N"]) -> Int64[np.ndarray, " starts"]:
+    """Where runs of equal codes begin, and where the last one ends."""
+    return np.concatenate(([0], np.flatnonzero(np.diff(codes)) + 1, [len(codes)]))
