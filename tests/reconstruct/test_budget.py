@@ -14,18 +14,19 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.reconstruct.budget import (
     LEAST_STEPS,
     BudgetConfig,
+    affordable_steps,
     choose_scale,
-    plan_steps,
     step_seconds,
     steps_for_minutes,
     trial_views,
 )
+from gsencoder.reconstruct.config import ReconstructConfig
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.run import ReconstructConfig, reconstruct
+from gsencoder.reconstruct.run import reconstruct
 from gsencoder.types import Cameras, Scene
 
 CPU, USUAL = torch.device("cpu"), OptimizeConfig()
@@ -38,13 +39,13 @@ def pictures(width: int, height: int) -> Cameras:
 def test_small_photographs_stay_and_phone_photographs_are_made_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
-    ten = BudgetConfig()
+    ten = BudgetConfig().minutes_left(100.0)
     assert choose_scale(pictures(320, 240), ten, CPU, USUAL) == 1
     phone = choose_scale(pictures(4000, 3000), ten, CPU, USUAL)
     assert 0.05 < phone < 0.2
-    assert choose_scale(pictures(4000, 3000), BudgetConfig(minutes=0.0), CPU, USUAL) == 1
+    assert choose_scale(pictures(4000, 3000), 0.0, CPU, USUAL) == 1
     # More time gives larger pictures, whatever they are; a GPU needs less.
-    scales = [choose_scale(pictures(4000, 3000), BudgetConfig(minutes=float(m)), CPU, USUAL) for m in (3, 10, 30, 100)]
+    scales = [choose_scale(pictures(4000, 3000), float(m), CPU, USUAL) for m in (3, 10, 30, 100)]
     assert scales == sorted(scales)
     assert scales[0] < scales[-1]
     assert choose_scale(pictures(4000, 3000), ten, torch.device("cuda"), USUAL) > phone
@@ -92,12 +93,12 @@ def test_four_views_from_the_first_to_the_last_stand_for_all() -> None:
 
 
 def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time() -> None:
-    assert plan_steps(optimizer(OptimizeConfig(steps=5000)), BudgetConfig(minutes=0.1)) == 5000
+    assert affordable_steps(optimizer(OptimizeConfig(steps=5000)), 0.1) == 5000
     usual = optimizer(USUAL)
-    assert plan_steps(usual, BudgetConfig(minutes=0.0)) == USUAL.steps
-    assert plan_steps(usual, BudgetConfig()) == USUAL.steps
-    assert plan_steps(usual, BudgetConfig(minutes=0.01)) == LEAST_STEPS
-    assert plan_steps(usual, BudgetConfig(minutes=80.0)) == 2 * USUAL.steps
+    assert affordable_steps(usual, 0.0) == USUAL.steps
+    assert affordable_steps(usual, 10.0) == USUAL.steps
+    assert affordable_steps(usual, 0.01) == LEAST_STEPS
+    assert affordable_steps(usual, 80.0) == 2 * USUAL.steps
 
 
 @pytest.mark.usefixtures("no_gpu")
