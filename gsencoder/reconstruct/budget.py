@@ -32,6 +32,9 @@ CUDA_GAIN = 30.0
 SEED_SHARE = 0.2
 """Share of the time that reading and seeding may take."""
 DEFAULT_MINUTES = 10.0
+PROMISED_STEPS = 400
+"""For promised seconds photographs are made smaller only where there is no time for so many steps: of the same time,
+fewer steps cost less than smaller photographs (docs/measurements.md, Trade-off)."""
 LEAST_STEPS, LEAST_PIXELS = 200, 40_000
 SMALLEST_REDUCTION = 0.95
 """Photographs are not resized by less than this."""
@@ -112,19 +115,24 @@ def steps_for_minutes(minutes: float, config: OptimizeConfig) -> int:
     return max(LEAST_STEPS, round(config.steps * (minutes / DEFAULT_MINUTES) ** (1 / 3)))
 
 
-def choose_scale(cameras: Cameras, minutes: float, device: torch.device, config: OptimizeConfig) -> float:
+def choose_scale(
+    cameras: Cameras, budget: BudgetConfig, device: torch.device, config: OptimizeConfig, *, spent: float = 0.0
+) -> float:
     """The factor by which photographs are made smaller, 1 = not at all.
 
     Args:
         cameras: of the photographs at their full size.
-        minutes: that the reconstruction should take; 0 = as long as it wants.
+        budget: the aim in minutes, or promised seconds.
         device: where it is computed.
         config: the stages.
+        spent: seconds that reading has taken.
     """
     pixels = float(np.median(cameras.widths.astype(np.float64) * cameras.heights))
+    minutes = budget.minutes_left(spent)
     if not minutes:
         return 1.0
-    seconds = (1 - SEED_SHARE) * 60 * minutes / steps_for_minutes(minutes, config)
+    steps = steps_for_minutes(minutes, config) if budget.seconds is None else PROMISED_STEPS
+    seconds = (1 - SEED_SHARE) * 60 * minutes / steps
     none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
     affordable = max(LEAST_PIXELS, (seconds - none) / (one - none))
     scale = math.sqrt(affordable / pixels)

@@ -10,9 +10,11 @@ from splats import random_gaussians
 from walls import cameras, wall_views
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.promises import PLANNED
 from gsencoder.data.photographs import Photographs
 from gsencoder.reconstruct.budget import (
     LEAST_STEPS,
+    PROMISED_STEPS,
     BudgetConfig,
     affordable_steps,
     choose_scale,
@@ -39,19 +41,33 @@ def pictures(width: int, height: int) -> Cameras:
 def test_small_photographs_stay_and_phone_photographs_are_made_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
-    ten = BudgetConfig().minutes_left(100.0)
+    ten = BudgetConfig()
     assert choose_scale(pictures(320, 240), ten, CPU, USUAL) == 1
     phone = choose_scale(pictures(4000, 3000), ten, CPU, USUAL)
     assert 0.05 < phone < 0.2
-    assert choose_scale(pictures(4000, 3000), 0.0, CPU, USUAL) == 1
+    assert choose_scale(pictures(4000, 3000), BudgetConfig(minutes=0.0), CPU, USUAL) == 1
     # More time gives larger pictures, whatever they are; a GPU needs less.
-    scales = [choose_scale(pictures(4000, 3000), float(m), CPU, USUAL) for m in (3, 10, 30, 100)]
+    scales = [choose_scale(pictures(4000, 3000), BudgetConfig(minutes=float(m)), CPU, USUAL) for m in (3, 10, 30, 100)]
     assert scales == sorted(scales)
     assert scales[0] < scales[-1]
     assert choose_scale(pictures(4000, 3000), ten, torch.device("cuda"), USUAL) > phone
     # What is chosen costs no more than there is time for.
     pixels = 4000 * 3000 * phone**2
     assert steps_for_minutes(10.0, USUAL) * step_seconds(pixels, 60_000.0, CPU, USUAL) <= 600 * 0.81
+
+
+def test_for_promised_seconds_photographs_are_made_smaller_only_where_there_is_no_time_for_some_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    needed = PROMISED_STEPS * step_seconds(320.0 * 240.0, 60_000.0, CPU, USUAL) / (PLANNED * 0.8)
+    assert choose_scale(pictures(320, 240), BudgetConfig(seconds=1.01 * needed), CPU, USUAL) == 1
+    smaller = choose_scale(pictures(320, 240), BudgetConfig(seconds=0.75 * needed), CPU, USUAL)
+    assert smaller < 1
+    # What reading took is missing then.
+    late = choose_scale(pictures(320, 240), BudgetConfig(seconds=1.01 * needed), CPU, USUAL, spent=0.26 * needed)
+    assert late < 1
 
 
 def test_cores_and_stages_count(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -199,7 +199,8 @@ def _affordable_scale(opened: OpenedScene, work: Path, config: ReconstructComman
     begun = image_scale_of(work / CHECKPOINT_FILE)
     if begun is not None:
         return begun
-    return choose_scale(views.cameras, config.budget.minutes_left(spent), choose_device(config.device), config.optimize)
+    device = choose_device(config.device)
+    return choose_scale(views.cameras, config.budget, device, config.optimize, spent=spent)
 
 
 def _at_scale(
