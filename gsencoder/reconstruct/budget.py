@@ -131,10 +131,14 @@ def choose_scale(
     minutes = budget.minutes_left(spent)
     if not minutes:
         return 1.0
-    steps = steps_for_minutes(minutes, config) if budget.seconds is None else PROMISED_STEPS
-    seconds = (1 - SEED_SHARE) * 60 * minutes / steps
     none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
-    affordable = max(LEAST_PIXELS, (seconds - none) / (one - none))
+    if budget.seconds is None:
+        steps, least = steps_for_minutes(minutes, config), LEAST_PIXELS
+    else:
+        # Where pixels are a third of a step, even half of them would hardly save time.
+        steps, least = PROMISED_STEPS, none / (one - none) / 2
+    seconds = (1 - SEED_SHARE) * 60 * minutes / steps
+    affordable = max(least, (seconds - none) / (one - none))
     scale = math.sqrt(affordable / pixels)
     return 1.0 if scale > SMALLEST_REDUCTION else round(scale, 3)
 

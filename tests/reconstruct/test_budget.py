@@ -61,13 +61,18 @@ def test_for_promised_seconds_photographs_are_made_smaller_only_where_there_is_n
 ) -> None:
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
-    needed = PROMISED_STEPS * step_seconds(320.0 * 240.0, 60_000.0, CPU, USUAL) / (PLANNED * 0.8)
-    assert choose_scale(pictures(320, 240), BudgetConfig(seconds=1.01 * needed), CPU, USUAL) == 1
-    smaller = choose_scale(pictures(320, 240), BudgetConfig(seconds=0.75 * needed), CPU, USUAL)
-    assert smaller < 1
+    needed = PROMISED_STEPS * step_seconds(640.0 * 480.0, 60_000.0, CPU, USUAL) / (PLANNED * 0.8)
+
+    def scale(seconds: float, *, width: int = 640, height: int = 480, spent: float = 0.0) -> float:
+        return choose_scale(pictures(width, height), BudgetConfig(seconds=seconds), CPU, USUAL, spent=spent)
+
+    assert scale(1.01 * needed) == 1
+    assert 0.6 < scale(0.75 * needed) < 1
     # What reading took is missing then.
-    late = choose_scale(pictures(320, 240), BudgetConfig(seconds=1.01 * needed), CPU, USUAL, spent=0.26 * needed)
-    assert late < 1
+    assert scale(1.01 * needed, spent=0.26 * needed * PLANNED) == pytest.approx(scale(0.75 * needed), abs=1e-3)
+    # Small photographs stay, since what they cost is small beside the Gaussians.
+    assert scale(1.0, width=320, height=240) == 1
+    assert scale(1.0, width=4000, height=3000) == pytest.approx((97_000 / 12e6) ** 0.5, rel=0.02)
 
 
 def test_cores_and_stages_count(monkeypatch: pytest.MonkeyPatch) -> None:
