@@ -1,5 +1,6 @@
 """`gsencoder encode SPLAT weights=FILE`: features of every Gaussian in one pass, without photographs or a teacher."""
 
+import math
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -113,6 +114,12 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
                 with one.step("seeds"):
                     scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
             scene = with_reported_up(scene, one, quiet=config.quiet)
+            assert scene.gaussians is not None
+            count, chunk = len(scene.gaussians), config.encode.chunk
+            if chunk and count > chunk:
+                # Before they are cut, which takes a while where there are thousands.
+                least = counted(math.ceil(count / chunk), "chunk")
+                screen.print(f"{out}: {count:,} Gaussians in {least} or more (encode.chunk={chunk})")
             with about(scene.name):
                 spaces, promises = _encode_into(folder, scene, encoder, config, made_with, one)
             if heads is not None:
