@@ -187,6 +187,16 @@ def load_property(path: str | Path, name: str) -> Float64[np.ndarray, " N"]:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
+def check_splat_name(path: Path) -> None:
+    """Checks that `save_splat` knows a format by the name of a file.
+
+    Raises:
+        InputError: it does not.
+    """
+    if not path.name.lower().endswith((".ply", ".spz")):
+        raise InputError(f"{path}: cannot write {path.suffix or 'a name without suffix'}; expected {WRITABLE}")
+
+
 def save_splat(
     path: str | Path,
     gaussians: Gaussians,
@@ -222,9 +232,8 @@ def save_splat(
         SceneWarning: values were clipped to the range of a packed format, or positions lose precision in it.
     """
     path = Path(path)
+    check_splat_name(path)
     name = path.name.lower()
-    if not name.endswith((".ply", ".spz")):
-        raise InputError(f"{path}: cannot write {path.suffix or 'a name without suffix'}; expected {WRITABLE}")
     if spz_version not in (3, 4):
         raise InputError(f"spz_version={spz_version}: expected 3 or 4")
     if len(gaussians) == 0:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.app.commands.words_options import WordsOptions
-from gsencoder.app.runs.output_file import refuse_existing, sole_writer
+from gsencoder.app.runs.output_file import check_output_files, sole_writer
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
@@ -109,8 +109,7 @@ def run(config: ViewConfig, summary: Summary) -> None:
     DistinctPaths().add(map(Path, config.paths))
     bundle = load_bundle()
     if config.out is not None:
-        for path in (config.out, Path(f"{config.out}.summary.json")):
-            refuse_existing(path, config.overwrite)
+        check_output_files((config.out, Path(f"{config.out}.summary.json")), config.overwrite)
     with summary.step("load"):
         photographed = load_scene(config.photos, options=config.data) if config.photos else None
         loaded = [_load(Path(path), config, photographed) for path in config.paths]
