@@ -13,7 +13,7 @@ import textwrap
 import threading
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from types import FrameType
@@ -214,7 +214,7 @@ def _run(command: Command, config: Any, debug: bool) -> None:
     values = settings(config)
     refuse_to_replace_inputs(config.out, values)
     summary = Summary(command.name, values)
-    with _collected_warnings(summary.warnings, debug):
+    with _collected_warnings(summary.add_warning, debug):
         run(config, summary)
 
 
@@ -232,8 +232,8 @@ def _run_one(command: Command, config: Any, debug: bool) -> str:
 
 
 @contextmanager
-def _collected_warnings(messages: list[str], debug: bool) -> Iterator[None]:
-    """Each `SceneWarning` becomes one line on standard error and one entry of `messages`."""
+def _collected_warnings(add: Callable[[str], str], debug: bool) -> Iterator[None]:
+    """Each `SceneWarning` is added to a summary, and what that returns becomes one line on standard error."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", SceneWarning)
         usual = warnings.showwarning
@@ -242,8 +242,7 @@ def _collected_warnings(messages: list[str], debug: bool) -> Iterator[None]:
             if not issubclass(category, SceneWarning):
                 usual(message, category, filename, lineno, file, line)
                 return
-            text = one_line(str(message))
-            messages.append(text)
+            text = one_line(add(one_line(str(message))))
             print(f"warning: {text}" + (f" ({filename}:{lineno})" if debug else ""), file=sys.stderr)
 
         warnings.showwarning = show
