@@ -10,13 +10,11 @@ import os
 import signal
 import sys
 import textwrap
-import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from types import FrameType
 from typing import Any
 
 import gsencoder
@@ -25,7 +23,7 @@ from gsencoder.app.runs.printable import clipped, one_line, printable
 from gsencoder.app.settings.options import near, without_value
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.runtime.process_rank import refuse_several
-from gsencoder.core.runtime.signals import Stopped, stop_of
+from gsencoder.core.runtime.signals import Stopped, stop_of, stopping_signals
 
 FLAGS = {
     "--help": "show this help (-h)",
@@ -50,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     try:
-        with _stop_signals():
+        with stopping_signals():
             code = _dispatch(words)
             sys.stdout.flush()
             return code
@@ -121,29 +119,6 @@ def _report_notes(error: BaseException) -> None:
 def _discard_stdout() -> None:
     """Redirects standard output to nowhere: its reader is gone, and the interpreter would fail to flush it at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-@contextmanager
-def _stop_signals() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise an exception, unless they are ignored (nohup)."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(number: int, _: FrameType | None) -> None:
-        raise Stopped(number)
-
-    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {number: signal.getsignal(number) for number in (getattr(signal, name) for name in names)}
-    try:
-        for number, handler in before.items():
-            if handler == signal.SIG_DFL:
-                signal.signal(number, stop)
-        yield
-    finally:
-        for number, handler in before.items():
-            if handler == signal.SIG_DFL:
-                signal.signal(number, handler)
 
 
 def _split_flags(words: Sequence[str]) -> tuple[set[str], list[str]]:

@@ -13,6 +13,7 @@ from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.runtime.signals import accept_stop
 from gsencoder.data.scene_paths import DistinctPaths
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import with_up
@@ -170,6 +171,7 @@ def _serve(
         try:
             server.serve_forever(poll_interval=0.1)
         except KeyboardInterrupt:
+            accept_stop()
             console(config.quiet).print("ended")
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import gsencoder
 from gsencoder.core.files.json_values import plain, write_json
 from gsencoder.core.files.written_files import SUMMARY_NAME, sha256_of
+from gsencoder.core.runtime.signals import raise_dropped_stop
 from gsencoder.core.runtime.threads import available_cores
 
 LIBRARIES = {
@@ -100,12 +101,14 @@ class Summary:
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
         """Adds the seconds of the block to the step, also if it fails."""
+        raise_dropped_stop()
         start = time.perf_counter()
         self.timings.setdefault(name, 0.0)
         try:
             yield
         finally:
             self.timings[name] += time.perf_counter() - start
+        raise_dropped_stop()
 
     def add_seconds(self, steps: Mapping[str, float]) -> None:
         """Adds the seconds of steps that were timed elsewhere."""
