@@ -21,6 +21,11 @@ class Stopped(BaseException):
         self.number = number
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C. A class of its own, since CPython ends the process by SIGINT in the end, in place of its exit code, if a
+    `KeyboardInterrupt` has left an `exec`, as dataclasses do when they are made, even though it was caught."""
+
+
 def stop_of(error: BaseException) -> Stopped | KeyboardInterrupt | None:
     """The signal or interrupt behind an exception, or None. A signal that arrives within a compiled function leaves it
     wrapped in a `SystemError`, and in one more for each function that had called it."""
@@ -106,7 +111,7 @@ def accept_stop() -> None:
 
 
 def _stop(number: int) -> Stopped | KeyboardInterrupt:
-    return KeyboardInterrupt() if number == signal.SIGINT else Stopped(number)
+    return Interrupted() if number == signal.SIGINT else Stopped(number)
 
 
 @contextmanager
