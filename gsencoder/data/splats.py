@@ -127,7 +127,11 @@ def read_raw(path: str | Path) -> RawSplat:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
             if not (path / "meta.json").is_file():
-                raise InputError(f"{path}: is a folder without meta.json; expected a splat file or a SOG folder")
+                inner = sorted(each.name for each in path.iterdir() if each.name.lower().endswith(".ply"))
+                hint = (
+                    f"; give its {', '.join(inner)}" if inner else ", such as the splat.ply of `gsencoder reconstruct`"
+                )
+                raise InputError(f"{path}: is a folder without meta.json; expected a splat file or a SOG folder{hint}")
             return read_sog_folder(path)
         if not stat.S_ISREG(status.st_mode):
             raise InputError(f"{path}: is not a regular file; expected {READABLE}")
