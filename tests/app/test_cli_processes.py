@@ -150,6 +150,8 @@ sys.exit(cli.main())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
-def test_an_interrupt_within_an_exec_ends_with_the_exit_code_of_an_interrupt() -> None:
-    done = subprocess.run([sys.executable, "-c", WITHIN_EXEC, "inspect", "a"], capture_output=True, text=True)
+def test_an_interrupt_within_an_exec_ends_with_the_exit_code_of_an_interrupt(tmp_path: Path) -> None:
+    (tmp_path / "within_exec.py").write_text(WITHIN_EXEC)
+    words = [sys.executable, "-m", "within_exec", "inspect", "a"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "interrupted\n")

@@ -22,8 +22,8 @@ class Stopped(BaseException):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C. A class of its own, since CPython ends the process by SIGINT in the end, in place of its exit code, if a
-    `KeyboardInterrupt` has left an `exec`, as dataclasses do when they are made, even though it was caught."""
+    """Ctrl-C. A class of its own, since `python -m` ends by SIGINT in place of its exit code if a `KeyboardInterrupt`
+    proper has left an `exec`, such as dataclasses run when they are made, even though it was caught."""
 
 
 def stop_of(error: BaseException) -> Stopped | KeyboardInterrupt | None:
