@@ -10,13 +10,11 @@ import os
 import signal
 import sys
 import textwrap
-import threading
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from types import FrameType
 from typing import Any
 
 import gsencoder
@@ -25,7 +23,7 @@ from gsencoder.app.runs.printable import clipped, one_line, printable
 from gsencoder.app.settings.options import near, without_value
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.runtime.process_rank import refuse_several
-from gsencoder.core.runtime.signals import Stopped, stop_of
+from gsencoder.core.runtime.signals import Stopped, stop_of, stopping_signals
 
 FLAGS = {
     "--help": "show this help (-h)",
@@ -50,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
     try:
-        with _stop_signals():
+        with stopping_signals():
             code = _dispatch(words)
             sys.stdout.flush()
             return code
@@ -123,29 +121,6 @@ def _discard_stdout() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-@contextmanager
-def _stop_signals() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise an exception, unless they are ignored (nohup)."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(number: int, _: FrameType | None) -> None:
-        raise Stopped(number)
-
-    names = [name for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    before = {number: signal.getsignal(number) for number in (getattr(signal, name) for name in names)}
-    try:
-        for number, handler in before.items():
-            if handler == signal.SIG_DFL:
-                signal.signal(number, stop)
-        yield
-    finally:
-        for number, handler in before.items():
-            if handler == signal.SIG_DFL:
-                signal.signal(number, handler)
-
-
 def _split_flags(words: Sequence[str]) -> tuple[set[str], list[str]]:
     flags: set[str] = set()
     rest: list[str] = []
@@ -214,7 +189,7 @@ def _run(command: Command, config: Any, debug: bool) -> None:
     values = settings(config)
     refuse_to_replace_inputs(config.out, values)
     summary = Summary(command.name, values)
-    with _collected_warnings(summary.warnings, debug):
+    with _collected_warnings(summary.add_warning, debug):
         run(config, summary)
 
 
@@ -232,8 +207,8 @@ def _run_one(command: Command, config: Any, debug: bool) -> str:
 
 
 @contextmanager
-def _collected_warnings(messages: list[str], debug: bool) -> Iterator[None]:
-    """Each `SceneWarning` becomes one line on standard error and one entry of `messages`."""
+def _collected_warnings(add: Callable[[str], str], debug: bool) -> Iterator[None]:
+    """Each `SceneWarning` is added to a summary, and what that returns becomes one line on standard error."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", SceneWarning)
         usual = warnings.showwarning
@@ -242,8 +217,7 @@ def _collected_warnings(messages: list[str], debug: bool) -> Iterator[None]:
             if not issubclass(category, SceneWarning):
                 usual(message, category, filename, lineno, file, line)
                 return
-            text = one_line(str(message))
-            messages.append(text)
+            text = one_line(add(one_line(str(message))))
             print(f"warning: {text}" + (f" ({filename}:{lineno})" if debug else ""), file=sys.stderr)
 
         warnings.showwarning = show

@@ -37,12 +37,12 @@ def counted(number: int, noun: str, several: str = "") -> str:
 
 
 @contextmanager
-def about(what: object) -> Iterator[None]:
-    """Prefixes the message of an `InputError` that leaves the block with `what`, unless it contains it already."""
+def about(subject: object) -> Iterator[None]:
+    """Prefixes the message of an `InputError` that leaves the block with `subject`, unless it contains it already."""
     try:
         yield
     except InputError as error:
-        raise error if str(what) in str(error) else type(error)(f"{what}: {error}") from error
+        raise error if str(subject) in str(error) else type(error)(f"{subject}: {error}") from error
 
 
 @contextmanager

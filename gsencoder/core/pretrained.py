@@ -21,7 +21,7 @@ VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tikto
 def load_pretrained(
     loader: Any,
     folder: Path,
-    what: str,
+    subject: str,
     *,
     other_parts: str = "warn",
     known_parts: Sequence[str] = (),
@@ -32,7 +32,7 @@ def load_pretrained(
     Args:
         loader: a class of transformers with `from_pretrained`.
         folder: with `config.json` and safetensors files.
-        what: who loads it, for messages.
+        subject: who loads it, for messages.
         other_parts: what is done about weights of modules that the class does not have, such as the other tower of a
             joint model: "warn" or "ignore".
         known_parts: what keys of weights begin with that are read from the same files by other means, and need no
@@ -46,19 +46,19 @@ def load_pretrained(
     Warns:
         SceneWarning: weights of other modules are not used, with `other_parts="warn"`.
     """
-    weight_files(folder, what)
-    with _readable(folder, what):
+    weight_files(folder, subject)
+    with _readable(folder, subject):
         import torch
 
         # transformers would take the type of the files, in which pictures of float32 do not fit every layer.
         model, report = _from_pretrained(loader, str(folder), use_safetensors=True, dtype=torch.float32, **options)
     report["unexpected_keys"] = [key for key in report["unexpected_keys"] if not key.startswith(tuple(known_parts))]
-    _check_keys(folder, model, report, what, other_parts)
-    _check_finite(folder, model, what)
+    _check_keys(folder, model, report, subject, other_parts)
+    _check_finite(folder, model, subject)
     return model.eval()
 
 
-def load_part(loader: Any, config: Any, folder: Path, weight: str, what: str) -> tuple[Any, list[Path]]:
+def load_part(loader: Any, config: Any, folder: Path, weight: str, subject: str) -> tuple[Any, list[Path]]:
     """A part of the model of a folder, such as the vision tower of a vision-language model, with exactly its weights.
 
     No other weights are read. The part is in evaluation mode and in float32.
@@ -69,7 +69,7 @@ def load_part(loader: Any, config: Any, folder: Path, weight: str, what: str) ->
         folder: with safetensors files.
         weight: name of one of the part's weights within the part; the rest of its name in the files is the prefix of
             the part.
-        what: who loads it, for messages.
+        subject: who loads it, for messages.
 
     Returns:
         The part, and the files that hold weights of it.
@@ -78,8 +78,8 @@ def load_part(loader: Any, config: Any, folder: Path, weight: str, what: str) ->
         InputError: the files hold no such part or several, or weights that do not fit its configuration or are not
             finite.
     """
-    files = weight_files(folder, what)
-    with _readable(folder, what):
+    files = weight_files(folder, subject)
+    with _readable(folder, subject):
         import torch
         from safetensors import safe_open
 
@@ -89,7 +89,7 @@ def load_part(loader: Any, config: Any, folder: Path, weight: str, what: str) ->
                 names |= dict.fromkeys(opened.keys(), path)
         prefixes = sorted(name.removesuffix(weight) for name in names if name.endswith(f".{weight}") or name == weight)
         if len(prefixes) != 1:
-            raise InputError(f"{what}: {folder}: {len(prefixes)} of its weights end in {weight}; expected one")
+            raise InputError(f"{subject}: {folder}: {len(prefixes)} of its weights end in {weight}; expected one")
         weights: dict[str, Any] = {}
         used = sorted({path for name, path in names.items() if name.startswith(prefixes[0])})
         for path in used:
@@ -98,12 +98,12 @@ def load_part(loader: Any, config: Any, folder: Path, weight: str, what: str) ->
                     if name.startswith(prefixes[0]):
                         weights[name.removeprefix(prefixes[0])] = opened.get_tensor(name)
         model, report = _from_pretrained(loader, None, config=config, state_dict=weights, dtype=torch.float32)
-    _check_keys(folder, model, report, what, "warn")
-    _check_finite(folder, model, what)
+    _check_keys(folder, model, report, subject, "warn")
+    _check_finite(folder, model, subject)
     return model.eval(), used
 
 
-def weight_files(folder: Path, what: str) -> list[Path]:
+def weight_files(folder: Path, subject: str) -> list[Path]:
     """The safetensors files of a folder.
 
     Raises:
@@ -114,18 +114,18 @@ def weight_files(folder: Path, what: str) -> list[Path]:
         try:
             stated = json.loads(index.read_text(encoding="utf-8"))
         except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"{what}: {index} cannot be read: {error}") from error
+            raise InputError(f"{subject}: {index} cannot be read: {error}") from error
         shards = stated.get("weight_map") if isinstance(stated, dict) else None
         names = sorted({str(name) for name in shards.values()}) if isinstance(shards, dict) else []
         missing = [name for name in names if not (folder / name).is_file()]
         if missing:
             raise InputError(
-                f"{what}: {folder}: {len(missing)} of {len(names)} files of weights that {INDEX_FILE} names are "
+                f"{subject}: {folder}: {len(missing)} of {len(names)} files of weights that {INDEX_FILE} names are "
                 f"missing: {listed(missing, 3)}; fetch the complete folder"
             )
     files = sorted(folder.glob("*.safetensors"))
     if not files:
-        raise InputError(f"{what}: {folder} has no weights as safetensors, and files of pickles are not opened")
+        raise InputError(f"{subject}: {folder} has no weights as safetensors, and files of pickles are not opened")
     return files
 
 
@@ -145,12 +145,12 @@ def _from_pretrained(loader: Any, source: str | None, **options: Any) -> tuple[A
 
 
 @contextmanager
-def _readable(folder: Path, what: str) -> Iterator[None]:
+def _readable(folder: Path, subject: str) -> Iterator[None]:
     """Turns the errors of libraries that read a model into one that names its folder."""
     try:
         from safetensors import SafetensorError
     except ImportError as error:
-        raise InputError(f"{what}: needs the package transformers ({EXTRA})") from error
+        raise InputError(f"{subject}: needs the package transformers ({EXTRA})") from error
     try:
         yield
     except InputError:
@@ -158,10 +158,10 @@ def _readable(folder: Path, what: str) -> Iterator[None]:
     except (*UNREADABLE, SafetensorError) as error:
         for path in folder.glob("*.safetensors"):
             check_fetched(path)
-        raise _unreadable(folder, what, error) from error
+        raise _unreadable(folder, subject, error) from error
 
 
-def read_config(folder: Path, what: str) -> Any:
+def read_config(folder: Path, subject: str) -> Any:
     """The configuration of the model in a folder.
 
     Raises:
@@ -170,41 +170,41 @@ def read_config(folder: Path, what: str) -> Any:
     try:
         from transformers import AutoConfig
     except ImportError as error:
-        raise InputError(f"{what}: needs the package transformers ({EXTRA})") from error
+        raise InputError(f"{subject}: needs the package transformers ({EXTRA})") from error
     try:
         with quiet_transformers():
             return AutoConfig.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False)
     except UNREADABLE as error:
-        raise _unreadable(folder, what, error) from error
+        raise _unreadable(folder, subject, error) from error
 
 
-def _unreadable(folder: Path, what: str, error: Exception) -> InputError:
+def _unreadable(folder: Path, subject: str, error: Exception) -> InputError:
     message = " ".join(str(error).split())
     if "custom code" in message or "trust_remote_code" in message:
         return InputError(
-            f"{what}: {folder}: the model needs Python code of its own, which is never run; give a model of a kind "
+            f"{subject}: {folder}: the model needs Python code of its own, which is never run; give a model of a kind "
             "that transformers knows"
         )
-    return InputError(f"{what}: {folder} holds no model that transformers reads: {message[:160]}")
+    return InputError(f"{subject}: {folder} holds no model that transformers reads: {message[:160]}")
 
 
-def _check_finite(folder: Path, model: Any, what: str) -> None:
+def _check_finite(folder: Path, model: Any, subject: str) -> None:
     """Kernels of attention may turn weights that are not finite into features that are, and wrong."""
     broken = [name for name, value in model.named_parameters() if not value.isfinite().all()]
     if broken:
         raise InputError(
-            f"{what}: {folder}: {len(broken)} weights are not finite ({listed(broken, 3)}); the files are damaged, or "
-            "the model's training diverged; get them again"
+            f"{subject}: {folder}: {len(broken)} weights are not finite ({listed(broken, 3)}); the files are damaged, "
+            "or the model's training diverged; get them again"
         )
 
 
-def load_companion(loader: Any, folder: Path, what: str, noun: str, **options: Any) -> Any:
+def load_companion(loader: Any, folder: Path, subject: str, noun: str, **options: Any) -> Any:
     """What belongs to the model of a folder, such as its tokenizer or its preprocessing.
 
     Args:
         loader: a class of transformers with `from_pretrained`.
         folder: of the model.
-        what: who loads it, for messages.
+        subject: who loads it, for messages.
         noun: what it is, for messages.
         options: further arguments of `from_pretrained`.
 
@@ -216,10 +216,10 @@ def load_companion(loader: Any, folder: Path, what: str, noun: str, **options: A
             return loader.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False, **options)
     except Exception as error:  # tokenizers raises plain Exceptions
         message = " ".join(str(error).split())[:160]
-        raise InputError(f"{what}: {folder} holds no {noun} that transformers reads: {message}") from error
+        raise InputError(f"{subject}: {folder} holds no {noun} that transformers reads: {message}") from error
 
 
-def load_tokenizer(folder: Path, what: str, **options: Any) -> Any:
+def load_tokenizer(folder: Path, subject: str, **options: Any) -> Any:
     """The tokenizer of a folder; arguments are those of `load_companion`.
 
     Raises:
@@ -227,10 +227,10 @@ def load_tokenizer(folder: Path, what: str, **options: Any) -> Any:
     """
     # Without any vocabulary transformers makes a tokenizer that knows nothing.
     if not any(path for pattern in VOCABULARIES for path in folder.glob(pattern)):
-        raise InputError(f"{what}: {folder}: the tokenizer is missing; expected tokenizer.json beside the model")
+        raise InputError(f"{subject}: {folder}: the tokenizer is missing; expected tokenizer.json beside the model")
     from transformers import AutoTokenizer
 
-    return load_companion(AutoTokenizer, folder, what, "tokenizer", **options)
+    return load_companion(AutoTokenizer, folder, subject, "tokenizer", **options)
 
 
 @contextmanager
@@ -250,7 +250,7 @@ def quiet_transformers() -> Iterator[None]:
             logging.enable_progress_bar()
 
 
-def _check_keys(folder: Path, model: Any, report: Mapping[str, Any], what: str, other_parts: str) -> None:
+def _check_keys(folder: Path, model: Any, report: Mapping[str, Any], subject: str, other_parts: str) -> None:
     """Whether the files hold exactly the weights of the model: transformers fills what is missing with random ones, and
     drops layers that the configuration does not have."""
     modules = {name.partition(".")[0] for name in model.state_dict()}
@@ -264,12 +264,12 @@ def _check_keys(folder: Path, model: Any, report: Mapping[str, Any], what: str, 
     ):
         if names:
             raise InputError(
-                f"{what}: {folder}: the weights do not fit the configuration: {len(names)} {problem} "
+                f"{subject}: {folder}: the weights do not fit the configuration: {len(names)} {problem} "
                 f"({listed(names, 3)}); expected config.json and weights of one model"
             )
     if unused and other_parts == "warn":
         warnings.warn(
-            f"{what}: {folder}: {len(unused)} weights that are no part of the backbone are not used: "
+            f"{subject}: {folder}: {len(unused)} weights that are no part of the backbone are not used: "
             f"{listed(unused, 3)}",
             SceneWarning,
             stacklevel=4,

@@ -1,17 +1,23 @@
-"""Paths of scenes: which paths are scenes, the scenes in folders and lists of paths, and their names.
+"""Paths of scenes: which paths are scenes, the scenes in folders and lists of paths, and their names; and what other
+paths are.
 
 Judged by names of files alone; `scenes.py` reads them.
 """
 
+import json
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.written_files import SUMMARY_NAME
 from gsencoder.data.readers.layouts import describe_layouts, layout_of
 from gsencoder.data.readers.scene_splat import SPLAT_SUFFIXES
 
 FEATURES_FILE = "scene.safetensors"
 """The file by which a folder of features, or of a memory of a scene, is recognized."""
+UNFINISHED_FILE = "unfinished.txt"
+"""The file by which the state of an unfinished run is recognized."""
 
 
 def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
@@ -38,7 +44,8 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
             )
         if not scenes_of_path:
             raise InputError(
-                f"{path}: neither a scene nor a folder of scenes; a scene holds one of: {describe_layouts()}; a splat"
+                f"{path}: {kind_of_path(path)}, neither a scene nor a folder of scenes; a scene holds one of: "
+                f"{describe_layouts()}; a splat"
             )
         scenes.add(scenes_of_path)
     return scenes.paths
@@ -150,3 +157,37 @@ def check_names(paths: Sequence[Path]) -> None:
                 "rename one, or run them with different out="
             )
         first[name] = path
+
+
+def kind_of_path(path: str | Path) -> str:
+    """What a path is, judged by names of files and by the record of the run that wrote it: such as "a folder that
+    `gsencoder fuse` wrote", or "an empty folder"."""
+    path = Path(path)
+    with suppress(OSError, ValueError):
+        if path.is_dir():
+            return _kind_of_folder(path)
+        if path.is_file():
+            if path.suffix.lower() in SPLAT_SUFFIXES:
+                return "a splat"
+            return f"a {path.suffix.lower()} file" if path.suffix else "a file"
+    return "no file or folder"
+
+
+def _kind_of_folder(folder: Path) -> str:
+    with suppress(OSError, ValueError, TypeError, AttributeError):
+        command = json.loads((folder / SUMMARY_NAME).read_text(encoding="utf-8"))["command"]
+        if isinstance(command, str) and command.isalpha() and len(command) < 20:
+            return f"a folder that `gsencoder {command}` wrote"
+    if (folder / UNFINISHED_FILE).is_file():
+        return "the state of an unfinished run, which its command continues"
+    if (folder / FEATURES_FILE).is_file():
+        return "a folder of features"
+    if is_scene(folder):
+        return "a scene"
+    entries = list(folder.iterdir())
+    if not entries:
+        return "an empty folder"
+    inner = sorted(entry for entry in entries if entry.is_dir() and (entry / FEATURES_FILE).is_file())
+    if inner:
+        return f"a folder of folders of features ({inner[0].name}, …)"
+    return "a folder of other files"

@@ -127,7 +127,11 @@ def read_raw(path: str | Path) -> RawSplat:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
             if not (path / "meta.json").is_file():
-                raise InputError(f"{path}: is a folder without meta.json; expected a splat file or a SOG folder")
+                inner = sorted(each.name for each in path.iterdir() if each.name.lower().endswith(".ply"))
+                hint = (
+                    f"; give its {', '.join(inner)}" if inner else ", such as the splat.ply of `gsencoder reconstruct`"
+                )
+                raise InputError(f"{path}: is a folder without meta.json; expected a splat file or a SOG folder{hint}")
             return read_sog_folder(path)
         if not stat.S_ISREG(status.st_mode):
             raise InputError(f"{path}: is not a regular file; expected {READABLE}")
@@ -187,6 +191,16 @@ def load_property(path: str | Path, name: str) -> Float64[np.ndarray, " N"]:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
+def check_splat_name(path: Path) -> None:
+    """Checks that `save_splat` knows a format by the name of a file.
+
+    Raises:
+        InputError: it does not.
+    """
+    if not path.name.lower().endswith((".ply", ".spz")):
+        raise InputError(f"{path}: cannot write {path.suffix or 'a name without suffix'}; expected {WRITABLE}")
+
+
 def save_splat(
     path: str | Path,
     gaussians: Gaussians,
@@ -222,9 +236,8 @@ def save_splat(
         SceneWarning: values were clipped to the range of a packed format, or positions lose precision in it.
     """
     path = Path(path)
+    check_splat_name(path)
     name = path.name.lower()
-    if not name.endswith((".ply", ".spz")):
-        raise InputError(f"{path}: cannot write {path.suffix or 'a name without suffix'}; expected {WRITABLE}")
     if spz_version not in (3, 4):
         raise InputError(f"spz_version={spz_version}: expected 3 or 4")
     if len(gaussians) == 0:

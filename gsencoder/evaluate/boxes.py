@@ -60,18 +60,18 @@ def queryable_objects(objects: Sequence[SceneObject], *, min_views: int = 5, min
     return [o for o in objects if o.placed and o.name and is_seen(o, min_views=min_views, min_pixels=min_pixels)]
 
 
-def is_seen(thing: SceneObject, *, min_views: int, min_pixels: int) -> bool:
+def is_seen(scene_object: SceneObject, *, min_views: int, min_pixels: int) -> bool:
     """Whether an object shows in enough views, and in one of them with enough pixels.
 
     Raises:
         InputError: its views were not counted.
     """
-    if thing.views is None or thing.max_pixels is None:
+    if scene_object.views is None or scene_object.max_pixels is None:
         raise InputError(
-            f"object {thing.id}: the views that show it were not counted; with_counted_views of "
+            f"object {scene_object.id}: the views that show it were not counted; with_counted_views of "
             "gsencoder.data.truth.scene_labels counts them"
         )
-    return thing.views >= min_views and thing.max_pixels >= min_pixels
+    return scene_object.views >= min_views and scene_object.max_pixels >= min_pixels
 
 
 def score_boxes(scene: Scene, localization: Localization, targets: Sequence[SceneObject]) -> list[Hit]:

@@ -67,6 +67,6 @@ class RenderedTally:
 
 
 def _cosines(a: Float32[np.ndarray, "n D"], b: Float32[np.ndarray, "n D"]) -> np.ndarray:
-    one, other = a.astype(np.float64), b.astype(np.float64)
-    products = (one * other).sum(axis=1)
-    return np.asarray(products / np.sqrt(((one**2).sum(axis=1) + EPS) * ((other**2).sum(axis=1) + EPS)))
+    first, second = a.astype(np.float64), b.astype(np.float64)
+    products = (first * second).sum(axis=1)
+    return np.asarray(products / np.sqrt(((first**2).sum(axis=1) + EPS) * ((second**2).sum(axis=1) + EPS)))

@@ -105,7 +105,7 @@ def score_retrieval(
 
 
 def _pool(name: str, side: Retrieval, others: int) -> str:
-    what = "texts" if name == "i2t" else "pictures"
+    media = "texts" if name == "i2t" else "pictures"
     if others:
-        return f"Pools of {name}: {side.distractors:,} of {others:,} {what} of others (M3: 1,999 of COCO)."
-    return f"Pools of {name}: the {what} of the other queries, and none of COCO as in M3, so that they are smaller."
+        return f"Pools of {name}: {side.distractors:,} of {others:,} {media} of others (M3: 1,999 of COCO)."
+    return f"Pools of {name}: the {media} of the other queries, and none of COCO as in M3, so that they are smaller."

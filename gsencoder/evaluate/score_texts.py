@@ -190,9 +190,9 @@ def _columns(overall: Mapping[str, float], published: tuple[str, ...]) -> tuple[
     return tuple(dict.fromkeys((*overall, *published)))
 
 
-def _refuse_missing(missing: list[str], what: str, predictions: Path, allowed: bool) -> None:
+def _refuse_missing(missing: list[str], subject: str, predictions: Path, allowed: bool) -> None:
     if missing and not allowed:
         raise InputError(
-            f"{predictions}: {counted(len(missing), what)} without a prediction, first {missing[0][:60]}; "
+            f"{predictions}: {counted(len(missing), subject)} without a prediction, first {missing[0][:60]}; "
             "allow_missing=true counts them as wrong"
         )

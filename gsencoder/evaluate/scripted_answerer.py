@@ -193,11 +193,11 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(200, "text/event-stream", "".join([*events, "data: [DONE]\n\n"]).encode())
             return
         message = {"role": "assistant", "content": answer}
-        whole = head | {
+        completion = head | {
             "object": "chat.completion",
             "choices": [{"index": 0, "finish_reason": "stop", "message": message}],
         }
-        self._send(200, "application/json", json.dumps(whole).encode())
+        self._send(200, "application/json", json.dumps(completion).encode())
 
     def _send(self, status: int, kind: str, data: bytes) -> None:
         self.send_response(status)

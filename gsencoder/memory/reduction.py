@@ -34,8 +34,8 @@ def unit_rows(rows: Float32[np.ndarray, "n D"], where: str = "features") -> Floa
     bad = ~np.isfinite(largest[:, 0]) | (largest[:, 0] == 0)
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
-        what = "zero" if largest[row, 0] == 0 else "not finite"
-        raise InputError(f"{where}: {int(bad.sum()):,} of {len(rows):,} rows have no direction: row {row} is {what}")
+        fault = "zero" if largest[row, 0] == 0 else "not finite"
+        raise InputError(f"{where}: {int(bad.sum()):,} of {len(rows):,} rows have no direction: row {row} is {fault}")
     scaled = rows / largest
     return np.asarray(scaled / np.sqrt(np.einsum("nd,nd->n", scaled, scaled))[:, None], np.float32)
 

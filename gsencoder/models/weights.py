@@ -12,6 +12,7 @@ import torch
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.model_files import find_file
+from gsencoder.data.scene_paths import kind_of_path
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces, output_spaces_parts, read_output_spaces
 
@@ -52,8 +53,17 @@ def find_weights(source: str, option: str = "weights") -> Path:
         if Path(source).is_dir():
             exports = sorted(path.name for path in Path(source).glob("*.onnx"))
             hint = f"; give its {', '.join(exports)} by its full path" if exports else ""
-            raise InputError(f"{option}: the folder {source} holds no {WEIGHTS_FILE}{hint}")
-        return find_file(source, option)
+            raise InputError(
+                f"{option}: {source} is {kind_of_path(source)}, and holds no {WEIGHTS_FILE}; expected a folder that "
+                f"`gsencoder train` wrote{hint}"
+            )
+        file = find_file(source, option)
+        if file.suffix != Path(WEIGHTS_FILE).suffix:
+            raise InputError(
+                f"{option}: {source} is {kind_of_path(file)}; expected {WEIGHTS_FILE} or its folder, which "
+                "`gsencoder train` writes"
+            )
+        return file
     except InputError as error:
         raise InputError(f"{error}; encoders that come with gsencoder: {', '.join(names)}") from error
     except (OSError, ValueError) as error:

@@ -284,7 +284,7 @@ class Optimizer:
         """
         raster = self._render(view, photo, self.config.sh_degree)[0]
         fitted = self._fitted_colors(raster.rgb, raster.alpha, photo)
-        return Pictures(*(apply_colors(raster.rgb, one).clamp(0, 1).cpu() for one in (colors, fitted)))
+        return Pictures(*(apply_colors(raster.rgb, color_map).clamp(0, 1).cpu() for color_map in (colors, fitted)))
 
     @torch.no_grad()
     def opacity(self, view: int, photo: ScaledPhotograph) -> Float[Tensor, "H W"]:

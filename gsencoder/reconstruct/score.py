@@ -60,13 +60,13 @@ def split(count: int, every: int) -> tuple[list[int], list[int]]:
     return training, held_out
 
 
-def drop_masked_views(photographs: Photographs, views: Sequence[int], what: str, *, least: int = 0) -> list[int]:
+def drop_masked_views(photographs: Photographs, views: Sequence[int], subject: str, *, least: int = 0) -> list[int]:
     """The views of which a mask leaves a window of pixels.
 
     Args:
         photographs: of all views.
         views: some of them.
-        what: they are called in messages.
+        subject: they are called in messages.
         least: so many must be left.
 
     Raises:
@@ -79,7 +79,7 @@ def drop_masked_views(photographs: Photographs, views: Sequence[int], what: str,
     masked = [view for view, mask in masks.items() if mask is not None and not inner(mask).any()]
     if not masked:
         return list(views)
-    message = f"{len(masked)} of {len(views)} {what} are masked all over"
+    message = f"{len(masked)} of {len(views)} {subject} are masked all over"
     names = listed([photographs.names[view] for view in masked])
     if len(views) - len(masked) < least:
         raise InputError(f"reconstruct: {message}: {names}; look at their masks, or at their alpha channels")

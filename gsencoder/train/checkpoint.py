@@ -138,8 +138,8 @@ def _describe_difference(stored: dict[str, Any], settings: dict[str, Any]) -> st
     # Stated by runs with several teachers alone.
     saved, requested = stored.get("teachers"), settings.get("teachers")
     if saved != requested:
-        one = "one teacher"
-        saved, requested = (one if each is None else f"teachers={each}" for each in (saved, requested))
+        single = "one teacher"
+        saved, requested = (single if each is None else f"teachers={each}" for each in (saved, requested))
         return f"was made with {saved}, and this run asks {requested}; give the same settings or another out="
     if any(stored.get(name) != settings.get(name) for name in ("space", "spaces", "scenes")):
         return "the prepared scenes have changed since; give the former prepared=, or another out="

@@ -206,11 +206,11 @@ def _is_nccl() -> bool:
     return _in_group() and distributed.get_backend() == "nccl"
 
 
-def check_agreement(what: str, value: str, advice: str = "give all processes the same files") -> None:
+def check_agreement(subject: str, value: str, advice: str = "give all processes the same files") -> None:
     """Checks that all processes have the same value of something, such as the digest of a teacher's weights.
 
     Args:
-        what: what it is the value of, for the error.
+        subject: what it is the value of, for the error.
         value: of this process; empty = it has none, and any fits.
         advice: what to do where they differ.
 
@@ -221,7 +221,7 @@ def check_agreement(what: str, value: str, advice: str = "give all processes the
     for rank, each in stated:
         if each != stated[0][1]:
             raise InputError(
-                f"training: {what} differ: their digest is {stated[0][1]} in process {stated[0][0]} and {each} in "
+                f"training: {subject} differ: their digest is {stated[0][1]} in process {stated[0][0]} and {each} in "
                 f"process {rank}; {advice}"
             )
 

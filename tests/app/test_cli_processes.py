@@ -136,3 +136,22 @@ def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code:
         assert process.communicate()[1] == problem
         assert process.returncode == code
     assert list(tmp_path.iterdir()) == []
+
+
+WITHIN_EXEC = """
+import sys
+from gsencoder.app import cli
+from gsencoder.app.commands import inspect
+def run(config, summary):
+    exec("import os, signal; os.kill(os.getpid(), signal.SIGINT)")
+inspect.run = run
+sys.exit(cli.main())
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_an_interrupt_within_an_exec_ends_with_the_exit_code_of_an_interrupt(tmp_path: Path) -> None:
+    (tmp_path / "within_exec.py").write_text(WITHIN_EXEC)
+    words = [sys.executable, "-m", "within_exec", "inspect", "a"]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")

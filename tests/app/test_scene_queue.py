@@ -10,8 +10,10 @@ import pytest
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app import cli
+from gsencoder.app.commands import fuse
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
+from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import BusyError, InputError
@@ -65,18 +67,44 @@ def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(
 
 def test_each_of_several_scenes_has_its_own_warnings_in_its_summary(tmp_path: Path) -> None:
     summary = Summary("fuse", SETTINGS)
-    summary.warnings.append("weights: old")
+    assert summary.add_warning("weights: old") == "weights: old"
+    shown, given = list[str](), list[Summary]()
 
     def run(path: Path, out: Path, one: Summary) -> None:
         with output_folder(out, summary=one):
             # As the command line does, which knows the summary of the whole run alone.
-            summary.warnings.append(f"{path.name}: dark")
+            shown.append(summary.add_warning(f"{path}/depth: dark" if path.name == "b" else "dark"))
+        given.append(one)
 
     paths, options = [tmp_path / name for name in "ab"], {"overwrite": False, "worker": 0, "screen": console()}
     run_scenes(paths, tmp_path / "out", "features", run, summary, **options)
-    for name in "ab":
+    # The run shows and keeps all, with the name of the scene where a warning does not say it.
+    assert shown == ["a: dark", f"{tmp_path / 'b'}/depth: dark"]
+    assert summary.warnings == ["weights: old", *shown]
+    for name, one, own in zip("ab", given, ("dark", shown[1]), strict=True):
         record = json.loads((tmp_path / "out" / name / "summary.json").read_text())
-        assert record["warnings"] == ["weights: old", f"{name}: dark"]
+        assert record["warnings"] == one.warnings == ["weights: old", own]
+
+
+def test_a_broken_promise_of_one_of_several_scenes_names_it_on_the_screen_and_stands_in_its_summary_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def run_one(path: Path, out: Path, one: Summary) -> None:
+        with output_folder(out, summary=one):
+            report_choice(one, path.name, {}, predicted={}, notes=[], quiet=True)
+            report_promises(one, fuse.BudgetConfig(seconds=1.0), {"seconds": 1.5 if path.name == "one" else 2.5})
+
+    def run(config: fuse.FuseCommandConfig, summary: Summary) -> None:
+        paths, options = [*map(Path, config.paths)], {"overwrite": False, "worker": 0, "screen": console()}
+        run_scenes(paths, config.out, "features", run_one, summary, **options)
+
+    monkeypatch.setattr(fuse, "run", run)
+    out = tmp_path / "out"
+    assert cli.main(["fuse", str(tmp_path / "one"), str(tmp_path / "two"), "teacher=palette", f"out={out}"]) == 0
+    broken = "budget.seconds: promised 1, and it became"
+    assert capsys.readouterr().err == f"warning: one: {broken} 1.5\nwarning: two: {broken} 2.5\n"
+    for name, seconds in (("one", 1.5), ("two", 2.5)):
+        assert json.loads((out / name / "summary.json").read_text())["warnings"] == [f"{broken} {seconds}"]
 
 
 def test_results_of_other_settings_are_neither_taken_nor_replaced(

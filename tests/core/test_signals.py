@@ -4,10 +4,19 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 
-from gsencoder.core.runtime.signals import SIGNALS, Stopped, defer_signals, stop_of
+from gsencoder.core.runtime.signals import (
+    SIGNALS,
+    Stopped,
+    accept_stop,
+    defer_signals,
+    raise_dropped_stop,
+    stop_of,
+    stopping_signals,
+)
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
 
@@ -105,3 +114,86 @@ def test_a_stop_is_known_by_itself_and_within_what_compiled_code_raises() -> Non
     other = ValueError("wrong")
     other.__cause__ = stop
     assert stop_of(other) is None
+
+
+def interrupt(number: int = signal.SIGTERM) -> None:
+    """Sends a signal and drops what its handler raises, as a library may."""
+    with suppress(Stopped, KeyboardInterrupt):
+        os.kill(os.getpid(), number)
+
+
+def test_a_dropped_stop_is_raised_again_each_time_it_is_asked_for_and_at_the_end() -> None:
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    raised = []
+
+    def work() -> None:
+        raise_dropped_stop()
+        interrupt()
+        for _ in range(2):
+            try:
+                raise_dropped_stop()
+            except Stopped as stop:
+                raised.append(stop.number)
+
+    with pytest.raises(Stopped), stopping_signals():
+        work()
+    assert raised == [signal.SIGTERM] * 2
+    assert {number: signal.getsignal(number) for number in SIGNALS} == before
+    raise_dropped_stop()
+
+
+def test_a_second_signal_is_raised_where_the_first_is_being_handled_and_the_first_is_not_raised_twice() -> None:
+    cleaned = []
+
+    def work() -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+        finally:
+            try:
+                raise OSError("in the cleanup")
+            except OSError:
+                raise_dropped_stop()
+            cleaned.append("first")
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt:
+                cleaned.append("second")
+
+    with pytest.raises(Stopped), stopping_signals():
+        work()
+    assert cleaned == ["first", "second"]
+
+
+def test_a_stop_that_was_accepted_is_over() -> None:
+    with stopping_signals():
+        interrupt(signal.SIGINT)
+        accept_stop()
+        raise_dropped_stop()
+
+
+def test_a_library_has_the_handlers_of_its_program_and_nothing_is_remembered() -> None:
+    received = []
+    before = signal.signal(signal.SIGINT, lambda number, _: received.append(number))
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        raise_dropped_stop()
+        with stopping_signals():
+            os.kill(os.getpid(), signal.SIGINT)
+            raise_dropped_stop()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert received == [signal.SIGINT] * 2
+
+
+def test_in_another_thread_nothing_is_installed() -> None:
+    before, seen = signal.getsignal(signal.SIGTERM), []
+
+    def work() -> None:
+        with stopping_signals():
+            seen.append(signal.getsignal(signal.SIGTERM))
+            raise_dropped_stop()
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [before]

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from splats import random_gaussians
 from training_scenes import SMALL
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.infer.encode import chunks as chunks_module
 from gsencoder.infer.encode.chunks import EncodeConfig, cut, encode_by_chunks
 from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder
@@ -149,6 +150,33 @@ def test_a_halo_is_as_many_metres_wide_in_every_unit_of_length() -> None:
         config = EncodeConfig(chunk=700, halo=0.1)
         encode_by_chunks(scene, run, lambda: None, config, metres_per_unit=unit, columns={"s": slice(0, 1)})
     assert seen[: len(seen) // 2] == seen[len(seen) // 2 :]
+
+
+def test_chunks_that_take_many_times_the_work_of_a_scene_are_warned_of_with_their_figures(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    one = random_gaussians(1500)
+
+    def run(subset: Gaussians, curves: object, count: int) -> np.ndarray:
+        return np.zeros((count, 1), np.float32)
+
+    def encoded(config: EncodeConfig) -> None:
+        encode_by_chunks(one, run, lambda: None, config, metres_per_unit=1.0, columns={"s": slice(0, 1)})
+
+    encoded(EncodeConfig(chunk=700, halo=0.1))
+    monkeypatch.setattr(chunks_module, "MUCH_WORK", 10_000)
+    # Of so small ones it is certain before they are cut.
+    with pytest.warns(SceneWarning, match="^encode.chunk=5: 300 chunks or more, .* at least 41 times") as caught:
+        encoded(EncodeConfig(chunk=5, halo=0.1))
+    assert len(caught) == 1
+    chunks = cut(one.means, 200, 0.5)
+    seen = sum(len(each.rows) for each in chunks)
+    figures = (
+        rf"encode.chunk=200: {len(chunks):,} chunks, .* hold {seen:,} Gaussians, {seen / 1500:.1f} times the 1,500 "
+    )
+    with pytest.warns(SceneWarning, match=f"^{figures}.*no room for a halo of 0.5 m.*larger encode.chunk=") as caught:
+        encoded(EncodeConfig(chunk=200, halo=0.5))
+    assert len(caught) == 1
 
 
 def test_a_rerun_gives_the_same_bits() -> None:

@@ -14,6 +14,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.splats import save_splat
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.store.folder import features_bytes, load_features, save_features
+from gsencoder.infer.encode import chunks
 from gsencoder.infer.encode.chunks import EncodeConfig, cut
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.encode_budget import encode_within as encode_within_module
@@ -190,3 +191,17 @@ def test_the_command_prints_and_records_each_promise_and_what_became_of_it(
     assert ("budget.error: promised 0.05, realised" if check else "not measured (budget.check=false)") in printed
     assert "room: budget: precision=bfloat16, rank=4" in printed
     assert len(load_features(out).features["six"]) == 600
+
+
+def test_the_command_says_before_it_cuts_how_many_chunks_there_are_at_least_and_records_a_warning_of_much_work(
+    splat: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chunks, "MUCH_WORK", 1000)
+    out = tmp_path / "out"
+    words = [str(splat), f"weights={weights}", "data.metres_per_unit=1", f"out={out}", "encode.chunk=100"]
+    assert cli.main(["encode", *words]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.startswith(f"{out}: 600 Gaussians in 6 chunks or more (encode.chunk=100)\n")
+    (warning,) = json.loads((out / "summary.json").read_text())["warnings"]
+    assert warning.startswith("encode.chunk=100: ")
+    assert f"warning: {warning}" in printed.err

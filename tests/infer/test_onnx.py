@@ -146,6 +146,10 @@ def deflated(raw: bytes) -> str:
     ("damage", "message"),
     [
         (lambda header: {}, "no encoder that `gsencoder export` wrote"),
+        (
+            lambda header: {KEY: '{"version": 1, "kind": "memory"}'},
+            "is the attention of a memory, .* expected an encoder",
+        ),
         (lambda header: {KEY: "{"}, "is damaged"),
         (lambda header: {KEY: "[]"}, "is damaged"),
         (lambda header: changed(header, "version", 1), "format version 1, and this gsencoder reads 2"),

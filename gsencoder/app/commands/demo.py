@@ -70,28 +70,29 @@ def run(config: DemoConfig, summary: Summary) -> None:
         assert scene.gaussians is not None
         save_splat(folder / "splat.ply", scene.gaussians, origin=scene.origin)
         screen.print(f"seeds: {len(scene.gaussians):,} Gaussians, no optimization")
-        things = [thing for thing in scene.objects if thing.placed and thing.name]
+        scene_objects = [scene_object for scene_object in scene.objects if scene_object.placed and scene_object.name]
         names = room_words(scene)
         labels = LabelsTeacher(scene.objects, names.names, names.embeddings, text_encoder=names.space.text_encoder)
         palette, colors = PaletteTeacher(), text_table_of(PaletteConfig())
         assert colors is not None
         hues = color_words(config.seed, objects=config.objects)
-        by_name = [(thing.name, thing) for thing in things if thing.name]
-        by_color = [(hues[thing.id], thing) for thing in things]
+        by_name = [(scene_object.name, scene_object) for scene_object in scene_objects if scene_object.name]
+        by_color = [(hues[scene_object.id], scene_object) for scene_object in scene_objects]
         results = (
             search(scene, labels, names, by_name, config, folder / "names", summary),
             search(scene, palette, colors, unrepeated(by_color), config, folder / "colors", summary),
         )
-        for one in results:
+        for result in results:
             screen.print(
-                f"{one.title}: features of {one.features.features.shape[1]} of {one.features.space.channels} channels; "
-                f"{one.num_localized} of {len(one.words)} words localized (IoU ≥ 0.5), mean IoU {one.mean_iou:.2f}"
+                f"{result.title}: features of {result.features.features.shape[1]} of "
+                f"{result.features.space.channels} channels; {result.num_localized} of {len(result.words)} words "
+                f"localized (IoU ≥ 0.5), mean IoU {result.mean_iou:.2f}"
             )
         summary.results.update(
             gaussians=len(scene.gaussians),
             views=config.views,
             report="report.html",
-            **{one.title: one.to_dict() for one in results},
+            **{result.title: result.to_dict() for result in results},
         )
         with summary.step("page"):
             problem = write_page(folder / PAGE, scene, results[0], names, config.localize)
@@ -102,16 +103,16 @@ def run(config: DemoConfig, summary: Summary) -> None:
     screen.print(f"{out}/report.html is the report; {out}/room is a scene folder for the other commands")
 
 
-def write_page(path: Path, scene: Scene, one: TeacherResult, words: TextTable, config: LocalizeConfig) -> str:
+def write_page(path: Path, scene: Scene, result: TeacherResult, words: TextTable, config: LocalizeConfig) -> str:
     """Writes the room as the page of `gsencoder view`; returns why there is none, or nothing."""
     try:
         bundle = load_bundle()
     except InputError as error:
         return str(error)
-    page_scene = replace(scene, features={one.features.space.name: one.features})
+    page_scene = replace(scene, features={result.features.space.name: result.features})
     page = fitting_page(
         bundle,
-        [(page_scene, one.title, words)],
+        [(page_scene, result.title, words)],
         config,
         scene.objects,
         PAGE_OPTIONS,
@@ -135,14 +136,14 @@ def photographed_room(config: DemoConfig, folder: Path, summary: Summary) -> Sce
 
 def room_words(scene: Scene) -> TextTable:
     """A text table with an orthogonal unit vector for each name in the scene."""
-    names = sorted({thing.name for thing in scene.objects if thing.name})
+    names = sorted({scene_object.name for scene_object in scene.objects if scene_object.name})
     return make_text_table(names, np.eye(len(names), dtype=np.float32), "demo-words")
 
 
 def unrepeated(pairs: list[tuple[str, SceneObject]]) -> list[tuple[str, SceneObject]]:
     """The pairs whose word stands for one object alone."""
     words = [word for word, _ in pairs]
-    return [(word, thing) for word, thing in pairs if words.count(word) == 1]
+    return [(word, scene_object) for word, scene_object in pairs if words.count(word) == 1]
 
 
 def search(
@@ -171,9 +172,13 @@ def search(
     write_json(folder / "boxes.json", localization_to_json(localization))
     write_boxes_ply(folder / "boxes.ply", stored, localization)
     ious = []
-    for word, thing in pairs:
+    for word, scene_object in pairs:
         box = next((box for box in localization.boxes if box.query == word), None)
-        ious.append(aabb_iou(box.aabb_min, box.aabb_max, thing.aabb_min, thing.aabb_max) if box is not None else 0.0)
+        ious.append(
+            aabb_iou(box.aabb_min, box.aabb_max, scene_object.aabb_min, scene_object.aabb_max)
+            if box is not None
+            else 0.0
+        )
     return TeacherResult(
         title=title, words=tuple(word for word, _ in pairs), ious=tuple(ious), fusion=fusion, localization=localization
     )

@@ -1,5 +1,6 @@
 """`gsencoder encode SPLAT weights=FILE`: features of every Gaussian in one pass, without photographs or a teacher."""
 
+import math
 import warnings
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -105,23 +106,29 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
     made_with = {"weights": str(file), "weights_digest": digest_files(file)}
     screen = console(config.quiet)
 
-    def run_one(path: Path, out: Path, one: Summary) -> None:
-        with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
-            with one.step("load"):
+    def run_one(path: Path, out: Path, scene_summary: Summary) -> None:
+        with output_folder(out, overwrite=config.overwrite, summary=scene_summary) as folder:
+            with scene_summary.step("load"):
                 scene = load_scene(path, splat=config.splat or None, options=config.data)
             if scene.gaussians is None:
-                with one.step("seeds"):
+                with scene_summary.step("seeds"):
                     scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
-            scene = with_reported_up(scene, one, quiet=config.quiet)
+            scene = with_reported_up(scene, scene_summary, quiet=config.quiet)
+            assert scene.gaussians is not None
+            count, chunk = len(scene.gaussians), config.encode.chunk
+            if chunk and count > chunk:
+                # Before they are cut, which takes a while where there are thousands.
+                least = counted(math.ceil(count / chunk), "chunk")
+                screen.print(f"{out}: {count:,} Gaussians in {least} or more (encode.chunk={chunk})")
             with about(scene.name):
-                spaces, promises = _encode_into(folder, scene, encoder, config, made_with, one)
+                spaces, promises = _encode_into(folder, scene, encoder, config, made_with, scene_summary)
             if heads is not None:
                 others = [space for space in encoder.spaces.values() if space not in spaces]
                 copy_heads(heads, folder / HEADS_FILE, spaces, left_out=others)
-        gaussians = counted(one.results["gaussians"], "Gaussian")
-        screen.print(f"{out}: features of {gaussians} in {one.timings['encode']:.1f} s")
+        gaussians = counted(scene_summary.results["gaussians"], "Gaussian")
+        screen.print(f"{out}: features of {gaussians} in {scene_summary.timings['encode']:.1f} s")
         where = "this scene" if config.basis_views else "the scenes held out of the training"
-        for name, figures in one.results.get("teachers", {"": one.results}).items():
+        for name, figures in scene_summary.results.get("teachers", {"": scene_summary.results}).items():
             of = f" for {name}" if name else ""
             screen.print(f"{out}: basis of the encoder{of}: {describe_basis(figures['basis'], where)}")
         for line in promises:

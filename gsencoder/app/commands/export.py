@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.runs.output_file import refuse_existing, sole_writer
+from gsencoder.app.runs.output_file import check_output_files, sole_writer
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.app.settings.config import CommonConfig
@@ -120,8 +120,8 @@ def run(config: ExportConfig, summary: Summary) -> None:
         raise InputError(f"out: expected a file that ends in {SUFFIX}, got {config.out.name}")
     if config.weights.lower().endswith(SUFFIX):
         raise InputError(f"weights: {config.weights} is an exported graph already; give the encoder that `train` wrote")
-    for path in (config.out, Path(f"{config.out}.summary.json"), heads_of_graph(config.out)):
-        refuse_existing(path, config.overwrite)
+    files = (config.out, Path(f"{config.out}.summary.json"), heads_of_graph(config.out))
+    check_output_files(files, config.overwrite)
     if config.memory:
         _export_memory(config, config.out, summary)
         return

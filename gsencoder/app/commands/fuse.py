@@ -99,11 +99,11 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
     outputs = load_weights_spaces(config.basis) if config.basis else None
     screen = console(config.quiet)
 
-    def run_one(path: Path, out: Path, one: Summary) -> None:
-        with output_folder(out, overwrite=config.overwrite, summary=one) as folder:
+    def run_one(path: Path, out: Path, scene_summary: Summary) -> None:
+        with output_folder(out, overwrite=config.overwrite, summary=scene_summary) as folder:
             scene = load_fusable(
                 path,
-                one,
+                scene_summary,
                 splat=config.splat,
                 data=config.data,
                 seeds=config.seeds,
@@ -113,29 +113,31 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
                 labels=isinstance(config.teacher, LabelsConfig),
                 quiet=config.quiet,
             )
-            with one.step("teacher"):
+            with scene_summary.step("teacher"):
                 teacher = build_teacher(config.teacher, scene, words)
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
             in_budget: BudgetFusion | None = None
             if config.budget.promised:
-                in_budget = fuse_in_budget(scene, teacher, config, one, work_folder(out), sample_cells=bool(heads))
+                in_budget = fuse_in_budget(
+                    scene, teacher, config, scene_summary, work_folder(out), sample_cells=bool(heads)
+                )
                 fusion = in_budget.fusion
             else:
-                fusion = fuse_scene(scene, teacher, config, one, out, basis=basis, sample_cells=bool(heads))
-            write_features(folder, scene, fusion, words_beside(teacher, words), config, one)
+                fusion = fuse_scene(scene, teacher, config, scene_summary, out, basis=basis, sample_cells=bool(heads))
+            write_features(folder, scene, fusion, words_beside(teacher, words), config, scene_summary)
             promises = []
             if in_budget is not None:
-                promises = check_promises(in_budget, folder / FEATURES_FILE, config, one)
-            lines = write_heads(folder, heads, fusion, one)
+                promises = check_promises(in_budget, folder / FEATURES_FILE, config, scene_summary)
+            lines = write_heads(folder, heads, fusion, scene_summary)
             if config.report:
-                with one.step("report"):
-                    report_fusion(folder, scene, fusion.features, fusion.truncation, config.teacher.name, one)
+                with scene_summary.step("report"):
+                    report_fusion(folder, scene, fusion.features, fusion.truncation, config.teacher.name, scene_summary)
         shutil.rmtree(work_folder(out), ignore_errors=True)
-        with_features, total = one.results["seen"], one.results["gaussians"]
+        with_features, total = scene_summary.results["seen"], scene_summary.results["gaussians"]
         screen.print(
             f"{out}: {with_features:,} of {counted(total, 'Gaussian')} have features, "
-            f"{one.results['channels']} channels ({describe_basis(one.results, 'this scene')}), "
-            f"from {counted(one.results['views'], 'view')}"
+            f"{scene_summary.results['channels']} channels ({describe_basis(scene_summary.results, 'this scene')}), "
+            f"from {counted(scene_summary.results['views'], 'view')}"
         )
         for line in (*promises, *lines):
             screen.print(f"{out}: {line}")

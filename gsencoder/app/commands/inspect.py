@@ -161,8 +161,8 @@ def report_table(path: str, report: SplatReport) -> Table:
 def _corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[str, str]:
     """The corners of a box, with four digits of its size also where it lies far from the origin."""
     digits = []
-    for one, other in zip(low, high, strict=True):
-        largest, size = max(abs(one), abs(other)), other - one
+    for least, most in zip(low, high, strict=True):
+        largest, size = max(abs(least), abs(most)), most - least
         # No float32 has more than nine.
         digits.append(4 + min(max(math.ceil(math.log10(largest / size)), 0), 5) if 0 < size < largest else 4)
     first, second = (

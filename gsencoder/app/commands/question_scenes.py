@@ -6,19 +6,13 @@ from pathlib import Path
 
 from gsencoder.app.commands.evaluated_features import folder_of
 from gsencoder.core.errors import InputError, SceneWarning, listed
-from gsencoder.data.scene_paths import DistinctPaths
-from gsencoder.fusion.store.folder import SCENE_FILE
-from gsencoder.fusion.store.package import PACKAGE_FILE
+from gsencoder.data.scene_paths import DistinctPaths, kind_of_path
+from gsencoder.fusion.store.folder import holds_features
 from gsencoder.infer.ask.ask import Asker
 from gsencoder.infer.ask.question_sets import SetQuestion, caption_question
 from gsencoder.infer.localize.localize import localize
 from gsencoder.infer.views.targets import best_boxes
 from gsencoder.text.build import closed_table
-
-
-def holds_features(folder: Path) -> bool:
-    """Whether a folder holds the features of a scene itself."""
-    return (folder / SCENE_FILE).is_file() or (folder / PACKAGE_FILE).is_file()
 
 
 def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:
@@ -29,11 +23,14 @@ def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:
     """
     folders = DistinctPaths()
     for path in map(Path, paths):
-        if not path.is_dir():
-            raise InputError(f"{path}: no such folder of features")
-        inner = [path] if holds_features(path) else sorted(each for each in path.iterdir() if holds_features(each))
+        inner = [path] if holds_features(path) else []
+        if not inner and path.is_dir():
+            inner = sorted(filter(holds_features, path.iterdir()))
         if not inner:
-            raise InputError(f"{path}: holds no features, nor folders of features; expected what fuse or encode wrote")
+            raise InputError(
+                f"{path}: {kind_of_path(path)}; expected a folder of features, which `gsencoder fuse`, `encode`, "
+                "`memory` and `pack` write, or a folder of such folders"
+            )
         folders.add(folder for folder in inner if folder is path or folder.name in scenes)
     return list(folders.paths)
 

@@ -76,7 +76,7 @@ def run(config: ReconstructCommandConfig, summary: Summary) -> None:
         find_photographed(config.paths),
         config.out,
         "reconstruction",
-        lambda path, out, one: _reconstruct_one(path, out, config, one),
+        lambda path, out, scene_summary: _reconstruct_one(path, out, config, scene_summary),
         summary,
         overwrite=config.overwrite,
         worker=config.worker,

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.app.runs.output_file import refuse_existing, sole_writer
+from gsencoder.app.runs.output_file import check_output_files, sole_writer
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.app.settings.config import CommonConfig
@@ -19,7 +19,15 @@ from gsencoder.core.files.json_values import write_json
 from gsencoder.data.scene_paths import has_views
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.splat_formats.repair import repair_splat
-from gsencoder.data.splats import READABLE, WRITABLE, RawSplat, gaussians_from_raw, read_raw, save_splat
+from gsencoder.data.splats import (
+    READABLE,
+    WRITABLE,
+    RawSplat,
+    check_splat_name,
+    gaussians_from_raw,
+    read_raw,
+    save_splat,
+)
 from gsencoder.types import Scene
 
 Fix = Literal["nonfinite", "quats", "scales", "opacities", "huge", "duplicates", "floaters", "all"]
@@ -68,9 +76,14 @@ class RepairConfig(CommonConfig):
 def run(config: RepairConfig, summary: Summary) -> None:
     """Reads, repairs and writes a splat or the poses of a scene, and prints each change."""
     assert config.out is not None
-    refuse_existing(config.out, config.overwrite)
     path = Path(config.paths[0])
-    if path.exists() and has_views(path):
+    is_scene = path.exists() and has_views(path)
+    if is_scene and config.out.suffix.lower() != ".json":
+        raise InputError(f"out={config.out}: the repaired poses of a scene are a nerfstudio file; give a name in .json")
+    if not is_scene:
+        check_splat_name(config.out)
+    check_output_files((config.out, Path(f"{config.out}.summary.json")), config.overwrite)
+    if is_scene:
         _repair_scene(path, config, summary)
         return
     with summary.step("read"):
@@ -100,8 +113,6 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
     from gsencoder.data.readers.write_transforms import transforms_of
 
     assert config.out is not None
-    if config.out.suffix.lower() != ".json":
-        raise InputError(f"out={config.out}: the repaired poses of a scene are a nerfstudio file; give a name in .json")
     track, screen = Progress(quiet=config.quiet), console(config.quiet)
     with summary.step("read"):
         scene = load_scene(path, options=config.data)
@@ -143,11 +154,8 @@ def _load_back(content: dict[str, Any], out: Path) -> Scene:
     """The scene of a transforms.json that is to stand at `out`; a hidden file beside it holds it meanwhile."""
     partial = out.with_name(f".{out.stem}.partial-{secrets.token_hex(6)}.json")
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
         write_json(partial, content)
         return load_scene(partial, options=SceneConfig(allow_outside=True))
-    except OSError as error:
-        raise InputError(f"{out}: cannot write here: {error.strerror or error}") from error
     finally:
         with suppress(OSError):
             partial.unlink()

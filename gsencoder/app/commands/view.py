@@ -8,11 +8,12 @@ from pathlib import Path
 
 from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.app.commands.words_options import WordsOptions
-from gsencoder.app.runs.output_file import refuse_existing, sole_writer
+from gsencoder.app.runs.output_file import check_output_files, sole_writer
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.runtime.signals import accept_stop
 from gsencoder.data.scene_paths import DistinctPaths
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import with_up
@@ -109,8 +110,7 @@ def run(config: ViewConfig, summary: Summary) -> None:
     DistinctPaths().add(map(Path, config.paths))
     bundle = load_bundle()
     if config.out is not None:
-        for path in (config.out, Path(f"{config.out}.summary.json")):
-            refuse_existing(path, config.overwrite)
+        check_output_files((config.out, Path(f"{config.out}.summary.json")), config.overwrite)
     with summary.step("load"):
         photographed = load_scene(config.photos, options=config.data) if config.photos else None
         loaded = [_load(Path(path), config, photographed) for path in config.paths]
@@ -171,6 +171,7 @@ def _serve(
         try:
             server.serve_forever(poll_interval=0.1)
         except KeyboardInterrupt:
+            accept_stop()
             console(config.quiet).print("ended")
 
 

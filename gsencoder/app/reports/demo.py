@@ -86,19 +86,19 @@ def write_report(
             "views": len(scene.views),
             "seconds before this page": sum(summary.timings.values()),
             "peak memory, MiB": peak_memory_mb(),
-            **{f"{one.title} localized": f"{one.num_localized} of {len(one.words)}" for one in results},
+            **{f"{result.title} localized": f"{result.num_localized} of {len(result.words)}" for result in results},
         }
     )
     if page:
         report.section("In a browser")
         report.link("The room as a page: type a word, and see it", page)
-    features = {one.title: one.features for one in results}
+    features = {result.title: result.features for result in results}
     add_views(report, scene, features)
-    for one in results:
-        report.section(*TEXTS[one.title])
-        add_words(report, scene, one.localization, dict(zip(one.words, one.ious, strict=True)))
+    for result in results:
+        report.section(*TEXTS[result.title])
+        add_words(report, scene, result.localization, dict(zip(result.words, result.ious, strict=True)))
     report.section("Seconds of each step")
     report.timings(summary.timings)
     report.section("Features")
-    add_features(report, features, {one.title: one.fusion.truncation for one in results})
+    add_features(report, features, {result.title: result.fusion.truncation for result in results})
     report.write(path)

@@ -1,12 +1,12 @@
 """Results that are one file, with its summary and other files beside it."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import locked
+from gsencoder.core.files.atomic import check_writable, locked
 
 
 def refuse_existing(path: str | Path, overwrite: bool) -> None:
@@ -19,6 +19,18 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
         raise InputError(f"{path}: is a folder; give the name of a file to write")
     if os.path.lexists(path) and not overwrite:
         raise InputError(f"{path}: exists; give another out= or overwrite=true")
+
+
+def check_output_files(paths: Iterable[Path], overwrite: bool) -> None:
+    """Checks files before the work whose results they will hold: none exists that may not be replaced, and all can be
+    written.
+
+    Raises:
+        InputError: one exists, its folder is missing, or the system refuses.
+    """
+    for path in paths:
+        refuse_existing(path, overwrite)
+        check_writable(path)
 
 
 @contextmanager

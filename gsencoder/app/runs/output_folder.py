@@ -17,6 +17,7 @@ from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.atomic import is_full_disk, lock_folder
 from gsencoder.core.files.json_values import json_bytes, write_bytes
 from gsencoder.core.files.written_files import SUMMARY_NAME, checksums_of
+from gsencoder.core.runtime.signals import raise_dropped_stop
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 
@@ -58,6 +59,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
             write_bytes(partial / SUMMARY_NAME, json_bytes(record)[0])
         _sync(partial)
         _check_target(path, target, overwrite)
+        raise_dropped_stop()
         _move_into_place(partial, target)
     except Exception as error:
         message = _refusal(error, partial, target, path)

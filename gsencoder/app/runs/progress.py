@@ -13,6 +13,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
+from gsencoder.core.runtime.signals import raise_dropped_stop
+
 T = TypeVar("T")
 
 
@@ -47,8 +49,9 @@ class Progress:
         """Yields the items and shows how many are done."""
         if total is None and isinstance(items, Sized):
             total = len(items)
+        items = _interruptible(items)
         if self._quiet:
-            return iter(items)
+            return items
         return self._on_terminal(items, label, total) if self._stream.isatty() else self._in_lines(items, label, total)
 
     def _on_terminal(self, items: Iterable[T], label: str, total: int | None) -> Iterator[T]:
@@ -84,3 +87,10 @@ class Progress:
                 print(f"{label}: {count}{of} after {now - start:.0f} s", file=self._stream, flush=True)
         if last > start:
             print(f"{label}: {count} done in {time.monotonic() - start:.0f} s", file=self._stream, flush=True)
+
+
+def _interruptible(items: Iterable[T]) -> Iterator[T]:
+    """Yields the items; between them a signal that was dropped is raised again."""
+    for item in items:
+        yield item
+        raise_dropped_stop()

@@ -54,7 +54,7 @@ def run_scenes(
 
     Of several scenes those are skipped whose folder holds the results of the same settings, and those that another
     process is writing now. An error in one does not stop the others. The summary of each has its own
-    warnings, and those from before the first.
+    warnings, and those from before the first; that of the run has all, with the names of scenes.
 
     Args:
         paths: the scenes.
@@ -87,11 +87,8 @@ def run_scenes(
             if not overwrite and _is_finished(target, summary):
                 skipped += 1
                 continue
-            one = Summary(summary.command, summary.settings)
-            # Warnings arrive in the list of the whole run; those of other scenes are no part of this one's record.
-            summary.warnings[:] = common
-            one.warnings = summary.warnings
-            run(path, target, one)
+            with summary.of_scene(name, path, common) as summary_of_scene:
+                run(path, target, summary_of_scene)
         except BusyError:
             screen.print(f"{target}: another run is writing it now")
         except InputError as error:

@@ -4,7 +4,7 @@ import math
 import platform
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 import gsencoder
 from gsencoder.core.files.json_values import plain, write_json
 from gsencoder.core.files.written_files import SUMMARY_NAME, sha256_of
+from gsencoder.core.runtime.signals import raise_dropped_stop
 from gsencoder.core.runtime.threads import available_cores
 
 LIBRARIES = {
@@ -56,7 +57,7 @@ class Summary:
 
     Attributes:
         results: figures and file names; filled by the command.
-        warnings: one line each, in order; the command line adds every `SceneWarning` of the run.
+        warnings: one line each, in order; see `add_warning`.
         timings: seconds by step, in order of first start.
     """
 
@@ -67,16 +68,47 @@ class Summary:
         self.warnings: list[str] = []
         self.timings: dict[str, float] = {}
         self._start = time.perf_counter()
+        self._scene: tuple[str, Path, Summary] | None = None
+
+    def add_warning(self, text: str) -> str:
+        """Adds a warning; the command line adds every `SceneWarning` of the run. Returns it as the run shows it: with
+        the name of the scene, if there are several and it names none."""
+        if self._scene is not None:
+            name, path, of_scene = self._scene
+            of_scene.warnings.append(text)
+            if not text.startswith(f"{name}: ") and str(path) not in text:
+                text = f"{name}: {text}"
+        self.warnings.append(text)
+        return text
+
+    @contextmanager
+    def of_scene(self, name: str, path: Path, common: Sequence[str]) -> Iterator["Summary"]:
+        """The summary of one of several scenes, which has the warnings that the run gets in the block.
+
+        Args:
+            name: of the scene.
+            path: of it.
+            common: warnings of the run as a whole, which are about each scene.
+        """
+        summary = Summary(self.command, self.settings)
+        summary.warnings += common
+        self._scene = (name, path, summary)
+        try:
+            yield summary
+        finally:
+            self._scene = None
 
     @contextmanager
     def step(self, name: str) -> Iterator[None]:
         """Adds the seconds of the block to the step, also if it fails."""
+        raise_dropped_stop()
         start = time.perf_counter()
         self.timings.setdefault(name, 0.0)
         try:
             yield
         finally:
             self.timings[name] += time.perf_counter() - start
+        raise_dropped_stop()
 
     def add_seconds(self, steps: Mapping[str, float]) -> None:
         """Adds the seconds of steps that were timed elsewhere."""

@@ -10,8 +10,9 @@ from types import TracebackType
 from gsencoder.app.runs.output_folder import lies_in
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files.atomic import atomic_file, lock_folder
+from gsencoder.data.scene_paths import UNFINISHED_FILE
 
-MARKER_FILE, DISCARDED_FILE = "unfinished.txt", "discarded.txt"
+MARKER_FILE, DISCARDED_FILE = UNFINISHED_FILE, "discarded.txt"
 """The marker of a state that can be continued, and its name while the state is removed."""
 _PARTIAL_MARKER = re.compile(re.escape(f".{MARKER_FILE}.") + "([0-9a-f]+[.])?tmp")
 

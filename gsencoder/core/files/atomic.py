@@ -153,17 +153,44 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
         WriteError: the disk is full, or the system refuses the write.
     """
     target = Path(path)
-    if target.is_dir():
-        raise InputError(f"{target}: is a folder; give the name of a file to write")
-    if not target.parent.is_dir():
-        raise InputError(f"{target}: the folder {target.parent} does not exist; make it first")
-    try:
+    with _named_errors(target):
+        _check_folder(target)
         with temporary_beside(target) as temporary:
             with open(temporary, "wb") as stream:
                 yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
             os.replace(temporary, target)
+
+
+def check_writable(path: str | Path) -> None:
+    """Checks that `atomic_file` could write a file, by opening its temporary file: before work that takes a while.
+
+    Raises:
+        InputError: the folder is missing, or `path` is one.
+        WriteError: the disk is full, or the system refuses the write.
+    """
+    target = Path(path)
+    with _named_errors(target):
+        _check_folder(target)
+        with suppress(FileNotFoundError):
+            os.lstat(target)  # The temporary name is shorter where this one is too long.
+        with temporary_beside(target) as temporary, open(temporary, "wb"):
+            pass
+
+
+def _check_folder(target: Path) -> None:
+    if target.is_dir():
+        raise InputError(f"{target}: is a folder; give the name of a file to write")
+    if not target.parent.is_dir():
+        raise InputError(f"{target}: the folder {target.parent} does not exist; make it first")
+
+
+@contextmanager
+def _named_errors(target: Path) -> Iterator[None]:
+    """Turns an error of the system in the block into one that names the file."""
+    try:
+        yield
     except OSError as error:
         if is_full_disk(error):
             raise full_disk(target) from error

@@ -57,11 +57,11 @@ def teacher_autocast(device: str) -> torch.autocast:
 
 
 @contextmanager
-def enough_memory(what: str, remedy: str) -> Iterator[None]:
+def enough_memory(subject: str, remedy: str) -> Iterator[None]:
     """Turns a lack of GPU memory into an error that says what needs less.
 
     Args:
-        what: who computes, for the message.
+        subject: who computes, for the message.
         remedy: the option that makes it need less.
 
     Raises:
@@ -70,4 +70,6 @@ def enough_memory(what: str, remedy: str) -> Iterator[None]:
     try:
         yield
     except torch.OutOfMemoryError as error:
-        raise InputError(f"{what}: the GPU has not enough memory; lower {remedy} or give teacher.device=cpu") from error
+        raise InputError(
+            f"{subject}: the GPU has not enough memory; lower {remedy} or give teacher.device=cpu"
+        ) from error

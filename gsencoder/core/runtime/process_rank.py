@@ -68,11 +68,11 @@ def rank_from_environment(environment: Mapping[str, str]) -> tuple[ProcessRank, 
     )
 
 
-def refuse_several(what: str, advice: str) -> None:
+def refuse_several(subject: str, advice: str) -> None:
     """Checks that a launcher started this process alone, for work that is not shared: all would write the same results.
 
     Args:
-        what: what runs in one process, for the error.
+        subject: what runs in one process, for the error.
         advice: what to do instead.
 
     Raises:
@@ -81,8 +81,8 @@ def refuse_several(what: str, advice: str) -> None:
     process, _ = rank_from_environment(os.environ)
     if process.world_size > 1:
         raise InputError(
-            f"{what}: runs in one process, and this is process {process.rank} of {process.world_size} that a launcher "
-            f"(torchrun, SLURM) started; {advice}"
+            f"{subject}: runs in one process, and this is process {process.rank} of {process.world_size} that a "
+            f"launcher (torchrun, SLURM) started; {advice}"
         )
 
 

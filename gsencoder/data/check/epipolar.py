@@ -194,8 +194,8 @@ def _best_reading(
         for cause, poses in other_poses(cameras.cam_from_world.astype(np.float64)).items()
     ]
     readings += [
-        ("order", float(places), replace(cameras, cam_from_world=poses[rows].astype(np.float32)))
-        for places, poses in other_orders(all_cameras.cam_from_world)
+        ("order", float(shift), replace(cameras, cam_from_world=poses[rows].astype(np.float32)))
+        for shift, poses in other_orders(all_cameras.cam_from_world)
     ]
     for factor in FOCAL_FACTORS:
         if abs(np.log(factor)) >= np.log(SMALLEST_FACTOR):

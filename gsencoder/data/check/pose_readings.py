@@ -24,5 +24,5 @@ def other_poses(cam_from_world: Float64[np.ndarray, "V 4 4"]) -> dict[str, Float
 def other_orders(poses: Float[np.ndarray, "V 4 4"]) -> Iterator[tuple[int, Float[np.ndarray, "V 4 4"]]]:
     """The poses if each belongs to the photograph some places further on, and by how many places; ends are wrapped."""
     if len(poses) > 2:
-        for places in PLACES:
-            yield places, np.roll(poses, places, axis=0)
+        for shift in PLACES:
+            yield shift, np.roll(poses, shift, axis=0)

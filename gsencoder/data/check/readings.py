@@ -56,8 +56,8 @@ def other_readings(
         for cause, poses in other_poses(views.cam_from_world).items()
     ]
     fixed += [
-        ("order", float(places), replace(views, cam_from_world=poses[rows].astype(np.float64)))
-        for places, poses in other_orders(all_poses)
+        ("order", float(shift), replace(views, cam_from_world=poses[rows].astype(np.float64)))
+        for shift, poses in other_orders(all_poses)
     ]
     fixed.append(("ray length", None, views.of_rays()))
     readings = [

@@ -24,30 +24,30 @@ class _Walker:
     def __init__(self, path: Path) -> None:
         self.path, self.data, self.at = path, path.read_bytes(), 0
 
-    def take(self, layout: struct.Struct, what: str) -> tuple[int, ...]:
-        self.skip(layout.size, what)
+    def take(self, layout: struct.Struct, field: str) -> tuple[int, ...]:
+        self.skip(layout.size, field)
         return layout.unpack_from(self.data, self.at - layout.size)
 
-    def skip(self, size: int, what: str) -> None:
+    def skip(self, size: int, field: str) -> None:
         if self.at + size > len(self.data):
             raise InputError(
-                f"{self.path}: ends at byte {len(self.data)} inside {what}, which needs {self.at + size} bytes; "
+                f"{self.path}: ends at byte {len(self.data)} inside {field}, which needs {self.at + size} bytes; "
                 "the file is cut short or damaged"
             )
         self.at += size
 
-    def count(self, smallest: int, what: str) -> int:
+    def count(self, smallest: int, field: str) -> int:
         """A record count, which the rest of the file must be able to hold."""
-        (count,) = self.take(_U64, f"the number of {what}")
+        (count,) = self.take(_U64, f"the number of {field}")
         if count * smallest > len(self.data) - self.at:
             raise InputError(
-                f"{self.path}: announces {count} {what} (at least {count * smallest} bytes) but "
+                f"{self.path}: announces {count} {field} (at least {count * smallest} bytes) but "
                 f"{len(self.data) - self.at} bytes follow; the file is cut short or damaged"
             )
         return count
 
-    def fail(self, what: str) -> None:
-        raise InputError(f"{self.path}: {what}; the file is damaged")
+    def fail(self, fault: str) -> None:
+        raise InputError(f"{self.path}: {fault}; the file is damaged")
 
 
 _U64, _U32 = struct.Struct("<Q"), struct.Struct("<I")

@@ -204,19 +204,19 @@ def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
     return np.asarray(values[..., : len(bands) - ("A" in bands)].any(axis=2))
 
 
-def read_integers(path: Path, what: str, *, wide: bool, data: io.BytesIO | None = None) -> np.ndarray:
+def read_integers(path: Path, subject: str, *, wide: bool, data: io.BytesIO | None = None) -> np.ndarray:
     """A single-channel integer PNG [H, W], int32; `wide` asks for more than 8 bits, as depth in millimetres has.
 
     With `data`, the content of the file is there already, and `path` names it in messages.
     """
     with open_picture(path, data) as file:
         if file.format == "JPEG":
-            raise InputError(f"{path}: {what} was saved as JPEG, which changes values; expected PNG")
+            raise InputError(f"{path}: {subject} was saved as JPEG, which changes values; expected PNG")
         allowed = DEEP_GREY + (() if wide else ("L", "P", "1"))
         if file.mode not in allowed:
             kind = "16-bit" if wide else "8- or 16-bit"
-            raise InputError(f"{path}: {what} must be a {kind} picture with one channel, got mode {file.mode}")
+            raise InputError(f"{path}: {subject} must be a {kind} picture with one channel, got mode {file.mode}")
         values = np.asarray(_decode(path, file)).astype(np.int32)
     if values.size and values.min() < 0:
-        raise InputError(f"{path}: {what} has negative values")
+        raise InputError(f"{path}: {subject} has negative values")
     return values

@@ -172,12 +172,12 @@ def number(values: Mapping[str, object], key: str, where: str) -> float | None:
     return float(value)
 
 
-def warn_left_out(missing: Iterable[str], total: int, source: str, what: str, result: str) -> None:
+def warn_left_out(missing: Iterable[str], total: int, source: str, subject: str, result: str) -> None:
     """Warns once, with a count, about files that are listed but missing, if there are any."""
     names = list(missing)
     if names:
         warnings.warn(
-            f"{source}: {len(names)} of {total} {what} are missing (first: {names[0][:200]!r}); {result}",
+            f"{source}: {len(names)} of {total} {subject} are missing (first: {names[0][:200]!r}); {result}",
             SceneWarning,
             stacklevel=3,
         )

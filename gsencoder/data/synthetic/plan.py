@@ -76,7 +76,7 @@ def plan_room(seed: int = 0, *, objects: int = 8) -> tuple[PlannedObject, ...]:
     names = [list(_CATALOGUE)[row] for row in rng.permutation(len(_CATALOGUE))[:objects]]
     colors = [OBJECT_COLORS[row % len(OBJECT_COLORS)] for row in _shuffled(rng, objects)]
     circles: list[tuple[float, np.ndarray]] = []
-    things = []
+    placed_objects = []
     # Wide things first: small ones fit between them.
     order = sorted(range(objects), key=lambda row: -_radius(_CATALOGUE[names[row]][1]()))
     homes = {}
@@ -88,8 +88,8 @@ def plan_room(seed: int = 0, *, objects: int = 8) -> tuple[PlannedObject, ...]:
         parts = _CATALOGUE[names[row]][1]()
         yaw = float(rng.uniform(-np.pi, np.pi))
         stood = tuple(_stand(part, homes[row], yaw) for part in parts)
-        things.append(PlannedObject(id=FIRST_ID + row, name=names[row], color=colors[row], parts=stood))
-    return (*furniture, *things)
+        placed_objects.append(PlannedObject(id=FIRST_ID + row, name=names[row], color=colors[row], parts=stood))
+    return (*furniture, *placed_objects)
 
 
 def _shuffled(rng: np.random.Generator, count: int) -> list[int]:

@@ -60,7 +60,7 @@ def make_room(
         raise InputError(f"synthetic room: spacing must be a positive length, got {spacing}")
     plan = plan_room(seed, objects=objects)
     cameras = _cameras(seed, views, width, height)
-    surfaces = [_Surface(part, thing) for thing in plan for part in thing.parts]
+    surfaces = [_Surface(part, planned) for planned in plan for part in planned.parts]
     pictures = [_cast(surfaces, cameras, view) for view in range(views)]
     instances = [labels for _, _, labels in pictures]
     return Scene(
@@ -81,7 +81,7 @@ def make_room(
 
 def color_words(seed: int = 0, *, objects: int = 8) -> dict[int, str]:
     """The color word of each object of `make_room(seed, objects=objects)`, by id."""
-    return {thing.id: thing.color for thing in plan_room(seed, objects=objects)}
+    return {planned.id: planned.color for planned in plan_room(seed, objects=objects)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,15 +89,15 @@ class _Surface:
     """A part with the object that it belongs to."""
 
     solid: Solid
-    thing: PlannedObject
+    planned: PlannedObject
 
     def shade(
         self, points: Float64[np.ndarray, "n 3"], normals: Float64[np.ndarray, "n 3"]
     ) -> Float64[np.ndarray, "n 3"]:
         """RGB in [0, 1] at points of the surface: the same for pixels and Gaussians."""
         light = AMBIENT + (1 - AMBIENT) * np.maximum(normals @ (LIGHT / np.linalg.norm(LIGHT)), 0)
-        base = np.array(COLORS[self.thing.color]) / 255
-        return base * (light * _pattern(self.thing.pattern, points, self.solid))[:, None]
+        base = np.array(COLORS[self.planned.color]) / 255
+        return base * (light * _pattern(self.planned.pattern, points, self.solid))[:, None]
 
 
 def _pattern(kind: str, points: np.ndarray, solid: Solid) -> np.ndarray:
@@ -140,7 +140,7 @@ def _cast(
         points = origin + rays[pixels] * depth[pixels][:, None]
         colors = surfaces[row].shade(points, surfaces[row].solid.normals(points))
         image[pixels] = np.rint(255 * np.clip(colors, 0, 1)).astype(np.uint8)
-        labels[pixels] = surfaces[row].thing.id
+        labels[pixels] = surfaces[row].planned.id
     return image, np.where(np.isfinite(depth), depth, 0).astype(np.float32), labels
 
 
@@ -161,8 +161,8 @@ def _gaussians(surfaces: list[_Surface], spacing: float) -> Gaussians:
     """Discs on the parts of all surfaces that are inside the room and not covered by another solid."""
     means, normals, colors, sizes = [], [], [], []
     for row, surface in enumerate(surfaces):
-        step = 2 * spacing if surface.thing.pattern == "plain" else spacing
-        if surface.thing.placed:
+        step = 2 * spacing if surface.planned.pattern == "plain" else spacing
+        if surface.planned.placed:
             step = min(spacing, max(FINEST, 2 * float(np.median(surface.solid.half)) / CELLS_ACROSS))
         points = surface.solid.lattice(step)
         inside = (np.abs(points[:, :2]) <= np.array(HALF_ROOM) + CONTACT).all(axis=1) & (points[:, 2] >= -CONTACT)
@@ -190,22 +190,22 @@ def _gaussians(surfaces: list[_Surface], spacing: float) -> Gaussians:
 
 
 def _objects(plan: tuple[PlannedObject, ...], instances: list[np.ndarray]) -> tuple[SceneObject, ...]:
-    largest = max(thing.id for thing in plan) + 1
+    largest = max(planned.id for planned in plan) + 1
     counts = np.array(
         [np.bincount(labels.ravel(), minlength=largest) for labels in instances] or np.zeros((1, largest), int)
     )
     objects = []
-    for thing in plan:
-        lower, upper = thing.aabb()
+    for planned in plan:
+        lower, upper = planned.aabb()
         objects.append(
             SceneObject(
-                id=thing.id,
-                name=thing.name,
+                id=planned.id,
+                name=planned.name,
                 aabb_min=lower,
                 aabb_max=upper,
-                placed=thing.placed,
-                views=int(np.count_nonzero(counts[:, thing.id])),
-                max_pixels=int(counts[:, thing.id].max()),
+                placed=planned.placed,
+                views=int(np.count_nonzero(counts[:, planned.id])),
+                max_pixels=int(counts[:, planned.id].max()),
             )
         )
     return tuple(objects)

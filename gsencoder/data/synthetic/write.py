@@ -89,16 +89,16 @@ def _write_views(scene: Scene, views: Views, folder: Path) -> None:
     }
     objects = [
         {
-            "id": thing.id,
-            "category": thing.name or "room",
-            "name": thing.name,
-            "aabb_min": thing.aabb_min.tolist(),
-            "aabb_max": thing.aabb_max.tolist(),
-            "views": thing.views,
-            "max_pixels": thing.max_pixels,
-            "placed": thing.placed,
+            "id": scene_object.id,
+            "category": scene_object.name or "room",
+            "name": scene_object.name,
+            "aabb_min": scene_object.aabb_min.tolist(),
+            "aabb_max": scene_object.aabb_max.tolist(),
+            "views": scene_object.views,
+            "max_pixels": scene_object.max_pixels,
+            "placed": scene_object.placed,
         }
-        for thing in scene.objects
+        for scene_object in scene.objects
     ]
     for name, content in (("transforms.json", transforms), ("objects.json", objects)):
         write_bytes(folder / name, json.dumps(content, indent=1).encode())

@@ -30,9 +30,9 @@ class ClassTable:
                 f"classes: expected one id for each of one or more names, got {len(self.names)} names and "
                 f"{len(self.ids)} ids"
             )
-        for what, values in (("name", self.names), ("id", self.ids)):
+        for kind, values in (("name", self.names), ("id", self.ids)):
             if repeated := first_repeated(values):
-                raise InputError(f"classes: the {what} {repeated[0]!r} is there twice")
+                raise InputError(f"classes: the {kind} {repeated[0]!r} is there twice")
         if min(self.ids) < 0:
             raise InputError(f"classes: expected ids of 0 or more, got {min(self.ids)}")
         for group, names in self.groups.items():

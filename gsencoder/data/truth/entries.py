@@ -46,8 +46,8 @@ def entries_of(rows: Any, path: Path, expected: str, *, key: str = "") -> tuple[
         InputError: no list, or an entry that is no object.
     """
     if not isinstance(rows, list):
-        what = f"{key} must be" if key else "expected"
-        raise InputError(f"{path}: {what} a list of objects with {expected}, got {shown(rows)}")
+        expectation = f"{key} must be" if key else "expected"
+        raise InputError(f"{path}: {expectation} a list of objects with {expected}, got {shown(rows)}")
     wheres = [f"{path}: {key}[{index}]" if key else f"{path}: entry {index}" for index in range(len(rows))]
     return tuple((object_of(row, where, expected), where) for row, where in zip(rows, wheres, strict=True))
 
@@ -87,38 +87,38 @@ def object_of(value: Any, where: str, expected: str) -> Mapping[str, Any]:
     return value
 
 
-def text_value(value: Any, where: str, what: str, *, empty: bool = False) -> str:
+def text_value(value: Any, where: str, field: str, *, empty: bool = False) -> str:
     """The value, which must be a text of at most `MAX_TEXT` characters.
 
     Args:
         value: of the file.
         where: file and entry.
-        what: name of the value.
+        field: name of the value.
         empty: whether a text without a character other than blanks is one.
 
     Raises:
         InputError: no text, an empty one, or one that is too long.
     """
     if not isinstance(value, str):
-        raise InputError(f"{where}: {what} must be a text, got {shown(value)}")
+        raise InputError(f"{where}: {field} must be a text, got {shown(value)}")
     if len(value) > MAX_TEXT:
         raise InputError(
-            f"{where}: {what} has {len(value):,} characters, expected at most {MAX_TEXT:,}: {shown(value)}"
+            f"{where}: {field} has {len(value):,} characters, expected at most {MAX_TEXT:,}: {shown(value)}"
         )
     if not empty and not value.strip():
-        raise InputError(f"{where}: {what} is empty; expected a text")
+        raise InputError(f"{where}: {field} is empty; expected a text")
     return value
 
 
-def text_list(value: Any, where: str, what: str, *, empty: bool = False) -> tuple[str, ...]:
+def text_list(value: Any, where: str, field: str, *, empty: bool = False) -> tuple[str, ...]:
     """The value, which must be a list of texts; `empty` as in `text_value`, for each of them.
 
     Raises:
         InputError: no list, or a member that is no text.
     """
     if not isinstance(value, list):
-        raise InputError(f"{where}: {what} must be a list of texts, got {shown(value)}")
-    return tuple(text_value(each, where, f"{what}[{index}]", empty=empty) for index, each in enumerate(value))
+        raise InputError(f"{where}: {field} must be a list of texts, got {shown(value)}")
+    return tuple(text_value(each, where, f"{field}[{index}]", empty=empty) for index, each in enumerate(value))
 
 
 def scene_name(value: Any, where: str) -> str:
@@ -133,7 +133,7 @@ def scene_name(value: Any, where: str) -> str:
     return name
 
 
-def id_value(value: Any, where: str, what: str) -> str:
+def id_value(value: Any, where: str, field: str) -> str:
     """An id as text; files write them as texts and as whole numbers.
 
     Raises:
@@ -144,22 +144,22 @@ def id_value(value: Any, where: str, what: str) -> str:
     if _is_name(value):
         return str(value)
     raise InputError(
-        f"{where}: {what} must be a whole number or a text of one line with 1 to {MAX_ID} characters, got "
+        f"{where}: {field} must be a whole number or a text of one line with 1 to {MAX_ID} characters, got "
         f"{_shown_name(value)}"
     )
 
 
-def annotation_id(value: Any, where: str, what: str = "ann_id") -> str:
+def annotation_id(value: Any, where: str, field: str = "ann_id") -> str:
     """The number of an annotation about an object, as text: 7, "7" and "07" are the same.
 
     Raises:
         InputError: as `id_value`.
     """
-    text = id_value(value, where, what)
+    text = id_value(value, where, field)
     return str(int(text)) if text.isascii() and text.isdigit() else text
 
 
-def name_value(value: Any, where: str, what: str) -> str:
+def name_value(value: Any, where: str, field: str) -> str:
     """The name of a class: a text of one line.
 
     Raises:
@@ -167,12 +167,12 @@ def name_value(value: Any, where: str, what: str) -> str:
     """
     if not _is_name(value):
         raise InputError(
-            f"{where}: {what} must be a text of one line with 1 to {MAX_ID} characters, got {_shown_name(value)}"
+            f"{where}: {field} must be a text of one line with 1 to {MAX_ID} characters, got {_shown_name(value)}"
         )
     return str(value)
 
 
-def flag_value(value: Any, where: str, what: str) -> bool | None:
+def flag_value(value: Any, where: str, field: str) -> bool | None:
     """0 or 1, or false or true; None if there is none.
 
     Raises:
@@ -181,7 +181,7 @@ def flag_value(value: Any, where: str, what: str) -> bool | None:
     if value is None:
         return None
     if not isinstance(value, int) or value not in (0, 1):
-        raise InputError(f"{where}: {what} must be 0 or 1, got {shown(value)}")
+        raise InputError(f"{where}: {field} must be 0 or 1, got {shown(value)}")
     return bool(value)
 
 
@@ -194,7 +194,7 @@ def _shown_name(value: Any) -> str:
     return f"{len(value):,} characters" if too_long else shown(value)
 
 
-def object_id(value: Any, where: str, what: str = "object_id") -> int:
+def object_id(value: Any, where: str, field: str = "object_id") -> int:
     """The `objectId` of an object in ScanNet's aggregation file, from 0; files write it as a number and as a text.
 
     Raises:
@@ -204,29 +204,29 @@ def object_id(value: Any, where: str, what: str = "object_id") -> int:
         return int(value)
     if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31:
         return value
-    raise InputError(f"{where}: {what} must be a whole number from 0, got {shown(value)}")
+    raise InputError(f"{where}: {field} must be a whole number from 0, got {shown(value)}")
 
 
-def number(value: Any, where: str, what: str, *, largest: float = 1e15) -> float:
+def number(value: Any, where: str, field: str, *, largest: float = 1e15) -> float:
     """A finite number.
 
     Args:
         value: of the file.
         where: file and entry.
-        what: name of the value.
+        field: name of the value.
         largest: largest absolute value.
 
     Raises:
         InputError: something else.
     """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"{where}: {what} must be a number, got {shown(value)}")
+        raise InputError(f"{where}: {field} must be a number, got {shown(value)}")
     if not abs(value) <= largest or not math.isfinite(value):
-        raise InputError(f"{where}: {what} must be a finite number of at most {largest:g}, got {shown(value)}")
+        raise InputError(f"{where}: {field} must be a finite number of at most {largest:g}, got {shown(value)}")
     return float(value)
 
 
-def corner_bounds(value: Any, where: str, what: str) -> tuple[Corner, Corner]:
+def corner_bounds(value: Any, where: str, field: str) -> tuple[Corner, Corner]:
     """Lower and upper corner of an axis-aligned box, which is written by its eight corners, as the official scripts
     take them and of which the lowest and highest coordinates count, or by its lower and its upper corner.
 
@@ -236,16 +236,17 @@ def corner_bounds(value: Any, where: str, what: str) -> tuple[Corner, Corner]:
     rows = value if isinstance(value, list) else []
     if len(rows) not in (2, 8):
         raise InputError(
-            f"{where}: {what} must be a list of 8 corners [x, y, z], or of a lower and an upper one, got {shown(value)}"
+            f"{where}: {field} must be a list of 8 corners [x, y, z], or of a lower and an upper one, got "
+            f"{shown(value)}"
         )
     corners = []
     for row, corner in enumerate(rows):
         if not isinstance(corner, list) or len(corner) != 3:
-            raise InputError(f"{where}: {what}[{row}] must be a corner [x, y, z], got {shown(corner)}")
-        corners.append([number(each, where, f"{what}[{row}]", largest=MAX_COORDINATE) for each in corner])
+            raise InputError(f"{where}: {field}[{row}] must be a corner [x, y, z], got {shown(corner)}")
+        corners.append([number(each, where, f"{field}[{row}]", largest=MAX_COORDINATE) for each in corner])
     lower, upper = ([pick(axis) for axis in zip(*corners, strict=True)] for pick in (min, max))
     if len(corners) == 2 and lower != corners[0]:
-        raise InputError(f"{where}: {what}: the lower corner {corners[0]} is not below the upper {corners[1]}")
+        raise InputError(f"{where}: {field}: the lower corner {corners[0]} is not below the upper {corners[1]}")
     return (lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])
 
 

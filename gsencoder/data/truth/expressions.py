@@ -243,7 +243,7 @@ def _check_objects(expressions: Sequence[Expression], path: Path) -> None:
         row = first.setdefault((each.scene, each.object_id), index)
         other = expressions[row]
         if (other.object_name, other.aabb) != (each.object_name, each.aabb):
-            what = "names" if other.object_name != each.object_name else "boxes"
+            attribute = "names" if other.object_name != each.object_name else "boxes"
             raise InputError(
-                f"{path}: entries {row} and {index} give object {each.object_id} of {each.scene} different {what}"
+                f"{path}: entries {row} and {index} give object {each.object_id} of {each.scene} different {attribute}"
             )

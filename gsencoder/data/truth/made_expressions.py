@@ -73,48 +73,54 @@ def make_expressions(
 
 def _of_scene(scene: SeenScene, seed: int, per_object: int, per_scene: int) -> list[MadeExpression]:
     rng = scene_rng(seed, scene.name, PART)
-    things = movables(scene.objects)
+    scene_objects = movables(scene.objects)
     described = [
-        (thing, ways) for thing in things if thing.name and scene.shown(thing) and (ways := ways_to_say(scene, thing))
+        (scene_object, ways)
+        for scene_object in scene_objects
+        if scene_object.name and scene.shown(scene_object) and (ways := ways_to_say(scene, scene_object))
     ]
     shuffled = rng.permutation(len(described)).tolist()
     expressions = []
     for row in sorted(shuffled[:per_scene] if per_scene else shuffled):
-        thing, ways = described[row]
+        scene_object, ways = described[row]
         wordings = [ways[way] for way in rng.permutation(len(ways))[:per_object]]
         for number, (text, others) in enumerate(wordings):
-            expressions.append(_made(scene, thing, text, others, number))
+            expressions.append(_made(scene, scene_object, text, others, number))
     return expressions
 
 
-def ways_to_say(scene: SeenScene, thing: SeenObject) -> list[tuple[str, tuple[SeenObject, ...]]]:
+def ways_to_say(scene: SeenScene, scene_object: SeenObject) -> list[tuple[str, tuple[SeenObject, ...]]]:
     """All clear descriptions of a thing, and the other things that each speaks of."""
-    things = movables(scene.objects)
-    name = str(thing.name)
-    others = [other for other in things if other.name == name and other is not thing]
+    scene_objects = movables(scene.objects)
+    name = str(scene_object.name)
+    others = [other for other in scene_objects if other.name == name and other is not scene_object]
     ways: list[tuple[str, tuple[SeenObject, ...]]] = []
-    if scene.unique(name) is thing:
+    if scene.unique(name) is scene_object:
         ways.append((f"the only {name} in the room", ()))
-    anchor = _anchor(scene, thing, others, things)
+    anchor = _anchor(scene, scene_object, others, scene_objects)
     if anchor is not None:
         ways.append((f"the {name} next to the {anchor.name}", (anchor,)))
-    below = supporter(thing, things)
-    if below is not None and scene.shown(below) and not any(_may_be_on(other, below, things) for other in others):
+    below = supporter(scene_object, scene_objects)
+    if (
+        below is not None
+        and scene.shown(below)
+        and not any(_may_be_on(other, below, scene_objects) for other in others)
+    ):
         ways.append((f"the {name} on the {below.name}", (below,)))
-    if others and all(scene.shown(other) for other in others) and largest([thing, *others]) is thing:
+    if others and all(scene.shown(other) for other in others) and largest([scene_object, *others]) is scene_object:
         ways.append((f"the largest {name}", tuple(others)))
     return ways
 
 
 def _anchor(
-    scene: SeenScene, thing: SeenObject, others: Sequence[SeenObject], things: Sequence[SeenObject]
+    scene: SeenScene, scene_object: SeenObject, others: Sequence[SeenObject], scene_objects: Sequence[SeenObject]
 ) -> SeenObject | None:
     """The nearest thing beside another whose name is its own and that no other object of the name is as near to."""
     if not others:
         # The one thing of a name is next to what the question's rule says, too.
-        near = neighbor(thing, things)
+        near = neighbor(scene_object, scene_objects)
         return near if near is not None and scene.unique(str(near.name)) is near else None
-    for distance, anchor in beside(thing, things):
+    for distance, anchor in beside(scene_object, scene_objects):
         if distance > NEAR:
             return None
         if anchor.name is None or scene.unique(anchor.name) is not anchor:
@@ -124,21 +130,25 @@ def _anchor(
     return None
 
 
-def _may_be_on(thing: SeenObject, below: SeenObject, things: Sequence[SeenObject]) -> bool:
+def _may_be_on(scene_object: SeenObject, below: SeenObject, scene_objects: Sequence[SeenObject]) -> bool:
     """Whether a thing may be said to be on something of another's name: it stands near the top of one, or is in its
     box."""
-    same = [other for other in things if other.name == below.name]
-    return any(gap(thing, other) < NEAR / 2 for other in same)
+    same = [other for other in scene_objects if other.name == below.name]
+    return any(gap(scene_object, other) < NEAR / 2 for other in same)
 
 
-def _made(scene: SeenScene, thing: SeenObject, text: str, others: Sequence[SeenObject], number: int) -> MadeExpression:
-    lower, upper = ((corner / scene.metres_per_unit).tolist() for corner in (thing.aabb_min, thing.aabb_max))
-    name = str(thing.name)
-    unique = len([other for other in scene.objects if other.name == thing.name]) == 1
+def _made(
+    scene: SeenScene, scene_object: SeenObject, text: str, others: Sequence[SeenObject], number: int
+) -> MadeExpression:
+    lower, upper = (
+        (corner / scene.metres_per_unit).tolist() for corner in (scene_object.aabb_min, scene_object.aabb_max)
+    )
+    name = str(scene_object.name)
+    unique = len([other for other in scene.objects if other.name == scene_object.name]) == 1
     return MadeExpression(
         expression=Expression(
             scene=scene.name,
-            object_id=thing.id,
+            object_id=scene_object.id,
             object_name=name.replace(" ", "_"),
             annotation=str(number),
             text=text,
@@ -148,5 +158,5 @@ def _made(scene: SeenScene, thing: SeenObject, text: str, others: Sequence[SeenO
             others=False,
         ),
         unique=unique,
-        needed=(thing.id, *(other.id for other in others)),
+        needed=(scene_object.id, *(other.id for other in others)),
     )

@@ -115,17 +115,17 @@ def balanced(units: Mapping[str, Mapping[Kind, Sequence[Unit]]], equal: bool) ->
     by_kind: dict[Kind, list[tuple[int, str, Unit]]] = {
         kind: sorted(
             ((row, name, unit) for name, kinds in units.items() for row, unit in enumerate(kinds[kind])),
-            key=lambda one: one[:2],
+            key=lambda entry: entry[:2],
         )
         for kind in KINDS
     }
-    counts = [sum(len(unit) for _, _, unit in one) for one in by_kind.values() if one]
+    counts = [sum(len(unit) for _, _, unit in ranked) for ranked in by_kind.values() if ranked]
     most = min(counts, default=0)
     numbered: list[Question] = []
     for kind, ranked in by_kind.items():
         selected = ranked[: -(-most // len(ranked[0][2]))] if equal and ranked else ranked
         numbers: dict[str, int] = {}
-        for _, name, unit in sorted(selected, key=lambda one: (one[1], one[0])):
+        for _, name, unit in sorted(selected, key=lambda entry: (entry[1], entry[0])):
             for question in unit:
                 numbers[name] = numbers.get(name, -1) + 1
                 numbered.append(replace(question, id=f"{name}-{kind}-{numbers[name]}"))
@@ -140,22 +140,24 @@ def kind_of(question: Question) -> Kind | None:
 
 def clear_names(scene: SeenScene) -> tuple[str, ...]:
     """Names all of whose objects are shown well enough, and beside which no name is that may mean the same."""
-    there = {thing.name for thing in scene.objects if thing.name and thing.pixels}
+    there = {scene_object.name for scene_object in scene.objects if scene_object.name and scene_object.pixels}
     return tuple(name for name in scene.names() if not any(alike(name, other) for other in there))
 
 
 def _candidates(scene: SeenScene, absent: Sequence[str]) -> dict[Kind, list[Question]]:
     """All that can be asked, kind by kind, sorted by name."""
-    things = movables(scene.objects)
+    scene_objects = movables(scene.objects)
     clear = clear_names(scene)
-    single = [thing for thing in map(scene.unique, clear) if thing is not None]
+    single = [scene_object for scene_object in map(scene.unique, clear) if scene_object is not None]
     return {
         "next_to": [
             question
-            for thing in single
-            if (beside := neighbor(thing, things)) is not None and scene.shown(beside)
+            for scene_object in single
+            if (beside := neighbor(scene_object, scene_objects)) is not None and scene.shown(beside)
             for question in [
-                _question(scene, f"What is next to the {thing.name}?", [str(beside.name)], [thing, beside])
+                _question(
+                    scene, f"What is next to the {scene_object.name}?", [str(beside.name)], [scene_object, beside]
+                )
             ]
         ],
         "how_many": [
@@ -166,11 +168,15 @@ def _candidates(scene: SeenScene, absent: Sequence[str]) -> dict[Kind, list[Ques
             if not is_plural(name) and len(same := scene.named(name)) < len(NUMBERS)
         ],
         "color": [
-            _question(scene, f"What color {_be(thing)} the {thing.name}?", [thing.color], [thing])
-            for thing in single
-            if thing.color is not None
+            _question(
+                scene, f"What color {_be(scene_object)} the {scene_object.name}?", [scene_object.color], [scene_object]
+            )
+            for scene_object in single
+            if scene_object.color is not None
         ],
-        "where": [question for thing in single if (question := _where(scene, thing, things)) is not None],
+        "where": [
+            question for scene_object in single if (question := _where(scene, scene_object, scene_objects)) is not None
+        ],
         "is_there": [
             *(_question(scene, _there(name), ["yes"], list(scene.named(name))) for name in clear),
             *(_question(scene, _there(name), ["no"], []) for name in absent_names(scene, absent)),
@@ -180,28 +186,30 @@ def _candidates(scene: SeenScene, absent: Sequence[str]) -> dict[Kind, list[Ques
 
 def absent_names(scene: SeenScene, names: Sequence[str]) -> list[str]:
     """The names that no label of a scene has, nor any name that may stand for the same thing."""
-    there = {thing.name for thing in scene.objects if thing.name}
+    there = {scene_object.name for scene_object in scene.objects if scene_object.name}
     return sorted({name for name in names if name not in there and not any(alike(name, other) for other in there)})
 
 
-def _where(scene: SeenScene, thing: SeenObject, things: Sequence[SeenObject]) -> Question | None:
+def _where(scene: SeenScene, scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> Question | None:
     """Where a thing is: on what, and beside what, as far as this is clear; the first of both is what must be seen."""
-    on, beside = supporter(thing, things), neighbor(thing, things)
+    on, beside = supporter(scene_object, scene_objects), neighbor(scene_object, scene_objects)
     answers: list[str] = []
     objects: list[SeenObject] = []
     for word, other in (("on", on), ("next to", beside)):
         if other is not None and scene.shown(other):
             answers.append(f"{word} the {other.name}")
-            objects = objects or [thing, other]
-    return _question(scene, f"Where {_be(thing)} the {thing.name}?", answers, objects) if answers else None
+            objects = objects or [scene_object, other]
+    return (
+        _question(scene, f"Where {_be(scene_object)} the {scene_object.name}?", answers, objects) if answers else None
+    )
 
 
 def _there(name: str) -> str:
     return f"Are there any {name} in the room?" if is_plural(name) else f"Is there {with_article(name)} in the room?"
 
 
-def _be(thing: SeenObject) -> str:
-    return "are" if thing.name and is_plural(thing.name) else "is"
+def _be(scene_object: SeenObject) -> str:
+    return "are" if scene_object.name and is_plural(scene_object.name) else "is"
 
 
 def _question(scene: SeenScene, text: str, answers: Sequence[str], objects: Sequence[SeenObject]) -> Question:
@@ -211,8 +219,8 @@ def _question(scene: SeenScene, text: str, answers: Sequence[str], objects: Sequ
         scene=scene.name,
         text=text,
         answers=tuple(answers),
-        object_ids=tuple(thing.id for thing in objects),
-        object_names=tuple(thing.name or "" for thing in objects),
+        object_ids=tuple(scene_object.id for scene_object in objects),
+        object_names=tuple(scene_object.name or "" for scene_object in objects),
     )
 
 

@@ -45,10 +45,20 @@ def make_situations(scenes: Iterable[SeenScene], *, seed: int = 0, per_kind: int
 
 def _of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
     rng = scene_rng(seed, scene.name, PART)
-    things = movables(scene.objects)
-    single = [thing for thing in map(scene.unique, clear_names(scene)) if thing is not None and thing in things]
-    places = [thing for thing in single if np.linalg.norm(thing.aabb_max - thing.aabb_min) >= SMALLEST_PLACE]
-    triples = [each for each in product(places, single, single) if len({thing.id for thing in each}) == 3]
+    scene_objects = movables(scene.objects)
+    single = [
+        scene_object
+        for scene_object in map(scene.unique, clear_names(scene))
+        if scene_object is not None and scene_object in scene_objects
+    ]
+    landmarks = [
+        scene_object
+        for scene_object in single
+        if np.linalg.norm(scene_object.aabb_max - scene_object.aabb_min) >= SMALLEST_PLACE
+    ]
+    triples = [
+        each for each in product(landmarks, single, single) if len({scene_object.id for scene_object in each}) == 3
+    ]
     shuffled = [triples[row] for row in rng.permutation(len(triples))]
     sides: dict[str, list[Question]] = {"left": [], "right": []}
     nearer: list[Question] = []
@@ -59,17 +69,17 @@ def _of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
             pairs.add((at.id, other.id))
             text = f"Is the {other.name} on my left or on my right?"
             sides[side].append(_question(scene, at, facing, [other], text, side))
-    for number, (at, one, other) in enumerate(shuffled):
-        first, second = gap(at, one), gap(at, other)
-        if first > second or (at.id, one.id) in pairs or len(nearer) == per_kind:
+    for number, (at, near, other) in enumerate(shuffled):
+        first, second = gap(at, near), gap(at, other)
+        if first > second or (at.id, near.id) in pairs or len(nearer) == per_kind:
             continue
         if clearly_nearer(first, second) and second - first >= CLEAR_DISTANCE:
-            pairs.add((at.id, one.id))
-            pair = sorted((one, other), key=lambda thing: str(thing.name))
+            pairs.add((at.id, near.id))
+            pair = sorted((near, other), key=lambda scene_object: str(scene_object.name))
             text = f"Which is closer to me, the {pair[0].name} or the {pair[1].name}?"
             # What one faces must not tell which is the nearer one.
-            facing, aside = (one, other) if number % 2 else (other, one)
-            nearer.append(_question(scene, at, facing, [aside], text, str(one.name)))
+            facing, aside = (near, other) if number % 2 else (other, near)
+            nearer.append(_question(scene, at, facing, [aside], text, str(near.name)))
     count = min(map(len, sides.values()))
     questions = [*sides["left"][:count], *sides["right"][:count], *nearer]
     kinds = ["side"] * (2 * count) + ["nearer"] * len(nearer)
@@ -95,15 +105,15 @@ def side_of(at: SeenObject, facing: SeenObject, other: SeenObject) -> str | None
     return None
 
 
-def _corners(thing: SeenObject) -> Float64[np.ndarray, "4 2"]:
-    low, high = thing.aabb_min[:2], thing.aabb_max[:2]
+def _corners(scene_object: SeenObject) -> Float64[np.ndarray, "4 2"]:
+    low, high = scene_object.aabb_min[:2], scene_object.aabb_max[:2]
     return np.array([(low[0], low[1]), (low[0], high[1]), (high[0], low[1]), (high[0], high[1])])
 
 
 def _question(
     scene: SeenScene, at: SeenObject, facing: SeenObject, others: Sequence[SeenObject], text: str, answer: str
 ) -> Question:
-    boxes = [(thing.aabb_min, thing.aabb_max) for thing in scene.objects]
+    boxes = [(scene_object.aabb_min, scene_object.aabb_max) for scene_object in scene.objects]
     middle = (np.min([low for low, _ in boxes], axis=0) + np.max([high for _, high in boxes], axis=0)) / 2
     position = at.center - middle
     ahead = facing.center - at.center
@@ -115,8 +125,8 @@ def _question(
         scene=scene.name,
         text=text,
         answers=(answer,),
-        object_ids=tuple(thing.id for thing in objects),
-        object_names=tuple(str(thing.name) for thing in objects),
+        object_ids=tuple(scene_object.id for scene_object in objects),
+        object_names=tuple(str(scene_object.name) for scene_object in objects),
         situation=f"I am standing at the {at.name} and facing the {facing.name}.",
         position=(float(position[0]), float(position[1]), 0.0),
         rotation=(float(np.cos(turn / 2)), 0.0, 0.0, float(np.sin(turn / 2))),

@@ -157,9 +157,9 @@ def _neighbors(
         yield part, rows.reshape(-1, k).astype(np.int64)
 
 
-def _check(points: np.ndarray, what: str) -> None:
+def _check(points: np.ndarray, subject: str) -> None:
     good = np.isfinite(points).all(axis=1)
     if not good.all():
         raise InputError(
-            f"{what}: row {int(np.flatnonzero(~good)[0])} is not finite ({int((~good).sum()):,} of {len(points):,})"
+            f"{subject}: row {int(np.flatnonzero(~good)[0])} is not finite ({int((~good).sum()):,} of {len(points):,})"
         )

@@ -47,40 +47,42 @@ def interlocked(a: SeenObject, b: SeenObject) -> bool:
     return bool(smaller > 0 and shared > SAME_PLACE * smaller)
 
 
-def is_structure(thing: SeenObject, others: Sequence[SeenObject]) -> bool:
+def is_structure(scene_object: SeenObject, others: Sequence[SeenObject]) -> bool:
     """Whether a thing without a name is part of the building: its box holds the middle of half of all the others."""
-    if thing.name is not None or not others:
+    if scene_object.name is not None or not others:
         return False
     xy = np.array([other.center[:2] for other in others])
-    inside = ((xy >= thing.aabb_min[:2]) & (xy <= thing.aabb_max[:2])).all(axis=1)
+    inside = ((xy >= scene_object.aabb_min[:2]) & (xy <= scene_object.aabb_max[:2])).all(axis=1)
     return bool(inside.mean() >= 0.5)
 
 
-def movables(things: Sequence[SeenObject]) -> tuple[SeenObject, ...]:
+def movables(scene_objects: Sequence[SeenObject]) -> tuple[SeenObject, ...]:
     """All things that are no part of the building."""
     return tuple(
-        thing for thing in things if not is_structure(thing, [other for other in things if other is not thing])
+        scene_object
+        for scene_object in scene_objects
+        if not is_structure(scene_object, [other for other in scene_objects if other is not scene_object])
     )
 
 
-def beside(thing: SeenObject, things: Sequence[SeenObject]) -> list[tuple[float, SeenObject]]:
+def beside(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> list[tuple[float, SeenObject]]:
     """The things that may be beside another, nearest first, with their distances.
 
     Left out are what it stands on or carries, what it is in or around, and what is wholly above or below it, as a
     carpet is.
 
     Args:
-        thing: one of `things`.
-        things: of `movables`.
+        scene_object: one of `scene_objects`.
+        scene_objects: of `movables`.
     """
     others = [
-        (gap(thing, other), other)
-        for other in things
-        if other is not thing
-        and not stands_on(thing, other)
-        and not stands_on(other, thing)
-        and not interlocked(thing, other)
-        and min(thing.aabb_max[2], other.aabb_max[2]) > max(thing.aabb_min[2], other.aabb_min[2])
+        (gap(scene_object, other), other)
+        for other in scene_objects
+        if other is not scene_object
+        and not stands_on(scene_object, other)
+        and not stands_on(other, scene_object)
+        and not interlocked(scene_object, other)
+        and min(scene_object.aabb_max[2], other.aabb_max[2]) > max(scene_object.aabb_min[2], other.aabb_min[2])
     ]
     return sorted(others, key=lambda pair: (pair[0], pair[1].id))
 
@@ -90,28 +92,28 @@ def clearly_nearer(first: float, second: float) -> bool:
     return second >= max(1.5 * first, first + MARGIN)
 
 
-def neighbor(thing: SeenObject, things: Sequence[SeenObject]) -> SeenObject | None:
+def neighbor(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> SeenObject | None:
     """What a thing is next to, where people would agree on its kind: the nearest of `beside`, at most 0.5 m away, and
     nearer than any thing of another name by 0.1 m and by half. None where it has no name or nothing is clear."""
-    ranked = beside(thing, things)
-    if not ranked or ranked[0][1].name is None or ranked[0][1].name == thing.name or ranked[0][0] > NEAR:
+    ranked = beside(scene_object, scene_objects)
+    if not ranked or ranked[0][1].name is None or ranked[0][1].name == scene_object.name or ranked[0][0] > NEAR:
         return None
     first, nearest = ranked[0]
     second = min((distance for distance, other in ranked if other.name != nearest.name), default=np.inf)
     return nearest if clearly_nearer(first, second) else None
 
 
-def supporter(thing: SeenObject, things: Sequence[SeenObject]) -> SeenObject | None:
+def supporter(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> SeenObject | None:
     """What a thing stands on, where only one thing qualifies, it has a name, and the thing is in no other's box."""
-    lower = [other for other in things if other is not thing and stands_on(thing, other)]
-    inside = [other for other in things if other is not thing and interlocked(thing, other)]
+    lower = [other for other in scene_objects if other is not scene_object and stands_on(scene_object, other)]
+    inside = [other for other in scene_objects if other is not scene_object and interlocked(scene_object, other)]
     return lower[0] if len(lower) == 1 and lower[0].name is not None and not inside else None
 
 
-def largest(things: Sequence[SeenObject]) -> SeenObject | None:
+def largest(scene_objects: Sequence[SeenObject]) -> SeenObject | None:
     """The largest of several things; None where another is nearly as long across its box."""
-    sizes = np.array([np.linalg.norm(thing.aabb_max - thing.aabb_min) for thing in things])
-    if len(things) < 2:
+    sizes = np.array([np.linalg.norm(scene_object.aabb_max - scene_object.aabb_min) for scene_object in scene_objects])
+    if len(scene_objects) < 2:
         return None
     order = np.argsort(-sizes, kind="stable")
-    return things[order[0]] if sizes[order[0]] >= LARGEST * sizes[order[1]] else None
+    return scene_objects[order[0]] if sizes[order[0]] >= LARGEST * sizes[order[1]] else None

@@ -55,25 +55,27 @@ class SeenScene:
     min_pixels: int
     metres_per_unit: float = 1.0
 
-    def shown(self, thing: SeenObject) -> bool:
+    def shown(self, scene_object: SeenObject) -> bool:
         """Whether some photograph shows a thing well enough to be asked about."""
-        return thing.pixels >= self.min_pixels
+        return scene_object.pixels >= self.min_pixels
 
     def named(self, name: str) -> tuple[SeenObject, ...]:
         """The objects of a name that any photograph shows. What none shows is outside of the recorded place."""
-        return tuple(thing for thing in self.objects if thing.name == name and thing.pixels)
+        return tuple(scene_object for scene_object in self.objects if scene_object.name == name and scene_object.pixels)
 
     def names(self) -> tuple[str, ...]:
         """Names all of whose objects that any photograph shows are shown well enough, sorted.
 
         Of other names, people would count differently, and not know which one is meant.
         """
-        names = sorted({thing.name for thing in self.objects if thing.name and thing.pixels})
+        names = sorted(
+            {scene_object.name for scene_object in self.objects if scene_object.name and scene_object.pixels}
+        )
         return tuple(name for name in names if all(map(self.shown, self.named(name))))
 
     def unique(self, name: str) -> SeenObject | None:
         """The only object of a name, where it is shown well enough; None where there are several or none."""
-        same = [thing for thing in self.objects if thing.name == name]
+        same = [scene_object for scene_object in self.objects if scene_object.name == name]
         return same[0] if len(same) == 1 and self.shown(same[0]) else None
 
 
@@ -89,8 +91,8 @@ def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
     """
     views = scene.views
     missing = [
-        what
-        for what, there in (
+        part
+        for part, there in (
             ("labeled objects (objects.json)", bool(scene.objects)),
             ("instance maps (instance_file_path)", views is not None and views.instances is not None),
             ("photographs", views is not None and views.images is not None),
@@ -99,7 +101,7 @@ def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
     ]
     if missing:
         raise InputError(f"questions: scene {scene.name} has no {' and no '.join(missing)}; questions need labels")
-    if not any(thing.name for thing in scene.objects):
+    if not any(scene_object.name for scene_object in scene.objects):
         raise InputError(f"questions: no object of scene {scene.name} has a name")
     if scene.metres_per_unit is None:
         raise InputError(f"questions: the unit of scene {scene.name} is unknown; give data.metres_per_unit=")
@@ -107,26 +109,26 @@ def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
         raise InputError(f"questions: up is {scene.up.round(3).tolist()} in scene {scene.name}; expected z")
     assert views is not None
     assert views.instances is not None
-    ids = np.array([thing.id for thing in scene.objects])
+    ids = np.array([scene_object.id for scene_object in scene.objects])
     largest = int(ids.max()) + 1
     counts = np.stack(
         [np.bincount(np.minimum(labels.ravel(), largest), minlength=largest + 1)[ids] for labels in views.instances]
     )
     unit = scene.metres_per_unit
-    things = [
+    scene_objects = [
         SeenObject(
-            id=thing.id,
-            name=thing.name,
-            aabb_min=thing.aabb_min * unit,
-            aabb_max=thing.aabb_max * unit,
+            id=scene_object.id,
+            name=scene_object.name,
+            aabb_min=scene_object.aabb_min * unit,
+            aabb_max=scene_object.aabb_max * unit,
             pixels=int(counts[:, row].max()),
-            color=_color(scene, thing.id, counts[:, row], min_pixels) if thing.name else None,
+            color=_color(scene, scene_object.id, counts[:, row], min_pixels) if scene_object.name else None,
         )
-        for row, thing in enumerate(scene.objects)
+        for row, scene_object in enumerate(scene.objects)
     ]
     return SeenScene(
         name=scene.name,
-        objects=tuple(sorted(things, key=lambda thing: thing.id)),
+        objects=tuple(sorted(scene_objects, key=lambda scene_object: scene_object.id)),
         min_pixels=min_pixels,
         metres_per_unit=unit,
     )

@@ -135,14 +135,14 @@ def check_counts(segments: Int64[np.ndarray, " V"], vertices: np.ndarray, path: 
         )
 
 
-def _read(path: Path, key: str, what: str) -> list[Any]:
+def _read(path: Path, key: str, subject: str) -> list[Any]:
     """The list at a key of the object that a JSON file holds."""
     check_file(path, max_bytes=MAX_BYTES)
     data = read_json(path)
     values = data.get(key) if isinstance(data, dict) else None
     if not isinstance(values, list):
         keys = f"an object with {', '.join(map(str, list(data)[:6]))[:80]}" if isinstance(data, dict) else "no object"
-        raise InputError(f"{path}: expected an object with the list {key!r}, {what}; got {keys}")
+        raise InputError(f"{path}: expected an object with the list {key!r}, {subject}; got {keys}")
     return values
 
 

@@ -145,12 +145,12 @@ class _Finder:
             raise InputError(f"{where}: says not which question it answers; expected {EXPECTED}")
         text = text_value(entry["question"], where, "question")
         situation = text_value(entry["situation"], where, "situation")
-        places = _numbers(entry, "agent_pos", ("x", "y", "z"), where)
+        position = _numbers(entry, "agent_pos", ("x", "y", "z"), where)
         turns = _numbers(entry, "agent_rot", ("_w", "_x", "_y", "_z"), where)
         fitting = [
             each
             for each in self.by_words.get((scene, situation, text), [])
-            if None in (places, each.position) or (places == each.position and turns in (None, each.rotation))
+            if None in (position, each.position) or (position == each.position and turns in (None, each.rotation))
         ]
         if len(fitting) != 1:
             fault = f"{len(fitting)} questions; give its question_id" if fitting else "no question of the truth"

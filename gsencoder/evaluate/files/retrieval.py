@@ -41,8 +41,8 @@ def read_scored_pairs(path: Path, *, pooling: Pooling = "max") -> ScoredPairs:
         InputError: not such a file, scores and features in one, or sizes that do not belong together.
     """
     if not path.is_file() or path.suffix.lower() in (".json", *PICKLE_SUFFIXES):
-        what = "no such file" if not path.exists() else "is none"
-        raise InputError(f"{path}: {what}; expected {EXPECTED}")
+        fault = "no such file" if not path.exists() else "is none"
+        raise InputError(f"{path}: {fault}; expected {EXPECTED}")
     arrays = read_npz(
         path,
         {"queries": ("U", 1)},

@@ -209,11 +209,11 @@ def masks_of(
     rows, columns = (slice(int(first), None, protocol.stride) for first in (lattice.y0, lattice.x0))
     masks, small = {}, 0
     for name, values in ids.items():
-        whole = np.isin(instances, values)
-        mask = whole[rows, columns]
-        if whole.sum() >= protocol.min_pixels and mask.any():
+        full_mask = np.isin(instances, values)
+        mask = full_mask[rows, columns]
+        if full_mask.sum() >= protocol.min_pixels and mask.any():
             masks[name] = mask
-        elif whole.any():
+        elif full_mask.any():
             small += 1
     return masks, small
 

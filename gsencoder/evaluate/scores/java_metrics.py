@@ -136,15 +136,15 @@ def _field(sentence: str) -> str:
 class _Conversation:
     """A program that answers lines with lines; it is ended with the block, or after `SECONDS`."""
 
-    def __init__(self, command: Sequence[str], what: str) -> None:
-        self.what = what
+    def __init__(self, command: Sequence[str], subject: str) -> None:
+        self.subject = subject
         self.errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the block
         pipe = subprocess.PIPE
         try:
             self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self.errors, env=_environment())
         except OSError as error:
             self.errors.close()
-            raise InputError(f"{what}: Java cannot be started: {error.strerror or error}") from error
+            raise InputError(f"{subject}: Java cannot be started: {error.strerror or error}") from error
         self.timer = threading.Timer(SECONDS, self.process.kill)
         self.timer.daemon = True
         self.timer.start()
@@ -175,21 +175,25 @@ class _Conversation:
 
     def _failure(self) -> InputError:
         self.errors.seek(0)
-        return InputError(f"{self.what}: Java ended early, or took more than {SECONDS:,} s: {_end(self.errors.read())}")
+        return InputError(
+            f"{self.subject}: Java ended early, or took more than {SECONDS:,} s: {_end(self.errors.read())}"
+        )
 
 
-def _run(command: Sequence[str], what: str) -> str:
+def _run(command: Sequence[str], subject: str) -> str:
     """What a program writes."""
     try:
         process = subprocess.run(
             command, stdin=subprocess.DEVNULL, capture_output=True, timeout=SECONDS, env=_environment(), check=False
         )
     except subprocess.TimeoutExpired:
-        raise InputError(f"{what}: Java did not end within {SECONDS:,} seconds; score fewer samples at once") from None
+        raise InputError(
+            f"{subject}: Java did not end within {SECONDS:,} seconds; score fewer samples at once"
+        ) from None
     except OSError as error:
-        raise InputError(f"{what}: Java cannot be started: {error.strerror or error}") from error
+        raise InputError(f"{subject}: Java cannot be started: {error.strerror or error}") from error
     if process.returncode:
-        raise InputError(f"{what}: Java ended with code {process.returncode}: {_end(process.stderr)}")
+        raise InputError(f"{subject}: Java ended with code {process.returncode}: {_end(process.stderr)}")
     return process.stdout.decode("utf-8", "replace")
 
 

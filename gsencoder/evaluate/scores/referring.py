@@ -216,10 +216,10 @@ def _refuse_repeated(keys: Sequence[tuple[str, str, str]], problem: str) -> None
         raise InputError(f"{described(repeated[0])} {problem}")
 
 
-def _agreed(true: bool | None, predicted: bool | None, what: str, key: tuple[str, str, str]) -> bool | None:
+def _agreed(true: bool | None, predicted: bool | None, subject: str, key: tuple[str, str, str]) -> bool | None:
     if true is not None and predicted is not None and true != predicted:
         raise InputError(
-            f"{described(key)}: {what} is {int(predicted)} in the prediction, and {int(true)} in the truth"
+            f"{described(key)}: {subject} is {int(predicted)} in the prediction, and {int(true)} in the truth"
         )
     return predicted if true is None else true
 

@@ -49,15 +49,18 @@ class ViewsScene:
         assert scene.gaussians is not None
         protocol = taught.inputs.protocol
         objects = queryable_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
-        names = list(dict.fromkeys(one.name for one in objects if one.name))
+        names = list(dict.fromkeys(scene_object.name for scene_object in objects if scene_object.name))
         if not names:
             raise InputError(f"tradeoff: scene {scene.name} has no object to choose views of")
         boxes = localize(scene, names, words, taught.inputs.localize)
         pairs: list[tuple[Target, Target]] = []
         means = scene.gaussians.means + scene.origin
         for target in targets_of(scene.gaussians, boxes):
-            same = [one for one in objects if one.name == target.name]
-            away = [np.linalg.norm((one.aabb_min + one.aabb_max) / 2 - scene.origin - target.center) for one in same]
+            same = [scene_object for scene_object in objects if scene_object.name == target.name]
+            away = [
+                np.linalg.norm((scene_object.aabb_min + scene_object.aabb_max) / 2 - scene.origin - target.center)
+                for scene_object in same
+            ]
             nearest = same[int(np.argmin(away))]
             rows = np.flatnonzero(((means >= nearest.aabb_min) & (means <= nearest.aabb_max)).all(axis=1))
             if len(rows):

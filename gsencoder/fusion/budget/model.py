@@ -50,9 +50,9 @@ def setting_weights(sight: Sight, stop: float, exact_stop: float) -> Float32[np.
         return np.where(sight.remains > exact_stop, sight.weights, np.float32(0))
     weights, m = sight.weights.copy(), len(sight.groups)
     for view, rays in enumerate(sight.rays):
-        whole = np.bincount(rays.owners, rays.weights, m)
+        totals = np.bincount(rays.owners, rays.weights, m)
         reached = np.bincount(rays.owners, np.where(rays.remains > stop, rays.weights, 0), m)
-        weights[view, sight.singles :] *= reached / np.maximum(whole, TINY)
+        weights[view, sight.singles :] *= reached / np.maximum(totals, TINY)
     return weights
 
 
@@ -212,7 +212,7 @@ def _scatter(
     """Sums of 1 − cosine and of c, where c is at most `largest`, of the means over some views with those over all."""
     weights, vectors = features.weights, features.vectors
     total, squares = weights.sum(axis=0), np.square(weights).sum(axis=0)
-    whole, _ = features.fused()
+    fused, _ = features.fused()
     turned, geometry = 0.0, 0.0
     for subset in subsets:
         part = weights[subset].sum(axis=0)
@@ -224,7 +224,7 @@ def _scatter(
         q = np.square(w).sum(axis=0)
         c = q * (1 / s**2 - 2 / (s * all_)) + squares[rows] / all_**2
         small = c <= largest
-        turned += float((1 - row_cosines(some - mean, whole[rows] - mean))[small].sum())
+        turned += float((1 - row_cosines(some - mean, fused[rows] - mean))[small].sum())
         geometry += float(c[small].sum())
     return turned, geometry
 
@@ -238,10 +238,10 @@ def measure_drift(features: SampleFeatures, means: Float64[np.ndarray, "M D"]) -
         means: of the map of each view.
     """
     count = len(means)
-    whole, seen = features.fused()
+    all_fused, seen = features.fused()
     if count < 2 or not seen.any():
         return UNKNOWN_SCATTER
-    fused, mean = whole[seen], means.mean(axis=0)
+    fused, mean = all_fused[seen], means.mean(axis=0)
     ratios = []
     for subsets in _parts(count):
         turned = [

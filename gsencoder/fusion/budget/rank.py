@@ -110,5 +110,5 @@ def file_bytes(rows: int, rank: int, channels: int, *, basis: bool) -> int:
 
 def rank_of_bytes(size: float, rows: int, channels: int) -> int:
     """The largest rank whose file has at most so many bytes; 0 where there is none."""
-    fixed, one = file_bytes(rows, 0, channels, basis=True), file_bytes(rows, 1, channels, basis=True)
-    return max(int((size - fixed) // (one - fixed)), 0)
+    fixed, with_one = file_bytes(rows, 0, channels, basis=True), file_bytes(rows, 1, channels, basis=True)
+    return max(int((size - fixed) // (with_one - fixed)), 0)

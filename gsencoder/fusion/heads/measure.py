@@ -145,10 +145,10 @@ def head_outputs(head: Head, vectors: Float32[np.ndarray, "n D"]) -> Float32[np.
 
 
 def _cosines(
-    one: Float32[np.ndarray, "n E"], other: Float32[np.ndarray, "n E"], mean: Float32[np.ndarray, " E"]
+    first: Float32[np.ndarray, "n E"], second: Float32[np.ndarray, "n E"], mean: Float32[np.ndarray, " E"]
 ) -> Float64[np.ndarray, " n"]:
     """Cosines of rows about a mean; 0 where a row is the mean itself."""
-    a, b = one - mean, other - mean
+    a, b = first - mean, second - mean
     lengths = np.sqrt(np.square(a, dtype=np.float64).sum(axis=1) * np.square(b, dtype=np.float64).sum(axis=1))
     products = (a * b).sum(axis=1, dtype=np.float64)
     return np.asarray(np.divide(products, lengths, where=lengths > 0, out=np.zeros(len(a))))

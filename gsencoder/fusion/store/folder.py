@@ -28,6 +28,7 @@ from gsencoder.core.files.archive import (
 from gsencoder.core.row_numbers import rise_within
 from gsencoder.core.runtime.threads import parallel
 from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
+from gsencoder.data.scene_paths import kind_of_path
 from gsencoder.data.splats import FINGERPRINT_DIGITS, fingerprint
 from gsencoder.fusion.store.memory_file import MEMORY_FILE, read_memory, write_memory
 from gsencoder.fusion.store.package import PACKAGE_FILE, load_package
@@ -202,6 +203,11 @@ def features_bytes(
     return archive_bytes(arrays, header)
 
 
+def holds_features(folder: Path) -> bool:
+    """Whether a folder holds the features of a scene itself."""
+    return (folder / SCENE_FILE).is_file() or (folder / PACKAGE_FILE).is_file()
+
+
 def load_features(folder: str | Path) -> Scene:
     """The scene and its features from a folder that `save_features`, `save_memories` or `save_package` wrote: by the
     name of their space, or, where there are those of several teachers, by teacher.
@@ -210,9 +216,10 @@ def load_features(folder: str | Path) -> Scene:
         InputError: not such a folder, damaged, of another version, or features of another splat.
     """
     folder = Path(folder)
-    if not folder.is_dir():
+    if not holds_features(folder):
         raise InputError(
-            f"{folder}: expected a folder of features made by `gsencoder fuse`, `encode`, `memory` or `pack`"
+            f"{folder}: {kind_of_path(folder)}, without {SCENE_FILE}; expected a folder of features, which "
+            "`gsencoder fuse`, `encode`, `memory` and `pack` write"
         )
     if (folder / PACKAGE_FILE).is_file():
         if (folder / SCENE_FILE).is_file():
@@ -237,6 +244,11 @@ def load_memories(folder: str | Path) -> dict[str | None, QueryMemory]:
         InputError: not such a folder, damaged, of another version, or memories of another splat.
     """
     folder = Path(folder)
+    if not folder.is_dir() or not _files_of_teachers(folder, MEMORY_FILE):
+        raise InputError(
+            f"{folder}: {kind_of_path(folder)}, without {MEMORY_FILE}; expected a folder with a memory, which "
+            "`gsencoder memory` writes"
+        )
     return _read_memories(folder, _load_scene(folder)[1])
 
 

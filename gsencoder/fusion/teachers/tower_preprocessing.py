@@ -70,7 +70,7 @@ class Preprocessing:
         return f"{self.resample.name.lower()}, × {self.factor:.6g}, {', '.join(numbers)}"
 
 
-def read_preprocessing(folder: Path, what: str, *, floats: bool = False) -> Preprocessing:
+def read_preprocessing(folder: Path, subject: str, *, floats: bool = False) -> Preprocessing:
     """The preprocessing that a folder states.
 
     Its sizes and crops are not used: a map is of the whole picture. Mean, standard deviation and filter must be stated,
@@ -78,14 +78,14 @@ def read_preprocessing(folder: Path, what: str, *, floats: bool = False) -> Prep
 
     Args:
         folder: of the model.
-        what: who reads it, for messages.
+        subject: who reads it, for messages.
         floats: see `Preprocessing`.
 
     Raises:
         InputError: no file, or one that does not state it.
     """
-    path, stated = _stated(folder, what)
-    where = f"{what}: {path}"
+    path, stated = _stated(folder, subject)
+    where = f"{subject}: {path}"
     missing = [name for name in ("resample", "image_mean", "image_std") if name not in stated]
     if missing:
         raise InputError(f"{where} does not state {', '.join(missing)}; take the file that belongs to the model")
@@ -107,19 +107,19 @@ def read_preprocessing(folder: Path, what: str, *, floats: bool = False) -> Prep
     )
 
 
-def _stated(folder: Path, what: str) -> tuple[Path, dict[str, Any]]:
+def _stated(folder: Path, subject: str) -> tuple[Path, dict[str, Any]]:
     for path in (folder / name for name in FILES):
         try:
             stated = json.loads(path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             continue
         except (OSError, ValueError) as error:
-            raise InputError(f"{what}: {path}: cannot be read: {error}") from error
+            raise InputError(f"{subject}: {path}: cannot be read: {error}") from error
         section = stated.get("image_processor") if isinstance(stated, dict) and path.name == FILES[0] else stated
         if isinstance(section, dict):
             return path, section
     raise InputError(
-        f"{what}: {folder} has no preprocessor_config.json, which says how its pictures are resized and normalized; "
+        f"{subject}: {folder} has no preprocessor_config.json, which says how its pictures are resized and normalized; "
         "take the file that belongs to the model"
     )
 

@@ -145,9 +145,9 @@ def _are_boxes(rows: Any) -> bool:
     return isinstance(rows, list) and all(isinstance(row, dict) and "box" in row for row in rows)
 
 
-def _check_task(path: Path, what: str, task: Task, allowed: Sequence[str]) -> None:
+def _check_task(path: Path, subject: str, task: Task, allowed: Sequence[str]) -> None:
     if task not in allowed:
-        raise InputError(f"task={task}: {path} holds {what}; expected task={' or '.join(allowed)}")
+        raise InputError(f"task={task}: {path} holds {subject}; expected task={' or '.join(allowed)}")
 
 
 def _answered(question: TruthQuestion) -> SetQuestion:

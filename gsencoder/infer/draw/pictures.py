@@ -128,7 +128,7 @@ def draw_boxes(
     order = {word: index for index, word in enumerate(dict.fromkeys(box.query for box in boxes))}
     labels: list[tuple[np.ndarray, str, tuple[int, int, int]]] = []
     # The best box of a word is drawn last, over the others.
-    for box in sorted(boxes, key=lambda one: -one.rank):
+    for box in sorted(boxes, key=lambda each: -each.rank):
         corners = box_corners(box, oriented=oriented)
         if origin is not None:
             corners = corners - origin

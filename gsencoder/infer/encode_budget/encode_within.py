@@ -224,8 +224,8 @@ def _within_megabytes(
     def bytes_of(name: str, rank: int) -> int:
         features = encoded[name]
         # All channels have no basis, which takes bytes of its own.
-        whole = features.basis is None and rank == features.features.shape[1]
-        return features_bytes(features.space, len(features), rank, header, basis=not whole)
+        all_channels = features.basis is None and rank == features.features.shape[1]
+        return features_bytes(features.space, len(features), rank, header, basis=not all_channels)
 
     full = {name: features.features.shape[1] for name, features in encoded.items()}
     sizes = {name: bytes_of(name, rank) for name, rank in full.items()}

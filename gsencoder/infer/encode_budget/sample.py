@@ -107,19 +107,19 @@ def measure_parts(
         return []
     count = max(min(len(gaussians) // SHARE, MOST_ROWS), LEAST_ROWS)
     # What a cut changes is the same in each precision, and the last one is the cheapest.
-    whole, parts = replace(config, chunk=0, precision=precisions[-1]), []
+    uncut, parts = replace(config, chunk=0, precision=precisions[-1]), []
     for center in _centers(gaussians, seed):
         part = gaussians.select(_box_around(gaussians, center, count))
         seconds: dict[Precision, float] = {}
         for precision in precisions if clock is not None else ():
             assert clock is not None
             begun = clock()
-            encoder.encode_spaces(part, replace(whole, precision=precision), metres_per_unit=metres_per_unit)
+            encoder.encode_spaces(part, replace(uncut, precision=precision), metres_per_unit=metres_per_unit)
             seconds[precision] = clock() - begun
         distances, cutting = np.zeros(0), np.zeros(0)
         if is_cut:
-            exact = encoder.encode_spaces(part, whole, metres_per_unit=metres_per_unit)
-            halves = replace(whole, chunk=max(len(part) * 2 // 3, 1), halo=0.0)
+            exact = encoder.encode_spaces(part, uncut, metres_per_unit=metres_per_unit)
+            halves = replace(uncut, chunk=max(len(part) * 2 // 3, 1), halo=0.0)
             halved = encoder.encode_spaces(part, halves, metres_per_unit=metres_per_unit)
             seen = seen_around(part.means, cut(part.means, halves.chunk, 0.0)) * metres_per_unit
             distances, cutting = _never_rising(seen, _errors(halved, exact))
@@ -153,7 +153,10 @@ def _box_around(gaussians: Gaussians, center: int, count: int) -> Int64[np.ndarr
 def _errors(features: dict[str, GaussianFeatures], exact: dict[str, GaussianFeatures]) -> Float64[np.ndarray, " n"]:
     """1 − centered cosine of each Gaussian, of the teacher that is off the most."""
     each = [
-        1 - row_cosines(*((one.decode().astype(np.float64) - one.mean) for one in (features[name], exact[name])))
+        1
+        - row_cosines(
+            *((encoded.decode().astype(np.float64) - encoded.mean) for encoded in (features[name], exact[name]))
+        )
         for name in exact
     ]
     return np.asarray(max(each, key=lambda values: float(values.mean())))

@@ -137,11 +137,13 @@ def localize(
     """
     gaussians, _ = select_features(scene, space)
     candidates = find_candidates(scene, queries, text, config, space=space, rivals=rivals)
-    probabilities = [[probability(each) for each in one.evidence] for one in candidates.words]
+    probabilities = [[probability(each) for each in candidate.evidence] for candidate in candidates.words]
     boxes = []
-    for word, one, values in zip(queries, candidates.words, probabilities, strict=True):
+    for word, candidate, values in zip(queries, candidates.words, probabilities, strict=True):
         probable = [
-            (each, value) for each, value in zip(one.clusters, values, strict=True) if value >= config.min_probability
+            (each, value)
+            for each, value in zip(candidate.clusters, values, strict=True)
+            if value >= config.min_probability
         ]
         boxes += boxes_of_word(
             word,
@@ -155,7 +157,7 @@ def localize(
     localization = Localization(
         queries=tuple(queries),
         relevancy=candidates.relevancy,
-        thresholds=np.array([one.threshold for one in candidates.words], np.float32),
+        thresholds=np.array([candidate.threshold for candidate in candidates.words], np.float32),
         probabilities=np.array([max(values, default=0.0) for values in probabilities], np.float32),
         boxes=tuple(boxes),
     )

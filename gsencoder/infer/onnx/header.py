@@ -135,6 +135,11 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
         version = values["version"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"the entry {KEY!r} is damaged ({type(error).__name__})") from error
+    if values.get("kind") == "memory":
+        raise InputError(
+            "is the attention of a memory, which `gsencoder export memory=` wrote; expected an encoder, which "
+            "`gsencoder export weights=` writes"
+        )
     if version not in (VERSION, VERSION_OF_SEVERAL):
         raise InputError(
             f"is of format version {str(version)[:20]}, and this gsencoder reads {VERSION} and {VERSION_OF_SEVERAL}; "

@@ -193,8 +193,8 @@ def test_a_set_and_folders_that_do_not_fit_end_in_one_line(
     other.write_text(json.dumps([{"scene_id": "hall", "question_id": "1", "question": "What?"}]))
     shutil.copytree(home / "features" / ROOMS[0], tmp_path / "again" / ROOMS[0])
     for words, problem in (
-        ((str(tmp_path / "none"), file), "no such folder of features"),
-        ((str(tmp_path / "empty"), file), "holds no features"),
+        ((str(tmp_path / "none"), file), "none: no file or folder; expected a folder of features"),
+        ((str(tmp_path / "empty"), file), "empty: an empty folder; expected a folder of features"),
         ((features, f"questions={lines}", "proposals=localize"), "questions about one scene"),
         ((features, features, f"questions={lines}"), "questions about one scene"),
         ((f"{features}/{ROOMS[0]}", f"questions={other}"), "asks about 1 scene (hall)"),

@@ -102,7 +102,9 @@ def test_three_folders_are_too_many(folder: Path, built: Path, capsys: pytest.Ca
 
 
 def test_a_folder_of_something_else_is_refused(built: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "expected a folder written by fuse" in refusal(capsys, "view", str(tmp_path))
+    assert "a folder of other files, without scene.safetensors; expected a folder of features, which" in refusal(
+        capsys, "view", str(tmp_path)
+    )
 
 
 def test_a_page_that_was_not_built_is_refused_in_one_line(

@@ -82,7 +82,9 @@ def read_captions(path: Path, view_names: Sequence[str]) -> Captions:
     if double:
         raise InputError(f"{path}: {double[0]!r} stands for {ends.count(double[0])} views; write their whole names")
     unique = {stem.name: str(stem) for stem in stems if ends.count(stem.name) == 1}
-    both = sorted(end for end, whole in unique.items() if end != whole and end in by_view and whole in by_view)
+    both = sorted(
+        end for end, full_name in unique.items() if end != full_name and end in by_view and full_name in by_view
+    )
     if both:
         raise InputError(f"{path}: {both[0]!r} and {unique[both[0]]!r} are one view, which is listed twice")
     by_view = {unique.get(view, view): captions for view, captions in by_view.items()}

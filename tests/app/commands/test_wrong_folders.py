@@ -1,0 +1,109 @@
+"""A folder of another kind than an option takes: the error says what was given, what was expected, and which command
+makes that."""
+
+import json
+from pathlib import Path
+
+import pytest
+from command_runs import refusal
+from textured_box import box_cameras, box_views, write_box
+
+from gsencoder.app.commands.fuse import load_weights_spaces
+from gsencoder.app.commands.question_scenes import scene_folders
+from gsencoder.app.runs.work_folder import WorkFolder
+from gsencoder.core.errors import InputError
+from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.splats import read_raw
+from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, load_memories
+from gsencoder.fusion.store.memory_file import MEMORY_FILE
+from gsencoder.fusion.store.package import PACKAGE_FILE
+from gsencoder.infer.load_encoder import load_encoder
+from gsencoder.models.weights import WEIGHTS_FILE
+
+WRITTEN = {
+    "fuse": (SCENE_FILE, FEATURES_FILE),
+    "memory": (SCENE_FILE, MEMORY_FILE),
+    "pack": (PACKAGE_FILE,),
+    "train": (WEIGHTS_FILE,),
+    "reconstruct": ("splat.ply",),
+}
+KINDS = {name: f"a folder that `gsencoder {name}` wrote" for name in WRITTEN} | {
+    "unfinished": "the state of an unfinished run",
+    "scene": "a scene",
+    "several": "a folder of folders of features (room, …)",
+    "empty": "an empty folder",
+    "missing": "",
+    "notes.csv": "a .csv file",
+}
+FEATURES = "expected a folder of features, which `gsencoder fuse`, `encode`, `memory` and `pack` write"
+READERS = {
+    "localize, views, ask, pack, view, select, evaluate features=": (
+        load_features,
+        ("fuse", "memory", "pack"),
+        FEATURES,
+    ),
+    "ask of a set, tune features=": (
+        lambda path: scene_folders([path], ["room"]),
+        ("fuse", "memory", "pack", "several"),
+        FEATURES,
+    ),
+    "export memory=": (
+        load_memories,
+        ("memory",),
+        "expected a folder with a memory, which `gsencoder memory` writes",
+    ),
+    "weights=": (load_encoder, ("train",), "`gsencoder train` w"),
+    "fuse basis=": (load_weights_spaces, ("train",), "`gsencoder train` w"),
+    "fuse, encode, train, reconstruct, evaluate": (
+        lambda path: find_scenes([path]),
+        ("scene", "reconstruct", "pack", "fuse", "memory", "missing", "notes.csv"),
+        "neither a scene nor a folder of scenes; a scene holds one of",
+    ),
+}
+
+
+@pytest.fixture
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of each kind, as far as names of files tell."""
+    monkeypatch.chdir(tmp_path)
+    for command, files in WRITTEN.items():
+        (tmp_path / command).mkdir()
+        (tmp_path / command / "summary.json").write_text(json.dumps({"command": command}))
+        for file in files:
+            (tmp_path / command / file).write_text("x")
+    WorkFolder(tmp_path / "unfinished").take(anew=False)
+    write_box(tmp_path / "scene", box_views(box_cameras(2, width=32, height=24, focal=22.0)))
+    (tmp_path / "several" / "room").mkdir(parents=True)
+    (tmp_path / "several" / "room" / SCENE_FILE).write_text("x")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "notes.csv").write_text("x")
+    return tmp_path
+
+
+@pytest.mark.parametrize("options", READERS)
+@pytest.mark.usefixtures("folders")
+def test_each_kind_of_folder_that_an_option_does_not_take(options: str) -> None:
+    read, taken, expected = READERS[options]
+    for name, kind in KINDS.items():
+        if name not in taken:
+            with pytest.raises(InputError) as error:
+                read(name)
+            assert name in str(error.value)
+            assert kind in str(error.value)
+            assert expected in str(error.value) or (name == "missing" and "no file at missing" in str(error.value))
+
+
+@pytest.mark.usefixtures("folders")
+def test_features_in_place_of_a_memory_are_said_to_be_those(capsys: pytest.CaptureFixture[str]) -> None:
+    assert refusal(capsys, "export", "memory=fuse", "out=x.onnx") == (
+        "error: fuse: a folder that `gsencoder fuse` wrote, without memory.safetensors; expected a folder with a "
+        "memory, which `gsencoder memory` writes"
+    )
+
+
+@pytest.mark.usefixtures("folders")
+def test_a_folder_with_a_splat_names_it() -> None:
+    with pytest.raises(InputError, match="expected a splat file or a SOG folder; give its splat.ply$"):
+        read_raw("reconstruct")
+    with pytest.raises(InputError, match="SOG folder, such as the splat.ply of `gsencoder reconstruct`$"):
+        read_raw("empty")
