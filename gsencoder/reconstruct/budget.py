@@ -35,7 +35,7 @@ DEFAULT_MINUTES = 10.0
 PROMISED_STEPS = 400
 """For promised seconds photographs are made smaller only where there is no time for so many steps: of the same time,
 fewer steps cost less than smaller photographs (docs/measurements.md, Trade-off)."""
-LEAST_STEPS, LEAST_PIXELS = 200, 40_000
+LEAST_STEPS = 200
 SMALLEST_REDUCTION = 0.95
 """Photographs are not resized by less than this."""
 TRIAL_VIEWS = 4
@@ -132,12 +132,10 @@ def choose_scale(
     if not minutes:
         return 1.0
     none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
-    if budget.seconds is None:
-        steps, least = steps_for_minutes(minutes, config), LEAST_PIXELS
-    else:
-        # Where pixels are a third of a step, even half of them would hardly save time.
-        steps, least = PROMISED_STEPS, none / (one - none) / 2
+    steps = steps_for_minutes(minutes, config) if budget.seconds is None else PROMISED_STEPS
     seconds = (1 - SEED_SHARE) * 60 * minutes / steps
+    # Where pixels are a third of a step, even half of them would hardly save time.
+    least = none / (one - none) / 2
     affordable = max(least, (seconds - none) / (one - none))
     scale = math.sqrt(affordable / pixels)
     return 1.0 if scale > SMALLEST_REDUCTION else round(scale, 3)
