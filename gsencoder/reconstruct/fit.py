@@ -87,10 +87,9 @@ def fit(
                 if time.monotonic() - saved_at >= config.checkpoint_every:
                     save()
                     saved_at, saved_step = time.monotonic(), optimizer.step
-            longer = extended(plan, config.budget, rows)
-            if longer is None:
+            plan = extended(plan, config.budget, rows)
+            if plan.steps == optimizer.step:
                 break
-            plan = longer
             follow(optimizer, plan)
     finally:
         # Also after the last step: writing the results may be interrupted as well.

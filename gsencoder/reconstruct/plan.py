@@ -21,6 +21,9 @@ from gsencoder.reconstruct.row_adam import RowAdam
 STEPS = (50, 100, 150, 200, 300, 400, 600, 800, 1100, 1500, 2100, 3000)
 """Steps after which a promised error is looked at. The last are those of preset=exact; no promise takes more of them,
 or fewer than the first."""
+PATIENCE = 2
+"""A promised error is given up once it was looked at so many times without becoming smaller than before: more steps
+then fit the photographs that are fitted, and no others."""
 HEADER_BYTES = 2048
 """Of a .ply file, at most."""
 PLAN = "plan"
@@ -122,12 +125,24 @@ def follow(optimizer: Optimizer, plan: Plan) -> None:
         )
 
 
-def extended(plan: Plan, budget: BudgetConfig, rows: Sequence[LogRow]) -> Plan | None:
-    """The plan with more steps, where a promised error was not reached and more may be taken; otherwise None."""
+def extended(plan: Plan, budget: BudgetConfig, rows: Sequence[LogRow]) -> Plan:
+    """The plan with more steps, where a promised error was not reached and more may reach it; otherwise the same, with
+    a note where more would not.
+
+    Args:
+        plan: that was followed to its end.
+        budget: what is promised.
+        rows: of the log.
+    """
     if budget.error is None or error_of(rows[-1]) <= budget.error:
-        return None
-    steps = next((steps for steps in STEPS if steps > plan.steps), None)
-    return None if steps is None else replace(plan, steps=steps)
+        return plan
+    errors = {int(row["step"]): error_of(row) for row in rows if row["step"] in STEPS}
+    best = min(errors, key=lambda step: errors[step])
+    if len([step for step in errors if step > best]) >= PATIENCE:
+        note = f"{budget.shown('error')}: it has not fallen since step {best} ({errors[best]:.4f}), so no more are done"
+        # A run that was cut off here finds the note in its checkpoint.
+        return replace(plan, notes=tuple(dict.fromkeys((*plan.notes, note))))
+    return replace(plan, steps=next((steps for steps in STEPS if steps > plan.steps), plan.steps))
 
 
 def error_of(row: LogRow) -> float:

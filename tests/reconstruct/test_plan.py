@@ -151,6 +151,31 @@ def test_a_promised_error_takes_the_fewest_steps_that_reach_it(
     assert result.seeding["steps_planned"] == STEPS[first]
 
 
+@pytest.mark.parametrize(
+    ("errors", "steps"),
+    [
+        ([0.9, 0.8], 150),
+        ([0.9, 0.8, 0.85], 200),
+        ([0.9, 0.8, 0.85, 0.79], 300),
+        ([0.9, 0.8, 0.85, 0.8], 200),
+        ([0.9, 0.9, 0.9], 150),
+        ([0.9, 0.4], 100),
+    ],
+)
+def test_an_error_that_two_looks_did_not_make_smaller_is_given_up(errors: list[float], steps: int) -> None:
+    rows = [{"step": 0, "ssim": 0.0, "psnr": 9.0}]
+    rows += [{"step": step, "ssim": 1 - error} for step, error in zip(planning.STEPS, errors, strict=False)]
+    # Validations between two looks say nothing.
+    rows.insert(1, {"step": 30, "ssim": 0.55})
+    plan = Plan(steps=int(rows[-1]["step"]), sh_degree=2)
+    longer = planning.extended(plan, BudgetConfig(error=0.5), rows)
+    assert longer.steps == steps
+    given_up = errors[-2:] == [0.85, 0.8] or errors == [0.9, 0.9, 0.9]
+    assert bool(longer.notes) == given_up
+    if errors[-1] == 0.8 and given_up:
+        assert longer.notes == ("budget.error=0.5: it has not fallen since step 100 (0.8000), so no more are done",)
+
+
 @pytest.mark.parametrize("cut", [4, 5])
 def test_a_run_for_an_error_that_was_cut_ends_with_the_same_splat(
     scene: Scene, errors: list[float], cut: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
