@@ -173,7 +173,9 @@ def test_an_error_that_two_looks_did_not_make_smaller_is_given_up(errors: list[f
     given_up = errors[-2:] == [0.85, 0.8] or errors == [0.9, 0.9, 0.9]
     assert bool(longer.notes) == given_up
     if errors[-1] == 0.8 and given_up:
-        assert longer.notes == ("budget.error=0.5: it has not fallen since step 100 (0.8000), so no more are done",)
+        assert longer.notes == (
+            "budget.error=0.5: it has not fallen since step 100 (0.8000), so no more steps are done",
+        )
 
 
 @pytest.mark.parametrize("cut", [4, 5])
