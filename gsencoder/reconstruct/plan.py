@@ -139,7 +139,8 @@ def extended(plan: Plan, budget: BudgetConfig, rows: Sequence[LogRow]) -> Plan:
     errors = {int(row["step"]): error_of(row) for row in rows if row["step"] in STEPS}
     best = min(errors, key=lambda step: errors[step])
     if len([step for step in errors if step > best]) >= PATIENCE:
-        note = f"{budget.shown('error')}: it has not fallen since step {best} ({errors[best]:.4f}), so no more steps are done"
+        lowest = f"step {best} ({errors[best]:.4f})"
+        note = f"{budget.shown('error')}: it has not fallen since {lowest}, so no more steps are done"
         # A run that was cut off here finds the note in its checkpoint.
         return replace(plan, notes=tuple(dict.fromkeys((*plan.notes, note))))
     return replace(plan, steps=next((steps for steps in STEPS if steps > plan.steps), plan.steps))
