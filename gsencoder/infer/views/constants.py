@@ -113,8 +113,10 @@ class ViewConstants:
     # Budgets of error and of megabytes (shown_error.py, picture_size.py)
     window_sigmas: float = 6.0
     """A Gaussian reaches no farther than so many standard deviations in a picture, and is left out of none by it."""
+    error_safety: float = 1.2
+    """What small renders leave unseen counts so many times …"""
     unsure_gaussians: float = 2.0
-    """So many Gaussians of each target count as unseen on top of those that small renders leave unseen."""
+    """… and so many Gaussians of each target count as unseen on top of it."""
     least_picture_side: int = 224
     """Pictures are made no smaller by a budget, longer side, pixels: the input of the smallest common vision towers."""
 

@@ -65,10 +65,11 @@ def fewest_views(scores: Sequence[ViewScores], error: float) -> tuple[Picked, fl
     """
     order, gains = order_by_error(scores)
     errors = errors_after(gains)
-    # Targets of few Gaussians are few pixels in small renders.
+    # Small renders err, and of targets of few Gaussians, which are few pixels, they err most.
     shown = [max(int(np.count_nonzero(each.target.any(axis=0))), 1) for each in scores]
     margin = CONSTANTS.unsure_gaussians * float(np.mean(1 / np.array(shown)))
-    count = int(np.flatnonzero(np.where(errors > 0, errors + margin, 0) <= error)[0]) + 1
+    bounds = np.where(errors > 0, CONSTANTS.error_safety * errors + margin, 0)
+    count = int(np.flatnonzero(bounds <= error)[0]) + 1
     return Picked(order[:count], gains[:count]), float(errors[count - 1])
 
 
