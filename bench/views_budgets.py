@@ -1,14 +1,16 @@
 """Whether budgets of error of `views` hold, and how many views they take.
 
-    python bench/views_budgets.py FEATURES… [--queries FILE] [--errors 0.02,0.05,0.1,0.2] [--most 10] [--out FILE.csv]
+    python bench/views_budgets.py FEATURES… --scenes FOLDER [--errors 0.02,0.05,0.1,0.2] [--most 9]
+    python bench/views_budgets.py FEATURES… --queries table,chair
 
-Each FEATURES is a folder of features; every name of its words, or of a file with one a line, is a target by itself
-where it has a box. A line for each target and promise: views, the error by the small renders, the error at the size of
-the pictures, and that of the eight views that are chosen without a budget.
+Each FEATURES is a folder of features; each name of its scene's objects.json in FOLDER, or each query, is a target by
+itself where it has a box. A line for each target and promise: views, the error by the small renders, the error at the
+size of the pictures, and that of the eight views that are chosen without a budget.
 """
 
 import argparse
 import csv
+import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -27,15 +29,16 @@ from gsencoder.infer.views.shown_error import fewest_views, measured_errors
 from gsencoder.infer.views.targets import targets_of
 from gsencoder.infer.views.utility import CoverageObjective
 from gsencoder.render import BlendConfig
-from gsencoder.text.build import closed_table
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+", metavar="FEATURES")
-    parser.add_argument("--queries", type=Path)
+    names_from = parser.add_mutually_exclusive_group(required=True)
+    names_from.add_argument("--scenes", type=Path)
+    names_from.add_argument("--queries")
     parser.add_argument("--errors", default="0.02,0.05,0.1,0.2")
-    parser.add_argument("--most", type=int, default=10, help="targets of each scene")
+    parser.add_argument("--most", type=int, default=9, help="targets of each scene")
     parser.add_argument("--out", type=Path, default=Path("views_budgets.csv"))
     add_json_option(parser)
     given = parser.parse_args()
@@ -46,7 +49,11 @@ def main() -> None:
         queried, words = queried_scene(scene, folder)
         gaussians = scene.gaussians
         assert gaussians is not None
-        names = given.queries.read_text().splitlines() if given.queries else list(closed_table(words).names)
+        if given.scenes is None:
+            names = given.queries.split(",")
+        else:
+            objects = json.loads((given.scenes / scene.name / "objects.json").read_text())
+            names = list(dict.fromkeys(each["name"] for each in objects if each["name"]))
         targets = targets_of(gaussians, localize(queried, names, words, LocalizeConfig()))[: given.most]
         free = FreeSpace(gaussians)
         for target in targets:
