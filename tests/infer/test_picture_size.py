@@ -43,6 +43,7 @@ def written(sized: SizedPictures, folder: Path) -> float:
     return sum((folder / f"{number}.png").stat().st_size for number in range(len(sized.pictures))) / 1e6
 
 
+@pytest.mark.slow
 def test_pictures_are_as_large_as_fit_and_files_keep_the_promise(viewed: tuple[Scene, ViewSet], tmp_path: Path) -> None:
     scene, views = viewed
     whole = written(pictures_within(scene, views, ViewsBudget(megabytes=10.0)), tmp_path)

@@ -124,6 +124,7 @@ def test_what_is_measured_in_windows_is_what_whole_pictures_show() -> None:
     assert measured[-1] == 0
 
 
+@pytest.mark.slow
 def test_a_half_that_is_hidden_takes_a_second_view_and_the_promise_is_kept() -> None:
     scene, plate = divided_plate()
     config = ViewsConfig(source="frames")
@@ -143,6 +144,7 @@ def test_a_half_that_is_hidden_takes_a_second_view_and_the_promise_is_kept() -> 
     assert measured[-1] == pytest.approx(0.5, abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_fewest_views_of_a_cube_keep_the_promise_at_the_size_of_their_pictures() -> None:
     scene, target = cube_in_room()
     made = choose_views_within(scene, [target], replace(SHELLS, count=8), ViewsBudget(error=0.1))
