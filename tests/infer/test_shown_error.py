@@ -101,9 +101,11 @@ def test_candidates_that_show_nothing_leave_one_view() -> None:
 
 
 def test_what_is_measured_in_windows_is_what_whole_pictures_show() -> None:
-    scene, target = cube_in_room()
+    # A Gaussian of the target is high above the room, where no camera looks.
+    scene, cube = cube_in_room(np.array([[0.3, 0.2, 9.0]]))
     gaussians = scene.gaussians
     assert gaussians is not None
+    target = replace(cube, rows=np.append(cube.rows, len(gaussians) - 1))
     cameras = corner_cameras(5, 96, 72)
     # One of another size, whose weights count as shares of the picture.
     large = corner_cameras(5, 192, 144)
@@ -118,6 +120,7 @@ def test_what_is_measured_in_windows_is_what_whole_pictures_show() -> None:
         b = blend(gaussians, cameras, view)
         whole = np.bincount(b.col.numpy(), b.weight.numpy(), minlength=len(gaussians))
         weights[view] = whole[target.rows] / max(cameras.widths[view], cameras.heights[view]) ** 2
+    assert (weights.max(axis=0) > 0).tolist() == [True] * len(cube.rows) + [False]
     choices = [(0,), (4,), (1, 2), (0, 1, 2, 3, 4)]
     measured = measured_errors(gaussians, [target], cameras, [np.array(each) for each in choices])
     assert measured == pytest.approx([error_of(each, weights) for each in choices], abs=1e-6)

@@ -24,8 +24,8 @@ PLANNED_BYTES = 0.95
 SAMPLED, CORRECTIONS = 2, 2
 """Pictures that are rendered in full to tell how bytes grow with pixels, and how often a side that took too many bytes
 is lowered before the least one is taken."""
-EXPONENTS = (0.3, 1.5)
-"""Between which powers of pixels bytes are taken to grow."""
+EXPONENTS, BISECTIONS = (0.3, 1.5), 20
+"""Between which powers of pixels bytes are taken to grow, and by how many halvings one is solved for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -71,13 +71,12 @@ def pictures_within(scene: Scene, views: ViewSet, budget: ViewsBudget) -> SizedP
     if sizes.sum() > limit:
         return _least(scene, smallest, pictures, sizes, budget)
     exponent = _exponent(scene, views, smallest, sizes)
-    planned = PLANNED_BYTES * limit
     for _ in range(1 + CORRECTIONS):
         # The largest side that is predicted to fit; the least one does.
         low, high = least, largest
         while low < high:
             middle = (low + high + 1) // 2
-            fits = _predicted(views, smallest, sizes, exponent, middle) <= planned
+            fits = _predicted(views, smallest, sizes, exponent, middle) <= PLANNED_BYTES * limit
             low, high = (middle, high) if fits else (low, middle - 1)
         side, predicted = low, _predicted(views, smallest, sizes, exponent, low)
         sized = _capped(views, side)
@@ -85,7 +84,7 @@ def pictures_within(scene: Scene, views: ViewSet, budget: ViewsBudget) -> SizedP
         taken = float(_sizes(pictures).sum())
         if taken <= limit:
             return SizedPictures(views=sized, pictures=pictures, side=side, predicted=predicted / MEGABYTE, notes=())
-        planned, largest = planned * predicted / taken, side - 1
+        exponent, largest = _refitted(views, smallest, sizes, side, taken), side - 1
     pictures, _ = view_pictures(scene, smallest)
     return SizedPictures(
         views=smallest, pictures=pictures, side=least, predicted=float(sizes.sum()) / MEGABYTE, notes=()
@@ -127,6 +126,15 @@ def _exponent(scene: Scene, views: ViewSet, smallest: ViewSet, sizes: Float64[np
     pictures, _ = view_pictures(scene, _selected(views, sample))
     powers = np.log(_sizes(pictures) / sizes[sample]) / np.log(growth[sample])
     return float(np.clip(powers.max(), *EXPONENTS))
+
+
+def _refitted(views: ViewSet, smallest: ViewSet, sizes: Float64[np.ndarray, " n"], side: int, taken: float) -> float:
+    """The power at which pictures of a side would take the bytes that they took."""
+    low, high = EXPONENTS
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        low, high = (middle, high) if _predicted(views, smallest, sizes, middle, side) < taken else (low, middle)
+    return high
 
 
 def _predicted(
