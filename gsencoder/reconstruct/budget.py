@@ -1,7 +1,8 @@
-"""How large photographs are looked at, and for how many steps, so that a reconstruction ends in about the time given.
+"""What a reconstruction may take: how large photographs are looked at, and for how many steps.
 
-A step costs about C₀ + C₁ · pixels + C₂ · Gaussians in view. Sizes and steps follow from this formula alone, so that
-the same command on the same machine gives the same splat; the time that is announced is measured.
+A step costs about C₀ + C₁ · pixels + C₂ · Gaussians in view. For an aim in minutes, sizes and steps follow from this
+formula alone, so that the same command on the same machine gives the same splat; the time that is announced is
+measured. What is promised (`error`, `seconds`, `megabytes`) is planned in `gsencoder.reconstruct.plan`.
 """
 
 import math
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.promises import PLANNED, Budget
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.types import Cameras
@@ -30,6 +32,9 @@ CUDA_GAIN = 30.0
 SEED_SHARE = 0.2
 """Share of the time that reading and seeding may take."""
 DEFAULT_MINUTES = 10.0
+PROMISED_STEPS = 400
+"""For promised seconds photographs are made smaller only where there is no time for so many steps: of the same time,
+fewer steps cost less than smaller photographs (docs/measurements.md, Trade-off)."""
 LEAST_STEPS, LEAST_PIXELS = 200, 40_000
 SMALLEST_REDUCTION = 0.95
 """Photographs are not resized by less than this."""
@@ -37,21 +42,56 @@ TRIAL_VIEWS = 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BudgetConfig:
-    """How long a reconstruction may take."""
+class BudgetConfig(Budget):
+    """What a reconstruction may take, or must reach. A promised size is kept in any case; error comes before seconds.
+
+    A promised error takes the fewest steps that reach it; seconds and megabytes without one take the most steps, the
+    highest degree of colors and the most Gaussians that they allow.
+    """
 
     minutes: float = field(
         default=DEFAULT_MINUTES,
         metadata={
             "help": "aim at so many minutes: photographs are made smaller and the default optimize.steps fewer or "
-            "more; "
-            "0 = neither"
+            "more; 0 = neither. No promise, and not used beside budget.seconds"
         },
+    )
+    error: float | None = field(
+        default=None,
+        metadata={
+            "help": "largest mean of 1 − SSIM on held-out photographs, at the size that photographs are looked at; "
+            "of measured surfaces, where a fitted photograph shows them"
+        },
+    )
+    seconds: float | None = field(
+        default=None,
+        metadata={
+            "help": "largest time from reading the photographs to the splat; what a kill made be repeated is extra"
+        },
+    )
+    megabytes: float | None = field(
+        default=None, metadata={"help": "largest size of splat.ply, in units of 1,000,000 bytes"}
     )
 
     def __post_init__(self) -> None:
+        Budget.__post_init__(self)
         if not 0 <= self.minutes < math.inf:
             raise InputError(f"minutes: expected 0 (no budget) or more, got {self.minutes}")
+
+    @property
+    def option_of_steps(self) -> str:
+        """The option that chooses the number of steps."""
+        return next((f"budget.{name}" for name in ("error", "seconds") if name in self.promised), "budget.minutes")
+
+    def minutes_left(self, spent: float = 0.0) -> float:
+        """The minutes that sizes and steps are chosen for; 0 = all that they want.
+
+        Args:
+            spent: seconds that reading has taken, which count to a promise of seconds.
+        """
+        if self.seconds is None:
+            return self.minutes
+        return max(PLANNED * self.seconds - spent, 1.0) / 60
 
 
 def step_seconds(pixels: float, gaussians: float, device: torch.device, config: OptimizeConfig) -> float:
@@ -75,29 +115,46 @@ def steps_for_minutes(minutes: float, config: OptimizeConfig) -> int:
     return max(LEAST_STEPS, round(config.steps * (minutes / DEFAULT_MINUTES) ** (1 / 3)))
 
 
-def choose_scale(cameras: Cameras, budget: BudgetConfig, device: torch.device, config: OptimizeConfig) -> float:
-    """The factor by which photographs are made smaller, 1 = not at all."""
+def choose_scale(
+    cameras: Cameras, budget: BudgetConfig, device: torch.device, config: OptimizeConfig, *, spent: float = 0.0
+) -> float:
+    """The factor by which photographs are made smaller, 1 = not at all.
+
+    Args:
+        cameras: of the photographs at their full size.
+        budget: the aim in minutes, or promised seconds.
+        device: where it is computed.
+        config: the stages.
+        spent: seconds that reading has taken.
+    """
     pixels = float(np.median(cameras.widths.astype(np.float64) * cameras.heights))
-    if not budget.minutes:
+    minutes = budget.minutes_left(spent)
+    if not minutes:
         return 1.0
-    seconds = (1 - SEED_SHARE) * 60 * budget.minutes / steps_for_minutes(budget.minutes, config)
     none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
-    affordable = max(LEAST_PIXELS, (seconds - none) / (one - none))
+    if budget.seconds is None:
+        steps, least = steps_for_minutes(minutes, config), LEAST_PIXELS
+    else:
+        # Where pixels are a third of a step, even half of them would hardly save time.
+        steps, least = PROMISED_STEPS, none / (one - none) / 2
+    seconds = (1 - SEED_SHARE) * 60 * minutes / steps
+    affordable = max(least, (seconds - none) / (one - none))
     scale = math.sqrt(affordable / pixels)
     return 1.0 if scale > SMALLEST_REDUCTION else round(scale, 3)
 
 
-def plan_steps(optimizer: Optimizer, budget: BudgetConfig) -> int:
-    """The number of steps, where the budget decides: `optimize.steps` is at its default and there is a budget."""
+def affordable_steps(optimizer: Optimizer, minutes: float) -> int:
+    """The number of steps that the formula allows; those of the settings where they are not the default, or for 0
+    minutes."""
     config = optimizer.config
-    if not budget.minutes or config.steps != OptimizeConfig().steps:
+    if not minutes or config.steps != OptimizeConfig().steps:
         return config.steps
     views = trial_views(optimizer.training)
     gaussians = float(np.mean([optimizer.rows_seen(view) for view in views]))
     pixels = float(np.mean([optimizer.photographs.at_scale(view).image[..., 0].numel() for view in views]))
     seconds = step_seconds(pixels, gaussians, optimizer.device, config)
-    affordable = (1 - SEED_SHARE) * 60 * budget.minutes / seconds
-    return int(min(max(LEAST_STEPS, affordable), steps_for_minutes(budget.minutes, config)))
+    affordable = (1 - SEED_SHARE) * 60 * minutes / seconds
+    return int(min(max(LEAST_STEPS, affordable), steps_for_minutes(minutes, config)))
 
 
 def trial_views(training: Sequence[int]) -> list[int]:

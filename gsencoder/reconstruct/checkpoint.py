@@ -15,6 +15,7 @@ from torch import Tensor
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.first_difference import first_difference
+from gsencoder.core.promises import PROMISES
 from gsencoder.core.removed_options import without_removed_options
 from gsencoder.reconstruct.anchor import Anchor
 from gsencoder.reconstruct.parameters import shapes_of
@@ -23,6 +24,8 @@ from gsencoder.reconstruct.row_adam import RowAdam
 CHECKPOINT_FILE = "reconstruction.safetensors"
 IMAGE_SCALE = "image_scale"
 """The setting that says by which factor a budget made the photographs smaller."""
+PLANNED_DEGREE = "sh_degree_planned"
+"""The fact that says up to which degree colors depend on the direction."""
 ANCHOR_SHAPES: dict[str, tuple[int | str, ...]] = {"means": ("N", 3), "reach": ("N",)}
 
 
@@ -37,7 +40,8 @@ class State:
             where photographs do not differ in exposure.
         step: steps that are done.
         seconds: that they took.
-        facts: how it began, as JSON values: number and source of the seeds, and what was added to points.
+        facts: how it began, as JSON values: number and source of the seeds, what was added to points, and what is
+            planned.
     """
 
     adam: RowAdam
@@ -101,8 +105,8 @@ def load_state(
     Args:
         path: the file.
         settings: of this run.
-        steps: that this run takes.
-        sh_degree: of its colors.
+        steps: that this run takes at most.
+        sh_degree: of its colors, unless `facts` have another one under `PLANNED_DEGREE`.
         device: where it computes.
 
     Raises:
@@ -113,6 +117,9 @@ def load_state(
         if "budget" not in earlier:
             # Runs of earlier versions had none, and took the steps of their settings.
             settings = {name: value for name, value in settings.items() if name != "budget"}
+        elif isinstance(earlier["budget"], dict):
+            # Others had minutes alone.
+            earlier["budget"] = {**dict.fromkeys(PROMISES), **earlier["budget"]}
         if IMAGE_SCALE not in earlier:
             # They did not say at which size they looked at photographs, which shows in the digest of these.
             settings = {name: value for name, value in settings.items() if name != IMAGE_SCALE}
@@ -129,10 +136,13 @@ def load_state(
         seconds, facts = float(file.value("seconds", float, int)), file.value("facts", dict)
         if not (0 <= adam_steps <= step <= steps and 0 <= seconds < math.inf):
             raise InputError(f"a state that no run was in (step {step} of {steps})")
+        degree = facts.get(PLANNED_DEGREE, sh_degree)
+        if degree not in range(sh_degree + 1):
+            raise InputError(f"colors of a degree that no run has ({degree!r})")
         tables = {
             kind: {
                 name: torch.from_numpy(file.array(f"{kind}.{name}", "float32", ("N", *shape)).copy()).to(device)
-                for name, shape in shapes_of(sh_degree).items()
+                for name, shape in shapes_of(degree).items()
             }
             for kind in RowAdam.KINDS
         }

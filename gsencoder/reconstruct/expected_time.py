@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +16,19 @@ from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.score import score
 
 
-def expected_seconds(optimizer: Optimizer, held_out: Sequence[int], validations: int) -> float:
+class ExpectedSeconds(NamedTuple):
+    """Seconds that the rest of a reconstruction will take.
+
+    Attributes:
+        steps: all steps.
+        other: prunings and validations.
+    """
+
+    steps: float
+    other: float
+
+
+def expected_seconds(optimizer: Optimizer, held_out: Sequence[int], validations: int) -> ExpectedSeconds:
     """Seconds that the remaining steps, prunings and validations will take; nothing changes.
 
     Gaussians that contribute nothing now will not contribute later either, and the first pruning takes them out. So it
@@ -29,10 +42,10 @@ def expected_seconds(optimizer: Optimizer, held_out: Sequence[int], validations:
     config, start = optimizer.config, optimizer.step
     steps = range(start, config.steps)
     if not steps:
-        return 0.0
+        return ExpectedSeconds(0.0, 0.0)
     prunings = [step + 1 for step in steps if optimizer.pruning.due(step + 1, config.steps)]
     first = prunings[0] if prunings else config.steps
-    seconds = 0.0
+    stepping = other = 0.0
     state = optimizer
     # Steps of one size between two prunings are alike.
     for (pruned, shrink), group in groupby(steps, key=lambda step: (step >= first, config.shrink_at(step))):
@@ -40,12 +53,12 @@ def expected_seconds(optimizer: Optimizer, held_out: Sequence[int], validations:
             began = time.perf_counter()
             state = _pruned(optimizer)
             left = len(state.parameters["means"]) / len(optimizer.parameters["means"])
-            seconds += (1 + (len(prunings) - 1) * left) * (time.perf_counter() - began)
-        seconds += len([*group]) * _mean_seconds(trial_views(optimizer.training), partial(_step, state, shrink))
+            other += (1 + (len(prunings) - 1) * left) * (time.perf_counter() - began)
+        stepping += len([*group]) * _mean_seconds(trial_views(optimizer.training), partial(_step, state, shrink))
     if held_out and validations:
         renders = validations * len(held_out)
-        seconds += renders * _mean_seconds(trial_views(held_out), lambda view: score(state, [view]))
-    return seconds
+        other += renders * _mean_seconds(trial_views(held_out), lambda view: score(state, [view]))
+    return ExpectedSeconds(stepping, other)
 
 
 def _pruned(optimizer: Optimizer) -> Optimizer:

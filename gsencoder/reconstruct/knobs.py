@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from gsencoder.core.knobs import Knob
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.reconstruct.budget import BudgetConfig
-from gsencoder.reconstruct.run import ReconstructConfig
+from gsencoder.reconstruct.config import ReconstructConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

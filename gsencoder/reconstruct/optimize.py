@@ -71,6 +71,7 @@ class Optimizer:
         step: number of steps done.
         is_consistent: whether the state is that between two steps, so that it may be saved.
         extent: length that the learning rate of positions is multiplied by, world units.
+        most: number of Gaussians that pruning leaves at most; None = no limit.
     """
 
     def __init__(
@@ -102,6 +103,7 @@ class Optimizer:
         """
         self.photographs, self.training, self.config = photographs, tuple(training), config
         self.pruning, self.raster = prune, raster
+        self.most: int | None = None
         self.adam, self.anchor, self.step, self.is_consistent = adam, anchor, step, True
         fits_exposure = config.exposure and (step == 0 or exposures is not None)
         self.exposures = Exposures(self.training, exposures) if fits_exposure else None
@@ -230,7 +232,7 @@ class Optimizer:
             InputError: pruning would leave no row.
         """
         views = ((view, self.photographs.at_scale(view, 2)) for view in self.training)
-        return rows_to_keep(self.parameters, self.photographs.cameras, views, self.pruning, self.raster)
+        return rows_to_keep(self.parameters, self.photographs.cameras, views, self.pruning, self.raster, most=self.most)
 
     def restricted(self, rows: Int64[Tensor, " n"]) -> "Optimizer":
         """A copy for trials that has these rows of the parameters alone."""

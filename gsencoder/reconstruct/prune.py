@@ -48,6 +48,8 @@ def rows_to_keep(
     views: Iterable[tuple[int, ScaledPhotograph]],
     config: PruneConfig,
     raster: RasterConfig,
+    *,
+    most: int | None = None,
 ) -> Int64[Tensor, " n"]:
     """Rows that are opaque enough, of sane size on every screen, and seen somewhere.
 
@@ -60,6 +62,7 @@ def rows_to_keep(
         views: photographs that count, at any size, gone through once.
         config: settings.
         raster: accuracy of rendering.
+        most: so many rows are left at most, those that contribute most to some view; None = no limit.
 
     Raises:
         InputError: nothing would be left.
@@ -91,4 +94,7 @@ def rows_to_keep(
             if rows.any()
         )
         raise InputError(f"reconstruct: pruning would leave none of {len(means)} Gaussians ({why}); change these")
+    if most is not None and len(rows_left) > most:
+        by_contribution = contributions[rows_left].argsort(descending=True, stable=True)
+        rows_left = rows_left[by_contribution[:most]].sort().values
     return rows_left

@@ -42,11 +42,18 @@ class Comparison:
     render: UInt8[np.ndarray, "H W 3"]
 
 
-def describe_plan(optimizer: Optimizer, usual: int, seconds: float) -> str:
-    """What is about to happen, and how long it should take."""
+def describe_plan(optimizer: Optimizer, usual: int, seconds: float, option: str) -> str:
+    """What is about to happen, and how long it should take.
+
+    Args:
+        optimizer: before its first step, or where it goes on.
+        usual: number of steps by default.
+        seconds: expected.
+        option: that changes this number.
+    """
     widths, heights = optimizer.photographs.cameras.widths, optimizer.photographs.cameras.heights
     steps = optimizer.config.steps
-    fewer = f" instead of {usual:,} (budget.minutes)" if steps != usual else ""
+    fewer = f" instead of {usual:,} ({option})" if steps != usual else ""
     expected = f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} s"
     return (
         f"{len(optimizer.training)} photographs of {int(np.median(widths))}×{int(np.median(heights))}, "

@@ -3,9 +3,9 @@
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,66 +14,27 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gsencoder.core.errors import InputError, SceneWarning, advised
-from gsencoder.core.files.json_values import plain
-from gsencoder.core.files.step_log import LOG_FILE, Log, read_log
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.runtime.clock import Clock
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.photographs import Photographs
-from gsencoder.data.seeding.dense import DenseConfig
-from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.anchor import anchor_at
-from gsencoder.reconstruct.budget import BudgetConfig, plan_steps, steps_for_minutes
+from gsencoder.reconstruct.budget import steps_for_minutes
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
+from gsencoder.reconstruct.config import ReconstructConfig, Report
 from gsencoder.reconstruct.expected_time import expected_seconds
 from gsencoder.reconstruct.exposure_prediction import predict_exposures
+from gsencoder.reconstruct.fit import fit
 from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.report import Comparison, LogRow, compare, describe, describe_exposure, describe_plan
+from gsencoder.reconstruct.plan import PLAN, STEPS, Plan, follow, make_plan
+from gsencoder.reconstruct.report import Comparison, LogRow, compare, describe_exposure, describe_plan
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.score import MIN_PHOTOGRAPHS, covisible_pixels, drop_masked_views, score, split
+from gsencoder.reconstruct.score import MIN_PHOTOGRAPHS, drop_masked_views, split
 from gsencoder.reconstruct.start import initial_gaussians
-from gsencoder.render.rasterize import RasterConfig
 from gsencoder.types import Gaussians, Scene
-
-START_AGAIN = "give resume=false to begin anew"
-Report = Callable[[str], None]
-"""Receives one line of text for people."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReconstructConfig:
-    """How photographs become Gaussians, and how the result is judged."""
-
-    holdout: int = field(default=8, metadata={"help": "hold out every n-th photograph for validation; 0 = none"})
-    validate_every: int = field(default=500, metadata={"help": "steps between validations; 0 = at the end alone"})
-    checkpoint_every: float = field(default=60.0, metadata={"help": "seconds between checkpoints"})
-    seeds: SeedConfig = field(default_factory=SeedConfig)
-    dense: DenseConfig = field(default_factory=DenseConfig)
-    optimize: OptimizeConfig = field(default_factory=OptimizeConfig)
-    budget: BudgetConfig = field(default_factory=BudgetConfig)
-    prune: PruneConfig = field(default_factory=PruneConfig)
-    raster: RasterConfig = field(default_factory=RasterConfig)
-
-    def __post_init__(self) -> None:
-        if self.holdout < 0 or self.holdout == 1:
-            raise InputError(f"holdout: expected 0 (none) or 2 and more, got {self.holdout}")
-        for name in ("validate_every", "checkpoint_every"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-
-    def validates_at(self, step: int, steps: int) -> bool:
-        """Whether is validated after `step` of `steps`."""
-        return step in (0, steps) or bool(self.validate_every and step % self.validate_every == 0)
-
-    def identity(self) -> dict[str, Any]:
-        """The settings that an interrupted run must share with the run that continues it, as JSON values."""
-        names = ("seeds", "dense", "optimize", "budget", "prune", "raster", "holdout")
-        return {name: plain(getattr(self, name)) for name in names}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,6 +55,8 @@ class Reconstruction:
         held_out_colors: color maps to which held-out photographs are expected to be exposed, in their order; identities
             where `exposure` is None.
         seconds: wall-clock time by step of the stage.
+        plan: that was followed.
+        elapsed: seconds from the first reading to the last step, of all runs that it took.
     """
 
     gaussians: Gaussians
@@ -107,6 +70,8 @@ class Reconstruction:
     exposure_source: str | None
     held_out_colors: Float32[np.ndarray, "Q 3 4"]
     seconds: Mapping[str, float]
+    plan: Plan
+    elapsed: float
 
 
 def reconstruct(
@@ -116,6 +81,7 @@ def reconstruct(
     device: Device = "auto",
     work: Path | None = None,
     made_from: Mapping[str, Any] = {},
+    spent: float = 0.0,
     track: Track = untracked,
     report: Report = lambda line: None,  # noqa: ARG005
 ) -> Reconstruction:
@@ -132,19 +98,20 @@ def reconstruct(
             checkpoint in it, with the same result; None = a temporary folder.
         made_from: what else a run must share with the run that it continues, as JSON values, such as the path and the
             reading options of the scene.
+        spent: seconds that reading the scene took, which count to a promise of seconds.
         track: progress of long loops.
         report: receives a line after seeding and after each validation.
 
     Raises:
         InputError: no photographs, too few of them, nothing to seed from, no Gaussian in view, a loss or gradient that
-            is not finite, or a checkpoint of another run.
+            is not finite, a promise that cannot be kept, or a checkpoint of another run.
 
     Warns:
         SceneWarning: photographs that are masked all over, or plane sweeps that found no surface.
     """
     if scene.views is None:
         raise InputError(f"reconstruct: scene {scene.name} has no photographs to fit a splat to")
-    clock = Clock()
+    clock, began = Clock(), time.monotonic()
     with ExitStack() as stack:
         folder = work or Path(stack.enter_context(TemporaryDirectory()))
         with clock("read"):
@@ -154,8 +121,10 @@ def reconstruct(
         held_out = drop_masked_views(photographs, held_out, "held-out photographs")
         identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
         chosen_device, checkpoint = choose_device(device), folder / CHECKPOINT_FILE
+        if config.budget.error is not None and not held_out:
+            raise InputError("budget.error: is measured on held-out photographs, and there are none; leave it out")
         if continued := os.path.lexists(checkpoint):
-            most = max(config.optimize.steps, steps_for_minutes(config.budget.minutes, config.optimize))
+            most = max(config.optimize.steps, steps_for_minutes(config.budget.minutes, config.optimize), STEPS[-1])
             shape = {"steps": most, "sh_degree": config.optimize.sh_degree}
             state = load_state(checkpoint, identity, **shape, device=chosen_device)
         else:
@@ -172,18 +141,33 @@ def reconstruct(
             exposures=state.exposures,
             step=state.step,
         )
-        if not continued:
-            state = replace(state, facts={**state.facts, "steps_planned": plan_steps(optimizer, config.budget)})
-            save_state(checkpoint, state, identity)
-        steps = int(state.facts.get("steps_planned", config.optimize.steps))
-        optimizer.config = replace(config.optimize, steps=steps)
+
+        def validations(steps: int) -> int:
+            return sum(config.validates_at(step, steps) for step in range(optimizer.step, steps + 1))
+
         with clock("trial"):
-            validations = sum(config.validates_at(step, steps) for step in range(optimizer.step, steps + 1))
-            seconds = expected_seconds(optimizer, held_out, validations)
-            report(describe_plan(optimizer, config.optimize.steps, seconds))
+            if continued:
+                plan = Plan.of(state.facts, steps=config.optimize.steps, sh_degree=config.optimize.sh_degree)
+            else:
+                plan = make_plan(
+                    optimizer,
+                    config.budget,
+                    held_out,
+                    validations,
+                    double_means=bool(scene.origin.any()),
+                    spent=lambda: time.monotonic() - began + spent,
+                )
+                follow(optimizer, plan)
+                state = replace(state, adam=optimizer.adam)
+                save_state(checkpoint, replace(state, facts={**state.facts, **plan.facts()}), identity)
+            follow(optimizer, plan)
+            if continued or plan.seconds is None:
+                seconds = sum(expected_seconds(optimizer, held_out, validations(plan.steps)))
+            else:
+                seconds = plan.seconds - plan.spent
+            report(describe_plan(optimizer, config.optimize.steps, seconds, config.budget.option_of_steps))
         with clock("optimise"):
-            config = replace(config, optimize=optimizer.config)
-            log = optimize(optimizer, state, held_out, config, folder, identity, track, report)
+            fitted = fit(optimizer, state, plan, held_out, config, folder, identity, track, report)
         exposure = differing = source = None
         predicted = predict_exposures(optimizer.exposures, photographs.cameras, held_out)
         if optimizer.exposures is not None:
@@ -193,16 +177,18 @@ def reconstruct(
             report(differing)
         return Reconstruction(
             gaussians=optimizer.gaussians(),
-            seeding=state.facts,
+            seeding={name: value for name, value in {**state.facts, **fitted.plan.facts()}.items() if name != PLAN},
             steps=optimizer.step,
             training=optimizer.training,
             held_out=tuple(held_out),
-            log=tuple(log),
+            log=tuple(fitted.rows),
             comparisons=compare(optimizer, held_out, matched=differing is not None and source == "mean"),
             exposure=exposure,
             exposure_source=source,
             held_out_colors=predicted.maps.numpy(),
             seconds=clock.seconds,
+            plan=fitted.plan,
+            elapsed=fitted.seconds,
         )
 
 
@@ -238,74 +224,3 @@ def initial_state(
     adam = RowAdam(parameters_from(start.gaussians, config.optimize.sh_degree, device))
     anchor = anchor_at(adam.parameters, config.optimize.leash) if start.measured and config.optimize.leash else None
     return State(adam=adam, anchor=anchor, step=0, seconds=0.0, facts=seeding)
-
-
-def optimize(
-    optimizer: Optimizer,
-    state: State,
-    held_out: Sequence[int],
-    config: ReconstructConfig,
-    work: Path,
-    identity: Mapping[str, Any],
-    track: Track,
-    report: Report,
-) -> list[LogRow]:
-    """All remaining steps; the rows of the log. Whatever stops the run between two steps leaves a checkpoint."""
-    steps = config.optimize.steps
-    with advised(START_AGAIN):
-        log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
-        rows = read_rows(work / LOG_FILE)
-    seen = covisible_pixels(optimizer.photographs, held_out, optimizer.training)
-    start, saved_at, saved_step = time.monotonic() - state.seconds, time.monotonic(), optimizer.step
-
-    def validate() -> None:
-        due = config.validates_at(optimizer.step, steps)
-        # A continued run may begin at a step whose validation was cut off, or whose row is in the log already.
-        if not held_out or not due or (rows and rows[-1]["step"] == optimizer.step):
-            return
-        scores = {
-            name: value for name, value in score(optimizer, held_out, seen)._asdict().items() if value is not None
-        }
-        row: LogRow = {"seconds": time.monotonic() - start, "gaussians": len(optimizer.parameters["means"]), **scores}
-        log.add(optimizer.step, row)
-        rows.append({"step": optimizer.step, **row})
-        report(
-            f"step {optimizer.step} of {steps}: {describe(row)}, {row['gaussians']:,} Gaussians, {row['seconds']:.0f} s"
-        )
-
-    def save() -> None:
-        now = State(
-            adam=optimizer.adam,
-            anchor=optimizer.anchor,
-            exposures=None if optimizer.exposures is None else optimizer.exposures.maps,
-            step=optimizer.step,
-            seconds=time.monotonic() - start,
-            facts=state.facts,
-        )
-        save_state(work / CHECKPOINT_FILE, now, identity)
-
-    try:
-        validate()
-        for _ in track(range(optimizer.step, steps), "optimising"):
-            optimizer.advance()
-            validate()
-            if time.monotonic() - saved_at >= config.checkpoint_every:
-                save()
-                saved_at, saved_step = time.monotonic(), optimizer.step
-    finally:
-        # Also after the last step: writing the results may be interrupted as well.
-        if optimizer.is_consistent and optimizer.step > saved_step:
-            save()
-    return rows
-
-
-def read_rows(path: Path) -> list[LogRow]:
-    """The rows of a log as numbers.
-
-    Raises:
-        InputError: a cell that is not a number.
-    """
-    try:
-        return [{name: float(cell) for name, cell in row.items()} for row in read_log(path)]
-    except ValueError as error:
-        raise InputError(f"{path}: damaged: {error}") from error

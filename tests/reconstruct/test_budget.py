@@ -10,22 +10,25 @@ from splats import random_gaussians
 from walls import cameras, wall_views
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.promises import PLANNED
 from gsencoder.data.photographs import Photographs
 from gsencoder.reconstruct.budget import (
     LEAST_STEPS,
+    PROMISED_STEPS,
     BudgetConfig,
+    affordable_steps,
     choose_scale,
-    plan_steps,
     step_seconds,
     steps_for_minutes,
     trial_views,
 )
+from gsencoder.reconstruct.config import ReconstructConfig
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.run import ReconstructConfig, reconstruct
+from gsencoder.reconstruct.run import reconstruct
 from gsencoder.types import Cameras, Scene
 
 CPU, USUAL = torch.device("cpu"), OptimizeConfig()
@@ -51,6 +54,25 @@ def test_small_photographs_stay_and_phone_photographs_are_made_smaller(monkeypat
     # What is chosen costs no more than there is time for.
     pixels = 4000 * 3000 * phone**2
     assert steps_for_minutes(10.0, USUAL) * step_seconds(pixels, 60_000.0, CPU, USUAL) <= 600 * 0.81
+
+
+def test_for_promised_seconds_photographs_are_made_smaller_only_where_there_is_no_time_for_some_steps(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    needed = PROMISED_STEPS * step_seconds(640.0 * 480.0, 60_000.0, CPU, USUAL) / (PLANNED * 0.8)
+
+    def scale(seconds: float, *, width: int = 640, height: int = 480, spent: float = 0.0) -> float:
+        return choose_scale(pictures(width, height), BudgetConfig(seconds=seconds), CPU, USUAL, spent=spent)
+
+    assert scale(1.01 * needed) == 1
+    assert 0.6 < scale(0.75 * needed) < 1
+    # What reading took is missing then.
+    assert scale(1.01 * needed, spent=0.26 * needed * PLANNED) == pytest.approx(scale(0.75 * needed), abs=1e-3)
+    # Small photographs stay, since what they cost is small beside the Gaussians.
+    assert scale(1.0, width=320, height=240) == 1
+    assert scale(1.0, width=4000, height=3000) == pytest.approx((97_000 / 12e6) ** 0.5, rel=0.02)
 
 
 def test_cores_and_stages_count(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,12 +114,12 @@ def test_four_views_from_the_first_to_the_last_stand_for_all() -> None:
 
 
 def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time() -> None:
-    assert plan_steps(optimizer(OptimizeConfig(steps=5000)), BudgetConfig(minutes=0.1)) == 5000
+    assert affordable_steps(optimizer(OptimizeConfig(steps=5000)), 0.1) == 5000
     usual = optimizer(USUAL)
-    assert plan_steps(usual, BudgetConfig(minutes=0.0)) == USUAL.steps
-    assert plan_steps(usual, BudgetConfig()) == USUAL.steps
-    assert plan_steps(usual, BudgetConfig(minutes=0.01)) == LEAST_STEPS
-    assert plan_steps(usual, BudgetConfig(minutes=80.0)) == 2 * USUAL.steps
+    assert affordable_steps(usual, 0.0) == USUAL.steps
+    assert affordable_steps(usual, 10.0) == USUAL.steps
+    assert affordable_steps(usual, 0.01) == LEAST_STEPS
+    assert affordable_steps(usual, 80.0) == 2 * USUAL.steps
 
 
 @pytest.mark.usefixtures("no_gpu")

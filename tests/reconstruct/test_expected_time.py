@@ -11,13 +11,13 @@ from walls import wall_views
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct import expected_time
+from gsencoder.reconstruct.config import ReconstructConfig
 from gsencoder.reconstruct.expected_time import expected_seconds
 from gsencoder.reconstruct.optimize import Optimizer, PhotographGradients
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.run import ReconstructConfig
 from gsencoder.reconstruct.score import Score, score
 from gsencoder.types import Gaussians
 
@@ -68,7 +68,7 @@ class Work:
 
 def test_what_is_announced_is_the_work_that_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
     work, one = Work(monkeypatch), optimizer(splat())
-    announced = expected_seconds(one, HELD_OUT, 3)
+    announced = sum(expected_seconds(one, HELD_OUT, 3))
     begun, before = work.now, len(one.parameters["means"])
     while one.step < CONFIG.steps:
         one.advance()
@@ -92,22 +92,22 @@ def test_every_pruning_is_announced_and_steps_after_the_first_are_of_what_it_lea
     monkeypatch.setattr(expected_time, "_step", step)
     steps = sum((before if step < at_step else left) / (4 if step < 6 else 1) for step in range(20))
     prunings = 3 * (before + (len(at) - 1) * left)
-    assert expected_seconds(one, [], 0) == pytest.approx(steps + prunings, rel=1e-6)
+    assert expected_seconds(one, [], 0) == pytest.approx((steps, prunings), rel=1e-6)
 
 
 def test_each_kind_of_work_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     work = Work(monkeypatch)
     one = optimizer(splat(), at=())
-    steps = expected_seconds(one, [], 0)
+    steps = expected_seconds(one, [], 0).steps
     rows = [len(one.gradients(view, 1).rows) for view in TRAINING[:4]]
     # Two stages: 6 steps of photographs of half the size, and 14 of the full size.
     assert steps == pytest.approx(np.mean(rows) * (6 / 4 + 14), rel=0.1)
-    assert expected_seconds(one, HELD_OUT, 2) == pytest.approx(steps + 2 * 500)
-    assert expected_seconds(one, HELD_OUT, 0) == pytest.approx(steps)
+    assert expected_seconds(one, HELD_OUT, 2) == pytest.approx((steps, 2 * 500))
+    assert expected_seconds(one, HELD_OUT, 0) == pytest.approx((steps, 0))
     one.step = 10
-    assert expected_seconds(one, [], 0) == pytest.approx(np.mean(rows) * 10, rel=0.1)
+    assert expected_seconds(one, [], 0).steps == pytest.approx(np.mean(rows) * 10, rel=0.1)
     one.step = 20
-    assert expected_seconds(one, HELD_OUT, 2) == 0
+    assert expected_seconds(one, HELD_OUT, 2) == (0, 0)
     assert work.now > 0
 
 
@@ -115,12 +115,12 @@ def test_a_pruning_that_would_leave_nothing_now_is_no_error_before_its_time() ->
     nothing = replace(random_gaussians(50), opacities=np.full(50, 0.003, np.float32))
     made = np.random.default_rng(0)
     means = np.column_stack((made.uniform(-1, 1, 50), made.uniform(-1, 1, 50), np.full(50, 3.0)))
-    assert expected_seconds(optimizer(replace(nothing, means=means.astype(np.float32))), HELD_OUT, 2) > 0
+    assert expected_seconds(optimizer(replace(nothing, means=means.astype(np.float32))), HELD_OUT, 2).steps > 0
 
 
 def test_the_trial_changes_nothing() -> None:
     one, other = optimizer(splat()), optimizer(splat())
-    assert expected_seconds(one, HELD_OUT, 2) > 0
+    assert expected_seconds(one, HELD_OUT, 2).steps > 0
     for _ in range(3):
         one.advance()
         other.advance()

@@ -12,9 +12,9 @@ from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
 from gsencoder.reconstruct import Reconstruction, reconstruct
+from gsencoder.reconstruct.config import ReconstructConfig
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.run import ReconstructConfig
 from gsencoder.types import Scene
 
 QUICK = ReconstructConfig(

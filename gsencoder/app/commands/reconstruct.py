@@ -1,6 +1,7 @@
 """`gsencoder reconstruct SCENE`: photographs to Gaussians, on a CPU or a GPU."""
 
 import shutil
+import time
 import warnings
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from rich.console import Console
 
 from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
 from gsencoder.app.runs.progress import Progress, console
+from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
@@ -17,6 +19,7 @@ from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import SceneWarning, counted
 from gsencoder.core.files.picture_file import write_picture
 from gsencoder.core.files.step_log import LOG_FILE
+from gsencoder.core.promises import MEGABYTE
 from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.heap import retain_freed_memory
@@ -27,9 +30,11 @@ from gsencoder.data.video.frames import RECORD_FILE, VideoConfig
 from gsencoder.infer.draw.pictures import contact_sheet
 from gsencoder.reconstruct.budget import choose_scale
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, IMAGE_SCALE, image_scale_of
+from gsencoder.reconstruct.config import ReconstructConfig
 from gsencoder.reconstruct.open_scene import FRAMES_FOLDER, OpenedScene, find_photographed, open_scene
+from gsencoder.reconstruct.plan import error_of
 from gsencoder.reconstruct.report import Comparison, LogRow, describe
-from gsencoder.reconstruct.run import ReconstructConfig, reconstruct
+from gsencoder.reconstruct.run import Reconstruction, reconstruct
 from gsencoder.reconstruct.score import Score
 from gsencoder.reconstruct.sfm import SfmConfig
 
@@ -81,7 +86,7 @@ def run(config: ReconstructCommandConfig, summary: Summary) -> None:
 
 def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, summary: Summary) -> None:
     """Reads a scene or registers photographs, reconstructs, and writes splat, log and pictures into `out`."""
-    screen = console(config.quiet)
+    screen, began = console(config.quiet), time.perf_counter()
     with (
         WorkFolder(folder_beside(out, "reconstruction")) as work,
         output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
@@ -89,7 +94,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
         refuse_to_replace_inputs(work.path, settings(config))
         work.take(anew=not config.resume)
         opened = _open(path, work.path, config, config.data)
-        scale = _affordable_scale(opened, work.path, config)
+        scale = _affordable_scale(opened, work.path, config, spent=time.perf_counter() - began)
         opened = _at_scale(opened, scale, path, work.path, config, screen)
         summary.add_seconds(opened.seconds)
         with summary.step("check"):
@@ -106,12 +111,15 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             device=config.device,
             work=work.path,
             made_from=made_from,
+            spent=time.perf_counter() - began,
             track=Progress(quiet=config.quiet),
             report=screen.print,
         )
+        fitted = time.perf_counter()
         summary.add_seconds(result.seconds)
         origin = opened.scene.origin
         save_splat(folder / PLY_FILE, result.gaussians, origin=origin if origin.any() else None)
+        seconds = result.elapsed + time.perf_counter() - fitted
         if opened.sfm is not None:
             # Without its poses the splat could not be fused.
             shutil.copytree(opened.sfm.model, folder / MODEL_FOLDER)
@@ -134,6 +142,9 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             splat=PLY_FILE,
             log=LOG_FILE,
         )
+        promises = _report_budget(summary, opened.scene.name, scale, result, folder / PLY_FILE, seconds, config)
+    for line in promises:
+        screen.print(f"{out}: {line}")
     scores = f"; {describe(last)} on {counted(len(result.held_out), 'held-out photograph')}" if last else ""
     screen.print(f"{out / PLY_FILE}: {counted(len(result.gaussians), 'Gaussian')}{scores}")
     if opened.sfm is not None:
@@ -149,7 +160,35 @@ def _open(path: Path, work: Path, config: ReconstructCommandConfig, data: SceneC
     return open_scene(path, work, splat=config.splat, data=data, sfm=config.sfm, video=config.video, track=track)
 
 
-def _affordable_scale(opened: OpenedScene, work: Path, config: ReconstructCommandConfig) -> float:
+def _report_budget(
+    summary: Summary,
+    scene: str,
+    scale: float,
+    result: Reconstruction,
+    file: Path,
+    seconds: float,
+    config: ReconstructCommandConfig,
+) -> list[str]:
+    """What promises chose and what became of them; none where nothing is promised."""
+    budget, plan = config.budget, result.plan
+    if not budget.promised:
+        return []
+    chosen = {"image_scale": scale, "steps": result.steps, "sh_degree": plan.sh_degree, "gaussians": plan.most}
+    report_choice(
+        summary,
+        scene,
+        {name: value for name, value in chosen.items() if value is not None},
+        predicted={"seconds": plan.seconds, "megabytes": plan.megabytes},
+        notes=plan.notes,
+        quiet=config.quiet,
+    )
+    realised = {"seconds": seconds, "megabytes": file.stat().st_size / MEGABYTE}
+    if result.log:
+        realised["error"] = error_of(result.log[-1])
+    return report_promises(summary, budget, {name: realised[name] for name in budget.promised})
+
+
+def _affordable_scale(opened: OpenedScene, work: Path, config: ReconstructCommandConfig, *, spent: float) -> float:
     """The factor by which photographs are made smaller for the budget; 1 where data.image_scale states one.
 
     That of an interrupted run stays: with other threads or on another device the same minutes would allow another.
@@ -160,7 +199,8 @@ def _affordable_scale(opened: OpenedScene, work: Path, config: ReconstructComman
     begun = image_scale_of(work / CHECKPOINT_FILE)
     if begun is not None:
         return begun
-    return choose_scale(views.cameras, config.budget, choose_device(config.device), config.optimize)
+    device = choose_device(config.device)
+    return choose_scale(views.cameras, config.budget, device, config.optimize, spent=spent)
 
 
 def _at_scale(
@@ -176,9 +216,12 @@ def _at_scale(
         warnings.simplefilter("ignore", SceneWarning)
         smaller = _open(path, work, config, data)
     width, height = (int(np.median(sizes)) for sizes in (views.cameras.widths, views.cameras.heights))
+    budget = config.budget
+    time_given = f"about {budget.minutes:g} minutes" if budget.seconds is None else f"{budget.seconds:g} s"
+    option = "budget.minutes=0" if budget.seconds is None else "budget.seconds="
     screen.print(
-        f"photographs of {width}×{height} are looked at {scale:g} times as large, for a result in about "
-        f"{config.budget.minutes:g} minutes (budget.minutes=0 or data.image_scale= change that)"
+        f"photographs of {width}×{height} are looked at {scale:g} times as large, for a result in {time_given} "
+        f"({option} or data.image_scale= change that)"
     )
     return replace(smaller, sfm=opened.sfm, seconds=opened.seconds)
 

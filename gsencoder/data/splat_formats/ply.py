@@ -242,6 +242,12 @@ def _ascii_rows(path: Path, stream: BinaryIO, header: PlyHeader, vertex: PlyElem
     return table.view(np.dtype([(name, np.float64) for name in names])).reshape(-1)
 
 
+def inria_row_bytes(sh_degree: int, *, double_means: bool) -> int:
+    """Bytes of a row that `write_inria` writes without further properties."""
+    positions, normals, others = 3, 3, 1 + 3 + 4
+    return 4 * (positions * (1 + double_means) + normals + 3 * (sh_degree + 1) ** 2 + others)
+
+
 def write_inria(
     stream: BinaryIO, raw: RawSplat, *, double_means: bool, further: Mapping[str, Float32[np.ndarray, " N"]]
 ) -> None:

@@ -1,0 +1,182 @@
+"""The plan of a reconstruction: how many steps, colors of which degree, and how many Gaussians keep its budget.
+
+Sizes are counted on a trial pruning of the seeds, and seconds are those of trial steps on the scene. How many steps an
+error takes is not predicted: the plan begins with few, and is extended until held-out photographs show that error.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.promises import MEGABYTE, PLANNED
+from gsencoder.data.splat_formats.ply import inria_row_bytes
+from gsencoder.reconstruct.budget import BudgetConfig, affordable_steps
+from gsencoder.reconstruct.checkpoint import PLANNED_DEGREE
+from gsencoder.reconstruct.expected_time import expected_seconds
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.report import LogRow
+from gsencoder.reconstruct.row_adam import RowAdam
+
+STEPS = (50, 100, 150, 200, 300, 400, 600, 800, 1100, 1500, 2100, 3000)
+"""Steps after which a promised error is looked at. The last are those of preset=exact; no promise takes more of them,
+or fewer than the first."""
+HEADER_BYTES = 2048
+"""Of a .ply file, at most."""
+PLAN = "plan"
+"""The fact of a checkpoint that holds the rest of the plan."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What a reconstruction is about to do.
+
+    Attributes:
+        steps: of the optimization; of a promised error the next at which it is looked at.
+        sh_degree: of colors.
+        most: Gaussians that pruning leaves at most; None = no limit.
+        spent: seconds before the first step.
+        seconds: expected in all; None without a promise of them.
+        megabytes: expected size of the splat; None without a promise of it.
+        notes: what is known not to be kept.
+    """
+
+    steps: int
+    sh_degree: int
+    most: int | None = None
+    spent: float = 0.0
+    seconds: float | None = None
+    megabytes: float | None = None
+    notes: tuple[str, ...] = ()
+
+    def facts(self) -> dict[str, Any]:
+        """The plan as facts of a checkpoint, JSON values."""
+        rest = {name: getattr(self, name) for name in ("most", "spent", "seconds", "megabytes")}
+        return {
+            "steps_planned": self.steps,
+            PLANNED_DEGREE: self.sh_degree,
+            PLAN: {**rest, "notes": list(self.notes)},
+        }
+
+    @classmethod
+    def of(cls, facts: Mapping[str, Any], *, steps: int, sh_degree: int) -> "Plan":
+        """The plan in the facts of a checkpoint.
+
+        Args:
+            facts: of the checkpoint.
+            steps: where there are none, as in checkpoints of earlier versions.
+            sh_degree: likewise.
+        """
+        rest = dict(facts.get(PLAN, {}))
+        notes = tuple(rest.pop("notes", ()))
+        steps = int(facts.get("steps_planned", steps))
+        return cls(steps=steps, sh_degree=int(facts.get(PLANNED_DEGREE, sh_degree)), notes=notes, **rest)
+
+
+def make_plan(
+    optimizer: Optimizer,
+    budget: BudgetConfig,
+    held_out: Sequence[int],
+    validations: Callable[[int], int],
+    *,
+    double_means: bool,
+    spent: Callable[[], float],
+) -> Plan:
+    """Plans a reconstruction that has not begun; `follow` carries the plan out.
+
+    Args:
+        optimizer: with the seeds.
+        budget: what is promised, and the aim in minutes.
+        held_out: views that are validated on.
+        validations: how many there are in so many steps.
+        double_means: whether the splat's positions are written as doubles.
+        spent: seconds until now.
+
+    Raises:
+        InputError: megabytes into which not one Gaussian fits.
+    """
+    config = optimizer.config
+    plan = Plan(steps=config.steps, sh_degree=config.sh_degree)
+    if budget.megabytes is not None:
+        plan = _within_megabytes(optimizer, budget, budget.megabytes, plan, double_means)
+    follow(optimizer, plan)
+    if budget.error is not None:
+        return replace(plan, steps=STEPS[0], spent=spent())
+    if budget.seconds is None:
+        return replace(plan, steps=affordable_steps(optimizer, budget.minutes), spent=spent())
+    return _within_seconds(optimizer, budget, budget.seconds, plan, held_out, validations, spent)
+
+
+def follow(optimizer: Optimizer, plan: Plan) -> None:
+    """Sets steps, colors and the limit of Gaussians; coefficients of colors above the planned degree are taken out."""
+    optimizer.config = replace(optimizer.config, steps=plan.steps, sh_degree=plan.sh_degree)
+    optimizer.most = plan.most
+    coefficients = (plan.sh_degree + 1) ** 2 - 1
+    if optimizer.parameters["shN"].shape[1] > coefficients:
+        # There are no moments yet.
+        optimizer.adam = RowAdam(
+            {
+                name: value[:, :coefficients].contiguous() if name == "shN" else value
+                for name, value in optimizer.parameters.items()
+            }
+        )
+
+
+def extended(plan: Plan, budget: BudgetConfig, rows: Sequence[LogRow]) -> Plan | None:
+    """The plan with more steps, where a promised error was not reached and more may be taken; otherwise None."""
+    if budget.error is None or error_of(rows[-1]) <= budget.error:
+        return None
+    steps = next((steps for steps in STEPS if steps > plan.steps), None)
+    return None if steps is None else replace(plan, steps=steps)
+
+
+def error_of(row: LogRow) -> float:
+    """1 − SSIM of a validation: of surfaces that a fitted photograph shows, where a sensor says which these are."""
+    return 1 - row.get("seen_ssim", row["ssim"])
+
+
+def _within_megabytes(
+    optimizer: Optimizer, budget: BudgetConfig, megabytes: float, plan: Plan, double_means: bool
+) -> Plan:
+    """The highest degree of colors with which the Gaussians that contribute now fit, or degree 0 and as many as fit."""
+    try:
+        contributing = len(optimizer.contributing())
+    except InputError:
+        # Nothing would be left now; the steps until the first pruning may change that.
+        contributing = len(optimizer.parameters["means"])
+    limit = megabytes * MEGABYTE - HEADER_BYTES
+    sizes = {d: inria_row_bytes(d, double_means=double_means) for d in range(plan.sh_degree, -1, -1)}
+    degree = next((d for d, row in sizes.items() if contributing * row <= limit), 0)
+    most = int(limit // sizes[degree])
+    if most < 1:
+        raise InputError(
+            f"{budget.shown('megabytes')}: not one Gaussian fits; a splat of one takes "
+            f"{(HEADER_BYTES + sizes[0]) / MEGABYTE:.2g}"
+        )
+    expected = (HEADER_BYTES + min(contributing, most) * sizes[degree]) / MEGABYTE
+    return replace(plan, sh_degree=degree, most=most, megabytes=expected)
+
+
+def _within_seconds(
+    optimizer: Optimizer,
+    budget: BudgetConfig,
+    seconds: float,
+    plan: Plan,
+    held_out: Sequence[int],
+    validations: Callable[[int], int],
+    spent: Callable[[], float],
+) -> Plan:
+    """As many steps as there is time for, by trial steps of each kind."""
+    trial = min(affordable_steps(optimizer, budget.minutes_left(spent())), STEPS[-1])
+    follow(optimizer, replace(plan, steps=trial))
+    expected = expected_seconds(optimizer, held_out, validations(trial))
+    before, each = spent(), expected.steps / trial
+    steps = int((PLANNED * seconds - before - expected.other) / each)
+    steps = min(max(steps, STEPS[0]), STEPS[-1])
+    total = before + expected.other + steps * each
+    notes: tuple[str, ...] = ()
+    if total > seconds:
+        notes = (
+            f"{budget.shown('seconds')}: the fewest steps, {steps}, take about {total:.3g} s in all; they are done",
+        )
+    return replace(plan, steps=steps, spent=before, seconds=total, notes=notes)
