@@ -6,10 +6,10 @@ from pathlib import Path
 from gsencoder.app.commands.query_words import queried_scene, query_words
 from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.app.commands.through_head import features_for_heads, heads_of_folder
+from gsencoder.app.commands.views_budget import check_promises, choose_in_budget
 from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
-from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import write_archive
@@ -18,9 +18,10 @@ from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.heads.apply import head_space, head_tokens
 from gsencoder.fusion.heads.store import find_head
 from gsencoder.fusion.store.heads_file import check_heads_space
+from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.localize.localization_json import box_to_json, words_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, select_features
-from gsencoder.infer.views.budget import ViewsBudget, check_views_budget, choose_views_within
+from gsencoder.infer.views.budget import ViewsBudget, check_views_budget
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.pictures import describe_view, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
@@ -107,33 +108,25 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
             raise InputError(f"views: none of the words has a box in scene {scene.name}: {listing}")
         boxes = best_boxes(localization, config.boxes)
         summary.results.update(boxes=[box_to_json(box) for box in boxes], words=words_to_json(localization))
-    promises: list[str] = []
-    with summary.step("choose"):
-        if config.budget.promised:
-            result = choose_views_within(scene, targets, config.choose, config.budget)
-            views = result.views
-            report_choice(
-                summary,
-                scene.name,
-                {"candidates": result.candidates},
-                predicted={"seconds": result.predicted},
-                notes=result.notes,
-                quiet=config.quiet,
-            )
-            promises = report_promises(summary, config.budget, {"seconds": result.seconds})
-        else:
+    choice, pictures, promises = None, list[Picture](), list[str]()
+    if config.budget.promised:
+        choice, views, pictures = choose_in_budget(scene, targets, config, summary)
+    else:
+        with summary.step("choose"):
             views = choose_views(scene, targets, config.choose)
     out = config.out or Path("outputs") / scene.name / "views"
     rows = views_to_json(scene, views)
     summary.results.update(views=rows, judged=views.judged)
     with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
         with summary.step("render"):
-            pictures, _ = view_pictures(scene, views)
-            write_pictures(target, scene, views, rows, pictures, boxes)
+            write_pictures(target, scene, views, rows, pictures or view_pictures(scene, views)[0], boxes)
         write_json(target / VIEWS, rows)
         if config.grid:
             with summary.step("tokens"):
                 write_tokens(target / TOKENS, scene, views, config)
+        if choice is not None:
+            files = [target / row["picture"] for row in rows]
+            promises = check_promises(choice, scene, targets, views, files, config, summary)
     screen = console(config.quiet)
     for word, text in absent.items():
         screen.print(f"{word}: {text}")

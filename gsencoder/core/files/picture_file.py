@@ -27,10 +27,15 @@ def write_picture(path: Path, picture: Image.Image | np.ndarray, **options: Any)
     Raises:
         InputError: the folder is missing, the disk is full, or the system refuses.
     """
+    write_bytes(path, picture_bytes(picture, path.suffix, **options))
+
+
+def picture_bytes(picture: Image.Image | np.ndarray, suffix: str, **options: Any) -> bytes:
+    """What `write_picture` writes into a file of this suffix, such as ".png"; its other arguments."""
     held = io.BytesIO()
     image = picture if isinstance(picture, Image.Image) else Image.fromarray(picture)
-    kind = Image.registered_extensions()[path.suffix.lower()]
+    kind = Image.registered_extensions()[suffix.lower()]
     if kind == "PNG":
         options = {"compress_level": PNG_LEVEL, **options}
     image.save(held, kind, **options)
-    write_bytes(path, held.getvalue())
+    return held.getvalue()

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.even_indices import even_indices
@@ -65,6 +65,13 @@ def checked_gaussians(scene: Scene, targets: Sequence[Target], config: ViewsConf
     return scene.gaussians
 
 
+class Picked(NamedTuple):
+    """Candidates that are shown whatever their utility: which, in order, and what each adds to those before it."""
+
+    order: Int64[np.ndarray, " n"]
+    gains: Float64[np.ndarray, " n"]
+
+
 class Judged(NamedTuple):
     """Candidates, and what they show of each target."""
 
@@ -90,17 +97,26 @@ def judge_candidates(
 
 
 def chosen_views(
-    scene: Scene, targets: Sequence[Target], judgment: Judged, free: FreeSpace, config: ViewsConfig
+    scene: Scene,
+    targets: Sequence[Target],
+    judgment: Judged,
+    free: FreeSpace,
+    config: ViewsConfig,
+    *,
+    picked: Picked | None = None,
 ) -> ViewSet:
-    """The candidates that show targets best together; see `choose_views`."""
+    """The candidates that show targets best together, or those that were picked; see `choose_views`."""
     candidates, scores, judged = judgment
     cameras = candidates.cameras
     values = CoverageObjective(cameras, targets, scores, config)
-    if config.method == "uniform":
+    gains: Float64[np.ndarray, " n"] | None
+    if picked is not None:
+        order, gains = picked
+    elif config.method == "uniform":
         order, gains = np.arange(len(cameras)), None
     else:
         order, gains = values.greedy(config.count)
-    _warn_about(scene, targets, scores, order, config)
+    _warn_about(scene, targets, scores, order, config.count if picked is None else len(order))
     target_scores = [
         tuple(
             TargetScore(
@@ -136,14 +152,12 @@ def _warn_about(
     targets: Sequence[Target],
     scores: Sequence[ViewScores],
     order: Int64[np.ndarray, " n"],
-    config: ViewsConfig,
+    count: int,
 ) -> None:
     """Warns of what a user would not expect."""
-    if len(order) < config.count:
+    if len(order) < count:
         reason = "no other shows more of what was found" if targets else "there are no more"
-        warnings.warn(
-            f"views: {len(order)} of {config.count} in scene {scene.name}: {reason}", SceneWarning, stacklevel=3
-        )
+        warnings.warn(f"views: {len(order)} of {count} in scene {scene.name}: {reason}", SceneWarning, stacklevel=3)
     for target, each in zip(targets, scores, strict=True):
         seen = (each.visible * each.inside)[order].max(initial=0)
         if seen < CONSTANTS.min_visible:

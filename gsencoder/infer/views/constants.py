@@ -110,6 +110,16 @@ class ViewConstants:
     frame_margin: float = 0.5
     """Margin around a target on every side, as a share of its size: for its opacity score, and in close-ups."""
 
+    # Budgets of error and of megabytes (shown_error.py, picture_size.py)
+    window_sigmas: float = 6.0
+    """A Gaussian reaches no farther than so many standard deviations in a picture, and is left out of none by it."""
+    error_safety: float = 1.2
+    """What small renders leave unseen counts so many times …"""
+    unsure_gaussians: float = 2.0
+    """… and so many Gaussians of each target count as unseen on top of it."""
+    least_picture_side: int = 224
+    """Pictures are made no smaller by a budget, longer side, pixels: the input of the smallest common vision towers."""
+
     # Utility of a view and of a set of views (utility.py, choose.py)
     half_blur: float = 0.04
     """Standard deviation of the target's Gaussians, as a share of the picture's longer side, that halves a view's

@@ -98,7 +98,7 @@ class SelectedView:
         name: of the frame, "IMG_2.jpg near mug" for a close-up, or "around mug 03".
         frame: which of the scene's views it is or is cut from; None where it was placed.
         clearance: world units from the camera to the nearest surface.
-        gain: what it added to the choice; None for uniform frames.
+        gain: what it added to the choice, with a budget of error by how much it lowered that; None for uniform frames.
         covered: how well this view and those before it show the targets' Gaussians, by `coverage`: 1 = each as well
             as the candidate that shows it best; None where there are no targets.
         target_scores: one for each target.

@@ -14,6 +14,8 @@ from gsencoder.types import Box, Scene
 from gsencoder.types.poses import move_origin
 
 SHEET = "sheet.png"
+SUFFIX = ".png"
+"""Of the pictures of views."""
 
 
 def score_to_json(score: TargetScore) -> dict[str, Any]:
@@ -38,7 +40,7 @@ def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
         rows.append(
             {
                 "name": each.name,
-                "picture": f"view_{number:02d}.png",
+                "picture": f"view_{number:02d}{SUFFIX}",
                 "kind": kind,
                 "frame": each.frame,
                 "clearance": each.clearance,

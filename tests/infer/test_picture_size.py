@@ -1,0 +1,108 @@
+"""Pictures of views within megabytes: smaller ones, then fewer, and beside an error all of them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rooms import corner_cameras, room
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.picture_file import write_picture
+from gsencoder.infer.views import picture_size as module
+from gsencoder.infer.views.budget import ViewsBudget
+from gsencoder.infer.views.picture_size import SizedPictures, pictures_within
+from gsencoder.infer.views.selection import SelectedView, ViewSet
+from gsencoder.types import Scene
+
+LEAST, COUNT = 32, 4
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "CONSTANTS", replace(module.CONSTANTS, least_picture_side=LEAST))
+
+
+@pytest.fixture(scope="module")
+def viewed() -> tuple[Scene, ViewSet]:
+    """The room, and views of it of two sizes."""
+    scene, _ = room()
+    cameras = corner_cameras(COUNT, 160, 120)
+    cameras = cameras.resized_to(np.array([160, 160, 80, 80], np.int32), np.array([120, 120, 60, 60], np.int32))
+    chosen = tuple(
+        SelectedView(name=str(number), frame=None, clearance=1.0, gain=None, covered=None, target_scores=())
+        for number in range(COUNT)
+    )
+    return scene, ViewSet(cameras=cameras, chosen=chosen, judged=COUNT, near=0.01)
+
+
+def written(sized: SizedPictures, folder: Path) -> float:
+    """Megabytes of the files."""
+    for number, picture in enumerate(sized.pictures):
+        write_picture(folder / f"{number}.png", picture)
+    return sum((folder / f"{number}.png").stat().st_size for number in range(len(sized.pictures))) / 1e6
+
+
+@pytest.mark.slow
+def test_pictures_are_as_large_as_fit_and_files_keep_the_promise(viewed: tuple[Scene, ViewSet], tmp_path: Path) -> None:
+    scene, views = viewed
+    whole = written(pictures_within(scene, views, ViewsBudget(megabytes=10.0)), tmp_path)
+    sides = []
+    for share in (0.1, 0.2, 0.4, 0.7, 0.99, 1.2):
+        sized = pictures_within(scene, views, ViewsBudget(megabytes=share * whole))
+        megabytes = written(sized, tmp_path)
+        assert megabytes <= share * whole
+        assert sized.predicted == pytest.approx(megabytes, rel=0.2)
+        assert sized.notes == ()
+        assert len(sized.views) == len(sized.pictures) == COUNT
+        # No picture is larger than it was, and none smaller than the side unless it was.
+        sizes = np.maximum(sized.views.cameras.widths, sized.views.cameras.heights)
+        assert sizes.tolist() == [min(side, sized.side) for side in (160, 160, 80, 80)]
+        assert [picture.shape[1] for picture in sized.pictures] == sizes.tolist()
+        # Little of the promise is left over.
+        if 0.15 < share < 0.9:
+            assert megabytes >= 0.8 * share * whole
+        sides.append(sized.side)
+    assert sides == sorted(sides)
+    assert sides[-1] == 160
+    assert LEAST <= sides[0] < sides[3]
+
+
+def test_a_side_that_took_more_than_was_predicted_is_lowered(
+    viewed: tuple[Scene, ViewSet], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, views = viewed
+    # Bytes that hardly grow with pixels would let all pictures stay as they are.
+    monkeypatch.setattr(module, "_exponent", lambda *_: 0.3)
+    budget = ViewsBudget(megabytes=0.03)
+    sized = pictures_within(scene, views, budget)
+    assert sum(map(len, map(module.picture_bytes, sized.pictures, [".png"] * COUNT))) <= 30_000
+    # The side that would have been taken without the wrong prediction.
+    monkeypatch.undo()
+    monkeypatch.setattr(module, "CONSTANTS", replace(module.CONSTANTS, least_picture_side=LEAST))
+    assert sized.side == pytest.approx(pictures_within(scene, views, budget).side, rel=0.15)
+
+
+def test_where_the_least_side_takes_too_much_the_last_views_are_left_out(viewed: tuple[Scene, ViewSet]) -> None:
+    scene, views = viewed
+    least = pictures_within(scene, views, ViewsBudget(megabytes=10.0))
+    sizes = module._sizes(module.view_pictures(scene, module._capped(views, LEAST))[0])
+    assert least.side == 160
+    sized = pictures_within(scene, views, ViewsBudget(megabytes=(sizes[:2].sum() + 10) / 1e6))
+    assert [each.name for each in sized.views.chosen] == ["0", "1"]
+    assert len(sized.pictures) == len(sized.views.cameras) == 2
+    assert sized.side == LEAST
+    (note,) = sized.notes
+    assert "2 of 4 views fit in pictures of 32 pixels, the least; all take" in note
+    with pytest.raises(InputError, match=f"one picture of {LEAST} pixels in scene room takes .* MB; give more$"):
+        pictures_within(scene, views, ViewsBudget(megabytes=(sizes[0] - 1) / 1e6))
+
+
+def test_an_error_comes_before_megabytes(viewed: tuple[Scene, ViewSet]) -> None:
+    scene, views = viewed
+    sized = pictures_within(scene, views, ViewsBudget(error=0.1, megabytes=1e-4))
+    assert len(sized.views) == COUNT
+    assert sized.side == LEAST
+    (note,) = sized.notes
+    assert note.startswith("budget.error=0.1 takes about ")
+    assert note.endswith(" MB, more than budget.megabytes=0.0001; budget.error comes first")
