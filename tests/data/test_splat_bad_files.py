@@ -109,7 +109,6 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-@pytest.mark.alone
 def test_bad_files_end_in_one_clear_line_soon_and_without_large_memory(tmp_path: Path, name: str) -> None:
     data, words = HOSTILE[name]
     (tmp_path / name).write_bytes(data)
