@@ -132,6 +132,7 @@ def choose_scale(
     if not minutes:
         return 1.0
     none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
+    least: float
     if budget.seconds is None:
         steps, least = steps_for_minutes(minutes, config), LEAST_PIXELS
     else:
