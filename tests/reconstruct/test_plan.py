@@ -282,11 +282,13 @@ def test_promises_and_what_became_of_them_are_printed_and_recorded(
 ) -> None:
     monkeypatch.setattr(planning, "STEPS", STEPS)
     words = ["reconstruct", str(folder), f"out={tmp_path / 'out'}", "seeds.voxel=0.15", "holdout=3"]
+    words += ["data.image_scale=0.5"]
     assert cli.main([*words, "budget.error=1e-4", "budget.seconds=500", "budget.megabytes=0.04"]) == 0
     printed = capsys.readouterr()
     budget = summary_of(tmp_path / "out")["results"]["budget"]
     assert budget["promised"] == {"error": 1e-4, "seconds": 500.0, "megabytes": 0.04}
     assert budget["chosen"]["steps"] == STEPS[-1]
+    assert budget["chosen"]["image_scale"] == 0.5
     assert budget["realised"]["megabytes"] == (tmp_path / "out" / "splat.ply").stat().st_size / 1e6 <= 0.04
     assert 0.001 < budget["realised"]["error"] < 1
     assert "budget.megabytes: promised 0.04, realised 0.0" in printed.out
