@@ -46,9 +46,10 @@ class ReconstructConfig:
                 "budget.error: is measured on held-out photographs, and holdout=0 holds out none; leave one of the two "
                 "out"
             )
-        if self.budget.megabytes is not None and not self.prune.at:
+        if self.budget.megabytes is not None and not (self.prune.at and self.optimize.steps):
+            never = "optimize.steps=0" if self.prune.at else "prune.at=[]"
             raise InputError(
-                "budget.megabytes: Gaussians that do not fit are taken out as the splat is pruned, and prune.at=[] "
+                f"budget.megabytes: Gaussians that do not fit are taken out as the splat is pruned, and {never} "
                 "never prunes; leave one of the two out"
             )
 

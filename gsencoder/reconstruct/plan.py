@@ -167,7 +167,7 @@ def _within_megabytes(
     if most < 1:
         raise InputError(
             f"{budget.shown('megabytes')}: not one Gaussian fits; a splat of one takes "
-            f"{(HEADER_BYTES + sizes[0]) / MEGABYTE:.2g}"
+            f"{(HEADER_BYTES + sizes[0]) / MEGABYTE:.4g}"
         )
     expected = (HEADER_BYTES + min(contributing, most) * sizes[degree]) / MEGABYTE
     return replace(plan, sh_degree=degree, most=most, megabytes=expected)

@@ -38,8 +38,8 @@ class PruneConfig:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
     def due(self, step: int, steps: int) -> bool:
-        """Whether is pruned after `step` of `steps`."""
-        return step in {round(share * steps) for share in self.at}
+        """Whether is pruned after `step` of `steps`; small shares are of the first step."""
+        return step in {max(1, round(share * steps)) for share in self.at}
 
 
 def rows_to_keep(

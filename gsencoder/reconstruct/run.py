@@ -56,7 +56,7 @@ class Reconstruction:
             where `exposure` is None.
         seconds: wall-clock time by step of the stage.
         plan: that was followed.
-        elapsed: seconds from the first reading to the last step, of all runs that it took.
+        elapsed: seconds from the first reading to the Gaussians and pictures, of all runs that it took.
     """
 
     gaussians: Gaussians
@@ -142,6 +142,9 @@ def reconstruct(
             step=state.step,
         )
 
+        def since_reading() -> float:
+            return time.monotonic() - began + spent
+
         def validations(steps: int) -> int:
             return sum(config.validates_at(step, steps) for step in range(optimizer.step, steps + 1))
 
@@ -155,7 +158,7 @@ def reconstruct(
                     held_out,
                     validations,
                     double_means=bool(scene.origin.any()),
-                    spent=lambda: time.monotonic() - began + spent,
+                    spent=since_reading,
                 )
                 follow(optimizer, plan)
                 state = replace(state, adam=optimizer.adam)
@@ -168,6 +171,7 @@ def reconstruct(
             report(describe_plan(optimizer, config.optimize.steps, seconds, config.budget.option_of_steps))
         with clock("optimise"):
             fitted = fit(optimizer, state, plan, held_out, config, folder, identity, track, report)
+        ended = time.monotonic()
         exposure = differing = source = None
         predicted = predict_exposures(optimizer.exposures, photographs.cameras, held_out)
         if optimizer.exposures is not None:
@@ -175,6 +179,9 @@ def reconstruct(
             differing = describe_exposure(min(exposure), max(exposure), source)
         if differing is not None:
             report(differing)
+        comparisons = compare(optimizer, held_out, matched=differing is not None and source == "mean")
+        # What a run that is continued repeats does not count.
+        elapsed = fitted.seconds + time.monotonic() - ended if continued else since_reading()
         return Reconstruction(
             gaussians=optimizer.gaussians(),
             seeding={name: value for name, value in {**state.facts, **fitted.plan.facts()}.items() if name != PLAN},
@@ -182,13 +189,13 @@ def reconstruct(
             training=optimizer.training,
             held_out=tuple(held_out),
             log=tuple(fitted.rows),
-            comparisons=compare(optimizer, held_out, matched=differing is not None and source == "mean"),
+            comparisons=comparisons,
             exposure=exposure,
             exposure_source=source,
             held_out_colors=predicted.maps.numpy(),
             seconds=clock.seconds,
             plan=fitted.plan,
-            elapsed=fitted.seconds,
+            elapsed=elapsed,
         )
 
 

@@ -177,7 +177,9 @@ def test_what_cannot_be_removed_is_said(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("taken", [True, False])
-def test_an_error_before_anything_was_computed_speaks_of_no_state(tmp_path: Path, *, taken: bool) -> None:
+def test_an_error_before_anything_was_computed_speaks_of_no_state_and_leaves_none(
+    tmp_path: Path, *, taken: bool
+) -> None:
     path = tmp_path / "run"
     if not taken:
         cut_off(path, "state of another run")
@@ -191,6 +193,7 @@ def test_an_error_before_anything_was_computed_speaks_of_no_state(tmp_path: Path
     with pytest.raises(InputError) as caught:
         fail()
     assert getattr(caught.value, "__notes__", []) == []
+    assert path.exists() == (not taken)
 
 
 def test_an_error_is_not_lost_where_the_folder_went_away_before_it(tmp_path: Path) -> None:

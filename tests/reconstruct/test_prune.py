@@ -89,6 +89,10 @@ def test_pruning_is_due_once_for_each_share_of_the_steps() -> None:
     assert [step for step in range(41) if config.due(step, 40)] == [10, 20, 40]
 
 
+def test_a_share_of_less_than_a_step_is_due_after_the_first() -> None:
+    assert [step for step in range(41) if PruneConfig(at=(0.01,)).due(step, 40)] == [1]
+
+
 @pytest.mark.parametrize("at", [0.0, -0.5, 1.01])
 def test_shares_of_the_steps_outside_0_to_1_are_refused(at: float) -> None:
     with pytest.raises(InputError, match="at: expected shares"):

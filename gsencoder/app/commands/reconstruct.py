@@ -142,7 +142,9 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             splat=PLY_FILE,
             log=LOG_FILE,
         )
-        promises = _report_budget(summary, opened.scene.name, scale, result, folder / PLY_FILE, seconds, config)
+        # A scene without poses of its own has the name of the folder of its state.
+        name = opened.scene.name if opened.sfm is None else path.name
+        promises = _report_budget(summary, name, scale, result, folder / PLY_FILE, seconds, config)
     for line in promises:
         screen.print(f"{out}: {line}")
     scores = f"; {describe(last)} on {counted(len(result.held_out), 'held-out photograph')}" if last else ""
@@ -173,7 +175,8 @@ def _report_budget(
     budget, plan = config.budget, result.plan
     if not budget.promised:
         return []
-    chosen = {"image_scale": scale, "steps": result.steps, "sh_degree": plan.sh_degree, "gaussians": plan.most}
+    image_scale = scale * config.data.image_scale
+    chosen = {"image_scale": image_scale, "steps": result.steps, "sh_degree": plan.sh_degree, "gaussians": plan.most}
     report_choice(
         summary,
         scene,

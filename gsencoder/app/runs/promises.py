@@ -55,7 +55,7 @@ def report_promises(summary: Summary, budget: Budget, realised: Mapping[str, flo
     """
     promised = {name: budget.promise(name) for name in budget.promised}
     summary.results["budget"].update(promised=promised, realised=dict(realised))
-    predicted = "; the summary says what was predicted" if summary.results["budget"]["predicted"] else ""
+    predicted = summary.results["budget"]["predicted"]
     lines = []
     for name, promise in promised.items():
         if name not in realised:
@@ -64,8 +64,9 @@ def report_promises(summary: Summary, budget: Budget, realised: Mapping[str, flo
         if realised[name] <= promise:
             lines.append(f"budget.{name}: promised {shown_value(promise)}, realised {realised[name]:.4g}")
         else:
+            more = "; the summary says what was predicted" if name in predicted else ""
             warnings.warn(
-                f"budget.{name}: promised {shown_value(promise)}, and it became {realised[name]:.4g}{predicted}",
+                f"budget.{name}: promised {shown_value(promise)}, and it became {realised[name]:.4g}{more}",
                 SceneWarning,
                 stacklevel=3,
             )

@@ -40,7 +40,8 @@ class WorkFolder:
     """A folder with a marker file, by which later runs recognize it.
 
     Enter it before the output folder and `take` it inside: it is then locked until the results have been renamed into
-    place, and removed after that. If the block ends early, the folder stays as it is, and a note of the error says so.
+    place, and removed after that. If the block ends early, the folder stays as it is, and a note of the error says so;
+    one that holds no state yet is removed.
 
     Attributes:
         path: of the folder, with symbolic links resolved.
@@ -131,7 +132,11 @@ class WorkFolder:
                 self._discard()
                 (self.path / DISCARDED_FILE).unlink(missing_ok=True)
                 self.path.rmdir()
-            elif error is not None and self._taken and self._has_state() and str(self.path) not in str(error):
+            elif self._taken and not self._has_state():
+                with suppress(OSError):
+                    (self.path / MARKER_FILE).unlink()
+                    self.path.rmdir()
+            elif error is not None and self._taken and str(self.path) not in str(error):
                 # An error that is about the folder says itself what to do with it.
                 error.add_note(
                     f"{self.path} holds what was computed; a run with the same out= and settings continues it"
