@@ -73,17 +73,21 @@ def test_each_of_several_scenes_has_its_own_warnings_in_its_summary(tmp_path: Pa
     def run(path: Path, out: Path, one: Summary) -> None:
         with output_folder(out, summary=one):
             # As the command line does, which knows the summary of the whole run alone.
-            shown.append(summary.add_warning(f"{path}/depth: dark" if path.name == "b" else "dark"))
+            shown.append(summary.add_warning(texts[path.name]))
         given.append(one)
 
-    paths, options = [tmp_path / name for name in "ab"], {"overwrite": False, "worker": 0, "screen": console()}
+    texts = {"a": "dark", "b": f"{tmp_path / 'b'}/depth: dark", "c": "c: dark"}
+    paths, options = [tmp_path / name for name in texts], {"overwrite": False, "worker": 0, "screen": console()}
     run_scenes(paths, tmp_path / "out", "features", run, summary, **options)
     # The run shows and keeps all, with the name of the scene where a warning does not say it.
-    assert shown == ["a: dark", f"{tmp_path / 'b'}/depth: dark"]
+    assert shown == ["a: dark", texts["b"], texts["c"]]
     assert summary.warnings == ["weights: old", *shown]
-    for name, one, own in zip("ab", given, ("dark", shown[1]), strict=True):
+    for one, (name, text) in zip(given, texts.items(), strict=True):
         record = json.loads((tmp_path / "out" / name / "summary.json").read_text())
-        assert record["warnings"] == one.warnings == ["weights: old", own]
+        assert record["warnings"] == one.warnings == ["weights: old", text]
+    # What comes after the last scene is of none.
+    assert summary.add_warning("disk: slow") == "disk: slow"
+    assert given[-1].warnings == ["weights: old", texts["c"]]
 
 
 def test_a_broken_promise_of_one_of_several_scenes_names_it_on_the_screen_and_stands_in_its_summary_alone(

@@ -85,6 +85,13 @@ def test_a_summary_records_what_the_run_did(tmp_path: Path) -> None:
     assert set(record) >= {"version", "peak_memory_mb", "platform"}
 
 
+def test_seconds_that_were_timed_elsewhere_are_added_up() -> None:
+    summary = Summary("reconstruct", {})
+    for steps in ({"read": 2.0, "seeds": 1.0}, {"read": 0.5}):
+        summary.add_seconds(steps)
+    assert summary.timings == {"read": 2.5, "seeds": 1.0}
+
+
 def test_a_summary_names_neither_the_machine_nor_the_user(tmp_path: Path) -> None:
     text = json.dumps(Summary("fuse", {}).to_dict())
     assert os.uname().nodename not in text

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -86,6 +87,14 @@ def test_signals_that_python_does_not_handle_are_left_alone() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
+def test_a_handler_that_was_taken_out_of_a_block_leads_to_the_one_before_it(number: int) -> None:
+    with defer_signals():
+        taken = signal.getsignal(number)
+    assert callable(taken)
+    with pytest.raises(Stopped):
+        taken(number, None)
+
+
 def test_other_threads_need_nothing() -> None:
     done = []
 
@@ -123,7 +132,7 @@ def interrupt(number: int = signal.SIGTERM) -> None:
 
 
 def test_a_dropped_stop_is_raised_again_each_time_it_is_asked_for_and_at_the_end() -> None:
-    before = {number: signal.getsignal(number) for number in SIGNALS}
+    before, hook = {number: signal.getsignal(number) for number in SIGNALS}, sys.unraisablehook
     raised = []
 
     def work() -> None:
@@ -139,7 +148,90 @@ def test_a_dropped_stop_is_raised_again_each_time_it_is_asked_for_and_at_the_end
         work()
     assert raised == [signal.SIGTERM] * 2
     assert {number: signal.getsignal(number) for number in SIGNALS} == before
+    assert sys.unraisablehook is hook
     raise_dropped_stop()
+
+
+def test_other_errors_that_python_drops_are_still_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Subject:
+        def __del__(self) -> None:
+            raise ValueError("of something else")
+
+    reported = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda dropped: reported.append(str(dropped.exc_value)))
+    with stopping_signals():
+        Subject()
+    assert reported == ["of something else"]
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+def test_a_stop_that_is_being_handled_is_not_raised_again(wrapped: bool) -> None:
+    stop, cleaned = Stopped(signal.SIGTERM), []
+    error = SystemError("<function> returned a result with an exception set")
+    error.__cause__ = stop
+
+    def work() -> None:
+        interrupt()
+        try:
+            raise error if wrapped else stop
+        finally:
+            raise_dropped_stop()
+            cleaned.append("all of it")
+
+    with pytest.raises(Stopped) as raised, stopping_signals():
+        work()
+    assert cleaned == ["all of it"]
+    assert (raised.value is stop) != wrapped
+
+
+def test_a_dropped_stop_is_raised_while_another_error_is_handled() -> None:
+    after = []
+
+    def work() -> None:
+        interrupt()
+        try:
+            raise OSError("of something else")
+        except OSError:
+            raise_dropped_stop()
+            after.append("went on")
+
+    with pytest.raises(Stopped), stopping_signals():
+        work()
+    assert after == []
+
+
+def test_an_error_that_was_made_of_a_stop_is_its_cause_and_gives_it_its_notes() -> None:
+    error = ValueError("the model cannot be run")
+    error.add_note("a folder is left behind")
+
+    def work() -> None:
+        interrupt()
+        raise error
+
+    with pytest.raises(Stopped) as stop, stopping_signals():
+        work()
+    assert stop.value.__cause__ is error
+    assert stop.value.__notes__ == ["a folder is left behind"]
+
+
+def test_a_dropped_stop_is_raised_in_the_main_thread_alone() -> None:
+    raised = []
+
+    def elsewhere() -> None:
+        try:
+            raise_dropped_stop()
+        except Stopped as stop:
+            raised.append(stop)
+
+    def work() -> None:
+        interrupt()
+        thread = threading.Thread(target=elsewhere)
+        thread.start()
+        thread.join()
+
+    with pytest.raises(Stopped), stopping_signals():
+        work()
+    assert raised == []
 
 
 def test_a_second_signal_is_raised_where_the_first_is_being_handled_and_the_first_is_not_raised_twice() -> None:

@@ -4,7 +4,8 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -63,6 +64,72 @@ def test_of_several_errors_the_one_of_the_first_piece_is_raised_and_no_more_piec
         parallel(work, range(9))
     assert sorted(begun) == [0, 1, 2, 3]
     assert parallel(lambda piece: piece, range(3)) == [0, 1, 2]
+
+
+def test_results_are_in_the_order_of_pieces_also_where_a_later_one_ends_first(two_threads: None) -> None:
+    later = threading.Event()
+
+    def work(piece: int) -> int:
+        if piece == 0:
+            assert later.wait(60)
+        later.set()
+        return piece
+
+    assert parallel(work, range(4)) == [0, 1, 2, 3]
+
+
+def test_an_interrupt_that_work_meets_on_another_thread_is_raised_by_the_caller(two_threads: None) -> None:
+    barrier = threading.Barrier(2)
+
+    def work(piece: int) -> int:
+        barrier.wait(timeout=60)
+        if threading.current_thread() is not threading.main_thread():
+            raise KeyboardInterrupt("of a thread")
+        return piece
+
+    with pytest.raises(KeyboardInterrupt, match="of a thread"):
+        parallel(work, range(2))
+
+
+def test_an_interrupt_before_any_thread_has_begun_is_raised(two_threads: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: threading.Thread) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(threading.Thread, "start", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        parallel(lambda piece: piece, range(3))
+
+
+def test_where_the_caller_is_interrupted_no_more_pieces_begin_and_none_runs_on(
+    two_threads: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    working, waited_for = threading.Event(), threading.Event()
+    begun, ended = list[int](), list[int]()
+    one_thread, join = threads._one_thread, threads._join
+
+    @contextmanager
+    def interrupted() -> Iterator[None]:
+        if threading.current_thread() is threading.main_thread():
+            working.wait(10)
+            raise KeyboardInterrupt
+        with one_thread():
+            yield
+
+    def joined(others: Iterable[threading.Thread]) -> None:
+        waited_for.set()
+        join(others)
+
+    def work(piece: int) -> None:
+        begun.append(piece)
+        working.set()
+        waited_for.wait(10)
+        ended.append(piece)
+
+    monkeypatch.setattr(threads, "_one_thread", interrupted)
+    monkeypatch.setattr(threads, "_join", joined)
+    with pytest.raises(KeyboardInterrupt):
+        parallel(work, range(9))
+    assert begun == ended == [0]
 
 
 def test_work_ahead_comes_in_order_and_one_item_before_it_is_asked_for() -> None:

@@ -30,7 +30,7 @@ def entries(b: Blend) -> set[tuple[int, int]]:
     return set(zip(rows.tolist(), b.col.tolist(), strict=True))
 
 
-@pytest.mark.parametrize(("relative", "absolute"), [(0.1, 0.0), (0.0, 0.3), (0.1, 0.2), (1.0, 0.0)])
+@pytest.mark.parametrize(("relative", "absolute"), [(0.1, 0.0), (0.0, 0.3), (0.1, 0.2), (1.0, 0.0), (0.0, 9.0)])
 def test_an_entry_stays_if_its_depth_is_among_those_that_its_rows_rays_meet(
     rng: np.random.Generator, relative: float, absolute: float
 ) -> None:

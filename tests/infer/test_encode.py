@@ -160,23 +160,41 @@ def test_chunks_that_take_many_times_the_work_of_a_scene_are_warned_of_with_thei
     def run(subset: Gaussians, curves: object, count: int) -> np.ndarray:
         return np.zeros((count, 1), np.float32)
 
-    def encoded(config: EncodeConfig) -> None:
-        encode_by_chunks(one, run, lambda: None, config, metres_per_unit=1.0, columns={"s": slice(0, 1)})
+    def encoded(config: EncodeConfig, unit: float = 1.0) -> None:
+        encode_by_chunks(one, run, lambda: None, config, metres_per_unit=unit, columns={"s": slice(0, 1)})
 
     encoded(EncodeConfig(chunk=700, halo=0.1))
     monkeypatch.setattr(chunks_module, "MUCH_WORK", 10_000)
     # Of so small ones it is certain before they are cut.
-    with pytest.warns(SceneWarning, match="^encode.chunk=5: 300 chunks or more, .* at least 41 times") as caught:
-        encoded(EncodeConfig(chunk=5, halo=0.1))
-    assert len(caught) == 1
+    for chunk, least, times in ((5, 300, 41), (35, 43, 7)):
+        figures = f"^encode.chunk={chunk}: {least} chunks or more, .* at least {times} times"
+        with pytest.warns(SceneWarning, match=figures) as caught:
+            encoded(EncodeConfig(chunk=chunk, halo=0.1))
+        assert len(caught) == 1
     chunks = cut(one.means, 200, 0.5)
-    seen = sum(len(each.rows) for each in chunks)
+    seen, narrow = sum(len(each.rows) for each in chunks), sum(each.halo < 0.495 for each in chunks)
+    assert 0 < narrow < len(chunks)
     figures = (
-        rf"encode.chunk=200: {len(chunks):,} chunks, .* hold {seen:,} Gaussians, {seen / 1500:.1f} times the 1,500 "
+        rf"encode.chunk=200: {len(chunks):,} chunks, .* hold {seen:,} Gaussians, {seen / 1500:.1f} times the 1,500 .* "
+        rf"about {(seen + 200 * len(chunks)) / 1500:.0f} times the work of one pass; {narrow} of them have no room "
     )
-    with pytest.warns(SceneWarning, match=f"^{figures}.*no room for a halo of 0.5 m.*larger encode.chunk=") as caught:
-        encoded(EncodeConfig(chunk=200, halo=0.5))
+    with pytest.warns(SceneWarning, match=f"^{figures}for a halo of 0.25 m.*larger encode.chunk=") as caught:
+        encoded(EncodeConfig(chunk=200, halo=0.25), 0.5)
     assert len(caught) == 1
+    with pytest.warns(SceneWarning, match="times the work of one pass; give a larger"):
+        encoded(EncodeConfig(chunk=40, halo=0.0))
+
+
+@pytest.mark.parametrize(
+    ("chunks", "seen", "count", "much"),
+    [(1, 120_001, 40_000, True), (1, 119_800, 40_000, False), (1, 99_801, 9, True), (1, 99_800, 9, False)],
+)
+def test_much_work_is_over_100000_gaussians_and_over_three_times_those_of_the_scene(
+    chunks: int, seen: int, count: int, much: bool
+) -> None:
+    """A chunk by itself counts as 200."""
+    assert chunks_module._is_much_work(chunks, seen, count) == much
+    assert chunks_module._is_much_work(chunks + 1, seen - 200, count) == much
 
 
 def test_a_rerun_gives_the_same_bits() -> None:

@@ -70,9 +70,34 @@ def test_for_promised_seconds_photographs_are_made_smaller_only_where_there_is_n
     assert 0.6 < scale(0.75 * needed) < 1
     # What reading took is missing then.
     assert scale(1.01 * needed, spent=0.26 * needed * PLANNED) == pytest.approx(scale(0.75 * needed), abs=1e-3)
+    # A reduction by less than a twentieth is none.
+    assert scale(0.97 * needed) == 1
+    # Where reading took more than all of it, as little as possible is left.
+    assert scale(needed, width=4000, height=3000, spent=2 * needed) == scale(1.0, width=4000, height=3000)
     # Small photographs stay, since what they cost is small beside the Gaussians.
     assert scale(1.0, width=320, height=240) == 1
     assert scale(1.0, width=4000, height=3000) == pytest.approx((97_000 / 12e6) ** 0.5, rel=0.02)
+
+
+def test_the_usual_photograph_decides_by_how_much_all_are_made_smaller() -> None:
+    usual = pictures(4000, 3000)
+    widths, heights = np.int32([4000, 4000, 12000]), np.int32([3000, 3000, 9000])
+    other = replace(usual, widths=widths, heights=heights)
+    assert choose_scale(other, BudgetConfig(), CPU, USUAL) == choose_scale(usual, BudgetConfig(), CPU, USUAL)
+
+
+def test_promised_seconds_come_before_the_aim_in_minutes_and_leave_a_second_at_least() -> None:
+    assert BudgetConfig(minutes=3.0).minutes_left(1e6) == 3
+    promise = BudgetConfig(minutes=3.0, seconds=600.0)
+    assert promise.minutes_left() == pytest.approx(PLANNED * 10)
+    assert promise.minutes_left(60.0) == pytest.approx(PLANNED * 10 - 1)
+    assert promise.minutes_left(600.0) == pytest.approx(1 / 60)
+
+
+def test_the_option_that_chooses_the_steps_is_the_promise_that_comes_first() -> None:
+    assert BudgetConfig(megabytes=1.0).option_of_steps == "budget.minutes"
+    assert BudgetConfig(megabytes=1.0, seconds=9.0).option_of_steps == "budget.seconds"
+    assert BudgetConfig(error=0.1, seconds=9.0).option_of_steps == "budget.error"
 
 
 def test_cores_and_stages_count(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,13 +138,16 @@ def test_four_views_from_the_first_to_the_last_stand_for_all() -> None:
     assert trial_views([7]) == [7]
 
 
-def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time() -> None:
+def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     assert affordable_steps(optimizer(OptimizeConfig(steps=5000)), 0.1) == 5000
     usual = optimizer(USUAL)
     assert affordable_steps(usual, 0.0) == USUAL.steps
     assert affordable_steps(usual, 10.0) == USUAL.steps
     assert affordable_steps(usual, 0.01) == LEAST_STEPS
     assert affordable_steps(usual, 80.0) == 2 * USUAL.steps
+    # Between these, a fifth of the time is left for reading and seeds.
+    monkeypatch.setattr("gsencoder.reconstruct.budget.step_seconds", lambda *_: 1.0)
+    assert affordable_steps(usual, 10.0) == 480
 
 
 @pytest.mark.usefixtures("no_gpu")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from archives import header_of, rewrite
 from reconstructions import refusal, summary_of
 
@@ -84,6 +85,39 @@ def test_less_room_first_costs_degrees_of_color_and_then_gaussians(optimizer: Op
     follow(optimizer, Plan(steps=9, sh_degree=0))
     wide = BudgetConfig(megabytes=(2048 + contributing * 68) / 1e6)
     assert planned(optimizer, wide, double=True).most == (contributing * 68) // 80
+
+
+def test_a_size_that_one_gaussian_fits_into_is_planned_with_that_one_in_a_single_color(optimizer: Optimizer) -> None:
+    plan = planned(optimizer, BudgetConfig(megabytes=(2048 + 68.5) / 1e6))
+    assert (plan.sh_degree, plan.most) == (0, 1)
+
+
+def test_where_nothing_contributes_yet_all_gaussians_are_to_fit(
+    optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none_left(_: Optimizer) -> None:
+        raise InputError("reconstruct: pruning would leave none")
+
+    monkeypatch.setattr(Optimizer, "contributing", none_left)
+    count = len(optimizer.parameters["means"])
+    for row, degree in ((164, 2), (163, 1), (103, 0)):
+        size = (2048 + count * row) / 1e6 + 1e-9
+        plan = planned(optimizer, BudgetConfig(megabytes=size))
+        assert plan.sh_degree == degree
+        assert plan.megabytes == pytest.approx((2048 + count * (164, 104, 68)[2 - degree]) / 1e6)
+        optimizer.adam = RowAdam(dict(optimizer.parameters, shN=torch.zeros(count, 8, 3)))
+
+
+def test_an_error_is_that_of_surfaces_that_a_fitted_photograph_shows_where_these_are_known() -> None:
+    assert error_of({"ssim": 0.5, "seen_ssim": 0.75}) == 0.25
+    assert error_of({"ssim": 0.5}) == 0.5
+
+
+@pytest.mark.parametrize("promises", [{}, {"error": 0.5}, {"megabytes": 1.0}])
+def test_a_plan_holds_the_seconds_before_its_first_step_whatever_is_promised(
+    optimizer: Optimizer, promises: dict[str, float]
+) -> None:
+    assert planned(optimizer, BudgetConfig(**promises), spent=7.0).spent == 7
 
 
 def test_the_colors_of_a_plan_are_those_that_were_there_without_the_higher_coefficients(optimizer: Optimizer) -> None:
@@ -195,6 +229,7 @@ def test_a_run_for_an_error_that_was_cut_ends_with_the_same_splat(
         patched.setattr(Optimizer, "advance", stop)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(scene, config, work=tmp_path)
+    assert header_of(tmp_path / CHECKPOINT_FILE)["facts"]["steps_planned"] == STEPS[-1]
     again = reconstruct(scene, config, work=tmp_path)
     assert again.steps == whole.steps
     assert [row["step"] for row in again.log] == [row["step"] for row in whole.log]
@@ -218,7 +253,12 @@ def test_a_run_for_a_size_that_was_cut_ends_with_the_same_splat(
         patched.setattr(Optimizer, "advance", stop)
         with pytest.raises(KeyboardInterrupt):
             reconstruct(scene, config, work=tmp_path)
+    header = header_of(tmp_path / CHECKPOINT_FILE)
+    assert header["seconds"] > 0
+    # What the first run took counts, however long ago that was.
+    rewrite(tmp_path / CHECKPOINT_FILE, header={**header, "seconds": 1000.0})
     again = reconstruct(scene, config, work=tmp_path)
+    assert again.elapsed > again.log[-1]["seconds"] > 1000 > whole.elapsed
     np.testing.assert_array_equal(again.gaussians.sh, whole.gaussians.sh)
     np.testing.assert_array_equal(again.gaussians.means, whole.gaussians.means)
     assert again.plan == replace(whole.plan, spent=again.plan.spent)
@@ -232,12 +272,19 @@ def test_seconds_buy_steps_by_what_trial_steps_take(
     optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch, seconds: float, steps: int, total: float, broken: bool
 ) -> None:
     """A step takes 3 s, all else 12 s, and 20 s are spent; 0.85 of what is promised is planned with, between 5 and
-    100 steps."""
-    expected: Callable[..., ExpectedSeconds] = lambda one, *_: ExpectedSeconds(3.0 * one.config.steps, 12.0)  # noqa: E731
+    100 steps. Those that are tried are as many as there may be time for."""
+    tried = []
+
+    def expected(one: Optimizer, _: object, validations: int) -> ExpectedSeconds:
+        tried.append((one.config.steps, validations))
+        return ExpectedSeconds(3.0 * one.config.steps, 12.0)
+
     monkeypatch.setattr(planning, "expected_seconds", expected)
+    monkeypatch.setattr(planning, "affordable_steps", lambda _, minutes: round(60 * minutes))
     monkeypatch.setattr(planning, "STEPS", (5, 100))
     plan = planned(optimizer, BudgetConfig(seconds=seconds), spent=20.0)
     assert (plan.steps, plan.seconds, plan.spent) == (steps, pytest.approx(total), 20.0)
+    assert tried == [(min(100, max(1, round(0.85 * seconds - 20))),) * 2]
     assert bool(plan.notes) == broken
     if broken:
         assert plan.notes == ("budget.seconds=20: the fewest steps, 5, take about 47 s in all; they are done",)
@@ -312,10 +359,12 @@ def test_promises_and_what_became_of_them_are_printed_and_recorded(
     words += ["data.image_scale=0.5"]
     assert cli.main([*words, "budget.error=1e-4", "budget.seconds=500", "budget.megabytes=0.04"]) == 0
     printed = capsys.readouterr()
-    budget = summary_of(tmp_path / "out")["results"]["budget"]
+    results = summary_of(tmp_path / "out")["results"]
+    budget = results["budget"]
     assert budget["promised"] == {"error": 1e-4, "seconds": 500.0, "megabytes": 0.04}
     assert budget["chosen"]["steps"] == STEPS[-1]
     assert budget["chosen"]["image_scale"] == 0.5
+    assert 0 < results["gaussians"] <= budget["chosen"]["gaussians"] < 0.04e6 / 68
     assert budget["realised"]["megabytes"] == (tmp_path / "out" / "splat.ply").stat().st_size / 1e6 <= 0.04
     assert 0.001 < budget["realised"]["error"] < 1
     assert "budget.megabytes: promised 0.04, realised 0.0" in printed.out
