@@ -1,7 +1,7 @@
 """Settings of `gsencoder.reconstruct.run.reconstruct`."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from gsencoder.core.errors import InputError
@@ -40,7 +40,8 @@ class ReconstructConfig:
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         if self.budget.error is not None or self.budget.seconds is not None:
-            check_governed(self.budget, self.optimize, OptimizeConfig(), ("steps",), "optimize")
+            of_steps = replace(self.budget, megabytes=None)
+            check_governed(of_steps, self.optimize, OptimizeConfig(), ("steps",), "optimize")
         if self.budget.error is not None and not self.holdout:
             raise InputError(
                 "budget.error: is measured on held-out photographs, and holdout=0 holds out none; leave one of the two "

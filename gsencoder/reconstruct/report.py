@@ -42,22 +42,27 @@ class Comparison:
     render: UInt8[np.ndarray, "H W 3"]
 
 
-def describe_plan(optimizer: Optimizer, usual: int, seconds: float, option: str) -> str:
+def describe_plan(optimizer: Optimizer, usual: int, seconds: float, option: str, most: int) -> str:
     """What is about to happen, and how long it should take.
 
     Args:
         optimizer: before its first step, or where it goes on.
         usual: number of steps by default.
         seconds: expected.
-        option: that changes this number.
+        option: that changes this number; with budget.error more follow until it is reached.
+        most: number of steps that may be done for it.
     """
     widths, heights = optimizer.photographs.cameras.widths, optimizer.photographs.cameras.heights
     steps = optimizer.config.steps
-    fewer = f" instead of {usual:,} ({option})" if steps != usual else ""
+    number = f"{steps - optimizer.step:,} more of {steps:,} steps" if optimizer.step else f"{steps:,} steps"
+    if option == "budget.error":
+        number += f", and up to {most:,} until {option} is reached"
+    elif steps != usual:
+        number += f" instead of {usual:,} ({option})"
     expected = f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} s"
     return (
         f"{len(optimizer.training)} photographs of {int(np.median(widths))}×{int(np.median(heights))}, "
-        f"{len(optimizer.parameters['means']):,} Gaussians, {steps - optimizer.step:,} steps{fewer}: about {expected}"
+        f"{len(optimizer.parameters['means']):,} Gaussians, {number}: about {expected}"
     )
 
 

@@ -168,7 +168,9 @@ def reconstruct(
                 seconds = sum(expected_seconds(optimizer, held_out, validations(plan.steps)))
             else:
                 seconds = plan.seconds - plan.spent
-            report(describe_plan(optimizer, config.optimize.steps, seconds, config.budget.option_of_steps))
+            report(describe_plan(optimizer, config.optimize.steps, seconds, config.budget.option_of_steps, STEPS[-1]))
+            for note in plan.notes:
+                report(note)
         with clock("optimise"):
             fitted = fit(optimizer, state, plan, held_out, config, folder, identity, track, report)
         ended = time.monotonic()

@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
 from gsencoder.reconstruct import Reconstruction, reconstruct
 from gsencoder.reconstruct.config import ReconstructConfig
 from gsencoder.reconstruct.optimize import Optimizer
@@ -23,13 +20,6 @@ QUICK = ReconstructConfig(
     seeds=SeedConfig(voxel=0.15),
     optimize=OptimizeConfig(steps=4, shrinks=(1,), shares=(1.0,)),
 )
-
-
-@pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    folder = tmp_path_factory.mktemp("rooms") / "room"
-    write_room(make_room(0, objects=4, views=6, width=60, height=45), folder)
-    return load_scene(folder)
 
 
 @pytest.fixture(scope="module")

@@ -176,11 +176,13 @@ def _report_budget(
     if not budget.promised:
         return []
     image_scale = scale * config.data.image_scale
-    chosen = {"image_scale": image_scale, "steps": result.steps, "sh_degree": plan.sh_degree, "gaussians": plan.most}
+    chosen = {"image_scale": image_scale, "steps": result.steps, "sh_degree": plan.sh_degree}
+    if plan.most is not None:
+        chosen["most_gaussians"] = plan.most
     report_choice(
         summary,
         scene,
-        {name: value for name, value in chosen.items() if value is not None},
+        chosen,
         predicted={"seconds": plan.seconds, "megabytes": plan.megabytes},
         notes=plan.notes,
         quiet=config.quiet,

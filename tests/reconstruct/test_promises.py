@@ -1,0 +1,215 @@
+"""Reconstructions within a budget: what was promised, and what became of it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from archives import header_of, rewrite
+from reconstructions import refusal, summary_of
+
+from gsencoder.app import cli
+from gsencoder.core.errors import InputError
+from gsencoder.data.seeding.seed import SeedConfig, seed
+from gsencoder.data.splats import save_splat
+from gsencoder.reconstruct import plan as planning
+from gsencoder.reconstruct import reconstruct
+from gsencoder.reconstruct.budget import BudgetConfig
+from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, PLANNED_DEGREE
+from gsencoder.reconstruct.config import ReconstructConfig
+from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
+from gsencoder.reconstruct.plan import error_of
+from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.types import Scene
+
+SEEDS = SeedConfig(voxel=0.15)
+STEPS = (2, 4, 8)
+"""In place of hundreds."""
+
+
+def promising(**promises: float) -> ReconstructConfig:
+    """Settings with a budget."""
+    return ReconstructConfig(holdout=3, validate_every=0, seeds=SEEDS, budget=BudgetConfig(**promises))
+
+
+def short(**promises: float) -> ReconstructConfig:
+    """Settings with a budget that does not choose the steps."""
+    return replace(promising(**promises), optimize=OptimizeConfig(steps=4, shrinks=(1,), shares=(1.0,)))
+
+
+@pytest.mark.parametrize("share", [0.7, 0.1])
+def test_the_file_is_no_larger_than_promised_and_as_large_as_predicted(
+    scene: Scene, share: float, tmp_path: Path
+) -> None:
+    promise = share * len(seed(scene, SEEDS)) * 164 / 1e6
+    result = reconstruct(scene, short(megabytes=promise))
+    save_splat(tmp_path / "part.ply", result.gaussians)
+    size = (tmp_path / "part.ply").stat().st_size / 1e6
+    assert 0.5 * promise < size <= promise
+    assert result.plan.megabytes == pytest.approx(size, rel=0.05, abs=0.002)
+    assert result.gaussians.sh_degree == result.plan.sh_degree
+
+
+@pytest.fixture(scope="module")
+def errors(scene: Scene) -> list[float]:
+    """After each of `STEPS`."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(planning, "STEPS", STEPS)
+        unreachable = reconstruct(scene, promising(error=1e-6))
+    assert [row["step"] for row in unreachable.log] == [0, *STEPS]
+    return [error_of(row) for row in unreachable.log[1:]]
+
+
+@pytest.mark.parametrize("number", range(len(STEPS)))
+def test_a_promised_error_takes_the_fewest_steps_that_reach_it(
+    scene: Scene, errors: list[float], number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(planning, "STEPS", STEPS)
+    result = reconstruct(scene, promising(error=errors[number]))
+    first = next(index for index, error in enumerate(errors) if error <= errors[number])
+    assert result.steps == STEPS[first]
+    assert error_of(result.log[-1]) == errors[first]
+    assert result.seeding["steps_planned"] == STEPS[first]
+
+
+@pytest.mark.parametrize("cut", [4, 5])
+def test_a_run_for_an_error_that_was_cut_ends_with_the_same_splat(
+    scene: Scene, errors: list[float], cut: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(planning, "STEPS", STEPS)
+    config = promising(error=errors[-1])
+    whole, advance = reconstruct(scene, config), Optimizer.advance
+
+    def stop(self: Optimizer) -> dict[str, float]:
+        if self.step == cut:
+            raise KeyboardInterrupt
+        return advance(self)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Optimizer, "advance", stop)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(scene, config, work=tmp_path)
+    assert header_of(tmp_path / CHECKPOINT_FILE)["facts"]["steps_planned"] == STEPS[-1]
+    again = reconstruct(scene, config, work=tmp_path)
+    assert again.steps == whole.steps
+    assert [row["step"] for row in again.log] == [row["step"] for row in whole.log]
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        np.testing.assert_array_equal(getattr(again.gaussians, name), getattr(whole.gaussians, name))
+
+
+def test_a_run_for_a_size_that_was_cut_ends_with_the_same_splat(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    config, advance = short(megabytes=0.05), Optimizer.advance
+    whole = reconstruct(scene, config)
+    assert whole.plan.sh_degree < 2
+
+    def stop(self: Optimizer) -> dict[str, float]:
+        if self.step == 1:
+            raise KeyboardInterrupt
+        return advance(self)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Optimizer, "advance", stop)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(scene, config, work=tmp_path)
+    header = header_of(tmp_path / CHECKPOINT_FILE)
+    assert header["seconds"] > 0
+    # What the first run took counts, however long ago that was.
+    rewrite(tmp_path / CHECKPOINT_FILE, header={**header, "seconds": 1000.0})
+    again = reconstruct(scene, config, work=tmp_path)
+    assert again.elapsed > again.log[-1]["seconds"] > 1000 > whole.elapsed
+    np.testing.assert_array_equal(again.gaussians.sh, whole.gaussians.sh)
+    np.testing.assert_array_equal(again.gaussians.means, whole.gaussians.means)
+    assert again.plan == replace(whole.plan, spent=again.plan.spent)
+
+
+def test_what_reading_took_counts_to_promised_seconds(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planning, "STEPS", STEPS)
+    result = reconstruct(scene, promising(seconds=100.0), spent=30.0)
+    assert result.steps == STEPS[-1]
+    assert 30 < result.plan.spent < result.elapsed < 90
+    # What is done between planning and the first step, and after the last one, counts as well.
+    assert result.elapsed > 30 + sum(seconds for name, seconds in result.seconds.items())
+    late = reconstruct(scene, promising(seconds=100.0), spent=99.0)
+    assert late.steps == STEPS[0]
+
+
+@pytest.mark.parametrize(
+    ("config", "problem"),
+    [
+        (lambda: replace(promising(error=0.1), holdout=0), "held-out photographs, and holdout=0 holds out none"),
+        (lambda: replace(short(megabytes=1.0), prune=PruneConfig(at=())), "prune.at=.. never prunes"),
+        (lambda: replace(short(megabytes=1.0), optimize=OptimizeConfig(steps=0)), "optimize.steps=0 never prunes"),
+        (lambda: short(seconds=9.0), "optimize.steps=4: is chosen by budget.seconds"),
+        (lambda: short(error=0.1), "optimize.steps=4: is chosen by budget.error"),
+        (lambda: promising(error=1.0), "error: expected a number between 0 and 1, got 1.0"),
+        (lambda: promising(seconds=float("nan")), "seconds: expected a number above 0, got nan"),
+    ],
+)
+def test_promises_that_mean_nothing_or_exclude_each_other_are_refused(
+    config: Callable[[], ReconstructConfig], problem: str
+) -> None:
+    with pytest.raises(InputError, match=problem):
+        config()
+
+
+def test_a_size_that_no_gaussian_fits_into_is_refused_with_one_that_does(scene: Scene) -> None:
+    with pytest.raises(
+        InputError, match="budget.megabytes=0.0021: not one Gaussian fits; a splat of one takes 0.002116"
+    ):
+        reconstruct(scene, short(megabytes=0.0021))
+
+
+def test_a_run_of_an_earlier_version_goes_on_and_one_of_another_promise_does_not(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def stop(_: Optimizer) -> dict[str, float]:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Optimizer, "advance", stop)
+        with pytest.raises(KeyboardInterrupt):
+            reconstruct(scene, short(), work=tmp_path)
+    with pytest.raises(InputError, match=r"was made with .*budget"):
+        reconstruct(scene, short(megabytes=1.0), work=tmp_path)
+
+    header = header_of(tmp_path / CHECKPOINT_FILE)
+    impossible = {**header, "facts": {**header["facts"], PLANNED_DEGREE: 3}}
+    rewrite(tmp_path / CHECKPOINT_FILE, header=impossible)
+    with pytest.raises(InputError, match=r"colors of a degree that no run has \(3\)"):
+        reconstruct(scene, short(), work=tmp_path)
+    header["settings"]["budget"] = {"minutes": 10.0}
+    header["facts"] = {name: header["facts"][name] for name in ("seeds", "source", "steps_planned")}
+    rewrite(tmp_path / CHECKPOINT_FILE, header=header)
+    assert reconstruct(scene, short(), work=tmp_path).steps == 4
+
+
+def test_promises_and_what_became_of_them_are_printed_and_recorded(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(planning, "STEPS", STEPS)
+    words = ["reconstruct", str(folder), f"out={tmp_path / 'out'}", "seeds.voxel=0.15", "holdout=3"]
+    words += ["data.image_scale=0.5"]
+    assert cli.main([*words, "budget.error=1e-4", "budget.seconds=500", "budget.megabytes=0.04"]) == 0
+    printed = capsys.readouterr()
+    results = summary_of(tmp_path / "out")["results"]
+    budget = results["budget"]
+    assert budget["promised"] == {"error": 1e-4, "seconds": 500.0, "megabytes": 0.04}
+    assert budget["chosen"]["steps"] == STEPS[-1]
+    assert budget["chosen"]["image_scale"] == 0.5
+    assert 0 < results["gaussians"] <= budget["chosen"]["most_gaussians"] < 0.04e6 / 68
+    assert budget["realised"]["megabytes"] == (tmp_path / "out" / "splat.ply").stat().st_size / 1e6 <= 0.04
+    assert 0.001 < budget["realised"]["error"] < 1
+    assert "budget.megabytes: promised 0.04, realised 0.0" in printed.out
+    assert "budget.seconds: promised 500, realised" in printed.out
+    assert f"budget.error: promised 0.0001, and it became {budget['realised']['error']:.4g}" in printed.err
+
+
+def test_a_promise_beside_an_option_that_it_chooses_is_refused(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    problem = refusal(capsys, str(folder), "budget.seconds=60", "preset=exact")
+    assert "optimize.steps=3000: is chosen by budget.seconds; leave it (or the preset that sets it) out" in problem
