@@ -25,13 +25,9 @@ def optimizer() -> Optimizer:
 
 def test_a_plan_names_what_is_left_and_the_time_in_the_unit_that_is_read_most_easily(optimizer: Optimizer) -> None:
     size = f"2 photographs of 96×72, {len(optimizer.parameters['means']):,} Gaussians"
-    assert (
-        describe_plan(optimizer, 2000, 89.4, "budget.seconds", 3000) == f"{size}, 1,600 more of 2,000 steps: about 89 s"
-    )
-    assert (
-        describe_plan(optimizer, 2000, 90.0, "budget.seconds", 3000)
-        == f"{size}, 1,600 more of 2,000 steps: about 1.5 minutes"
-    )
+    left = f"{size}, 1,600 more of 2,000 steps"
+    assert describe_plan(optimizer, 2000, 89.4, "budget.seconds", 3000) == f"{left}: about 89 s"
+    assert describe_plan(optimizer, 2000, 90.0, "budget.seconds", 3000) == f"{left}: about 1.5 minutes"
     fewer = describe_plan(optimizer, 3000, 630.0, "budget.minutes", 3000)
     assert fewer == f"{left} instead of 3,000 (budget.minutes): about 10.5 minutes"
 
