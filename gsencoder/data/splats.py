@@ -111,6 +111,15 @@ def gaussians_from_raw(
     )
 
 
+def _is_ply_of_splat(path: Path) -> bool:
+    """Whether a file is a .ply with Gaussians, by the names of its properties; boxes and meshes are not."""
+    if not (path.name.lower().endswith(".ply") and path.is_file()):
+        return False
+    with path.open("rb") as stream:
+        header = stream.read(4096)
+    return b" opacity" in header or b" packed_position" in header
+
+
 # Damaged numbers reach the caller as they are: no warning about a signalling NaN that is cast on the way.
 @np.errstate(invalid="ignore", over="ignore")
 def read_raw(path: str | Path) -> RawSplat:
@@ -127,7 +136,7 @@ def read_raw(path: str | Path) -> RawSplat:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
             if not (path / "meta.json").is_file():
-                inner = sorted(each.name for each in path.iterdir() if each.name.lower().endswith(".ply"))
+                inner = sorted(each.name for each in path.iterdir() if _is_ply_of_splat(each))
                 hint = (
                     f"; give its {', '.join(inner)}" if inner else ", such as the splat.ply of `gsencoder reconstruct`"
                 )

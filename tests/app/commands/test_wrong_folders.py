@@ -103,7 +103,13 @@ def test_features_in_place_of_a_memory_are_said_to_be_those(capsys: pytest.Captu
 
 @pytest.mark.usefixtures("folders")
 def test_a_folder_with_a_splat_names_it() -> None:
-    with pytest.raises(InputError, match="expected a splat file or a SOG folder; give its splat.ply$"):
+    header = b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float %b\nend_header\n"
+    Path("reconstruct/splat.ply").write_bytes(header % b"opacity")
+    with pytest.raises(InputError, match=r"expected a splat file or a SOG folder; give its splat\.ply$"):
         read_raw("reconstruct")
     with pytest.raises(InputError, match="SOG folder, such as the splat.ply of `gsencoder reconstruct`$"):
         read_raw("empty")
+    # Boxes are drawn as edges and are no Gaussians.
+    Path("reconstruct/boxes.ply").write_bytes(header % b"x")
+    with pytest.raises(InputError, match=r"give its splat\.ply$"):
+        read_raw("reconstruct")
