@@ -1,12 +1,15 @@
 """Short reconstructions, as a user runs them, and what they say when they refuse."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from gsencoder.app import cli
+from gsencoder.reconstruct.optimize import Optimizer
 
 QUICK = ("quiet=true", "optimize.steps=12", "holdout=4", "seeds.voxel=0.08", "optimize.sh_degree=1")
 
@@ -23,6 +26,21 @@ def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith(("warning: ", "note: "))]
     assert len(lines) == 1
     return lines[0]
+
+
+@contextmanager
+def cut_at(step: int) -> Iterator[None]:
+    """Interrupts the reconstruction in the block at a step."""
+    advance = Optimizer.advance
+
+    def stop(self: Optimizer) -> dict[str, float]:
+        if self.step == step:
+            raise KeyboardInterrupt
+        return advance(self)
+
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Optimizer, "advance", stop)
+        yield
 
 
 def never(*_: object, **__: object) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from reconstructions import cut_at
 from splats import random_gaussians
 from walls import cameras, wall_views
 
@@ -157,18 +158,9 @@ def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
     """Also on a machine that would have planned other ones."""
     scene = Scene(name="wall", views=wall_views(6, depth=True), metres_per_unit=1.0)
     config = ReconstructConfig(holdout=0, budget=BudgetConfig(minutes=0.01))
-    real = Optimizer.advance
-
-    def cut(self: Optimizer) -> dict[str, float]:
-        if self.step == 7:
-            raise KeyboardInterrupt
-        return real(self)
-
     monkeypatch.setattr("gsencoder.reconstruct.budget.LEAST_STEPS", 20)
-    monkeypatch.setattr(Optimizer, "advance", cut)
-    with pytest.raises(KeyboardInterrupt):
+    with cut_at(7):
         reconstruct(scene, config, work=tmp_path)
-    monkeypatch.setattr(Optimizer, "advance", real)
     monkeypatch.setattr("gsencoder.reconstruct.budget.LEAST_STEPS", 900)
     lines: list[str] = []
     result = reconstruct(scene, config, work=tmp_path, report=lines.append)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from archives import header_of, rewrite
-from reconstructions import refusal, summary_of
+from reconstructions import cut_at, refusal, summary_of
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
@@ -18,7 +18,6 @@ from gsencoder.reconstruct import reconstruct
 from gsencoder.reconstruct.budget import BudgetConfig
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, PLANNED_DEGREE
 from gsencoder.reconstruct.config import ReconstructConfig
-from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.plan import error_of
 from gsencoder.reconstruct.prune import PruneConfig
@@ -80,17 +79,9 @@ def test_a_run_for_an_error_that_was_cut_ends_with_the_same_splat(
 ) -> None:
     monkeypatch.setattr(planning, "STEPS", STEPS)
     config = promising(error=errors[-1])
-    whole, advance = reconstruct(scene, config), Optimizer.advance
-
-    def stop(self: Optimizer) -> dict[str, float]:
-        if self.step == cut:
-            raise KeyboardInterrupt
-        return advance(self)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Optimizer, "advance", stop)
-        with pytest.raises(KeyboardInterrupt):
-            reconstruct(scene, config, work=tmp_path)
+    whole = reconstruct(scene, config)
+    with cut_at(cut):
+        reconstruct(scene, config, work=tmp_path)
     assert header_of(tmp_path / CHECKPOINT_FILE)["facts"]["steps_planned"] == STEPS[-1]
     again = reconstruct(scene, config, work=tmp_path)
     assert again.steps == whole.steps
@@ -99,22 +90,12 @@ def test_a_run_for_an_error_that_was_cut_ends_with_the_same_splat(
         np.testing.assert_array_equal(getattr(again.gaussians, name), getattr(whole.gaussians, name))
 
 
-def test_a_run_for_a_size_that_was_cut_ends_with_the_same_splat(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    config, advance = short(megabytes=0.05), Optimizer.advance
+def test_a_run_for_a_size_that_was_cut_ends_with_the_same_splat(scene: Scene, tmp_path: Path) -> None:
+    config = short(megabytes=0.05)
     whole = reconstruct(scene, config)
     assert whole.plan.sh_degree < 2
-
-    def stop(self: Optimizer) -> dict[str, float]:
-        if self.step == 1:
-            raise KeyboardInterrupt
-        return advance(self)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Optimizer, "advance", stop)
-        with pytest.raises(KeyboardInterrupt):
-            reconstruct(scene, config, work=tmp_path)
+    with cut_at(1):
+        reconstruct(scene, config, work=tmp_path)
     header = header_of(tmp_path / CHECKPOINT_FILE)
     assert header["seconds"] > 0
     # What the first run took counts, however long ago that was.
@@ -163,16 +144,9 @@ def test_a_size_that_no_gaussian_fits_into_is_refused_with_one_that_does(scene: 
         reconstruct(scene, short(megabytes=0.0021))
 
 
-def test_a_run_of_an_earlier_version_goes_on_and_one_of_another_promise_does_not(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    def stop(_: Optimizer) -> dict[str, float]:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Optimizer, "advance", stop)
-        with pytest.raises(KeyboardInterrupt):
-            reconstruct(scene, short(), work=tmp_path)
+def test_a_run_of_an_earlier_version_goes_on_and_one_of_another_promise_does_not(scene: Scene, tmp_path: Path) -> None:
+    with cut_at(0):
+        reconstruct(scene, short(), work=tmp_path)
     with pytest.raises(InputError, match=r"was made with .*budget"):
         reconstruct(scene, short(megabytes=1.0), work=tmp_path)
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from reconstructions import cut_at
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct import Reconstruction, reconstruct
 from gsencoder.reconstruct.config import ReconstructConfig
-from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.types import Scene
 
@@ -53,19 +53,10 @@ def test_a_comparison_holds_the_photograph_and_the_render_of_the_same_view(
 
 @pytest.mark.usefixtures("no_gpu")
 def test_an_interrupted_call_is_continued_from_its_folder_with_the_same_result(
-    scene: Scene, result: Reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    scene: Scene, result: Reconstruction, tmp_path: Path
 ) -> None:
-    advance = Optimizer.advance
-
-    def stop_at_two(self: Optimizer) -> dict[str, float]:
-        if self.step == 2:
-            raise KeyboardInterrupt
-        return advance(self)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Optimizer, "advance", stop_at_two)
-        with pytest.raises(KeyboardInterrupt):
-            reconstruct(scene, QUICK, work=tmp_path)
+    with cut_at(2):
+        reconstruct(scene, QUICK, work=tmp_path)
     continued = reconstruct(scene, QUICK, work=tmp_path)
     np.testing.assert_array_equal(continued.gaussians.means, result.gaussians.means)
     np.testing.assert_array_equal(continued.gaussians.opacities, result.gaussians.opacities)
