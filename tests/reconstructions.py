@@ -38,9 +38,10 @@ def cut_at(step: int) -> Iterator[None]:
             raise KeyboardInterrupt
         return advance(self)
 
-    with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Optimizer, "advance", stop)
-        yield
+        with pytest.raises(KeyboardInterrupt):
+            yield
 
 
 def never(*_: object, **__: object) -> None:
