@@ -1,8 +1,8 @@
 """Budgets: what the section `budget` of a command may promise, and how promises are checked, ordered and worded.
 
-Each stage with budgets has a frozen dataclass of its promises beside its code (`gsencoder.fusion.budget.config`,
-`gsencoder.fusion.store.budget`, `gsencoder.infer.encode_budget.config`, `gsencoder.infer.views.budget`), with those
-fields of `PROMISES` that mean something there.
+Each stage with budgets has a frozen dataclass of its promises beside its code (`gsencoder.reconstruct.budget`,
+`gsencoder.fusion.budget.config`, `gsencoder.fusion.store.budget`, `gsencoder.infer.encode_budget.config`,
+`gsencoder.infer.views.budget`), with those fields of `PROMISES` that mean something there.
 """
 
 from collections.abc import Iterable
