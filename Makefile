@@ -2,8 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Processes that tests run in, each on one thread.
-PROCESSES ?= 2
+# Processes that tests run in, each on one thread: one more than there are cores, since some tests wait.
+PROCESSES ?= 3
 # Options of bench/run.py.
 BENCH ?= --minutes 60
 # Cases that `make stability` tries for each routine.
