@@ -58,7 +58,7 @@ def find_weights(source: str, option: str = "weights") -> Path:
                 f"`gsencoder train` wrote{hint}"
             )
         file = find_file(source, option)
-        if file.suffix != Path(WEIGHTS_FILE).suffix:
+        if file.suffix != Path(WEIGHTS_FILE).suffix and not _begins_as_archive(file):
             raise InputError(
                 f"{option}: {source} is {kind_of_path(file)}; expected {WEIGHTS_FILE} or its folder, which "
                 "`gsencoder train` writes"
@@ -68,6 +68,12 @@ def find_weights(source: str, option: str = "weights") -> Path:
         raise InputError(f"{error}; encoders that come with gsencoder: {', '.join(names)}") from error
     except (OSError, ValueError) as error:
         raise InputError(f"{option}: {source[:200]!r} is not a path ({type(error).__name__})") from error
+
+
+def _begins_as_archive(path: Path) -> bool:
+    """Whether a file begins as safetensors do, whatever it is called."""
+    with path.open("rb") as stream:
+        return stream.read(9)[8:] == b"{"
 
 
 def save_weights(

@@ -150,6 +150,7 @@ sys.exit(cli.main())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.usefixtures("interrupts")
 def test_an_interrupt_within_an_exec_ends_with_the_exit_code_of_an_interrupt(tmp_path: Path) -> None:
     (tmp_path / "within_exec.py").write_text(WITHIN_EXEC)
     words = [sys.executable, "-m", "within_exec", "inspect", "a"]

@@ -234,6 +234,7 @@ def test_a_dropped_stop_is_raised_in_the_main_thread_alone() -> None:
     assert raised == []
 
 
+@pytest.mark.usefixtures("interrupts")
 def test_a_second_signal_is_raised_where_the_first_is_being_handled_and_the_first_is_not_raised_twice() -> None:
     cleaned = []
 

@@ -105,7 +105,7 @@ def test_two_kinds_of_features_and_two_runs_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"holds memory\.safetensors and those of a, b, of two runs"):
         load_features(tmp_path / "b")
     save_features(tmp_path / "c", SCENE, memory.features())
-    with pytest.raises(InputError, match=r"memory\.safetensors is missing"):
+    with pytest.raises(InputError, match=r"features, without memory\.safetensors; expected a folder with a memory"):
         load_memories(tmp_path / "c")
 
 

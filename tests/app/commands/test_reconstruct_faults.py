@@ -12,6 +12,7 @@ from reconstructions import QUICK, interrupt, never, refusal, summary_of
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
+from gsencoder.reconstruct import fit
 from gsencoder.reconstruct import run as reconstruct
 
 pytestmark = pytest.mark.slow
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.slow
 def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(
     room: Path, built: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    out, score, calls = tmp_path / "out", reconstruct.score, []
+    out, score, calls = tmp_path / "out", fit.score, []
 
     def cut_off_at_the_last(*arguments: object) -> object:
         calls.append(arguments)
@@ -28,7 +29,7 @@ def test_a_judgement_that_was_cut_off_is_made_when_the_run_goes_on(
 
     words = ["reconstruct", str(room), f"out={out}", *QUICK]
     with monkeypatch.context() as patched:
-        patched.setattr(reconstruct, "score", cut_off_at_the_last)
+        patched.setattr(fit, "score", cut_off_at_the_last)
         assert cli.main(words) == 130
     with monkeypatch.context() as patched:
         patched.setattr(reconstruct.Optimizer, "advance", never)
