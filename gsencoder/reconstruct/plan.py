@@ -102,7 +102,6 @@ def make_plan(
     plan = Plan(steps=config.steps, sh_degree=config.sh_degree)
     if budget.megabytes is not None:
         plan = _within_megabytes(optimizer, budget, budget.megabytes, plan, double_means)
-    follow(optimizer, plan)
     if budget.error is not None:
         return replace(plan, steps=STEPS[0], spent=spent())
     if budget.seconds is None:

@@ -160,10 +160,10 @@ def reconstruct(
                     double_means=bool(scene.origin.any()),
                     spent=since_reading,
                 )
-                follow(optimizer, plan)
+            follow(optimizer, plan)
+            if not continued:
                 state = replace(state, adam=optimizer.adam)
                 save_state(checkpoint, replace(state, facts={**state.facts, **plan.facts()}), identity)
-            follow(optimizer, plan)
             if continued or plan.seconds is None:
                 seconds = sum(expected_seconds(optimizer, held_out, validations(plan.steps)))
             else:
