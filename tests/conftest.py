@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 import shape_checks  # Before any module of the package.
 from composed_once import compose_once
+from field_scenes import FieldRoom, make_field_room
 from forked_ranks import RankServer, rank_server
 from hypothesis import settings
 from jaxtyping import config as jaxtyping_config
@@ -55,6 +56,12 @@ def shared() -> Path:
     if not (folder / "scenes").is_dir():
         pytest.skip(f"no real data at {folder} (set GSENCODER_SHARED)")
     return folder
+
+
+@pytest.fixture(scope="session")
+def field_room(tmp_path_factory: pytest.TempPathFactory) -> FieldRoom:
+    """The small room that tests of other tools' files rewrite."""
+    return make_field_room(tmp_path_factory.mktemp("field"))
 
 
 @pytest.fixture
