@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import MODELS_VARIABLE
+from gsencoder.core.files.model_files import MODELS_VARIABLE, SENTENCE_ENCODER
 from gsencoder.text.onnx_tower import OnnxTextConfig, OnnxTower
 from gsencoder.text.open_vocabulary import OpenVocabulary, TowerMissing, make_vocabulary
 from gsencoder.text.table import TextTable
@@ -98,26 +98,27 @@ def stating_trained(words: Words, beside: TextTable | None) -> Words:
 
 
 def find_tower(record: TowerRecord) -> TextTower:
-    """Looks for a tower in the folder of models, first in the folder of its name, then in all others.
+    """Looks for a tower in the folder of models and among those installed, first in folders of its name.
 
     Raises:
         TowerMissing: it is in none of them.
     """
     models = os.environ.get(MODELS_VARIABLE, "")
-    if not models:
-        raise TowerMissing(f"{MODELS_VARIABLE} is not set")
     try:
-        folders = sorted(path for path in Path(models).iterdir() if path.is_dir())
+        folders = sorted(path for path in Path(models).iterdir() if path.is_dir()) if models else []
     except OSError as error:
         raise TowerMissing(f"{MODELS_VARIABLE}={models} cannot be read: {error.strerror or error}") from error
-    for folder in sorted(folders, key=lambda path: path.name != record.name):
+    problem = f"none of {len(folders)} folders in {models} holds it" if models else f"{MODELS_VARIABLE} is not set"
+    for folder in sorted([*folders, SENTENCE_ENCODER], key=lambda path: path.name != record.name):
         try:
             tower = _open_as(record, folder)
-        except InputError:
+        except InputError as error:
+            if folder.name == record.name:
+                problem = str(error)
             continue  # The folder of another model, or of none.
         if tower.identity == record.identity:
             return tower
-    raise TowerMissing(f"none of {len(folders)} folders in {models} holds it")
+    raise TowerMissing(problem)
 
 
 def _open_as(record: TowerRecord, folder: Path) -> TextTower:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import digest_files, find_file
+from gsencoder.core.files.model_files import SENTENCE_ENCODER, digest_files, find_file, sentence_encoder_graph
 from gsencoder.core.onnx_session import open_session
 from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
 
@@ -29,7 +29,8 @@ class OnnxTextConfig:
     name: Literal["onnx"] = "onnx"
     model: str = field(
         default="",
-        metadata={"help": "folder with model.onnx and tokenizer.json; also looked for in GSENCODER_MODELS"},
+        metadata={"help": "folder with model.onnx and tokenizer.json; also looked for in GSENCODER_MODELS; minilm_l6 is "
+            "installed"},
     )
     pooling: Literal["auto"] | Pooling = field(
         default="auto",
@@ -79,6 +80,8 @@ class OnnxTower:
             raise InputError("text.model= is missing: the folder of a text tower (model.onnx and tokenizer.json)")
         folder = find_file(config.model, "text.model", folder=True)
         graph = next((folder / name for name in GRAPHS if (folder / name).is_file()), None)
+        if folder == SENTENCE_ENCODER:
+            graph = sentence_encoder_graph()
         tokenizer = folder / "tokenizer.json"
         if graph is None or not tokenizer.is_file():
             missing = "tokenizer.json" if graph is not None else "model.onnx"

@@ -51,7 +51,7 @@ def load_fusable(
     if scene.views is None and labels:
         raise InputError(
             f"{path}: a splat without views has no labels for teacher=labels; give a teacher that looks at pictures, "
-            "such as teacher=palette, or teacher=mosaic text=minilm"
+            "such as teacher=mosaic text=minilm, or teacher=palette"
         )
     if scene.gaussians is None:
         with summary.step("seeds"):

@@ -3,6 +3,7 @@
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,7 @@ from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits
 from gsencoder.fusion.store.folder import FEATURES_FILE, WORDS_FILE, save_features
 from gsencoder.fusion.store.heads_file import HEADS_FILE
 from gsencoder.fusion.teachers import Teacher
+from gsencoder.fusion.teachers.auto import AutoConfig, choose_teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.models.output_space import OutputSpaces, name_of_space
@@ -81,7 +83,7 @@ class FuseCommandConfig(CommonConfig):
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     budget: BudgetConfig = field(default_factory=BudgetConfig)
-    teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    teacher: AutoConfig | TeacherConfig = field(default_factory=AutoConfig)
     text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
@@ -94,8 +96,10 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
     choose_device(config.device)  # A missing device is an error before anything is read.
     paths = find_scenes(config.paths)
     with summary.step("teacher"):
-        words = words_of(config.teacher, config.text)
-        heads = heads_of(config.teacher, stored_heads(config.teacher), "teacher.heads")
+        words_once, heads = cache(words_of), list[Head]()
+        if not isinstance(config.teacher, AutoConfig):
+            words_once(config.teacher, config.text)  # What cannot be read is an error before any scene is.
+            heads = heads_of(config.teacher, stored_heads(config.teacher), "teacher.heads")
     outputs = load_weights_spaces(config.basis) if config.basis else None
     screen = console(config.quiet)
 
@@ -114,7 +118,11 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
                 quiet=config.quiet,
             )
             with scene_summary.step("teacher"):
-                teacher = build_teacher(config.teacher, scene, words)
+                chosen = choose_teacher(config.teacher, config.text, scene, words_once)
+                teacher = build_teacher(chosen.teacher, scene, chosen.words)
+            if chosen.reason:
+                scene_summary.results.update(teacher=settings(chosen.teacher), text=settings(chosen.text))
+                screen.print(f"{scene.name}: {chosen.reason}; {chosen.describe()}")
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
             in_budget: BudgetFusion | None = None
             if config.budget.promised:
@@ -124,14 +132,14 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
                 fusion = in_budget.fusion
             else:
                 fusion = fuse_scene(scene, teacher, config, scene_summary, out, basis=basis, sample_cells=bool(heads))
-            write_features(folder, scene, fusion, words_beside(teacher, words), config, scene_summary)
+            write_features(folder, scene, fusion, words_beside(teacher, chosen.words), chosen.teacher, scene_summary)
             promises = []
             if in_budget is not None:
                 promises = check_promises(in_budget, folder / FEATURES_FILE, config, scene_summary)
             lines = write_heads(folder, heads, fusion, scene_summary)
             if config.report:
                 with scene_summary.step("report"):
-                    report_fusion(folder, scene, fusion.features, fusion.truncation, config.teacher.name, scene_summary)
+                    report_fusion(folder, scene, fusion.features, fusion.truncation, chosen.teacher.name, scene_summary)
         shutil.rmtree(work_folder(out), ignore_errors=True)
         with_features, total = scene_summary.results["seen"], scene_summary.results["gaussians"]
         screen.print(
@@ -208,12 +216,12 @@ def fuse_scene(
 
 
 def write_features(
-    folder: Path, scene: Scene, fusion: Fusion, words: TextTable | None, config: FuseCommandConfig, summary: Summary
+    folder: Path, scene: Scene, fusion: Fusion, words: TextTable | None, teacher: TeacherConfig, summary: Summary
 ) -> None:
     """Writes features, scene and words, and adds the figures of the fusion to the summary."""
     features = fusion.features
     with summary.step("write"):
-        recipe = {"teacher": settings(config.teacher), "fusion": settings(fusion.config)}
+        recipe = {"teacher": settings(teacher), "fusion": settings(fusion.config)}
         save_features(folder, scene, features, recipe)
         if words is not None:
             save_text_table(folder / WORDS_FILE, words)

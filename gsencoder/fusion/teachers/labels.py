@@ -74,7 +74,7 @@ class LabelsTeacher:
         if not objects:
             raise MissingInput(
                 "teacher labels: the scene lists no objects; it needs an objects.json beside its views, or the "
-                "label files of ScanNet or ScanNet++"
+                "label files of ScanNet or ScanNet++; teacher=mosaic text=minilm looks at pictures instead"
             )
         row_of = {name: row for row, name in enumerate(names)}
         used = sorted({o.name for o in objects if o.name is not None})
