@@ -18,6 +18,7 @@ _HOME = {
     "save_splat": "gsencoder.data.splats",
     "load_scene": "gsencoder.data.scenes",
     "seed": "gsencoder.data.seeding.seed",
+    "default_teacher": "gsencoder.fusion.teachers.auto",
     "PaletteConfig": "gsencoder.fusion.teachers.palette",
     "PaletteTeacher": "gsencoder.fusion.teachers.palette",
     "text_table_of": "gsencoder.fusion.teachers.build",

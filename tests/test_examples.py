@@ -3,12 +3,15 @@
 import os
 import re
 import runpy
+import shlex
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from field_scenes import FieldRoom, write_transforms
 from PIL import Image
 
 import gsencoder
@@ -88,6 +91,28 @@ def test_an_example_renders_views_of_a_target(run: Callable[..., str], room: Pat
     assert len(pictures) == len(out.splitlines()) == 8
     assert {size_of(picture) for picture in pictures} == {(640, 480)}
     assert re.match(r"view_00\.png: .*, shows \d+% of red", out)
+
+
+def test_the_first_commands_of_the_readme_need_nothing_but_gsencoder(
+    field_room: FieldRoom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Each `fuse` and `localize` of a labeled room, of a bare splat, and of photographs with a splat."""
+    monkeypatch.delenv("GSENCODER_MODELS", raising=False)
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(field_room.room, "outputs/demo/room")
+    content = field_room.copy_photographs(Path("splat"))
+    shutil.copytree("splat/images", "PHOTOS")
+    write_transforms(Path("splat"), content)
+    for folder in ("outputs/demo", ".", "splat"):
+        shutil.copy(field_room.splat, Path(folder, "splat.ply"))
+    readme = (EXAMPLES.parent / "README.md").read_text().partition("## I want to train")[0]
+    lines = [shlex.split(line, comments=True) for line in re.findall(r"^gsencoder (.*)", readme, re.MULTILINE)]
+    quick = {"fuse": ["orbits=2"], "localize": ["pictures=1"]}
+    for command, *words in lines:
+        if command == "fuse" or (command == "localize" and words[0] in ("features", "seen")):
+            assert cli.main([command, *words, *quick[command], "overwrite=true"]) == 0, words
+    printed = capsys.readouterr().out
+    assert (printed.count("; teacher=labels"), printed.count("; teacher=mosaic text=minilm")) == (1, 3)
 
 
 def test_examples_are_numbered_and_short_and_use_public_names_alone() -> None:

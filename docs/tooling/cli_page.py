@@ -18,7 +18,7 @@ from gsencoder.app.cli import FLAGS, SHORT
 from gsencoder.app.commands import COMMANDS, Command
 from gsencoder.app.settings.choices import choices_of, conf_folder
 from gsencoder.app.settings.config import CommonConfig
-from gsencoder.app.settings.help import RULES
+from gsencoder.app.settings.help import RULES, choice_help
 from gsencoder.app.settings.options import (
     Option,
     describe,
@@ -60,7 +60,7 @@ Results go to standard output, warnings and errors to standard error.
 
 | variable | holds |
 |---|---|
-| `GSENCODER_MODELS` | the folder where model files, text towers and text tables are looked for by name |
+| `GSENCODER_MODELS` | the folder where models, text towers and tables are looked for by name, before those installed |
 | `GSENCODER_CACHE` | the folder where vectors of phrases are cached, or `off`; by default one for each user |
 | `GSENCODER_VLM_MODEL` | the model that `ask` requests, where `vlm.model` is empty |
 | `OPENAI_BASE_URL`, `OPENAI_API_KEY` | the server that `ask` talks to, and its key |
@@ -189,7 +189,8 @@ def command_text(name: str, command: Command, shared: set[Section]) -> list[str]
     for group, members in choices.groups.items():
         if group != PRESET:
             names = ", ".join(f"`{member}`" for member in members)
-            lines += [f"Choice `{group}=` of {names}; default `{choices.chosen[group]}`.", ""]
+            meaning = f": {escaped(choice_help(cls, group))}" if choice_help(cls, group) else ""
+            lines += [f"Choice `{group}=` of {names}; default `{choices.chosen[group]}`{meaning}.", ""]
     elsewhere = dict.fromkeys(
         (section.title if not section.member else f"`{section.name}.`", anchor(section))
         for section in sections

@@ -29,8 +29,10 @@ class OnnxTextConfig:
     name: Literal["onnx"] = "onnx"
     model: str = field(
         default="",
-        metadata={"help": "folder with model.onnx and tokenizer.json; also looked for in GSENCODER_MODELS; minilm_l6 is "
-            "installed"},
+        metadata={
+            "help": "folder with model.onnx and tokenizer.json; also looked for in GSENCODER_MODELS; minilm_l6 is "
+            "installed"
+        },
     )
     pooling: Literal["auto"] | Pooling = field(
         default="auto",

@@ -83,7 +83,13 @@ class FuseCommandConfig(CommonConfig):
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     budget: BudgetConfig = field(default_factory=BudgetConfig)
-    teacher: AutoConfig | TeacherConfig = field(default_factory=AutoConfig)
+    teacher: AutoConfig | TeacherConfig = field(
+        default_factory=AutoConfig,
+        metadata={
+            "help": "the 2D model whose maps are lifted; auto = the labels of a scene that has some, else mosaic with "
+            "text=minilm: a segmenter and a sentence encoder, which are installed"
+        },
+    )
     text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:

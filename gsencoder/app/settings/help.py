@@ -3,6 +3,7 @@
 import shutil
 import textwrap
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,11 @@ def _option(option: Option, width: int) -> list[str]:
     return _entry(f"{option.key}={kind}", f"{option.help} [{_shown(option.default)}]", width)
 
 
+def choice_help(cls: type[CommonConfig], group: str) -> str:
+    """What a command says of one of its choices; empty for most, whose members say it."""
+    return str(next((each.metadata.get("help", "") for each in fields(cls) if each.name == group), ""))
+
+
 def command_help(
     name: str, summary: str, cls: type[CommonConfig], flags: Mapping[str, str], conf: Path | None = None
 ) -> str:
@@ -55,7 +61,8 @@ def command_help(
     if groups:
         lines += ["", "choices:"]
         for group, members in groups.items():
-            lines += _entry(f"{group}={'|'.join(members)}", f"[{_shown(choices.chosen[group])}]", width)
+            meaning = f"{choice_help(cls, group)} [{_shown(choices.chosen[group])}]".strip()
+            lines += _entry(f"{group}={'|'.join(members)}", meaning, width)
     lines += ["", f"presets [{DEFAULT_PRESET}]:"]
     for preset, changes in describe_presets(cls).items():
         lines += _entry(f"{PRESET}={preset}", changes, width)

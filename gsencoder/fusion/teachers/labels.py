@@ -21,7 +21,9 @@ class LabelsConfig:
     name: Literal["labels"] = "labels"
     words: str = field(
         default="clip_vitb32_names.npz",
-        metadata={"help": "text table of the names; a bare name is also looked for in GSENCODER_MODELS"},
+        metadata={
+            "help": "text table of the names; a bare name is also looked for in GSENCODER_MODELS; this one is installed"
+        },
     )
 
     cell: int = field(
