@@ -219,7 +219,8 @@ def _with_stated_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
     """A view with the intrinsics and the depth sensor that the user states."""
     if options.intrinsics is not None:
         fx, fy, cx, cy = options.intrinsics
-        image = replace(image, camera=pinhole_of(fx, fy, cx, cy, image.image, "data.intrinsics"))
+        size = image.camera.width, image.camera.height
+        image = replace(image, camera=pinhole_of(fx, fy, cx, cy, image.image, "data.intrinsics", size=size))
     if image.depth is not None and options.depth_intrinsics is not None:
         fx, fy, cx, cy = options.depth_intrinsics
         image = replace(image, depth_camera=pinhole_of(fx, fy, cx, cy, image.depth, "data.depth_intrinsics"))

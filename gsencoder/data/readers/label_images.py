@@ -27,7 +27,7 @@ class LabelFiles(PictureFiles[Int32[np.ndarray, "H W"]]):
     def _load(self, view: int) -> Int32[np.ndarray, "H W"]:
         path, grid = self._paths[view], self._grids[view]
         assert path is not None
-        labels = self._read(path)
+        labels = self._turned(view, self._read(path))
         if labels.shape != (grid.source.height, grid.source.width):
             raise InputError(
                 f"{path}: {labels.shape[1]}×{labels.shape[0]} pixels, expected {grid.source.width}×"

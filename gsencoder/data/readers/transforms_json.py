@@ -22,7 +22,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.written_files import check_written
-from gsencoder.data.readers.image_file import picture_size
+from gsencoder.data.readers.image_file import picture_info, picture_size
 from gsencoder.data.readers.posed import (
     PosedImage,
     PosedImages,
@@ -32,6 +32,7 @@ from gsencoder.data.readers.posed import (
     warn_left_out,
 )
 from gsencoder.data.readers.undistort import CameraModel, check_camera
+from gsencoder.types.orientation import EXCHANGED
 from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
 
 PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
@@ -246,16 +247,7 @@ def _up(value: object, path: Path) -> Float64[np.ndarray, "3"]:
 def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str) -> CameraModel:
     """The intrinsics of a frame: its own values first, then the file's."""
     both = data | {key: value for key, value in frame.items() if value is not None}
-    size = []
-    for key, actual in zip(("w", "h"), picture_size(image), strict=True):
-        pixels = number(both, key, where)
-        if pixels is not None and pixels != actual:
-            raise InputError(
-                f"{where}: {key} is {pixels:g} but the image {image} has {actual} pixels; give the images at the size "
-                "of the intrinsics (image_scale makes them smaller on load)"
-            )
-        size.append(actual)
-    w, h = size
+    w, h = _size_of_camera(both, image, where)
     fx = _focal(data, frame, "fl_x", "camera_angle_x", w, where)
     fy = _focal(data, frame, "fl_y", "camera_angle_y", h, where)
     if fx is None and fy is None:
@@ -283,6 +275,33 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
         camera = CameraModel(model="OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2))
     check_camera(camera, where)
     return camera
+
+
+def _size_of_camera(values: dict[str, Any], image: Path, where: str) -> tuple[int, int]:
+    """The size of the picture that intrinsics are of: as its pixels are stored, or of the upright picture, where only
+    that has the stated width and height, or else, of the two, where the principal point is nearer to the middle."""
+    stored = picture_size(image)
+    stated = number(values, "w", where), number(values, "h", where)
+    center = number(values, "cx", where), number(values, "cy", where)
+
+    def is_stated(size: tuple[int, int]) -> bool:
+        return all(pixels in (None, actual) for pixels, actual in zip(stated, size, strict=True))
+
+    def off_center(size: tuple[int, int]) -> float:
+        return max(0 if at is None else abs(at / side - 0.5) for at, side in zip(center, size, strict=True))
+
+    sizes = [stored]
+    if image.suffix.lower() != ".npy" and picture_info(image)[2] in EXCHANGED:
+        sizes.append(stored[::-1])
+    fitting = [size for size in sizes if is_stated(size)]
+    if not fitting:
+        each = zip("wh", stated, stored, strict=True)
+        key, pixels, actual = next(one for one in each if one[1] not in (None, one[2]))
+        raise InputError(
+            f"{where}: {key} is {pixels:g} but the image {image} has {actual} pixels; give the images at the size "
+            "of the intrinsics (image_scale makes them smaller on load)"
+        )
+    return min(fitting, key=off_center)
 
 
 def _focal(data: dict[str, Any], frame: dict[str, Any], length: str, angle: str, side: int, where: str) -> float | None:
