@@ -178,7 +178,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         up=posed.up if options.up is None else _unit(options.up),
         objects=objects,
         sfm_points=(points - origin).astype(np.float32) if len(points) else None,
-        sfm_colors=posed.colors if len(points) else None,
+        sfm_colors=posed.colors if len(points) and len(posed.colors) else None,
         folder=folder,
     )
 

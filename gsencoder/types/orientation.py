@@ -68,7 +68,7 @@ def upright_views(views: Views, *, unmirror: bool = False) -> Views:
     rotations = [UNMIRRORED[orientation] for orientation in views.orientations]
     mirrored = tuple(1 if UNMIRRORED[each] == each else 2 for each in views.orientations)
     orientations = list(views.orientations) if unmirror else rotations
-    lazy = {
+    lazy: dict[str, Any] = {
         name: None if (pictures := getattr(views, name)) is None else TurnedPictures(pictures, orientations)
         for name in LAZY
     }
@@ -123,7 +123,7 @@ def stored_map(feature_map: FeatureMap, orientation: int, width: int, height: in
     axes = [1, 0] if exchange else [0, 1]
     stored = np.diag([1.0, 1.0, 1.0])[:2]
     stored[[0, 1], [0, 1]], stored[:, 2] = scales[axes], shifts[axes]
-    forms = {
+    forms: dict[str, Any] = {
         name: turned(form, INVERSE[orientation])
         for name in ("features", "codes", "shares")
         if (form := getattr(feature_map, name)) is not None

@@ -11,13 +11,16 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, listed
 from gsencoder.data.readers.scene_splat import find_splat
 from gsencoder.data.scene_paths import DistinctPaths, find_scenes, has_views, scene_name
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.splat_formats.repair import SplatReport, inspect_splat
 from gsencoder.data.splats import READABLE, read_raw
 from gsencoder.data.video.decode import refuse_video
+
+MAX_UNUSED = 100
+"""Names of what was not used that are printed; the summary has all."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,7 +114,9 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
         assert posed is not None
     with summary.step("facts"):
         facts = scene_facts(scene, posed, layout)
-    lines: list[Table | str] = [str(path), scene_table(facts)]
+    table = scene_table(facts)
+    _add_unused(table, facts.unused)
+    lines: list[Table | str] = [str(path), table]
     results: dict[str, Any] = {"path": str(path), **facts.to_dict()}
     if config.check:
         with summary.step("check"):
@@ -154,8 +159,14 @@ def report_table(path: str, report: SplatReport) -> Table:
         first = ", ".join(map(str, defect.first_rows)) + (", …" if defect.count > len(defect.first_rows) else "")
         stops = "; stops loading" if defect.stops_loading else ""
         table.add_row(defect.name, f"{defect.count:,} rows ({first}){stops}")
+    _add_unused(table, report.unused)
     table.add_row("loads", "yes" if report.loadable else "no; see gsencoder repair")
     return table
+
+
+def _add_unused(table: Table, unused: tuple[str, ...]) -> None:
+    if unused:
+        table.add_row("not used", listed(unused, MAX_UNUSED))
 
 
 def _corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[str, str]:

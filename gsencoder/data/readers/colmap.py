@@ -4,14 +4,21 @@ import itertools
 import math
 import re
 import warnings
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap_binary import check_binary_model
-from gsencoder.data.readers.posed import MAX_COORDINATE, PosedImage, PosedImages, inside, rigid_pose, warn_left_out
+from gsencoder.data.readers.posed import (
+    PosedImage,
+    PosedImages,
+    finite_points,
+    inside,
+    rigid_pose,
+    warn_left_out,
+)
 from gsencoder.data.readers.undistort import CameraModel, check_camera, load_pycolmap
 
 QUATERNION_TOLERANCE = 1e-3
@@ -24,7 +31,13 @@ def is_colmap_model(folder: Path) -> bool:
 
 
 def read_colmap(
-    model: Path, images: Path, root: Path, *, allow_outside: bool = False, base_names: bool = False
+    model: Path,
+    images: Path,
+    root: Path,
+    *,
+    allow_outside: bool = False,
+    base_names: bool = False,
+    masks: Path | None = None,
 ) -> PosedImages:
     """Reads a model and finds its photographs.
 
@@ -34,6 +47,7 @@ def read_colmap(
         root: the scene folder, which names may not leave.
         allow_outside: let them.
         base_names: photographs lie in `images` itself, whatever folders the names of the model begin with.
+        masks: folder of masks; None = there are none.
 
     Returns:
         The registered pictures sorted by name, in the model's own world, and its points with their colors. The unit
@@ -85,6 +99,7 @@ def read_colmap(
                 camera=cameras[image.camera_id],
                 cam_from_world=rigid_pose(pose, where),
                 image=path,
+                mask=None if masks is None else find_mask(masks, image.name, where),
             )
         )
     total = len(reconstruction.images)
@@ -99,8 +114,28 @@ def read_colmap(
         warnings.warn(
             f"{model}: {unregistered} of {total} images have no pose and are left out", SceneWarning, stacklevel=2
         )
+    if masks is not None:
+        without = [image.name for image in posed if image.mask is None]
+        if len(without) < len(posed):
+            warn_left_out(without, len(posed), str(masks), "masks", "all pixels of those views are used")
+        else:
+            warnings.warn(
+                f"{masks}: is not used, since none of its files is called as COLMAP calls masks, such as "
+                f"{without[0][:120]}.png",
+                SceneWarning,
+                stacklevel=2,
+            )
     points, colors = _points(reconstruction, model)
-    return PosedImages(source=str(model), images=tuple(posed), points=points, colors=colors)
+    return PosedImages(source=str(model), images=tuple(posed), points=points, colors=colors, read=(model,))
+
+
+def find_mask(masks: Path, name: str, where: str) -> Path | None:
+    """The mask of an image, as COLMAP calls it (the image's name and .png), or with .png in place of the ending."""
+    for candidate in (f"{name}.png", str(PurePosixPath(name).with_suffix(".png"))):
+        path = inside(masks, candidate, where)
+        if path.is_file():
+            return path
+    return None
 
 
 def _pose_file(model: Path) -> str:
@@ -167,12 +202,4 @@ def _points(reconstruction: Any, model: Path) -> tuple[np.ndarray, np.ndarray]:
     sfm_points = list(reconstruction.points3D.values())
     points = np.array([point.xyz for point in sfm_points], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in sfm_points], np.uint8).reshape(-1, 3)
-    with np.errstate(invalid="ignore"):
-        good = np.abs(points).max(axis=1, initial=0) <= MAX_COORDINATE
-    if not good.all():
-        warnings.warn(
-            f"{model}: {int((~good).sum())} of {len(good)} points are not finite and are left out",
-            SceneWarning,
-            stacklevel=3,
-        )
-    return points[good], colors[good]
+    return finite_points(points, colors, model)

@@ -58,7 +58,19 @@ class PosedImage:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PosedImages:
-    """The views of a scene and its world; coordinates are those of the files, in float64."""
+    """The views of a scene and its world; coordinates are those of the files, in float64.
+
+    Attributes:
+        source: file or folder of the views, for messages.
+        images: the views.
+        metres_per_unit: None where unknown.
+        up: unit vector; None where unknown.
+        points: for seeds, of structure from motion or others.
+        colors: of the points; empty where they have none.
+        points_file: a .ply that holds the points; None where another file does.
+        read: other files and folders that were read.
+        unused: what the files say that was not used, in words.
+    """
 
     source: str
     images: tuple[PosedImage, ...]
@@ -66,6 +78,28 @@ class PosedImages:
     up: Float64[np.ndarray, "3"] | None = None
     points: Float64[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     colors: UInt8[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    points_file: Path | None = None
+    read: tuple[Path, ...] = ()
+    unused: tuple[str, ...] = ()
+
+    def unused_folders(self, root: Path) -> tuple[str, ...]:
+        """Folders in that of the scene, and beside those of its photographs, of which nothing was read."""
+        files = [
+            path for image in self.images for path in (image.image, image.depth, image.mask, image.instance) if path
+        ]
+        homes = {path.parent for path in files} | {path for path in (self.points_file, *self.read) if path is not None}
+        # Links are followed, since a folder of links to photographs elsewhere is one that is used.
+        used = {home for path in homes for home in (path, *path.parents)}
+        levels = {root, *(level for path in {image.image.parent for image in self.images} for level in path.parents)}
+        return tuple(
+            sorted(
+                entry.relative_to(root).as_posix()
+                for level in levels
+                if level.is_relative_to(root)
+                for entry in level.iterdir()
+                if entry.is_dir() and not entry.name.startswith(".") and entry not in used
+            )
+        )
 
 
 def choose_origin(points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3"]:
@@ -150,6 +184,21 @@ def inside(folder: Path, relative: str, where: str, *, root: Path | None = None,
             "copy the file into it, or set allow_outside=true if you trust the scene"
         )
     return path
+
+
+def finite_points(
+    points: Float64[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "m 3"], source: object
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "_ 3"]]:
+    """The points that are finite, and their colors if there are any; the number of others is a warning."""
+    with np.errstate(invalid="ignore"):
+        good = np.abs(points).max(axis=1, initial=0) <= MAX_COORDINATE
+    if not good.all():
+        warnings.warn(
+            f"{source}: {int((~good).sum())} of {len(good)} points are not finite and are left out",
+            SceneWarning,
+            stacklevel=4,
+        )
+    return points[good], colors[good] if len(colors) else colors
 
 
 def number(values: Mapping[str, object], key: str, where: str) -> float | None:

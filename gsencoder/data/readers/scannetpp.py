@@ -19,6 +19,8 @@ from gsencoder.data.readers.posed import PosedImages
 from gsencoder.data.readers.transforms_json import read_transforms
 
 NERFSTUDIO = ("nerfstudio/transforms.json", "nerfstudio/transforms_undistorted.json")
+SCANS = "scans"
+"""The folder of the mesh and its labels, beside those of the devices."""
 DSLR_PICTURES = ("resized_images", "undistorted_images")
 DSLR_MASKS = ("resized_anon_masks", "undistorted_anon_masks")
 
@@ -62,7 +64,8 @@ def read_scannetpp(root: Path, *, allow_outside: bool = False, depth_scale: floa
         posed = _read_dslr(folder, allow_outside=allow_outside)
     else:
         posed = read_iphone(folder, allow_outside=allow_outside, depth_scale=depth_scale)
-    return replace(posed, metres_per_unit=1.0, up=np.array([0.0, 0.0, 1.0]))
+    read = (*posed.read, folder.parent / SCANS)
+    return replace(posed, metres_per_unit=1.0, up=np.array([0.0, 0.0, 1.0]), read=read)
 
 
 def _read_dslr(folder: Path, *, allow_outside: bool) -> PosedImages:
@@ -77,4 +80,5 @@ def _read_dslr(folder: Path, *, allow_outside: bool) -> PosedImages:
                 masks=masks if masks.is_dir() else None,
             )
             return in_world_of_scan(posed)
-    return read_colmap(folder / "colmap", folder / DSLR_PICTURES[0], folder, allow_outside=allow_outside)
+    masks = folder / DSLR_MASKS[0] if (folder / DSLR_MASKS[0]).is_dir() else None
+    return read_colmap(folder / "colmap", folder / DSLR_PICTURES[0], folder, allow_outside=allow_outside, masks=masks)

@@ -2,8 +2,9 @@
 
 `transform_matrix` is world_from_camera with OpenGL axes (x right, y up, z backward); y and z are turned round on load.
 Values of a frame come before those of the file. Distortion (k1, k2, k3, k4, p1, p2) is OpenCV's, of the perspective
-or, for OPENCV_FISHEYE or `is_fisheye`, of the equidistant model. `applied_transform`, `scale`, `offset` and
-`aabb_scale` are not used: the world is that of the matrices.
+or, for OPENCV_FISHEYE or `is_fisheye`, of the equidistant model. `ply_file_path` names points of the same world.
+`applied_transform`, `scale`, `offset` and `aabb_scale` are not used: the world is that of the matrices. Intrinsics may
+be of the upright picture where the file is stored sideways (EXIF); its width and height, which differ, tell.
 
 Beside the keys of those programs these are read: `instance_file_path` (integers, 0 = none) for a frame, and
 `metres_per_unit` and `up` for the file; for both, `depth_camera` (an object with fl_x, fl_y, cx and cy, for the depth
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.written_files import check_written
@@ -26,12 +27,14 @@ from gsencoder.data.readers.image_file import picture_info, picture_size
 from gsencoder.data.readers.posed import (
     PosedImage,
     PosedImages,
+    finite_points,
     inside,
     number,
     rigid_pose,
     warn_left_out,
 )
 from gsencoder.data.readers.undistort import CameraModel, check_camera
+from gsencoder.data.splat_formats.ply import read_points
 from gsencoder.types.orientation import EXCHANGED
 from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
 
@@ -39,6 +42,17 @@ PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPEN
 NERFSTUDIO_DEPTH_SCALE = 1e-3
 """nerfstudio's own default for depth_unit_scale_factor: integer millimetres."""
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
+
+CAMERA_KEYS = frozenset(
+    ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "camera_angle_x")
+    + ("camera_angle_y", "camera_model", "is_fisheye", "depth_unit_scale_factor", "integer_depth_scale")
+    + ("depth_camera", "depth_from_color", "depth_measure", "no_depth")
+)
+FILE_KEYS = frozenset(("frames", "metres_per_unit", "up", "ply_file_path"))
+FRAME_KEYS = frozenset(
+    ("file_path", "transform_matrix", "depth_file_path", "depth_path", "mask_path", "instance_file_path")
+)
+"""Keys that are read here: of cameras, for the file or a frame, and of one of these alone."""
 
 TRANSFORMS = ("transforms.json", "transforms_train.json")
 """The names that such files have."""
@@ -174,6 +188,7 @@ def read_transforms(
     warn_left_out(missing["depth"], total, source, "listed depth files", "those views have no depth")
     warn_left_out(missing["mask"], total, source, "listed masks", "all pixels of those views are used")
     warn_left_out(missing["instance"], total, source, "listed instance maps", "those views have no instances")
+    points, colors, points_file = _points(data, path, allow_outside=allow_outside)
     metres = number(data, "metres_per_unit", str(path))
     if metres is not None and metres <= 0:
         raise InputError(f"{path}: metres_per_unit must be positive, got {metres:g}")
@@ -184,7 +199,38 @@ def read_transforms(
         up=_up(data.get("up"), path)
         if data.get("up") is not None
         else (np.array([0, 0, 1.0]) if metric_depth else None),
+        points=points,
+        colors=colors,
+        points_file=points_file,
+        read=(path,),
+        unused=_unused_keys(path, data, frames),
     )
+
+
+def _points(
+    data: dict[str, Any], path: Path, *, allow_outside: bool
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "_ 3"], Path | None]:
+    """The points that `ply_file_path` names, their colors if they have any, and the file; in the world of the matrices,
+    as nerfstudio writes them."""
+    name, none = data.get("ply_file_path"), (np.zeros((0, 3)), np.zeros((0, 3), np.uint8), None)
+    if name is None or name == "":
+        return none
+    if not isinstance(name, str):
+        raise InputError(f"{path}: ply_file_path must be a path, got {str(name)[:40]!r}")
+    file = inside(path.parent, name, f"{path}: ply_file_path", allow_outside=allow_outside)
+    if not file.is_file():
+        warn_left_out([name], 1, path.name, "files of points", "seeds come from elsewhere")
+        return none
+    points, colors = read_points(file)
+    return *finite_points(points, none[1] if colors is None else colors, file), file
+
+
+def _unused_keys(path: Path, data: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[str, ...]:
+    """Keys of a file and of its frames that nothing here reads."""
+    of_file = [key for key in data if key not in FILE_KEYS | CAMERA_KEYS]
+    of_frames = dict.fromkeys(key for frame in frames for key in frame if key not in FRAME_KEYS | CAMERA_KEYS)
+    lists = ((of_file, f"key {{}} of {path.name}"), (of_frames, f"key {{}} of the frames of {path.name}"))
+    return tuple(form.format(key[:40]) for keys, form in lists for key in keys)
 
 
 def _find_image(root: Path, name: str, where: str, *, allow_outside: bool) -> Path | None:
@@ -254,6 +300,7 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
         raise InputError(f"{where}: no focal length; expected fl_x, or camera_angle_x in radians")
     cx, cy = number(both, "cx", where), number(both, "cy", where)
     k1, k2, k3, k4, p1, p2 = (number(both, key, where) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    further = [key for key in ("k4", "k5", "k6") if number(both, key, where)]
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
     assert fx is not None
     assert fy is not None
@@ -267,8 +314,10 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
         camera = CameraModel(model="OPENCV_FISHEYE", width=w, height=h, params=(*base, k1, k2, k3, k4))
     elif model not in PERSPECTIVE:
         raise InputError(f"{where}: camera model {model[:40]!r} is not supported; expected OPENCV or OPENCV_FISHEYE")
-    elif k4:
-        raise InputError(f"{where}: k4 of a perspective camera has no agreed meaning; expected k1, k2, k3, p1, p2")
+    elif further:
+        raise InputError(
+            f"{where}: {further[0]} of a perspective camera has no agreed meaning; expected k1, k2, k3, p1, p2"
+        )
     elif k3:
         camera = CameraModel(model="FULL_OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
     else:

@@ -122,8 +122,9 @@ class FileMasks:
         row = self._row_of[views.names[view]]
         labels: Int32[np.ndarray, "H W"] = self._files[row]
         # Files lie as photographs are stored; upright views have no orientations.
-        is_upright = self._orientations is not None and views.orientations is None
-        return turned(labels, self._orientations[row]) if is_upright else labels
+        if self._orientations is None or views.orientations is not None:
+            return labels
+        return turned(labels, self._orientations[row])
 
     def settings(self) -> dict[str, Any]:
         return {"masks": "files", "labels": digest_files(*self._paths)}
