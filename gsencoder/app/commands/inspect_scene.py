@@ -52,7 +52,7 @@ def scene_table(facts: SceneFacts) -> Table:
         empty = "" if facts.empty is None else f"; {facts.empty:.0%} of the pixels show that nothing is there"
         table.add_row("masks", f"yes{empty}")
     if facts.points:
-        table.add_row("points", f"{facts.points:,} of structure from motion")
+        table.add_row("points", f"{facts.points:,}")
     if facts.objects:
         table.add_row("objects", f"{facts.objects:,} with boxes")
     if facts.instances:

@@ -84,12 +84,9 @@ class PosedImages:
 
     def unused_folders(self, root: Path) -> tuple[str, ...]:
         """Folders in that of the scene, and beside those of its photographs, of which nothing was read."""
-        files = [
-            path for image in self.images for path in (image.image, image.depth, image.mask, image.instance) if path
-        ]
-        homes = {path.parent for path in files} | {path for path in (self.points_file, *self.read) if path is not None}
-        # Links are followed, since a folder of links to photographs elsewhere is one that is used.
-        used = {home for path in homes for home in (path, *path.parents)}
+        files = [path for each in self.images for path in (each.image, each.depth, each.mask, each.instance) if path]
+        read = [*files, *self.read, *([self.points_file] if self.points_file is not None else [])]
+        used = {home for path in set(read) for home in (path, *path.parents)}
         levels = {root, *(level for path in {image.image.parent for image in self.images} for level in path.parents)}
         return tuple(
             sorted(

@@ -43,11 +43,11 @@ NERFSTUDIO_DEPTH_SCALE = 1e-3
 """nerfstudio's own default for depth_unit_scale_factor: integer millimetres."""
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
-CAMERA_KEYS = frozenset(
-    ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "camera_angle_x")
-    + ("camera_angle_y", "camera_model", "is_fisheye", "depth_unit_scale_factor", "integer_depth_scale")
-    + ("depth_camera", "depth_from_color", "depth_measure", "no_depth")
-)
+CAMERA_KEYS = frozenset((
+    "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "camera_angle_x",
+    "camera_angle_y", "camera_model", "is_fisheye", "depth_unit_scale_factor", "integer_depth_scale", "depth_camera",
+    "depth_from_color", "depth_measure", "no_depth",
+))  # fmt: skip
 FILE_KEYS = frozenset(("frames", "metres_per_unit", "up", "ply_file_path"))
 FRAME_KEYS = frozenset(
     ("file_path", "transform_matrix", "depth_file_path", "depth_path", "mask_path", "instance_file_path")
@@ -300,23 +300,24 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
         raise InputError(f"{where}: no focal length; expected fl_x, or camera_angle_x in radians")
     cx, cy = number(both, "cx", where), number(both, "cy", where)
     k1, k2, k3, k4, p1, p2 = (number(both, key, where) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    further = [key for key in ("k4", "k5", "k6") if number(both, key, where)]
     fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
     assert fx is not None
     assert fy is not None
     base = (fx, fy, w / 2 if cx is None else cx, h / 2 if cy is None else cy)
+    further = [key for key in ("k5", "k6") if number(both, key, where)]
     model = both.get("camera_model", "")
     if not isinstance(model, str):
         raise InputError(f"{where}: camera_model must be a name, got {str(model)[:40]!r}")
     if model == "OPENCV_FISHEYE" or (model in PERSPECTIVE and both.get("is_fisheye") is True):
-        if p1 or p2:
-            raise InputError(f"{where}: p1 and p2 do not belong to OPENCV_FISHEYE")
+        if p1 or p2 or further:
+            raise InputError(f"{where}: {', '.join(further) or 'p1 and p2'} do not belong to OPENCV_FISHEYE")
         camera = CameraModel(model="OPENCV_FISHEYE", width=w, height=h, params=(*base, k1, k2, k3, k4))
     elif model not in PERSPECTIVE:
         raise InputError(f"{where}: camera model {model[:40]!r} is not supported; expected OPENCV or OPENCV_FISHEYE")
-    elif further:
+    elif k4 or further:
         raise InputError(
-            f"{where}: {further[0]} of a perspective camera has no agreed meaning; expected k1, k2, k3, p1, p2"
+            f"{where}: {'k4' if k4 else further[0]} of a perspective camera has no agreed meaning; expected k1, k2, "
+            "k3, p1, p2"
         )
     elif k3:
         camera = CameraModel(model="FULL_OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))

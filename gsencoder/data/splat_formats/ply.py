@@ -195,17 +195,15 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
             # Trainers write normals of zeros.
             used -= {name for name in normals if block[name].any()}
     if FILTER in names:
-        filtered, faded = _filtered(scales, opacities, widths)
-        before, after = (
-            (float(np.median(opacities_from_logits(each))) for each in (opacities, faded)) if count else (0, 0)
-        )
+        before = float(np.median(opacities_from_logits(opacities))) if count else 0.0
+        scales, opacities = _filtered(scales, opacities, widths)
+        after = float(np.median(opacities_from_logits(opacities))) if count else 0.0
         warnings.warn(
-            f"{path}: {FILTER} of mip-splatting is applied to scales and opacities (median opacity {before:.3f} becomes "
-            f"{after:.3f})",
+            f"{path}: {FILTER} of mip-splatting is applied to scales and opacities (median opacity {before:.3f} "
+            f"becomes {after:.3f})",
             SceneWarning,
             stacklevel=2,
         )
-        scales, opacities = filtered, faded
     others = [f"element {element.name}" for element in header.elements if element is not vertex and element.count]
     return RawSplat(
         means=means,
@@ -221,8 +219,8 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
 def _filtered(
     log_scales: Float32[np.ndarray, "N 3"], logits: Float32[np.ndarray, " N"], widths: Float64[np.ndarray, " N"]
 ) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, " N"]]:
-    """Gaussians convolved with isotropic ones of these widths, at the same total weight: scale √(s² + f²), opacity times
-    √(Π s² / Π (s² + f²)) (Yu et al., Mip-Splatting, 2024, Eq. 7)."""
+    """Gaussians convolved with isotropic ones of these widths: scale √(s² + f²), opacity times √(Π s² / Π (s² + f²))
+    (Yu et al., Mip-Splatting, 2024)."""
     logs = log_scales.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         wider = np.logaddexp(2 * logs, 2 * np.log(np.abs(widths))[:, None]) / 2
