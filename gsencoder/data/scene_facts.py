@@ -152,13 +152,8 @@ def scene_facts(scene: Scene, posed: PosedImages, layout: str) -> SceneFacts:
         metres_per_unit=scene.metres_per_unit,
         up=up,
         missing=_missing(scene, up),
-        unused=_unused(scene, posed),
+        unused=(*posed.unused, *(f"folder {name}" for name in posed.unused_folders(scene.folder, layout))),
     )
-
-
-def _unused(scene: Scene, posed: PosedImages) -> tuple[str, ...]:
-    folders = () if scene.folder is None else posed.unused_folders(scene.folder)
-    return (*posed.unused, *(f"folder {name}" for name in folders))
 
 
 def _empty_share(views: Views) -> float | None:

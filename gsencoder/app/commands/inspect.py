@@ -11,16 +11,13 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
-from gsencoder.core.errors import InputError, listed
+from gsencoder.core.errors import InputError
 from gsencoder.data.readers.scene_splat import find_splat
 from gsencoder.data.scene_paths import DistinctPaths, find_scenes, has_views, scene_name
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.splat_formats.repair import SplatReport, inspect_splat
 from gsencoder.data.splats import READABLE, read_raw
 from gsencoder.data.video.decode import refuse_video
-
-MAX_UNUSED = 100
-"""Names of what was not used that are printed; the summary has all."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,7 +163,7 @@ def report_table(path: str, report: SplatReport) -> Table:
 
 def _add_unused(table: Table, unused: tuple[str, ...]) -> None:
     if unused:
-        table.add_row("not used", listed(unused, MAX_UNUSED))
+        table.add_row("not used", ", ".join(unused))
 
 
 def _corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[str, str]:

@@ -115,16 +115,8 @@ def read_colmap(
             f"{model}: {unregistered} of {total} images have no pose and are left out", SceneWarning, stacklevel=2
         )
     if masks is not None:
-        without = [image.name for image in posed if image.mask is None]
-        if len(without) < len(posed):
-            warn_left_out(without, len(posed), str(masks), "masks", "all pixels of those views are used")
-        else:
-            warnings.warn(
-                f"{masks}: is not used, since none of its files is called as COLMAP calls masks, such as "
-                f"{without[0][:120]}.png",
-                SceneWarning,
-                stacklevel=2,
-            )
+        without = [f"{image.name}.png" for image in posed if image.mask is None]
+        warn_left_out(without, len(posed), str(masks), "masks", "all pixels of those views are used")
     points, colors = _points(reconstruction, model)
     return PosedImages(source=str(model), images=tuple(posed), points=points, colors=colors, read=(model,))
 

@@ -28,14 +28,9 @@ PIXEL_LIMIT = 80_000_000
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
 EXIF_ORIENTATION = 0x0112
 TIFF_UNDO = {
-    2: "FLIP_LEFT_RIGHT",
-    3: "ROTATE_180",
-    4: "FLIP_TOP_BOTTOM",
-    5: "TRANSPOSE",
-    6: "ROTATE_90",
-    7: "TRANSVERSE",
+    2: "FLIP_LEFT_RIGHT", 3: "ROTATE_180", 4: "FLIP_TOP_BOTTOM", 5: "TRANSPOSE", 6: "ROTATE_90", 7: "TRANSVERSE",
     8: "ROTATE_270",
-}
+}  # fmt: skip
 """By EXIF orientation: Pillow's name of what turns an upright picture back."""
 DEEP_GREY = ("I;16", "I;16B", "I;16L", "I")
 """Pillow's modes of pictures with one channel of more than 8 bits."""

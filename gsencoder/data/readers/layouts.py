@@ -15,8 +15,6 @@ from gsencoder.data.readers.seven_scenes import is_seven_scenes, read_seven_scen
 from gsencoder.data.readers.transforms_json import TRANSFORMS, read_transforms
 from gsencoder.data.readers.tum import is_tum, read_tum
 
-MASKS = "masks"
-"""Beside images/: what COLMAP is given as ImageReader.mask_path by convention."""
 COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 
 
@@ -105,8 +103,8 @@ def _read_colmap(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
 
 def _masks_beside(home: Path, model: Path, options: ReadOptions) -> Path | None:
     """The folder of masks of a COLMAP scene."""
-    folder = home / MASKS
-    return inside(home, MASKS, str(model), allow_outside=options.allow_outside) if folder.is_dir() else None
+    exists = (home / "masks").is_dir()
+    return inside(home, "masks", str(model), allow_outside=options.allow_outside) if exists else None
 
 
 def _read_tum(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:

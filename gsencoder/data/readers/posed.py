@@ -20,6 +20,8 @@ MAX_PATH = 4096
 MAX_COORDINATE = 1e12
 """Largest coordinate, where float64 has steps of a tenth of a millimeter."""
 ORIGIN_STEP = 1000.0
+FOLDERS_OF_LAYOUT = {"ScanNet": ("pose", "intrinsic"), "ScanNet++": ("scans", "colmap")}
+"""Folders that are read beside those of the files of views."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,21 +84,21 @@ class PosedImages:
     read: tuple[Path, ...] = ()
     unused: tuple[str, ...] = ()
 
-    def unused_folders(self, root: Path) -> tuple[str, ...]:
+    def unused_folders(self, root: Path | None, layout: str) -> tuple[str, ...]:
         """Folders in that of the scene, and beside those of its photographs, of which nothing was read."""
-        files = [path for each in self.images for path in (each.image, each.depth, each.mask, each.instance) if path]
-        read = [*files, *self.read, *([self.points_file] if self.points_file is not None else [])]
-        used = {home for path in set(read) for home in (path, *path.parents)}
-        levels = {root, *(level for path in {image.image.parent for image in self.images} for level in path.parents)}
-        return tuple(
-            sorted(
-                entry.relative_to(root).as_posix()
-                for level in levels
-                if level.is_relative_to(root)
-                for entry in level.iterdir()
-                if entry.is_dir() and not entry.name.startswith(".") and entry not in used
-            )
-        )
+        if root is None:
+            return ()
+        paths = [path for each in self.images for path in (each.image, each.depth, each.mask, each.instance)]
+        used = {home for path in {*paths, *self.read, self.points_file} if path for home in (path, *path.parents)}
+        levels = {root, *(level for path in {each.image.parent for each in self.images} for level in path.parents)}
+        folders = {
+            entry.relative_to(root).as_posix()
+            for level in levels
+            if level.is_relative_to(root)
+            for entry in level.iterdir()
+            if entry.is_dir() and entry not in used and entry.name not in FOLDERS_OF_LAYOUT.get(layout, ())
+        }
+        return tuple(sorted(name for name in folders if not name.startswith(".")))
 
 
 def choose_origin(points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3"]:

@@ -85,13 +85,7 @@ def read_scannet(root: Path, *, allow_outside: bool = False, depth_scale: float 
     if depths:
         without = [image.name for image in images if image.depth is None]
         warn_left_out(without, len(images), str(root), "depth files", "those views have no depth")
-    return PosedImages(
-        source=str(root),
-        images=tuple(images),
-        metres_per_unit=1.0,
-        up=np.array([0.0, 0.0, 1.0]),
-        read=(root / "pose", root / "intrinsic"),
-    )
+    return PosedImages(source=str(root), images=tuple(images), metres_per_unit=1.0, up=np.array([0.0, 0.0, 1.0]))
 
 
 def _intrinsic_files(root: Path) -> tuple[Path, Path]:

@@ -19,8 +19,6 @@ from gsencoder.data.readers.posed import PosedImages
 from gsencoder.data.readers.transforms_json import read_transforms
 
 NERFSTUDIO = ("nerfstudio/transforms.json", "nerfstudio/transforms_undistorted.json")
-SCANS = "scans"
-"""The folder of the mesh and its labels, beside those of the devices."""
 DSLR_PICTURES = ("resized_images", "undistorted_images")
 DSLR_MASKS = ("resized_anon_masks", "undistorted_anon_masks")
 
@@ -64,8 +62,7 @@ def read_scannetpp(root: Path, *, allow_outside: bool = False, depth_scale: floa
         posed = _read_dslr(folder, allow_outside=allow_outside)
     else:
         posed = read_iphone(folder, allow_outside=allow_outside, depth_scale=depth_scale)
-    read = (*posed.read, folder.parent / SCANS)
-    return replace(posed, metres_per_unit=1.0, up=np.array([0.0, 0.0, 1.0]), read=read)
+    return replace(posed, metres_per_unit=1.0, up=np.array([0.0, 0.0, 1.0]))
 
 
 def _read_dslr(folder: Path, *, allow_outside: bool) -> PosedImages:

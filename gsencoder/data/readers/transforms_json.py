@@ -331,27 +331,22 @@ def _size_of_camera(values: dict[str, Any], image: Path, where: str) -> tuple[in
     """The size of the picture that intrinsics are of: as its pixels are stored, or of the upright picture, where only
     that has the stated width and height, or else, of the two, where the principal point is nearer to the middle."""
     stored = picture_size(image)
-    stated = number(values, "w", where), number(values, "h", where)
-    center = number(values, "cx", where), number(values, "cy", where)
-
-    def is_stated(size: tuple[int, int]) -> bool:
-        return all(pixels in (None, actual) for pixels, actual in zip(stated, size, strict=True))
-
-    def off_center(size: tuple[int, int]) -> float:
-        return max(0 if at is None else abs(at / side - 0.5) for at, side in zip(center, size, strict=True))
-
-    sizes = [stored]
-    if image.suffix.lower() != ".npy" and picture_info(image)[2] in EXCHANGED:
-        sizes.append(stored[::-1])
-    fitting = [size for size in sizes if is_stated(size)]
-    if not fitting:
-        each = zip("wh", stated, stored, strict=True)
-        key, pixels, actual = next(one for one in each if one[1] not in (None, one[2]))
+    w, h, cx, cy = (number(values, key, where) for key in ("w", "h", "cx", "cy"))
+    is_sideways = image.suffix.lower() != ".npy" and picture_info(image)[2] in EXCHANGED
+    sizes = [
+        size for size in (stored, stored[::-1])[: 1 + is_sideways] if w in (None, size[0]) and h in (None, size[1])
+    ]
+    if not sizes:
+        key, pixels, actual = ("w", w, stored[0]) if w not in (None, stored[0]) else ("h", h, stored[1])
         raise InputError(
             f"{where}: {key} is {pixels:g} but the image {image} has {actual} pixels; give the images at the size "
             "of the intrinsics (image_scale makes them smaller on load)"
         )
-    return min(fitting, key=off_center)
+
+    def off_center(size: tuple[int, int]) -> float:
+        return sum(abs(at / side - 0.5) for at, side in zip((cx, cy), size, strict=True) if at is not None)
+
+    return min(sizes, key=off_center)
 
 
 def _focal(data: dict[str, Any], frame: dict[str, Any], length: str, angle: str, side: int, where: str) -> float | None:

@@ -34,7 +34,7 @@ _REQUIRED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", 
 
 FILTER = "filter_3D"
 """The property with the width of mip-splatting's smoothing filter, which its files leave to be applied."""
-_NORMALS = ("nx", "ny", "nz")
+_COLORS, _NORMALS = ("red", "green", "blue"), ("nx", "ny", "nz")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -195,12 +195,9 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
             # Trainers write normals of zeros.
             used -= {name for name in normals if block[name].any()}
     if FILTER in names:
-        before = float(np.median(opacities_from_logits(opacities))) if count else 0.0
         scales, opacities = _filtered(scales, opacities, widths)
-        after = float(np.median(opacities_from_logits(opacities))) if count else 0.0
         warnings.warn(
-            f"{path}: {FILTER} of mip-splatting is applied to scales and opacities (median opacity {before:.3f} "
-            f"becomes {after:.3f})",
+            f"{path}: {FILTER} of mip-splatting is applied, which widens Gaussians and makes them fainter",
             SceneWarning,
             stacklevel=2,
         )
@@ -243,11 +240,12 @@ def read_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarra
         header = read_header(path, stream)
         points = np.stack([read_property(path, stream, header, size, name) for name in "xyz"], axis=1)
         vertex = header.element("vertex")
-        kinds = {} if vertex is None or vertex.dtype is None else {n: vertex.dtype[n] for n in vertex.dtype.names or ()}
-        if not {"red", "green", "blue"} <= set(kinds):
+        assert vertex is not None
+        assert vertex.dtype is not None
+        if not set(_COLORS) <= set(vertex.dtype.names or ()):
             return points, None
-        scale = 1 if kinds["red"].kind in "iu" else 255
-        colors = [read_property(path, stream, header, size, name) * scale for name in ("red", "green", "blue")]
+        scale = 1 if vertex.dtype["red"].kind in "iu" else 255
+        colors = [read_property(path, stream, header, size, name) * scale for name in _COLORS]
     return points, np.stack(colors, axis=1).round().clip(0, 255).astype(np.uint8)
 
 
