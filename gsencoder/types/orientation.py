@@ -63,7 +63,7 @@ def upright_views(views: Views, *, unmirror: bool = False) -> Views:
         unmirror: whether pictures that the orientation mirrors are mirrored as well, as people see them. Their cameras
             cannot be, so that geometry fits only without it; `orientations` of the result then say what is left.
     """
-    if views.orientations is None:
+    if views.orientations is None or (not unmirror and max(map(UNMIRRORED.__getitem__, views.orientations)) == 1):
         return views
     rotations = [UNMIRRORED[orientation] for orientation in views.orientations]
     mirrored = tuple(1 if UNMIRRORED[each] == each else 2 for each in views.orientations)

@@ -111,9 +111,7 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
         assert posed is not None
     with summary.step("facts"):
         facts = scene_facts(scene, posed, layout)
-    table = scene_table(facts)
-    _add_unused(table, facts.unused)
-    lines: list[Table | str] = [str(path), table]
+    lines: list[Table | str] = [str(path), scene_table(facts)]
     results: dict[str, Any] = {"path": str(path), **facts.to_dict()}
     if config.check:
         with summary.step("check"):
@@ -156,14 +154,10 @@ def report_table(path: str, report: SplatReport) -> Table:
         first = ", ".join(map(str, defect.first_rows)) + (", …" if defect.count > len(defect.first_rows) else "")
         stops = "; stops loading" if defect.stops_loading else ""
         table.add_row(defect.name, f"{defect.count:,} rows ({first}){stops}")
-    _add_unused(table, report.unused)
+    if report.unused:
+        table.add_row("not used", ", ".join(report.unused))
     table.add_row("loads", "yes" if report.loadable else "no; see gsencoder repair")
     return table
-
-
-def _add_unused(table: Table, unused: tuple[str, ...]) -> None:
-    if unused:
-        table.add_row("not used", ", ".join(unused))
 
 
 def _corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[str, str]:

@@ -47,7 +47,7 @@ def read_colmap(
         root: the scene folder, which names may not leave.
         allow_outside: let them.
         base_names: photographs lie in `images` itself, whatever folders the names of the model begin with.
-        masks: folder of masks; None = there are none.
+        masks: folder of masks; it may be missing.
 
     Returns:
         The registered pictures sorted by name, in the model's own world, and its points with their colors. The unit
@@ -57,6 +57,7 @@ def read_colmap(
         InputError: damaged files, no registered picture whose photograph exists, an unusable camera or pose.
     """
     reconstruction = _load(model)
+    masks = masks if masks is not None and masks.is_dir() else None
     posed: list[PosedImage] = []
     missing: list[str] = []
     unregistered = 0
@@ -99,7 +100,7 @@ def read_colmap(
                 camera=cameras[image.camera_id],
                 cam_from_world=rigid_pose(pose, where),
                 image=path,
-                mask=None if masks is None else find_mask(masks, image.name, where),
+                mask=None if masks is None else _find_mask(masks, image.name, where, allow_outside=allow_outside),
             )
         )
     total = len(reconstruction.images)
@@ -121,10 +122,10 @@ def read_colmap(
     return PosedImages(source=str(model), images=tuple(posed), points=points, colors=colors, read=(model,))
 
 
-def find_mask(masks: Path, name: str, where: str) -> Path | None:
+def _find_mask(masks: Path, name: str, where: str, *, allow_outside: bool) -> Path | None:
     """The mask of an image, as COLMAP calls it (the image's name and .png), or with .png in place of the ending."""
     for candidate in (f"{name}.png", str(PurePosixPath(name).with_suffix(".png"))):
-        path = inside(masks, candidate, where)
+        path = inside(masks, candidate, where, root=masks.parent, allow_outside=allow_outside)
         if path.is_file():
             return path
     return None

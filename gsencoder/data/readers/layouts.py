@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
-from gsencoder.data.readers.posed import PosedImages, inside
+from gsencoder.data.readers.posed import PosedImages
 from gsencoder.data.readers.replica import is_replica, read_replica
 from gsencoder.data.readers.scannet import is_scannet_export, read_scannet
 from gsencoder.data.readers.scannetpp import is_scannetpp, read_scannetpp
@@ -15,6 +15,7 @@ from gsencoder.data.readers.seven_scenes import is_seven_scenes, read_seven_scen
 from gsencoder.data.readers.transforms_json import TRANSFORMS, read_transforms
 from gsencoder.data.readers.tum import is_tum, read_tum
 
+MASKS = "masks"
 COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 
 
@@ -90,21 +91,14 @@ def _read_colmap(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
         if not images.is_dir():
             raise InputError(f"images={options.images}: no such folder (looked from here and in {root})")
         # A folder that the user names may be read.
-        masks = _masks_beside(root, model, options) or _masks_beside(images.parent, model, options)
+        masks = next((home / MASKS for home in (root, images.parent) if (home / MASKS).is_dir()), None)
         return read_colmap(model, images, images, allow_outside=options.allow_outside, masks=masks), root
     homes = [root, root.parent, root.parent.parent] if model == root else [root]
     home = next((home for home in homes if (home / "images").is_dir()), None)
     if home is None:
         searched = ", ".join(str(home / "images") for home in homes)
         raise InputError(f"{model}: a COLMAP model without photographs; looked for {searched}; say images=FOLDER")
-    masks = _masks_beside(home, model, options)
-    return read_colmap(model, home / "images", home, allow_outside=options.allow_outside, masks=masks), home
-
-
-def _masks_beside(home: Path, model: Path, options: ReadOptions) -> Path | None:
-    """The folder of masks of a COLMAP scene."""
-    exists = (home / "masks").is_dir()
-    return inside(home, "masks", str(model), allow_outside=options.allow_outside) if exists else None
+    return read_colmap(model, home / "images", home, allow_outside=options.allow_outside, masks=home / MASKS), home
 
 
 def _read_tum(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:

@@ -63,12 +63,6 @@ class PosedImages:
     """The views of a scene and its world; coordinates are those of the files, in float64.
 
     Attributes:
-        source: file or folder of the views, for messages.
-        images: the views.
-        metres_per_unit: None where unknown.
-        up: unit vector; None where unknown.
-        points: for seeds, of structure from motion or others.
-        colors: of the points; empty where they have none.
         points_file: a .ply that holds the points; None where another file does.
         read: other files and folders that were read.
         unused: what the files say that was not used, in words.

@@ -19,7 +19,7 @@ from gsencoder.infer.views.closeups import closeups
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.frames import frames_on
 from gsencoder.infer.views.free_space import FreeSpace
-from gsencoder.infer.views.photographs import photograph_cameras
+from gsencoder.infer.views.photographs import photograph_cameras, with_upright_frames
 from gsencoder.infer.views.scores import ViewScores, replace_with_photographs, score_views
 from gsencoder.infer.views.selection import SelectedView, TargetScore, ViewsConfig, ViewSet
 from gsencoder.infer.views.shells import shell_cameras, up_of
@@ -47,7 +47,7 @@ def choose_views(
     Raises:
         InputError: no Gaussians; no targets; frames are asked for where there are none; no camera finds room.
     """
-    gaussians = checked_gaussians(scene, targets, config)
+    gaussians, scene = checked_gaussians(scene, targets, config), with_upright_frames(scene)
     free = free or FreeSpace(gaussians)
     return chosen_views(scene, targets, judge_candidates(scene, gaussians, targets, free, config), free, config)
 

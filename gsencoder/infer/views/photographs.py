@@ -10,6 +10,7 @@ from PIL import Image
 
 from gsencoder.core.errors import InputError, listed
 from gsencoder.types import Cameras, Scene, Views
+from gsencoder.types.orientation import upright_scene, upright_views
 
 ANGLE_TOLERANCE, POSITION_TOLERANCE = 0.01, 1e-3
 """How far two readings of one camera may be from each other: radians or parts of a focal length, and parts of the
@@ -39,6 +40,10 @@ class FramePhotographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
         assert self._views.images is not None
         return self._views.images[int(self._rows[index])]
 
+    def upright(self, cameras: Cameras) -> "FramePhotographs":
+        """The pictures as people see them, for the same cameras upright."""
+        return FramePhotographs(upright_views(self._views), self._rows, cameras)
+
     @property
     def cameras(self) -> Cameras:
         """The cameras in the sizes that the pictures were taken in."""
@@ -49,6 +54,16 @@ class FramePhotographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
 def photograph_cameras(views: Views) -> Cameras:
     """The cameras of views in the sizes that their photographs were taken in."""
     return views.images.cameras if isinstance(views.images, FramePhotographs) else views.cameras
+
+
+def with_upright_frames(scene: Scene) -> Scene:
+    """The scene with upright frames, and photographs in the sizes that they were taken in."""
+    upright = upright_scene(scene)
+    if upright is scene or scene.views is None or not isinstance(scene.views.images, FramePhotographs):
+        return upright
+    assert upright.views is not None
+    images = scene.views.images.upright(upright.views.cameras)
+    return replace(upright, views=replace(upright.views, images=images))
 
 
 def resized_picture(picture: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
@@ -134,7 +149,9 @@ def with_photographs(scene: Scene, photographed: Scene) -> Scene:
             f"photos: the cameras of scene {photographed.name} are not those of the features: {len(apart)} of "
             f"{len(scene.views)} differ, {listed(apart, MAX_NAMED)}; give the scene that the features were made from"
         )
-    return replace(scene, views=replace(scene.views, images=FramePhotographs(photographed.views, rows, scene_cameras)))
+    images = FramePhotographs(photographed.views, rows, scene_cameras)
+    orientations = photographed.views.select(rows).orientations
+    return replace(scene, views=replace(scene.views, images=images, orientations=orientations))
 
 
 def _differ(scene_cameras: Cameras, photo_cameras: Cameras, offset: np.ndarray) -> np.ndarray:
