@@ -15,6 +15,14 @@ from gsencoder.data.readers.image_file import picture_info, read_rgba
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import up_of_scene
 from gsencoder.fusion.fuse import fuse
+from gsencoder.fusion.store.folder import load_features, save_features
+from gsencoder.fusion.teacher_maps import upright
+from gsencoder.fusion.teachers.palette import PaletteTeacher
+from gsencoder.fusion.teachers.regions.masks import FileMasks
+from gsencoder.infer.views.choose import choose_views
+from gsencoder.infer.views.photographs import with_photographs
+from gsencoder.infer.views.pictures import view_pictures
+from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 from gsencoder.types.orientation import INVERSE, TURNS, stored_map, turned, upright_scene, upright_views
 
@@ -164,7 +172,9 @@ def test_mirrored_photographs_are_named_and_teachers_see_them_as_people_do(
     with pytest.warns(SceneWarning, match="8 of 8 photographs are stored mirrored"):
         scene = load_scene(folder, splat=field_room.splat)
     assert degrees_from_z(replace(scene, gaussians=None))[0] < 2
-    teacher = fused(scene)[1]
+    teacher = _Seen()
+    assert scene.views is not None
+    upright(teacher).feature_map(scene.views, 0)
     stored = folder / "images" / "000.jpg"
     with Image.open(stored) as picture:
         assert np.array_equal(teacher.pictures["000.jpg"], np.asarray(ImageOps.exif_transpose(picture)))
@@ -258,3 +268,42 @@ def test_square_pictures_are_taken_as_they_are_stored(field_room: FieldRoom, tmp
     assert views.images is not None
     assert views.orientations == (6,) * 8
     assert np.array_equal(views.images[0], np.asarray(Image.open(folder / "images/000.jpg")))
+
+
+def test_files_of_regions_lie_as_photographs_are_stored(field_room: FieldRoom, tmp_path: Path) -> None:
+    folder, _ = turned_scene(field_room, tmp_path / "turned", MIXED)
+    labels = np.zeros((120, 160), np.uint8)
+    labels[:40, :100] = 7
+    (folder / "labels").mkdir()
+    for row, orientation in enumerate(MIXED):
+        Image.fromarray(turned(labels, INVERSE[orientation])).save(folder / f"labels/{row:03d}.png")
+    scene = load_scene(folder)
+    masks = FileMasks(scene, "labels")
+    assert scene.views is not None
+    shown = upright_views(scene.views, unmirror=True)
+    for row in range(len(MIXED)):
+        assert np.array_equal(masks.labels(shown, row), labels)
+        assert np.array_equal(turned(masks.labels(scene.views, row), MIXED[row]), labels)
+
+
+def test_views_for_people_and_models_are_upright(field_room: FieldRoom, tmp_path: Path) -> None:
+    folder, _ = turned_scene(field_room, tmp_path / "turned", MIXED)
+    scene = load_scene(folder, splat=field_room.splat)
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    features = fuse(scene, PaletteTeacher()).features
+    save_features(tmp_path / "features", scene, features)
+    loaded = load_features(tmp_path / "features")
+    assert loaded.views is not None
+    # What is stored are the poses of the photographs as they are stored, and how these are turned.
+    assert loaded.views.orientations == MIXED
+    assert np.array_equal(loaded.views.cameras.cam_from_world, scene.views.cameras.cam_from_world)
+    photographed = with_photographs(loaded, load_scene(folder))
+    config = ViewsConfig(method="uniform", count=8)
+    views = choose_views(photographed, [], config)
+    pictures, _ = view_pictures(photographed, views)
+    for chosen, picture in zip(views.chosen, pictures, strict=True):
+        with Image.open(folder / "images" / chosen.name) as stored:
+            assert np.array_equal(picture, np.asarray(ImageOps.exif_transpose(stored)))
+    rendered, _ = view_pictures(loaded, choose_views(loaded, [], config))
+    assert all(np.abs(each.astype(int) - picture).mean() < 25 for each, picture in zip(rendered, pictures, strict=True))

@@ -11,14 +11,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap_binary import check_binary_model
-from gsencoder.data.readers.posed import (
-    PosedImage,
-    PosedImages,
-    finite_points,
-    inside,
-    rigid_pose,
-    warn_left_out,
-)
+from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.undistort import CameraModel, check_camera, load_pycolmap
 
 QUATERNION_TOLERANCE = 1e-3
@@ -118,8 +111,8 @@ def read_colmap(
     if masks is not None:
         without = [f"{image.name}.png" for image in posed if image.mask is None]
         warn_left_out(without, len(posed), str(masks), "masks", "all pixels of those views are used")
-    points, colors = _points(reconstruction, model)
-    return PosedImages(source=str(model), images=tuple(posed), points=points, colors=colors, read=(model,))
+    points, colors = _points(reconstruction)
+    return PosedImages(source=str(model), images=tuple(posed), points=points, colors=colors)
 
 
 def _find_mask(masks: Path, name: str, where: str, *, allow_outside: bool) -> Path | None:
@@ -191,8 +184,8 @@ def _check_text_counts(model: Path, reconstruction: Any) -> None:
                     )
 
 
-def _points(reconstruction: Any, model: Path) -> tuple[np.ndarray, np.ndarray]:
+def _points(reconstruction: Any) -> tuple[np.ndarray, np.ndarray]:
     sfm_points = list(reconstruction.points3D.values())
     points = np.array([point.xyz for point in sfm_points], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in sfm_points], np.uint8).reshape(-1, 3)
-    return finite_points(points, colors, model)
+    return points, colors

@@ -53,7 +53,8 @@ class PixelGrid:
         """Whether a file of this size has the shape of the photograph, to the nearest pixel."""
         if self.is_exchanged(width, height):
             width, height = height, width
-        return abs(width * self.source.height - height * self.source.width) < self.source.width
+        source = self.source
+        return abs(width * source.height - height * source.width) < min(source.width, source.height)
 
 
 class PictureFiles(Sequence[Array]):
@@ -98,8 +99,8 @@ class PictureFiles(Sequence[Array]):
         source = self._grids[view].source
         if shape != (source.height, source.width):
             raise InputError(
-                f"{self._paths[view]}: {shape[1]}×{shape[0]} pixels, expected {source.width}×{source.height}; "
-                "the file changed since the scene was loaded"
+                f"{self._paths[view]}: {shape[1]}×{shape[0]} pixels, expected {source.width}×{source.height}, as the "
+                "photograph had when the scene was loaded"
             )
 
     def _turned(self, view: int, pixels: np.ndarray) -> np.ndarray:

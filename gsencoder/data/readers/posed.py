@@ -20,7 +20,11 @@ MAX_PATH = 4096
 MAX_COORDINATE = 1e12
 """Largest coordinate, where float64 has steps of a tenth of a millimeter."""
 ORIGIN_STEP = 1000.0
-FOLDERS_OF_LAYOUT = {"ScanNet": ("pose", "intrinsic"), "ScanNet++": ("scans", "colmap")}
+FOLDERS_OF_LAYOUT = {
+    "COLMAP": ("sparse", "colmap"),
+    "ScanNet": ("pose", "intrinsic"),
+    "ScanNet++": ("scans", "colmap", "nerfstudio"),
+}
 """Folders that are read beside those of the files of views."""
 
 
@@ -64,7 +68,6 @@ class PosedImages:
 
     Attributes:
         points_file: a .ply that holds the points; None where another file does.
-        read: other files and folders that were read.
         unused: what the files say that was not used, in words.
     """
 
@@ -73,9 +76,8 @@ class PosedImages:
     metres_per_unit: float | None = None
     up: Float64[np.ndarray, "3"] | None = None
     points: Float64[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3)))
-    colors: UInt8[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    colors: UInt8[np.ndarray, "_ 3"] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
     points_file: Path | None = None
-    read: tuple[Path, ...] = ()
     unused: tuple[str, ...] = ()
 
     def unused_folders(self, root: Path | None, layout: str) -> tuple[str, ...]:
@@ -83,7 +85,7 @@ class PosedImages:
         if root is None:
             return ()
         paths = [path for each in self.images for path in (each.image, each.depth, each.mask, each.instance)]
-        used = {home for path in {*paths, *self.read, self.points_file} if path for home in (path, *path.parents)}
+        used = {home for path in {*paths, self.points_file} if path for home in (path, *path.parents)}
         levels = {root, *(level for path in {each.image.parent for each in self.images} for level in path.parents)}
         folders = {
             entry.relative_to(root).as_posix()
@@ -177,21 +179,6 @@ def inside(folder: Path, relative: str, where: str, *, root: Path | None = None,
             "copy the file into it, or set allow_outside=true if you trust the scene"
         )
     return path
-
-
-def finite_points(
-    points: Float64[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "m 3"], source: object
-) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "_ 3"]]:
-    """The points that are finite, and their colors if there are any; the number of others is a warning."""
-    with np.errstate(invalid="ignore"):
-        good = np.abs(points).max(axis=1, initial=0) <= MAX_COORDINATE
-    if not good.all():
-        warnings.warn(
-            f"{source}: {int((~good).sum())} of {len(good)} points are not finite and are left out",
-            SceneWarning,
-            stacklevel=4,
-        )
-    return points[good], colors[good] if len(colors) else colors
 
 
 def number(values: Mapping[str, object], key: str, where: str) -> float | None:

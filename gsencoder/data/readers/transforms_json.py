@@ -27,7 +27,6 @@ from gsencoder.data.readers.image_file import picture_info, picture_size
 from gsencoder.data.readers.posed import (
     PosedImage,
     PosedImages,
-    finite_points,
     inside,
     number,
     rigid_pose,
@@ -43,15 +42,13 @@ NERFSTUDIO_DEPTH_SCALE = 1e-3
 """nerfstudio's own default for depth_unit_scale_factor: integer millimetres."""
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
-CAMERA_KEYS = frozenset((
+CAMERA_KEYS = {
     "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "camera_angle_x",
     "camera_angle_y", "camera_model", "is_fisheye", "depth_unit_scale_factor", "integer_depth_scale", "depth_camera",
     "depth_from_color", "depth_measure", "no_depth",
-))  # fmt: skip
-FILE_KEYS = frozenset(("frames", "metres_per_unit", "up", "ply_file_path"))
-FRAME_KEYS = frozenset(
-    ("file_path", "transform_matrix", "depth_file_path", "depth_path", "mask_path", "instance_file_path")
-)
+}  # fmt: skip
+FILE_KEYS = {"frames", "metres_per_unit", "up", "ply_file_path"}
+FRAME_KEYS = {"file_path", "transform_matrix", "depth_file_path", "depth_path", "mask_path", "instance_file_path"}
 """Keys that are read here: of cameras, for the file or a frame, and of one of these alone."""
 
 TRANSFORMS = ("transforms.json", "transforms_train.json")
@@ -202,7 +199,6 @@ def read_transforms(
         points=points,
         colors=colors,
         points_file=points_file,
-        read=(path,),
         unused=_unused_keys(path, data, frames),
     )
 
@@ -222,7 +218,7 @@ def _points(
         warn_left_out([name], 1, path.name, "files of points", "seeds come from elsewhere")
         return none
     points, colors = read_points(file)
-    return *finite_points(points, none[1] if colors is None else colors, file), file
+    return points, none[1] if colors is None else colors, file
 
 
 def _unused_keys(path: Path, data: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[str, ...]:
@@ -304,20 +300,19 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
     assert fx is not None
     assert fy is not None
     base = (fx, fy, w / 2 if cx is None else cx, h / 2 if cy is None else cy)
-    further = [key for key in ("k5", "k6") if number(both, key, where)]
+    further = number(both, "k5", where) or number(both, "k6", where)
     model = both.get("camera_model", "")
     if not isinstance(model, str):
         raise InputError(f"{where}: camera_model must be a name, got {str(model)[:40]!r}")
     if model == "OPENCV_FISHEYE" or (model in PERSPECTIVE and both.get("is_fisheye") is True):
         if p1 or p2 or further:
-            raise InputError(f"{where}: {', '.join(further) or 'p1 and p2'} do not belong to OPENCV_FISHEYE")
+            raise InputError(f"{where}: p1, p2, k5 and k6 do not belong to OPENCV_FISHEYE")
         camera = CameraModel(model="OPENCV_FISHEYE", width=w, height=h, params=(*base, k1, k2, k3, k4))
     elif model not in PERSPECTIVE:
         raise InputError(f"{where}: camera model {model[:40]!r} is not supported; expected OPENCV or OPENCV_FISHEYE")
     elif k4 or further:
         raise InputError(
-            f"{where}: {'k4' if k4 else further[0]} of a perspective camera has no agreed meaning; expected k1, k2, "
-            "k3, p1, p2"
+            f"{where}: k4, k5, k6 of a perspective camera have no agreed meaning; expected k1 to k3, p1, p2"
         )
     elif k3:
         camera = CameraModel(model="FULL_OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
@@ -344,7 +339,7 @@ def _size_of_camera(values: dict[str, Any], image: Path, where: str) -> tuple[in
         )
 
     def off_center(size: tuple[int, int]) -> float:
-        return sum(abs(at / side - 0.5) for at, side in zip((cx, cy), size, strict=True) if at is not None)
+        return float(sum(abs(at / side - 0.5) for at, side in zip((cx, cy), size, strict=True) if at is not None))
 
     return min(sizes, key=off_center)
 

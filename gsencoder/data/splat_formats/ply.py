@@ -15,12 +15,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning, readable
-from gsencoder.data.splat_formats.raw import (
-    SH_COEFFICIENTS,
-    RawSplat,
-    logits_from_opacities,
-    opacities_from_logits,
-)
+from gsencoder.data.splat_formats.raw import SH_COEFFICIENTS, RawSplat, logits_from_opacities, opacities_from_logits
 
 MAX_HEADER = 1 << 18
 _BLOCK = 1 << 12  # Rows a block: small enough that its columns are picked from cache.
