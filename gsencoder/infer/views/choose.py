@@ -47,7 +47,7 @@ def choose_views(
     Raises:
         InputError: no Gaussians; no targets; frames are asked for where there are none; no camera finds room.
     """
-    gaussians, scene = checked_gaussians(scene, targets, config), with_upright_frames(scene)
+    gaussians = checked_gaussians(scene, targets, config)
     free = free or FreeSpace(gaussians)
     return chosen_views(scene, targets, judge_candidates(scene, gaussians, targets, free, config), free, config)
 
@@ -84,6 +84,7 @@ def judge_candidates(
     scene: Scene, gaussians: Gaussians, targets: Sequence[Target], free: FreeSpace, config: ViewsConfig
 ) -> Judged:
     """Places candidates and judges them by small renders; arguments and errors are those of `choose_views`."""
+    scene = with_upright_frames(scene)
     judged = replace(CONSTANTS.score_blend, near=min(CONSTANTS.score_blend.near, free.cell / 2))
     if config.method == "uniform":
         candidates = _uniform(scene, gaussians, config)
