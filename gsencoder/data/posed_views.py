@@ -105,8 +105,7 @@ def make_views(
     if mirrored:
         _warn(
             f"{posed.source}: {mirrored} of {len(images)} photographs are stored mirrored (EXIF orientation 2, 4, 5, "
-            "7); poses belong to the stored pixels, so that the scene may be a mirror image; teachers see photographs "
-            "as people do"
+            "7), and poses belong to the stored pixels: the scene may be a mirror image"
         )
     if background is not None:
         if _is_measured(views):

@@ -306,7 +306,7 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
         raise InputError(f"{where}: camera_model must be a name, got {str(model)[:40]!r}")
     if model == "OPENCV_FISHEYE" or (model in PERSPECTIVE and both.get("is_fisheye") is True):
         if p1 or p2 or further:
-            raise InputError(f"{where}: p1, p2, k5 and k6 do not belong to OPENCV_FISHEYE")
+            raise InputError(f"{where}: p1 and p2, k5 and k6 do not belong to OPENCV_FISHEYE")
         camera = CameraModel(model="OPENCV_FISHEYE", width=w, height=h, params=(*base, k1, k2, k3, k4))
     elif model not in PERSPECTIVE:
         raise InputError(f"{where}: camera model {model[:40]!r} is not supported; expected OPENCV or OPENCV_FISHEYE")
@@ -324,7 +324,7 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
 
 def _size_of_camera(values: dict[str, Any], image: Path, where: str) -> tuple[int, int]:
     """The size of the picture that intrinsics are of: as its pixels are stored, or of the upright picture, where only
-    that has the stated width and height, or else, of the two, where the principal point is nearer to the middle."""
+    that has the stated width and height, or else, of the two, where the principal point is as far right as down."""
     stored = picture_size(image)
     w, h, cx, cy = (number(values, key, where) for key in ("w", "h", "cx", "cy"))
     is_sideways = image.suffix.lower() != ".npy" and picture_info(image)[2] in EXCHANGED
@@ -338,10 +338,7 @@ def _size_of_camera(values: dict[str, Any], image: Path, where: str) -> tuple[in
             "of the intrinsics (image_scale makes them smaller on load)"
         )
 
-    def off_center(size: tuple[int, int]) -> float:
-        return float(sum(abs(at / side - 0.5) for at, side in zip((cx, cy), size, strict=True) if at is not None))
-
-    return min(sizes, key=off_center)
+    return min(sizes, key=lambda size: abs((cx or 0) / size[0] - (cy or 0) / size[1]))
 
 
 def _focal(data: dict[str, Any], frame: dict[str, Any], length: str, angle: str, side: int, where: str) -> float | None:

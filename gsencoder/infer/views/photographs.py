@@ -24,30 +24,26 @@ class FramePhotographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
     """Pictures of a scene in the order and the sizes of other cameras, read on access."""
 
     def __init__(self, views: Views, rows: Int64[np.ndarray, " n"], cameras: Cameras) -> None:
-        self._views, self._rows, self._cameras = views, rows, cameras
+        self.views, self.rows, self._cameras = views, rows, cameras
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.rows)
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
-            return FramePhotographs(self._views, self._rows[index], self._cameras.select(index))
+            return FramePhotographs(self.views, self.rows[index], self._cameras.select(index))
         size = int(self._cameras.widths[index]), int(self._cameras.heights[index])
         return resized_picture(self.photograph_at(index), size)
 
     def photograph_at(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         """A picture in the size that it was taken in."""
-        assert self._views.images is not None
-        return self._views.images[int(self._rows[index])]
-
-    def upright(self, cameras: Cameras) -> "FramePhotographs":
-        """The pictures as people see them, for the same cameras upright."""
-        return FramePhotographs(upright_views(self._views), self._rows, cameras)
+        assert self.views.images is not None
+        return self.views.images[int(self.rows[index])]
 
     @property
     def cameras(self) -> Cameras:
         """The cameras in the sizes that the pictures were taken in."""
-        photograph_at = self._views.cameras.select(self._rows)
+        photograph_at = self.views.cameras.select(self.rows)
         return self._cameras.resized_to(photograph_at.widths, photograph_at.heights)
 
 
@@ -58,11 +54,10 @@ def photograph_cameras(views: Views) -> Cameras:
 
 def with_upright_frames(scene: Scene) -> Scene:
     """The scene with upright frames, and photographs in the sizes that they were taken in."""
-    upright = upright_scene(scene)
-    if upright is scene or scene.views is None or not isinstance(scene.views.images, FramePhotographs):
+    upright, images = upright_scene(scene), scene.views.images if scene.views is not None else None
+    if upright.views is None or upright is scene or not isinstance(images, FramePhotographs):
         return upright
-    assert upright.views is not None
-    images = scene.views.images.upright(upright.views.cameras)
+    images = FramePhotographs(upright_views(images.views), images.rows, upright.views.cameras)
     return replace(upright, views=replace(upright.views, images=images))
 
 
