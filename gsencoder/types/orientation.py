@@ -93,9 +93,8 @@ def _turned_cameras(cameras: Cameras, rotations: Sequence[int]) -> Cameras:
         Ks[view, [0, 1], [0, 1]] = cameras.Ks[view, axes, axes]
         centers = cameras.Ks[view, axes, 2]
         Ks[view, :2, 2] = np.where(reverse, sizes[view] - centers, centers)
-    return Cameras(
-        cam_from_world=poses, Ks=Ks, widths=np.ascontiguousarray(sizes[:, 0]), heights=np.ascontiguousarray(sizes[:, 1])
-    )
+    widths, heights = sizes.T.copy()
+    return Cameras(cam_from_world=poses, Ks=Ks, widths=widths, heights=heights)
 
 
 def stored_map(feature_map: FeatureMap, orientation: int, width: int, height: int) -> FeatureMap:
@@ -115,8 +114,7 @@ def stored_map(feature_map: FeatureMap, orientation: int, width: int, height: in
         if reverse[axis]:
             shifts[axis] = cells - scales[axis] * lengths[axis] - shifts[axis]
     axes = [1, 0] if exchange else [0, 1]
-    stored = np.diag([1.0, 1.0, 1.0])[:2]
-    stored[[0, 1], [0, 1]], stored[:, 2] = scales[axes], shifts[axes]
+    stored = np.column_stack((np.diag(scales[axes]), shifts[axes]))
     forms: dict[str, Any] = {
         name: turned(form, INVERSE[orientation])
         for name in ("features", "codes", "shares")

@@ -14,7 +14,7 @@ from gsencoder.core.errors import SceneWarning
 from gsencoder.data.readers.image_file import picture_info, read_rgba
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import up_of_scene
-from gsencoder.fusion.fuse import fuse
+from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.store.folder import load_features, save_features
 from gsencoder.fusion.teacher_maps import upright
 from gsencoder.fusion.teachers.palette import PaletteTeacher
@@ -291,7 +291,7 @@ def test_views_for_people_and_models_are_upright(field_room: FieldRoom, tmp_path
     scene = load_scene(folder, splat=field_room.splat)
     assert scene.gaussians is not None
     assert scene.views is not None
-    features = fuse(scene, PaletteTeacher()).features
+    features = fuse(scene, PaletteTeacher(), FuseConfig(views=2)).features
     save_features(tmp_path / "features", scene, features)
     loaded = load_features(tmp_path / "features")
     assert loaded.views is not None
@@ -299,7 +299,7 @@ def test_views_for_people_and_models_are_upright(field_room: FieldRoom, tmp_path
     assert loaded.views.orientations == MIXED
     assert np.array_equal(loaded.views.cameras.cam_from_world, scene.views.cameras.cam_from_world)
     photographed = with_photographs(loaded, load_scene(folder))
-    config = ViewsConfig(method="uniform", count=8)
+    config = ViewsConfig(method="uniform", count=3)
     views = choose_views(photographed, [], config)
     pictures, _ = view_pictures(photographed, views)
     for chosen, picture in zip(views.chosen, pictures, strict=True):

@@ -27,11 +27,8 @@ PIXEL_LIMIT = 80_000_000
 """Pictures of more pixels are refused before they are decoded (Pillow's own warning starts a little above this)."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
 EXIF_ORIENTATION = 0x0112
-TIFF_UNDO = {
-    2: "FLIP_LEFT_RIGHT", 3: "ROTATE_180", 4: "FLIP_TOP_BOTTOM", 5: "TRANSPOSE", 6: "ROTATE_90", 7: "TRANSVERSE",
-    8: "ROTATE_270",
-}  # fmt: skip
-"""By EXIF orientation: Pillow's name of what turns an upright picture back."""
+TIFF_UNDO = (0, 0, 0, 3, 1, 5, 2, 6, 4)
+"""By EXIF orientation: Pillow's number (`Image.Transpose`) of what turns an upright picture back."""
 DEEP_GREY = ("I;16", "I;16B", "I;16L", "I")
 """Pillow's modes of pictures with one channel of more than 8 bits."""
 
@@ -84,7 +81,7 @@ def _decode(path: Path, picture: "Image") -> "Image":
         return picture
     from PIL import Image
 
-    return picture.transpose(Image.Transpose[TIFF_UNDO[orientation]])
+    return picture.transpose(Image.Transpose(TIFF_UNDO[orientation]))
 
 
 def _orientation(picture: "Image") -> int:

@@ -20,11 +20,7 @@ MAX_PATH = 4096
 MAX_COORDINATE = 1e12
 """Largest coordinate, where float64 has steps of a tenth of a millimeter."""
 ORIGIN_STEP = 1000.0
-FOLDERS_OF_LAYOUT = {
-    "COLMAP": ("sparse", "colmap"),
-    "ScanNet": ("pose", "intrinsic"),
-    "ScanNet++": ("scans", "colmap", "nerfstudio"),
-}
+FOLDERS_OF_LAYOUT = {"COLMAP": "sparse colmap", "ScanNet": "pose intrinsic", "ScanNet++": "scans colmap nerfstudio"}
 """Folders that are read beside those of the files of views."""
 
 
@@ -92,7 +88,7 @@ class PosedImages:
             for level in levels
             if level.is_relative_to(root)
             for entry in level.iterdir()
-            if entry.is_dir() and entry not in used and entry.name not in FOLDERS_OF_LAYOUT.get(layout, ())
+            if entry.is_dir() and entry not in used and entry.name not in FOLDERS_OF_LAYOUT.get(layout, "").split()
         }
         return tuple(sorted(name for name in folders if not name.startswith(".")))
 
