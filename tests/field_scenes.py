@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gsencoder.data.scenes import load_scene
@@ -73,22 +74,27 @@ def write_colmap_text(
     folder: Path,
     content: dict[str, Any],
     *,
-    camera: str = CAMERA,
+    camera: str | Sequence[str] = CAMERA,
     poses: Sequence[np.ndarray] | None = None,
     blank_lines: bool = True,
     names: Sequence[str] | None = None,
 ) -> Path:
-    """Writes sparse/0 as text, without points; `blank_lines` stand where the matches of an image would."""
+    """Writes sparse/0 as text, without points; `blank_lines` stand where the matches of an image would.
+
+    `camera` is that of all images, or one an image.
+    """
     sparse = folder / "sparse/0"
     sparse.mkdir(parents=True)
-    (sparse / "cameras.txt").write_text(f"1 {camera}\n")
+    cameras = [camera] if isinstance(camera, str) else list(camera)
+    (sparse / "cameras.txt").write_text("".join(f"{i + 1} {each}\n" for i, each in enumerate(cameras)))
     (sparse / "points3D.txt").write_text("")
     lines = []
     for i, frame in enumerate(content["frames"]):
         pose = cam_from_world(frame) if poses is None else poses[i]
         quat = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
         name = names[i] if names else Path(frame["file_path"]).name
-        lines.append(" ".join(map(str, [i + 1, *quat, *pose[:3, 3], 1, name])))
+        number = min(i + 1, len(cameras))
+        lines.append(" ".join(map(str, [i + 1, *quat, *pose[:3, 3], number, name])))
         if blank_lines:
             lines.append("")
     (sparse / "images.txt").write_text("\n".join(lines) + "\n")
@@ -119,3 +125,33 @@ def with_fields(rows: np.ndarray, drop: Sequence[str] = (), **new: np.ndarray) -
     for name in result.dtype.names or ():
         result[name] = new[name] if name in new else rows[name]
     return result
+
+
+def store_turned(folder: Path, content: dict[str, Any], orientations: Sequence[int]) -> list[np.ndarray]:
+    """Stores the photographs as JPEG files whose EXIF orientation makes them upright again.
+
+    Returns:
+        float64 [4, 4] a view: the poses of the stored pixels, OpenCV axes. Of mirrored pixels there is none; it is
+        that of the picture which is only rotated.
+    """
+    # Stored from upright axes, by the orientation's rotation (5 and 7: that of 6 and 8).
+    right_angles = {1: 0, 2: 0, 3: 2, 4: 2, 5: 1, 6: 1, 7: 3, 8: 3}
+    transposes = Image.Transpose
+    undo = (None, None, transposes.FLIP_LEFT_RIGHT, transposes.ROTATE_180, transposes.FLIP_TOP_BOTTOM,
+            transposes.TRANSPOSE, transposes.ROTATE_90, transposes.TRANSVERSE, transposes.ROTATE_270)  # fmt: skip
+    poses = []
+    for frame, orientation in zip(content["frames"], orientations, strict=True):
+        path = folder / frame["file_path"]
+        picture = Image.open(path).convert("RGB")
+        method = undo[orientation]
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        stored = picture if method is None else picture.transpose(method)
+        stored.save(path.with_suffix(".jpg"), quality=95, exif=exif)
+        path.unlink()
+        frame["file_path"] = frame["file_path"].replace(".png", ".jpg")
+        turn = np.eye(4)
+        for _ in range(right_angles[orientation]):
+            turn[:3, :3] = np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]) @ turn[:3, :3]
+        poses.append(turn @ cam_from_world(frame))
+    return poses

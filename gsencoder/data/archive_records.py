@@ -10,6 +10,7 @@ from gsencoder.core.files.archive import Archive
 from gsencoder.data.readers.image_file import PIXEL_LIMIT
 from gsencoder.data.splats import fingerprint
 from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, Gaussians, MemoryBank, Scene, Views
+from gsencoder.types.orientation import TURNS
 
 
 def check_splat(file: Archive, gaussians: Gaussians, advice: str) -> None:
@@ -109,6 +110,8 @@ def scene_parts(scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if scene.views is not None:
         arrays |= camera_arrays(scene.views.cameras)
         header["views"] = list(scene.views.names)
+        if scene.views.orientations is not None:
+            header["orientations"] = list(scene.views.orientations)
     return arrays, header
 
 
@@ -139,4 +142,7 @@ def _read_views(file: Archive) -> Views:
     pixels = cameras.widths.astype(np.int64) * cameras.heights
     if len(pixels) and pixels.max() > PIXEL_LIMIT:
         raise InputError(f"expected views of at most {PIXEL_LIMIT:,} pixels, got one of {pixels.max():,}")
-    return Views(cameras=cameras, names=tuple(names))
+    orientations = tuple(file.value("orientations", list)) if "orientations" in file else None
+    if orientations is not None and not all(each in TURNS for each in orientations):
+        raise InputError(f"expected EXIF orientations from 1 to 8, got {str(orientations)[:60]}")
+    return Views(cameras=cameras, names=tuple(names), orientations=orientations)

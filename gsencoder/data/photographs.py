@@ -48,6 +48,7 @@ class Photographs:
     Attributes:
         cameras: of all views, at full size.
         names: of all views.
+        orientations: of all views, EXIF's; 1 = upright.
     """
 
     def __init__(self, views: Views, *, track: Track = untracked) -> None:
@@ -60,6 +61,7 @@ class Photographs:
             raise InputError("the scene has cameras but no photographs")
         self.cameras: Cameras = views.cameras
         self.names = views.names
+        self.orientations = views.orientations or (1,) * len(views)
         self._images: list[Tensor] = []
         self._masks: list[Tensor | None] = []
         self._empty: list[Tensor | None] = []

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from gsencoder.data.readers.masks import EmptyFiles, MaskFiles
 from gsencoder.data.readers.posed import PosedImage, PosedImages, choose_origin
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
 from gsencoder.types import Cameras, Views
+from gsencoder.types.orientation import EXCHANGED, INVERSE, UNMIRRORED
 from gsencoder.types.poses import invert_rigid, move_origin
 
 FEW_CAMERAS = 8
@@ -51,6 +53,7 @@ def make_views(
     pinholes: dict[CameraModel, Pinhole] = {}
     grids, depth_grids = [], []
     transparent: list[Path | None] = []
+    orientations: list[int] = []
     for image in images:
         where = f"{posed.source}: view {image.name[:120]!r}"
         if image.camera not in pinholes:
@@ -58,10 +61,17 @@ def make_views(
         pinhole = pinholes[image.camera]
         width = max(1, round(pinhole.width * image_scale))
         height = max(1, round(pinhole.height * image_scale))
-        grids.append(PixelGrid(source=image.camera, pinhole=pinhole, width=width, height=height))
-        depth_camera = image.depth_camera or image.camera
-        depth_grids.append(PixelGrid(source=depth_camera, pinhole=pinhole, width=width, height=height))
-        transparent.append(image.image if _check_sizes(image, depth_camera, where) else None)
+        size, is_transparent, orientation = picture_info(image.image)
+        # A photograph that is stored sideways, with the camera of the upright picture, is turned on load. With the
+        # camera of its stored pixels it is not, and a mask whose sides are exchanged belongs to the upright picture.
+        camera_size = image.camera.width, image.camera.height
+        exchanged = orientation in EXCHANGED and size[::-1] == camera_size != size
+        turn = orientation if exchanged else INVERSE[orientation]
+        orientations.append(1 if exchanged else orientation)
+        grids.append(PixelGrid(source=image.camera, pinhole=pinhole, width=width, height=height, turn=turn))
+        depth_grids.append(replace(grids[-1], source=image.depth_camera or image.camera))
+        _check_sizes(image, grids[-1], depth_grids[-1], size, where)
+        transparent.append(image.image if is_transparent else None)
     remaps = RemapCache()
     cameras = Cameras(
         cam_from_world=move_origin(cam_from_world, origin).astype(np.float32),
@@ -88,8 +98,15 @@ def make_views(
         masks=MaskFiles(masks, grids, remaps, outlined, background) if _any(masks) or has_outlines or partial else None,
         empty=EmptyFiles(masks, grids, remaps, outlined, background) if has_outlines else None,
         instances=InstanceFiles(instances, grids, remaps) if _any(instances) else None,
+        orientations=tuple(orientations) if max(orientations) > 1 else None,
     )
     _warn_of_odd_files(posed.source, images)
+    mirrored = sum(UNMIRRORED[orientation] != orientation for orientation in orientations)
+    if mirrored:
+        _warn(
+            f"{posed.source}: {mirrored} of {len(images)} photographs are stored mirrored (EXIF orientation 2, 4, 5, "
+            "7), and poses belong to the stored pixels: the scene may be a mirror image"
+        )
     if background is not None:
         if _is_measured(views):
             return make_views(posed, max_views=max_views, image_scale=image_scale)
@@ -151,26 +168,22 @@ def _any(paths: Sequence[Path | None]) -> bool:
     return any(path is not None for path in paths)
 
 
-def _check_sizes(image: PosedImage, depth_camera: CameraModel, where: str) -> bool:
-    """Checks the sizes in the headers of the files; returns whether the photograph has transparency."""
+def _check_sizes(image: PosedImage, grid: PixelGrid, depth_grid: PixelGrid, size: tuple[int, int], where: str) -> None:
+    """Checks the sizes in the headers of the files; `size` is the photograph's."""
     camera = image.camera
     if image.depth is not None and image.depth == image.image:
         raise InputError(f"{where}: {image.image} is listed as photograph and as depth image; list the photograph")
-    size, transparent = picture_info(image.image)
-    if size != (camera.width, camera.height):
+    if (size[::-1] if grid.is_exchanged(*size) else size) != (camera.width, camera.height):
         raise InputError(
             f"{where}: {image.image} has {size[0]}×{size[1]} pixels but its camera {camera.width}×{camera.height}; "
             "give the images at the size of the intrinsics (image_scale makes them smaller on load)"
         )
-    for file, expected in ((image.depth, depth_camera), (image.mask, camera), (image.instance, camera)):
-        if file is not None:
-            actual = picture_size(file)
-            if actual != (expected.width, expected.height):
-                raise InputError(
-                    f"{where}: {file} has {actual[0]}×{actual[1]} pixels but {image.image} has {size[0]}×{size[1]}; "
-                    "both must have the same size"
-                )
-    return transparent
+    for file, expected in ((image.depth, depth_grid), (image.mask, grid), (image.instance, grid)):
+        if file is not None and not expected.fits(*(actual := picture_size(file))):
+            raise InputError(
+                f"{where}: {file} has {actual[0]}×{actual[1]} pixels but {image.image} has {size[0]}×{size[1]}; "
+                "both must have the same shape"
+            )
 
 
 def _have_empty_pixels(cameras: list[tuple[Pinhole, CameraModel]], remaps: RemapCache) -> bool:

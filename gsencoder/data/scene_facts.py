@@ -60,6 +60,7 @@ class SceneFacts:
         metres_per_unit: None where unknown.
         up: stated or estimated; None where nothing says.
         missing: what is not there, and what follows from it.
+        unused: keys of the files, and folders, that were not used.
     """
 
     layout: str
@@ -78,6 +79,7 @@ class SceneFacts:
     metres_per_unit: float | None
     up: Up | None
     missing: tuple[str, ...]
+    unused: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The facts as JSON values."""
@@ -107,6 +109,7 @@ class SceneFacts:
             "metres_per_unit": self.metres_per_unit,
             "up": None if up is None else up.to_dict(),
             "missing": list(self.missing),
+            "unused": list(self.unused),
         }
 
 
@@ -149,6 +152,7 @@ def scene_facts(scene: Scene, posed: PosedImages, layout: str) -> SceneFacts:
         metres_per_unit=scene.metres_per_unit,
         up=up,
         missing=_missing(scene, up),
+        unused=(*posed.unused, *(f"folder {name}" for name in posed.unused_folders(scene.folder, layout))),
     )
 
 

@@ -1,20 +1,21 @@
 """Loading of scenes in any supported layout, or of a splat alone."""
 
 import math
+import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.posed_views import make_views
 from gsencoder.data.readers.depth_images import DepthMeasure
 from gsencoder.data.readers.frames import pinhole_of
 from gsencoder.data.readers.layouts import ReadOptions, layout_of, read_transforms_file
 from gsencoder.data.readers.objects_json import read_objects
-from gsencoder.data.readers.posed import PosedImage, PosedImages, rigid_pose
+from gsencoder.data.readers.posed import MAX_COORDINATE, PosedImage, PosedImages, rigid_pose
 from gsencoder.data.readers.scene_splat import (
     file_of_scene,
     find_splat,
@@ -168,7 +169,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
             views = with_archived_instances(views, folder)
         views = with_mesh_instances(views, labels, origin)
         objects = objects_of_labels(labels)
-    points = posed.points
+    points, colors = _finite_points(posed)
     return Scene(
         name=name_of_folder(folder),
         gaussians=gaussians,
@@ -178,9 +179,19 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         up=posed.up if options.up is None else _unit(options.up),
         objects=objects,
         sfm_points=(points - origin).astype(np.float32) if len(points) else None,
-        sfm_colors=posed.colors if len(points) else None,
+        sfm_colors=colors if len(colors) else None,
         folder=folder,
     )
+
+
+def _finite_points(posed: PosedImages) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "_ 3"]]:
+    """The points that are finite, and their colors if they have any."""
+    with np.errstate(invalid="ignore"):
+        good = np.abs(posed.points).max(axis=1, initial=0) <= MAX_COORDINATE
+    if not good.all():
+        message = f"{int((~good).sum())} of {len(good)} points are not finite and are left out"
+        warnings.warn(f"{posed.source}: {message}", SceneWarning, stacklevel=3)
+    return posed.points[good], posed.colors[good] if len(posed.colors) else posed.colors
 
 
 def _unit(direction: tuple[float, float, float] | None) -> Float64[np.ndarray, "3"] | None:
@@ -219,7 +230,8 @@ def _with_stated_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
     """A view with the intrinsics and the depth sensor that the user states."""
     if options.intrinsics is not None:
         fx, fy, cx, cy = options.intrinsics
-        image = replace(image, camera=pinhole_of(fx, fy, cx, cy, image.image, "data.intrinsics"))
+        size = image.camera.width, image.camera.height
+        image = replace(image, camera=pinhole_of(fx, fy, cx, cy, image.image, "data.intrinsics", size=size))
     if image.depth is not None and options.depth_intrinsics is not None:
         fx, fy, cx, cy = options.depth_intrinsics
         image = replace(image, depth_camera=pinhole_of(fx, fy, cx, cy, image.depth, "data.depth_intrinsics"))

@@ -19,6 +19,7 @@ from jaxtyping import Float, Float64
 from gsencoder.core.errors import InputError
 from gsencoder.data.surfaces import Surfaces, planes_of_gaussians, surfaces_of_depth, surfaces_of_gaussians
 from gsencoder.types import Cameras, Scene
+from gsencoder.types.orientation import upright_views
 
 ALIGNED = np.deg2rad(6.0)
 """Width of the bell by which normals count as parallel or perpendicular."""
@@ -96,7 +97,7 @@ def up_of_scene(scene: Scene) -> Up | None:
     """
     if scene.up is not None:
         return Up(direction=scene.up, confidence=1.0, source="stated", from_cameras=None)
-    cameras = scene.views.cameras if scene.views is not None else None
+    cameras = upright_views(scene.views).cameras if scene.views is not None else None
     surfaces = None
     if scene.gaussians is not None:
         surfaces = surfaces_of_gaussians(scene.gaussians)

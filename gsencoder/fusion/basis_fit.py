@@ -14,6 +14,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.lift import map_rows
+from gsencoder.fusion.teacher_maps import upright
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.types import FeatureBasis, FeatureMap, Views
 
@@ -122,7 +123,7 @@ def basis_fit(basis: FeatureBasis, teacher: Teacher, views: Views, count: int) -
     """
     if teacher.space != basis.space:
         raise InputError(f"basis: is of ({basis.space.describe()}), the maps of ({teacher.space.describe()})")
-    sums = ProjectionSums()
+    sums, teacher = ProjectionSums(), upright(teacher)
     for view in even_indices(len(views), count):
         sums.add_map(basis, teacher.feature_map(views, int(view)))
     return sums.fit()

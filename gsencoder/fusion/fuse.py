@@ -31,6 +31,7 @@ from gsencoder.fusion.cell_sample import CellSample
 from gsencoder.fusion.checkpoint import open_checkpoint
 from gsencoder.fusion.coverage.covering import covering_views
 from gsencoder.fusion.lift import FeatureSums, distinct_rows, view_matrix
+from gsencoder.fusion.teacher_maps import upright
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
 from gsencoder.render import Blend, BlendConfig
@@ -138,7 +139,7 @@ def fuse(
         InputError: nothing to lift or to lift onto, a basis of another space, no view sees anything, no such device, or
             `work` holds another run.
     """
-    requested = config
+    requested, teacher = config, upright(teacher)
     chosen_device = device if isinstance(device, torch.device) else choose_device(device)
     gaussians, views = checked_scene(scene, teacher, basis)
     config = replace(config, visibility=resolve(config.visibility, views, config.lift))

@@ -16,6 +16,7 @@ from gsencoder.core.errors import advised
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.types import FeatureMap, FeatureSpace, Views
+from gsencoder.types.orientation import stored_map, upright_views
 
 SMALLEST_SCALE = 1e-30
 
@@ -107,6 +108,34 @@ class WrappedTeacher:
 
     def settings(self) -> dict[str, Any]:
         return self.teacher.settings()
+
+
+class UprightTeacher(WrappedTeacher):
+    """A teacher that sees upright pictures, whose maps are turned back to the stored pixels."""
+
+    def __init__(self, teacher: Teacher) -> None:
+        super().__init__(teacher)
+        self._last: tuple[Views, Views] | None = None
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        """The map of a view, on its stored pixels."""
+        if views.orientations is None:
+            return self.teacher.feature_map(views, view)
+        last = self._last
+        if last is None or last[0] is not views:
+            self._last = last = (views, upright_views(views, unmirror=True))
+        size = int(views.cameras.widths[view]), int(views.cameras.heights[view])
+        return stored_map(self.teacher.feature_map(last[1], view), views.orientations[view], *size)
+
+
+def upright(teacher: Teacher) -> Teacher:
+    """The teacher, made to see upright pictures once."""
+    inner = teacher
+    while isinstance(inner, WrappedTeacher):
+        if isinstance(inner, UprightTeacher):
+            return teacher
+        inner = inner.teacher
+    return UprightTeacher(teacher)
 
 
 class CachedTeacher(WrappedTeacher):

@@ -11,6 +11,7 @@ from gsencoder.core.even_indices import even_indices
 from gsencoder.reconstruct.exposure import SAME
 from gsencoder.reconstruct.exposure_prediction import predict_exposures
 from gsencoder.reconstruct.optimize import Optimizer
+from gsencoder.types.orientation import turned
 
 MAX_COMPARISONS = 4
 """Held-out photographs of which the result holds a render."""
@@ -87,13 +88,13 @@ def compare(optimizer: Optimizer, held_out: Sequence[int], *, matched: bool) -> 
 
     comparisons = []
     for view, colors in zip(chosen, predicted.maps, strict=True):
-        photo = optimizer.photographs.at_scale(view)
+        photo, orientation = optimizer.photographs.at_scale(view), optimizer.photographs.orientations[view]
         pictures = optimizer.pictures(view, photo, colors)
         comparisons.append(
             Comparison(
                 name=optimizer.photographs.names[view],
-                photograph=pixels(photo.image),
-                render=pixels(pictures.matched if matched else pictures.expected),
+                photograph=turned(pixels(photo.image), orientation),
+                render=turned(pixels(pictures.matched if matched else pictures.expected), orientation),
             )
         )
     return tuple(comparisons)

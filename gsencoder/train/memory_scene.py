@@ -26,7 +26,7 @@ from gsencoder.data.archive_records import bank_parts, read_bank
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teacher_maps import CachedTeacher
+from gsencoder.fusion.teacher_maps import CachedTeacher, upright
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.memory.bank import BankConfig, build_bank
 from gsencoder.memory.raw_features import MapStream, RawSample, draw_sample
@@ -208,6 +208,7 @@ def _sample_raw(folder: Path, stream: MapStream, space: FeatureSpace, count: int
 
 def _source(teacher: Teacher, folder: Path) -> Teacher:
     """The teacher, its maps read from where the fusion has left them unless they are cheap."""
+    teacher = upright(teacher)
     return teacher if teacher.cheap else CachedTeacher(teacher, folder / MAPS_FOLDER)
 
 

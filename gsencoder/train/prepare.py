@@ -12,6 +12,7 @@ from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import capped, map_rows
+from gsencoder.fusion.teacher_maps import upright
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
 from gsencoder.models.output_space import OutputSpace
@@ -129,7 +130,7 @@ def view_rows(
     assert scene.gaussians is not None
     assert scene.views is not None
     blending = replace(config.fusion.blend, min_weight=config.render_min_weight)
-    rows = []
+    rows, teacher = [], upright(teacher)
     for view in views.tolist():
         targets, valid, grid = _pool_map(teacher.feature_map(scene.views, view), outputs, config.render_cell)
         b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid), device=device)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.core.even_indices import even_indices
+from gsencoder.fusion.teacher_maps import upright
 from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.types import FeatureMap, Scene
 
@@ -118,7 +119,7 @@ def requested_maps(
         assert scene.views is not None
         even = even_indices(len(scene.views), len(request.used) + request.count).tolist()
         for view in [view for view in even if view not in request.used][: request.count]:
-            yield teacher, teacher.feature_map(scene.views, view)
+            yield teacher, upright(teacher).feature_map(scene.views, view)
             views.append(view)
     except MissingInput as error:
         if not optional:

@@ -30,6 +30,8 @@ class Views:
         empty: bool [H, W] each, True = the photograph shows that nothing is there, as transparency does; such pixels
             are masked, too.
         instances: int32 [H, W] each, 0 = none.
+        orientations: EXIF orientations, 1 to 8: how the stored pixels, which cameras and pictures are of, are turned to
+            be upright (`gsencoder.types.orientation`); None = all are.
     """
 
     cameras: Cameras
@@ -39,13 +41,14 @@ class Views:
     masks: Sequence[Bool[np.ndarray, "_ _"]] | None = None
     empty: Sequence[Bool[np.ndarray, "_ _"]] | None = None
     instances: Sequence[Int32[np.ndarray, "_ _"]] | None = None
+    orientations: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
         if len(self.names) != len(self.cameras):
             fail("Views", "names", f"{len(self.cameras)} names, one a camera", str(len(self.names)))
         if len(set(self.names)) != len(self.names):
             fail("Views", "names", "unique names", f"{len(self.names) - len(set(self.names))} repeated")
-        for name in LAZY:
+        for name in (*LAZY, "orientations"):
             value = getattr(self, name)
             if value is not None and len(value) != len(self.cameras):
                 fail("Views", name, f"{len(self.cameras)} entries, one a camera", str(len(value)))
@@ -57,7 +60,12 @@ class Views:
         """The views of these rows, in that order; files are still read on access."""
         rows = [int(view) for view in views]
         lazy = {name: None if (items := getattr(self, name)) is None else Selected(items, rows) for name in LAZY}
-        return Views(cameras=self.cameras.select(rows), names=tuple(self.names[row] for row in rows), **lazy)
+        return Views(
+            cameras=self.cameras.select(rows),
+            names=tuple(self.names[row] for row in rows),
+            orientations=None if self.orientations is None else tuple(self.orientations[row] for row in rows),
+            **lazy,
+        )
 
 
 class Selected(Sequence[Any]):

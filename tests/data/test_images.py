@@ -41,7 +41,7 @@ def test_alpha_composites_over_black_and_becomes_the_mask(tmp_path: Path) -> Non
     rgba = np.dstack([photograph(0), np.full((24, 32), 255, np.uint8)])
     rgba[:, :8, 3], rgba[:, 8:16, 3], rgba[:, 16:20, 3] = 0, 127, 128
     path = save(tmp_path / "a.png", rgba)
-    assert picture_info(path) == ((32, 24), True)
+    assert picture_info(path) == ((32, 24), True, 1)
     color = ImageFiles([path], [grid()], RemapCache())[0]
     assert np.abs(color - rgba[..., :3] * (rgba[..., 3:] / 255.0)).max() <= 0.5
     mask = MaskFiles([None], [grid()], RemapCache(), [path])[0]
@@ -49,7 +49,7 @@ def test_alpha_composites_over_black_and_becomes_the_mask(tmp_path: Path) -> Non
     assert mask[:, 16:].all()
 
 
-def test_exif_orientation_is_ignored(tmp_path: Path) -> None:
+def test_pixels_are_read_as_they_are_stored(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(photograph(0)).save(tmp_path / "turned.jpg", exif=exif)

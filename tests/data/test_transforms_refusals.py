@@ -88,8 +88,8 @@ def test_a_frame_that_cannot_be_used_is_named(tmp_path: Path, values: dict[str, 
 
 def test_depth_of_another_size_names_both(tmp_path: Path) -> None:
     write_transforms(tmp_path, depth=True)
-    save(tmp_path / "depth/002.png", np.ones((12, 16), np.uint16))
-    with pytest.raises(InputError, match=r"depth/002.png has 16×12 pixels but .*images/002.png has 32×24"):
+    save(tmp_path / "depth/002.png", np.ones((12, 24), np.uint16))
+    with pytest.raises(InputError, match=r"depth/002.png has 24×12 pixels but .*images/002.png has 32×24"):
         load_scene(tmp_path)
 
 

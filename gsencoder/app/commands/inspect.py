@@ -154,6 +154,8 @@ def report_table(path: str, report: SplatReport) -> Table:
         first = ", ".join(map(str, defect.first_rows)) + (", …" if defect.count > len(defect.first_rows) else "")
         stops = "; stops loading" if defect.stops_loading else ""
         table.add_row(defect.name, f"{defect.count:,} rows ({first}){stops}")
+    if report.unused:
+        table.add_row("not used", ", ".join(report.unused))
     table.add_row("loads", "yes" if report.loadable else "no; see gsencoder repair")
     return table
 

@@ -18,6 +18,7 @@ from gsencoder.data.scene_facts import SceneFacts
 from gsencoder.data.seeding.feature_matches import epipolar_distances, fundamental_matrix
 from gsencoder.infer.draw.pictures import contact_sheet, depth_picture
 from gsencoder.types import Views
+from gsencoder.types.orientation import turned
 
 MAX_ROWS = 4
 """Views in the picture."""
@@ -52,7 +53,7 @@ def scene_table(facts: SceneFacts) -> Table:
         empty = "" if facts.empty is None else f"; {facts.empty:.0%} of the pixels show that nothing is there"
         table.add_row("masks", f"yes{empty}")
     if facts.points:
-        table.add_row("points", f"{facts.points:,} of structure from motion")
+        table.add_row("points", f"{facts.points:,}")
     if facts.objects:
         table.add_row("objects", f"{facts.objects:,} with boxes")
     if facts.instances:
@@ -61,6 +62,8 @@ def scene_table(facts: SceneFacts) -> Table:
     table.add_row("up", "unknown" if facts.up is None else facts.up.describe())
     for line in facts.missing:
         table.add_row("missing", line)
+    if facts.unused:
+        table.add_row("not used", ", ".join(facts.unused))
     return table
 
 
@@ -152,15 +155,17 @@ def save_check_picture(path: Path, views: Views, depth: DepthCheck | None, match
     Of depth: photograph, depth and agreement of up to four views. Of matches: the pair that fits its poses worst, its
     matches green where they lie on their epipolar lines, and red where they do not.
     """
+    orientations = views.orientations or (1,) * len(views)
     if depth is not None and depth.comparable:
         pictures, titles = [], []
         for index in even_indices(len(depth.views), MAX_ROWS):
             view = int(depth.views[index])
-            share = agreement_map(depth.depth, int(index))
+            share, orientation = agreement_map(depth.depth, int(index)), orientations[view]
             if views.images is not None:
-                pictures.append(views.images[view])
+                pictures.append(turned(views.images[view], orientation))
                 titles.append(views.names[view])
-            pictures += [depth_picture(depth.depth.depths[index]), _agreement_picture(share)]
+            measured = (depth_picture(depth.depth.depths[index]), _agreement_picture(share))
+            pictures += [turned(picture, orientation) for picture in measured]
             shares = share[np.isfinite(share)]
             titles += [
                 "depth",
@@ -176,7 +181,7 @@ def save_check_picture(path: Path, views: Views, depth: DepthCheck | None, match
         for row, pixels in ((pair.first, pair.first_pixels), (pair.second, pair.second_pixels)):
             view = int(matches.views[row])
             size = int(cameras.widths[row]), int(cameras.heights[row])
-            pictures.append(_dots(views.images[view], size, pixels, distances))
+            pictures.append(turned(_dots(views.images[view], size, pixels, distances), orientations[view]))
             titles.append(views.names[view])
         sheet = contact_sheet(pictures, titles, columns=2, width=640)
     else:

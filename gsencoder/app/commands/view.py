@@ -29,6 +29,7 @@ from gsencoder.infer.viewer.shown import drawn_scene
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.text.build import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene, SceneObject
+from gsencoder.types.orientation import upright_scene
 
 SUFFIX = ".html"
 
@@ -130,8 +131,7 @@ def run(config: ViewConfig, summary: Summary) -> None:
 
 def _load(folder: Path, config: ViewConfig, photographed: Scene | None) -> tuple[Scene, Words | None]:
     scene, _ = with_up(load_features(folder))
-    if photographed is not None:
-        scene = with_photographs(scene, photographed)
+    scene = upright_scene(scene if photographed is None else with_photographs(scene, photographed))
     if not (config.head or config.words) and isinstance(config.text, TableTextConfig):
         _, features = select_features(scene, config.space or None)
         if not features.space.text_encoder:

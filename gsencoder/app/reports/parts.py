@@ -12,6 +12,7 @@ from gsencoder.infer.draw.report import HtmlReport
 from gsencoder.render import blend
 from gsencoder.render.images import depth_image, render_image
 from gsencoder.types import GaussianFeatures, Localization, Scene
+from gsencoder.types.orientation import upright_views
 
 SHOWN_VIEWS = 4
 MIN_CELL = 220
@@ -28,9 +29,10 @@ def add_views(report: HtmlReport, scene: Scene, features: Mapping[str, GaussianF
         scene: Gaussians and cameras.
         features: of the Gaussians, by title.
     """
-    gaussians, views = scene.gaussians, scene.views
+    gaussians = scene.gaussians
     assert gaussians is not None
-    assert views is not None
+    assert scene.views is not None
+    views = upright_views(scene.views)
     numbers = even_indices(len(views), SHOWN_VIEWS).tolist()
     colors = {title: fit_pca_colors(each.stored(each.seen)) for title, each in features.items()}
     rendered, depths = [], []

@@ -4,14 +4,14 @@ import itertools
 import math
 import re
 import warnings
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap_binary import check_binary_model
-from gsencoder.data.readers.posed import MAX_COORDINATE, PosedImage, PosedImages, inside, rigid_pose, warn_left_out
+from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.undistort import CameraModel, check_camera, load_pycolmap
 
 QUATERNION_TOLERANCE = 1e-3
@@ -24,7 +24,13 @@ def is_colmap_model(folder: Path) -> bool:
 
 
 def read_colmap(
-    model: Path, images: Path, root: Path, *, allow_outside: bool = False, base_names: bool = False
+    model: Path,
+    images: Path,
+    root: Path,
+    *,
+    allow_outside: bool = False,
+    base_names: bool = False,
+    masks: Path | None = None,
 ) -> PosedImages:
     """Reads a model and finds its photographs.
 
@@ -34,6 +40,7 @@ def read_colmap(
         root: the scene folder, which names may not leave.
         allow_outside: let them.
         base_names: photographs lie in `images` itself, whatever folders the names of the model begin with.
+        masks: folder of masks; it may be missing.
 
     Returns:
         The registered pictures sorted by name, in the model's own world, and its points with their colors. The unit
@@ -43,6 +50,7 @@ def read_colmap(
         InputError: damaged files, no registered picture whose photograph exists, an unusable camera or pose.
     """
     reconstruction = _load(model)
+    masks = masks if masks is not None and masks.is_dir() else None
     posed: list[PosedImage] = []
     missing: list[str] = []
     unregistered = 0
@@ -85,6 +93,7 @@ def read_colmap(
                 camera=cameras[image.camera_id],
                 cam_from_world=rigid_pose(pose, where),
                 image=path,
+                mask=None if masks is None else _find_mask(masks, image.name, where, allow_outside=allow_outside),
             )
         )
     total = len(reconstruction.images)
@@ -99,8 +108,20 @@ def read_colmap(
         warnings.warn(
             f"{model}: {unregistered} of {total} images have no pose and are left out", SceneWarning, stacklevel=2
         )
-    points, colors = _points(reconstruction, model)
+    if masks is not None:
+        without = [f"{image.name}.png" for image in posed if image.mask is None]
+        warn_left_out(without, len(posed), str(masks), "masks", "all pixels of those views are used")
+    points, colors = _points(reconstruction)
     return PosedImages(source=str(model), images=tuple(posed), points=points, colors=colors)
+
+
+def _find_mask(masks: Path, name: str, where: str, *, allow_outside: bool) -> Path | None:
+    """The mask of an image, as COLMAP calls it (the image's name and .png), or with .png in place of the ending."""
+    for candidate in (f"{name}.png", str(PurePosixPath(name).with_suffix(".png"))):
+        path = inside(masks, candidate, where, root=masks.parent, allow_outside=allow_outside)
+        if path.is_file():
+            return path
+    return None
 
 
 def _pose_file(model: Path) -> str:
@@ -163,16 +184,8 @@ def _check_text_counts(model: Path, reconstruction: Any) -> None:
                     )
 
 
-def _points(reconstruction: Any, model: Path) -> tuple[np.ndarray, np.ndarray]:
+def _points(reconstruction: Any) -> tuple[np.ndarray, np.ndarray]:
     sfm_points = list(reconstruction.points3D.values())
     points = np.array([point.xyz for point in sfm_points], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in sfm_points], np.uint8).reshape(-1, 3)
-    with np.errstate(invalid="ignore"):
-        good = np.abs(points).max(axis=1, initial=0) <= MAX_COORDINATE
-    if not good.all():
-        warnings.warn(
-            f"{model}: {int((~good).sum())} of {len(good)} points are not finite and are left out",
-            SceneWarning,
-            stacklevel=3,
-        )
-    return points[good], colors[good]
+    return points, colors

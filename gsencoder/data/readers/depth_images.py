@@ -92,7 +92,7 @@ class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
         from gsencoder.data.readers.registration import register_depth
 
         grid = self._grids[view]
-        self.check_size(view, depth.shape)
+        depth = self._of_source(view, depth)
         source = grid.source
         pinhole = pinhole_for(source, str(self._paths[view]))
         remap = self._remaps.get(pinhole, source)

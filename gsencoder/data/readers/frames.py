@@ -41,14 +41,16 @@ def is_lost(pose: Float64[np.ndarray, "4 4"]) -> bool:
     return not np.isfinite(pose).all()
 
 
-def pinhole_of(fx: float, fy: float, cx: float, cy: float, picture: Path, where: str) -> CameraModel:
-    """A camera without distortion at the size of a picture.
+def pinhole_of(
+    fx: float, fy: float, cx: float, cy: float, picture: Path, where: str, *, size: tuple[int, int] | None = None
+) -> CameraModel:
+    """A camera without distortion at the size of a picture, or at another that is given.
 
     Raises:
         InputError: numbers that are no camera's, or a principal point that lies outside the middle of the picture, as
             that of intrinsics for another size does.
     """
-    width, height = picture_size(picture)
+    width, height = size or picture_size(picture)
     camera = CameraModel(model="PINHOLE", width=width, height=height, params=(fx, fy, cx, cy))
     check_camera(camera, where)
     if not (0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height):

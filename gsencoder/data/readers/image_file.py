@@ -3,7 +3,8 @@
 - The size in a file's header is checked before anything is decoded; more than `PIXEL_LIMIT` pixels are refused.
 - Only PNG, JPEG, WebP, TIFF, BMP and PPM are opened, and .npy for depth. A file that cannot be decoded to its
   end is an InputError that names it.
-- The EXIF orientation is ignored, as COLMAP does: poses and intrinsics belong to the pixels as they are stored.
+- Pixels are as they are stored, as COLMAP takes them, whatever the EXIF orientation says: poses and intrinsics belong
+  to these. `picture_info` reads the orientation.
 - Grey becomes RGB by repetition, 16-bit grey keeps its upper 8 bits. An alpha channel composites the color over
   black, which is what a splat rendered without a background gives.
 """
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from gsencoder.core.errors import InputError
+from gsencoder.types.orientation import EXCHANGED
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
 PIXEL_LIMIT = 80_000_000
 """Pictures of more pixels are refused before they are decoded (Pillow's own warning starts a little above this)."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
+EXIF_ORIENTATION = 0x0112
+TIFF_UNDO = (0, 0, 0, 3, 1, 5, 2, 6, 4)
+"""By EXIF orientation: Pillow's number (`Image.Transpose`) of what turns an upright picture back."""
 DEEP_GREY = ("I;16", "I;16B", "I;16L", "I")
 """Pillow's modes of pictures with one channel of more than 8 bits."""
 
@@ -66,11 +71,34 @@ def _brief(error: Exception) -> str:
 
 
 def _decode(path: Path, picture: "Image") -> "Image":
+    """The stored pixels; Pillow turns those of TIFF files upright, and of no others."""
+    orientation = _orientation(picture) if picture.format == "TIFF" else 1
     try:
         picture.load()
     except Exception as error:
         raise InputError(f"{path}: cannot be decoded ({_brief(error)}); the file is cut short or damaged") from error
-    return picture
+    if orientation == 1:
+        return picture
+    from PIL import Image
+
+    return picture.transpose(Image.Transpose(TIFF_UNDO[orientation]))
+
+
+def _orientation(picture: "Image") -> int:
+    """The EXIF orientation from the header; 1 where there is none that can be read."""
+    from PIL import Image
+
+    try:
+        # Of PNG files Pillow's own method would decode all pixels, in case EXIF data follow them.
+        value = Image.Image.getexif(picture).get(EXIF_ORIENTATION)
+    except Exception:
+        return 1
+    return int(value) if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def _stored_size(picture: "Image") -> tuple[int, int]:
+    width, height = picture.size
+    return (height, width) if picture.format == "TIFF" and _orientation(picture) in EXCHANGED else (width, height)
 
 
 def check_picture(path: Path) -> None:
@@ -123,14 +151,15 @@ def picture_size(path: Path) -> tuple[int, int]:
         height, width = load_npy(path, header_only=True).shape
         return width, height
     with open_picture(path) as picture:
-        return picture.size
+        return _stored_size(picture)
 
 
-def picture_info(path: Path) -> tuple[tuple[int, int], bool]:
-    """((width, height), whether there is transparency) from the header alone; errors as in `picture_size`."""
+def picture_info(path: Path) -> tuple[tuple[int, int], bool, int]:
+    """((width, height), whether there is transparency, EXIF orientation) from the header alone; errors as in
+    `picture_size`."""
     with open_picture(path) as picture:
         try:
-            return picture.size, bool(picture.has_transparency_data)
+            return _stored_size(picture), bool(picture.has_transparency_data), _orientation(picture)
         except Exception as error:
             raise InputError(f"{path}: not a readable picture ({_brief(error)})") from error
 

@@ -3,6 +3,8 @@ scaled. `depth_images.py` has depth of sensors, `masks.py` masks.
 
 - Distorted pictures are resampled once (undistort.py): color bilinearly, everything else by the nearest pixel.
 - A smaller scale averages color over areas; depth and instances take the pixel at the new center.
+- A file whose width and height are exchanged is turned by the photograph's EXIF orientation. Masks, depth and instance
+  maps of another size than the photograph are enlarged or reduced by the nearest pixel.
 """
 
 import operator
@@ -18,6 +20,7 @@ from jaxtyping import Int32, UInt8
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.image_file import read_integers, read_rgba
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache
+from gsencoder.types.orientation import EXCHANGED, turned
 
 Array = TypeVar("Array", bound=np.ndarray)
 
@@ -31,12 +34,27 @@ class PixelGrid:
         pinhole: the camera without distortion, at full size.
         width: of the view, after scaling.
         height: of the view, after scaling.
+        turn: EXIF orientation by which a file is turned whose width and height are those of `source` exchanged; 1 = no
+            such file is read.
     """
 
     source: CameraModel
     pinhole: Pinhole
     width: int
     height: int
+    turn: int = 1
+
+    def is_exchanged(self, width: int, height: int) -> bool:
+        """Whether a file of this size is to be turned."""
+        source = self.source
+        return self.turn in EXCHANGED and (width > height) != (source.width > source.height) and width != height
+
+    def fits(self, width: int, height: int) -> bool:
+        """Whether a file of this size has the shape of the photograph, to the nearest pixel."""
+        if self.is_exchanged(width, height):
+            width, height = height, width
+        source = self.source
+        return abs(width * source.height - height * source.width) < min(source.width, source.height)
 
 
 class PictureFiles(Sequence[Array]):
@@ -81,21 +99,39 @@ class PictureFiles(Sequence[Array]):
         source = self._grids[view].source
         if shape != (source.height, source.width):
             raise InputError(
-                f"{self._paths[view]}: {shape[1]}×{shape[0]} pixels, expected {source.width}×{source.height}; "
-                "the file changed since the scene was loaded"
+                f"{self._paths[view]}: {shape[1]}×{shape[0]} pixels, expected {source.width}×{source.height}, as the "
+                "photograph had when the scene was loaded"
             )
+
+    def _turned(self, view: int, pixels: np.ndarray) -> np.ndarray:
+        """Pixels of a file turned as those of `source`, where width and height are exchanged."""
+        grid = self._grids[view]
+        return turned(pixels, grid.turn) if grid.is_exchanged(pixels.shape[1], pixels.shape[0]) else pixels
+
+    def _of_source(self, view: int, values: np.ndarray) -> np.ndarray:
+        """Values of a file turned and scaled by the nearest pixel to the pixels of `source`."""
+        values, grid = self._turned(view, values), self._grids[view]
+        if grid.fits(values.shape[1], values.shape[0]):
+            values = resized_nearest(values, grid.source.width, grid.source.height)
+        self.check_size(view, values.shape)
+        return values
 
     def _nearest(self, view: int, values: np.ndarray) -> np.ndarray:
         grid = self._grids[view]
-        self.check_size(view, values.shape)
+        values = self._of_source(view, values)
         remap = self._remaps.get(grid.pinhole, grid.source)
         if remap is not None:
             values = remap.nearest(values)
-        if values.shape != (grid.height, grid.width):
-            rows = ((np.arange(grid.height) + 0.5) * (values.shape[0] / grid.height)).astype(np.int64)
-            columns = ((np.arange(grid.width) + 0.5) * (values.shape[1] / grid.width)).astype(np.int64)
-            values = values[rows][:, columns]
+        return resized_nearest(values, grid.width, grid.height)
+
+
+def resized_nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
+    """[h, w] at another size: the value at the center of each new pixel."""
+    if values.shape == (height, width):
         return values
+    rows = ((np.arange(height) + 0.5) * (values.shape[0] / height)).astype(np.int64)
+    columns = ((np.arange(width) + 0.5) * (values.shape[1] / width)).astype(np.int64)
+    return values[rows][:, columns]
 
 
 class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
@@ -106,7 +142,7 @@ class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
 
         path, grid = self._paths[view], self._grids[view]
         assert path is not None
-        color = read_rgba(path)[0]
+        color = self._turned(view, read_rgba(path)[0])
         self.check_size(view, color.shape[:2])
         remap = self._remaps.get(grid.pinhole, grid.source)
         if remap is not None:

@@ -99,7 +99,8 @@ def read_iphone(folder: Path, *, allow_outside: bool = False, depth_scale: float
 def in_world_of_scan(posed: PosedImages) -> PosedImages:
     """Views of a nerfstudio/transforms.json of ScanNet++, in the world of its scan."""
     images = tuple(replace(image, cam_from_world=image.cam_from_world @ NERFSTUDIO_FROM_SCAN) for image in posed.images)
-    return replace(posed, images=images)
+    # Row vectors times R are Rᵀ times column vectors: the inverse of the exchange.
+    return replace(posed, images=images, points=posed.points @ NERFSTUDIO_FROM_SCAN[:3, :3])
 
 
 def _read_arkit(folder: Path, *, allow_outside: bool) -> PosedImages:

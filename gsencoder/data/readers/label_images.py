@@ -25,15 +25,9 @@ class LabelFiles(PictureFiles[Int32[np.ndarray, "H W"]]):
     """Label images as int32 [H, W], 0 = none, undistorted and scaled as the photographs are."""
 
     def _load(self, view: int) -> Int32[np.ndarray, "H W"]:
-        path, grid = self._paths[view], self._grids[view]
+        path = self._paths[view]
         assert path is not None
-        labels = self._read(path)
-        if labels.shape != (grid.source.height, grid.source.width):
-            raise InputError(
-                f"{path}: {labels.shape[1]}×{labels.shape[0]} pixels, expected {grid.source.width}×"
-                f"{grid.source.height}, as the file of the photograph has"
-            )
-        return self._nearest(view, labels)
+        return self._nearest(view, self._read(path))
 
     def _read(self, path: Path) -> Int32[np.ndarray, "H W"]:
         return read_labels(path)

@@ -15,6 +15,7 @@ from gsencoder.data.readers.seven_scenes import is_seven_scenes, read_seven_scen
 from gsencoder.data.readers.transforms_json import TRANSFORMS, read_transforms
 from gsencoder.data.readers.tum import is_tum, read_tum
 
+MASKS = "masks"
 COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 
 
@@ -90,13 +91,14 @@ def _read_colmap(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
         if not images.is_dir():
             raise InputError(f"images={options.images}: no such folder (looked from here and in {root})")
         # A folder that the user names may be read.
-        return read_colmap(model, images, images, allow_outside=options.allow_outside), root
+        masks = next((home / MASKS for home in (root, images.parent) if (home / MASKS).is_dir()), None)
+        return read_colmap(model, images, images, allow_outside=options.allow_outside, masks=masks), root
     homes = [root, root.parent, root.parent.parent] if model == root else [root]
     home = next((home for home in homes if (home / "images").is_dir()), None)
     if home is None:
         searched = ", ".join(str(home / "images") for home in homes)
         raise InputError(f"{model}: a COLMAP model without photographs; looked for {searched}; say images=FOLDER")
-    return read_colmap(model, home / "images", home, allow_outside=options.allow_outside), home
+    return read_colmap(model, home / "images", home, allow_outside=options.allow_outside, masks=home / MASKS), home
 
 
 def _read_tum(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:

@@ -48,7 +48,8 @@ class _OutlineFiles(PictureFiles[Bool[np.ndarray, "H W"]]):
         if path is None:
             return None
         state = path.stat()
-        foreground, empty = _last_outline(path, self._background, state.st_mtime_ns, state.st_size)
+        outlines = _last_outline(path, self._background, state.st_mtime_ns, state.st_size)
+        foreground, empty = (self._turned(view, pixels) for pixels in outlines)
         self.check_size(view, foreground.shape)
         return foreground, empty
 
@@ -84,9 +85,7 @@ class MaskFiles(_OutlineFiles):
         path, grid = self._paths[view], self._grids[view]
         pixels = np.ones((grid.source.height, grid.source.width), bool)
         if path is not None:
-            nonzero = read_mask(path)
-            self.check_size(view, nonzero.shape)
-            pixels &= nonzero
+            pixels &= self._of_source(view, read_mask(path))
         outlines = self._outline(view)
         if outlines is not None:
             pixels &= outlines[0]

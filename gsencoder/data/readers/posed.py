@@ -20,6 +20,8 @@ MAX_PATH = 4096
 MAX_COORDINATE = 1e12
 """Largest coordinate, where float64 has steps of a tenth of a millimeter."""
 ORIGIN_STEP = 1000.0
+FOLDERS_OF_LAYOUT = {"COLMAP": "sparse colmap", "ScanNet": "pose intrinsic", "ScanNet++": "scans colmap nerfstudio"}
+"""Folders that are read beside those of the files of views."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,14 +60,37 @@ class PosedImage:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PosedImages:
-    """The views of a scene and its world; coordinates are those of the files, in float64."""
+    """The views of a scene and its world; coordinates are those of the files, in float64.
+
+    Attributes:
+        points_file: a .ply that holds the points; None where another file does.
+        unused: what the files say that was not used, in words.
+    """
 
     source: str
     images: tuple[PosedImage, ...]
     metres_per_unit: float | None = None
     up: Float64[np.ndarray, "3"] | None = None
     points: Float64[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3)))
-    colors: UInt8[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    colors: UInt8[np.ndarray, "_ 3"] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
+    points_file: Path | None = None
+    unused: tuple[str, ...] = ()
+
+    def unused_folders(self, root: Path | None, layout: str) -> tuple[str, ...]:
+        """Folders in that of the scene, and beside those of its photographs, of which nothing was read."""
+        if root is None:
+            return ()
+        paths = [path for each in self.images for path in (each.image, each.depth, each.mask, each.instance)]
+        used = {home for path in {*paths, self.points_file} if path for home in (path, *path.parents)}
+        levels = {root, *(level for path in {each.image.parent for each in self.images} for level in path.parents)}
+        folders = {
+            entry.relative_to(root).as_posix()
+            for level in levels
+            if level.is_relative_to(root)
+            for entry in level.iterdir()
+            if entry.is_dir() and entry not in used and entry.name not in FOLDERS_OF_LAYOUT.get(layout, "").split()
+        }
+        return tuple(sorted(name for name in folders if not name.startswith(".")))
 
 
 def choose_origin(points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3"]:

@@ -77,4 +77,10 @@ def _read_dslr(folder: Path, *, allow_outside: bool) -> PosedImages:
                 masks=masks if masks.is_dir() else None,
             )
             return in_world_of_scan(posed)
-    return read_colmap(folder / "colmap", folder / DSLR_PICTURES[0], folder, allow_outside=allow_outside)
+    return read_colmap(
+        folder / "colmap",
+        folder / DSLR_PICTURES[0],
+        folder,
+        allow_outside=allow_outside,
+        masks=folder / DSLR_MASKS[0],
+    )

@@ -2,8 +2,9 @@
 
 `transform_matrix` is world_from_camera with OpenGL axes (x right, y up, z backward); y and z are turned round on load.
 Values of a frame come before those of the file. Distortion (k1, k2, k3, k4, p1, p2) is OpenCV's, of the perspective
-or, for OPENCV_FISHEYE or `is_fisheye`, of the equidistant model. `applied_transform`, `scale`, `offset` and
-`aabb_scale` are not used: the world is that of the matrices.
+or, for OPENCV_FISHEYE or `is_fisheye`, of the equidistant model. `ply_file_path` names points of the same world.
+`applied_transform`, `scale`, `offset` and `aabb_scale` are not used: the world is that of the matrices. Intrinsics may
+be of the upright picture where the file is stored sideways (EXIF); its width and height, which differ, tell.
 
 Beside the keys of those programs these are read: `instance_file_path` (integers, 0 = none) for a frame, and
 `metres_per_unit` and `up` for the file; for both, `depth_camera` (an object with fl_x, fl_y, cx and cy, for the depth
@@ -18,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.written_files import check_written
-from gsencoder.data.readers.image_file import picture_size
+from gsencoder.data.readers.image_file import picture_info, picture_size
 from gsencoder.data.readers.posed import (
     PosedImage,
     PosedImages,
@@ -32,12 +33,23 @@ from gsencoder.data.readers.posed import (
     warn_left_out,
 )
 from gsencoder.data.readers.undistort import CameraModel, check_camera
+from gsencoder.data.splat_formats.ply import read_points
+from gsencoder.types.orientation import EXCHANGED
 from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
 
 PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 NERFSTUDIO_DEPTH_SCALE = 1e-3
 """nerfstudio's own default for depth_unit_scale_factor: integer millimetres."""
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
+
+CAMERA_KEYS = {
+    "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "camera_angle_x",
+    "camera_angle_y", "camera_model", "is_fisheye", "depth_unit_scale_factor", "integer_depth_scale", "depth_camera",
+    "depth_from_color", "depth_measure", "no_depth",
+}  # fmt: skip
+FILE_KEYS = {"frames", "metres_per_unit", "up", "ply_file_path"}
+FRAME_KEYS = {"file_path", "transform_matrix", "depth_file_path", "depth_path", "mask_path", "instance_file_path"}
+"""Keys that are read here: of cameras, for the file or a frame, and of one of these alone."""
 
 TRANSFORMS = ("transforms.json", "transforms_train.json")
 """The names that such files have."""
@@ -173,6 +185,7 @@ def read_transforms(
     warn_left_out(missing["depth"], total, source, "listed depth files", "those views have no depth")
     warn_left_out(missing["mask"], total, source, "listed masks", "all pixels of those views are used")
     warn_left_out(missing["instance"], total, source, "listed instance maps", "those views have no instances")
+    points, colors, points_file = _points(data, path, allow_outside=allow_outside)
     metres = number(data, "metres_per_unit", str(path))
     if metres is not None and metres <= 0:
         raise InputError(f"{path}: metres_per_unit must be positive, got {metres:g}")
@@ -183,7 +196,37 @@ def read_transforms(
         up=_up(data.get("up"), path)
         if data.get("up") is not None
         else (np.array([0, 0, 1.0]) if metric_depth else None),
+        points=points,
+        colors=colors,
+        points_file=points_file,
+        unused=_unused_keys(path, data, frames),
     )
+
+
+def _points(
+    data: dict[str, Any], path: Path, *, allow_outside: bool
+) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "_ 3"], Path | None]:
+    """The points that `ply_file_path` names, their colors if they have any, and the file; in the world of the matrices,
+    as nerfstudio writes them."""
+    name, none = data.get("ply_file_path"), (np.zeros((0, 3)), np.zeros((0, 3), np.uint8), None)
+    if name is None or name == "":
+        return none
+    if not isinstance(name, str):
+        raise InputError(f"{path}: ply_file_path must be a path, got {str(name)[:40]!r}")
+    file = inside(path.parent, name, f"{path}: ply_file_path", allow_outside=allow_outside)
+    if not file.is_file():
+        warn_left_out([name], 1, path.name, "files of points", "seeds come from elsewhere")
+        return none
+    points, colors = read_points(file)
+    return points, none[1] if colors is None else colors, file
+
+
+def _unused_keys(path: Path, data: dict[str, Any], frames: list[dict[str, Any]]) -> tuple[str, ...]:
+    """Keys of a file and of its frames that nothing here reads."""
+    of_file = [key for key in data if key not in FILE_KEYS | CAMERA_KEYS]
+    of_frames = dict.fromkeys(key for frame in frames for key in frame if key not in FRAME_KEYS | CAMERA_KEYS)
+    lists = ((of_file, f"key {{}} of {path.name}"), (of_frames, f"key {{}} of the frames of {path.name}"))
+    return tuple(form.format(key[:40]) for keys, form in lists for key in keys)
 
 
 def _find_image(root: Path, name: str, where: str, *, allow_outside: bool) -> Path | None:
@@ -246,16 +289,7 @@ def _up(value: object, path: Path) -> Float64[np.ndarray, "3"]:
 def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str) -> CameraModel:
     """The intrinsics of a frame: its own values first, then the file's."""
     both = data | {key: value for key, value in frame.items() if value is not None}
-    size = []
-    for key, actual in zip(("w", "h"), picture_size(image), strict=True):
-        pixels = number(both, key, where)
-        if pixels is not None and pixels != actual:
-            raise InputError(
-                f"{where}: {key} is {pixels:g} but the image {image} has {actual} pixels; give the images at the size "
-                "of the intrinsics (image_scale makes them smaller on load)"
-            )
-        size.append(actual)
-    w, h = size
+    w, h = _size_of_camera(both, image, where)
     fx = _focal(data, frame, "fl_x", "camera_angle_x", w, where)
     fy = _focal(data, frame, "fl_y", "camera_angle_y", h, where)
     if fx is None and fy is None:
@@ -266,23 +300,45 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
     assert fx is not None
     assert fy is not None
     base = (fx, fy, w / 2 if cx is None else cx, h / 2 if cy is None else cy)
+    further = number(both, "k5", where) or number(both, "k6", where)
     model = both.get("camera_model", "")
     if not isinstance(model, str):
         raise InputError(f"{where}: camera_model must be a name, got {str(model)[:40]!r}")
     if model == "OPENCV_FISHEYE" or (model in PERSPECTIVE and both.get("is_fisheye") is True):
-        if p1 or p2:
-            raise InputError(f"{where}: p1 and p2 do not belong to OPENCV_FISHEYE")
+        if p1 or p2 or further:
+            raise InputError(f"{where}: p1 and p2, k5 and k6 do not belong to OPENCV_FISHEYE")
         camera = CameraModel(model="OPENCV_FISHEYE", width=w, height=h, params=(*base, k1, k2, k3, k4))
     elif model not in PERSPECTIVE:
         raise InputError(f"{where}: camera model {model[:40]!r} is not supported; expected OPENCV or OPENCV_FISHEYE")
-    elif k4:
-        raise InputError(f"{where}: k4 of a perspective camera has no agreed meaning; expected k1, k2, k3, p1, p2")
+    elif k4 or further:
+        raise InputError(
+            f"{where}: k4, k5, k6 of a perspective camera have no agreed meaning; expected k1 to k3, p1, p2"
+        )
     elif k3:
         camera = CameraModel(model="FULL_OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
     else:
         camera = CameraModel(model="OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2))
     check_camera(camera, where)
     return camera
+
+
+def _size_of_camera(values: dict[str, Any], image: Path, where: str) -> tuple[int, int]:
+    """The size of the picture that intrinsics are of: as its pixels are stored, or of the upright picture, where only
+    that has the stated width and height, or else, of the two, where the principal point is as far right as down."""
+    stored = picture_size(image)
+    w, h, cx, cy = (number(values, key, where) for key in ("w", "h", "cx", "cy"))
+    is_sideways = image.suffix.lower() != ".npy" and picture_info(image)[2] in EXCHANGED
+    sizes = [
+        size for size in (stored, stored[::-1])[: 1 + is_sideways] if w in (None, size[0]) and h in (None, size[1])
+    ]
+    if not sizes:
+        key, pixels, actual = ("w", w, stored[0]) if w not in (None, stored[0]) else ("h", h, stored[1])
+        raise InputError(
+            f"{where}: {key} is {pixels:g} but the image {image} has {actual} pixels; give the images at the size "
+            "of the intrinsics (image_scale makes them smaller on load)"
+        )
+
+    return min(sizes, key=lambda size: abs((cx or 0) / size[0] - (cy or 0) / size[1]))
 
 
 def _focal(data: dict[str, Any], frame: dict[str, Any], length: str, angle: str, side: int, where: str) -> float | None:

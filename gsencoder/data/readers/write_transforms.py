@@ -22,7 +22,7 @@ DISTORTION = {
 
 
 def transforms_of(posed: PosedImages, folder: Path) -> dict[str, Any]:
-    """The content of a transforms.json in `folder` for posed images; points are not part of it.
+    """The content of a transforms.json in `folder` for posed images; points are part of it where a .ply holds them.
 
     Raises:
         InputError: a camera model that the format does not have.
@@ -32,6 +32,8 @@ def transforms_of(posed: PosedImages, folder: Path) -> dict[str, Any]:
         content["metres_per_unit"] = posed.metres_per_unit
     if posed.up is not None:
         content["up"] = posed.up.tolist()
+    if posed.points_file is not None:
+        content["ply_file_path"] = _relative(posed.points_file, folder)
     content["frames"] = [_frame(image, folder) for image in posed.images]
     return content
 

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, UInt8
 
-from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.splat_formats.raw import SH_COEFFICIENTS, RawSplat
+from gsencoder.core.errors import InputError, SceneWarning, readable
+from gsencoder.data.splat_formats.raw import SH_COEFFICIENTS, RawSplat, logits_from_opacities, opacities_from_logits
 
 MAX_HEADER = 1 << 18
 _BLOCK = 1 << 12  # Rows a block: small enough that its columns are picked from cache.
@@ -26,6 +26,10 @@ _TYPES = {
 }  # fmt: skip
 _REQUIRED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
              "rot_0", "rot_1", "rot_2", "rot_3")  # fmt: skip
+
+FILTER = "filter_3D"
+"""The property with the width of mip-splatting's smoothing filter, which its files leave to be applied."""
+_COLORS, _NORMALS = ("red", "green", "blue"), ("nx", "ny", "nz")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,7 +134,8 @@ def element_start(path: Path, header: PlyHeader, name: str, size: int) -> int:
 
 
 def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> RawSplat:
-    """Gaussians from the element `vertex`: any order of properties, any number type, others ignored."""
+    """Gaussians from the element `vertex`: any order of properties, any number type; `filter_3D` is applied, with a
+    warning, and others are ignored and listed."""
     vertex = header.element("vertex")
     if vertex is None or vertex.dtype is None:
         raise InputError(f"{path}: the .ply has no element 'vertex' of plain numbers; expected a Gaussian splat")
@@ -161,6 +166,9 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
     means = np.empty((count, 3), np.float64)
     quats, scales = np.empty((count, 4), np.float32), np.empty((count, 3), np.float32)
     opacities, sh = np.empty(count, np.float32), np.empty((count, coefficients, 3), np.float32)
+    widths = np.zeros(count, np.float64)
+    normals = [name for name in _NORMALS if name in names]
+    used = {*_REQUIRED, *(name for name in names if name.startswith("f_rest_")), *normals, FILTER}
     with np.errstate(over="ignore", invalid="ignore"):
         for start in range(0, count, _BLOCK):
             stop = min(start + _BLOCK, count)
@@ -177,14 +185,63 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
                 for k in range(1, coefficients):
                     sh[start:stop, k, axis] = block[f"f_rest_{axis * per_channel + k - 1}"]
             opacities[start:stop] = block["opacity"]
+            if FILTER in names:
+                widths[start:stop] = block[FILTER]
+            # Trainers write normals of zeros.
+            used -= {name for name in normals if block[name].any()}
+    if FILTER in names:
+        scales, opacities = _filtered(scales, opacities, widths)
+        warnings.warn(
+            f"{path}: {FILTER} of mip-splatting is applied, which widens Gaussians and makes them fainter",
+            SceneWarning,
+            stacklevel=2,
+        )
+    others = [f"element {element.name}" for element in header.elements if element is not vertex and element.count]
     return RawSplat(
         means=means,
         quats=quats,
         log_scales=scales,
         logit_opacities=opacities,
         sh=sh,
-        format=f"INRIA .ply, {header.encoding}",
+        format=f"INRIA .ply, {header.encoding}{f', {FILTER} applied' if FILTER in names else ''}",
+        unused=(*(f"property {name}" for name in names if name not in used), *others),
     )
+
+
+def _filtered(
+    log_scales: Float32[np.ndarray, "N 3"], logits: Float32[np.ndarray, " N"], widths: Float64[np.ndarray, " N"]
+) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, " N"]]:
+    """Gaussians convolved with isotropic ones of these widths: scale √(s² + f²), opacity times √(Π s² / Π (s² + f²))
+    (Yu et al., Mip-Splatting, 2024)."""
+    logs = log_scales.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wider = np.logaddexp(2 * logs, 2 * np.log(np.abs(widths))[:, None]) / 2
+        opacities = opacities_from_logits(logits) * np.exp((logs - wider).sum(axis=1))
+    return wider.astype(np.float32), logits_from_opacities(opacities)
+
+
+def read_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
+    """Positions of the element `vertex` of a point cloud, and its colors if it has red, green and blue; those that are
+    no integers are taken for shares of 1.
+
+    Raises:
+        InputError: unreadable, not a .ply, truncated, or without x, y and z.
+    """
+    with readable(path), path.open("rb") as stream:
+        if stream.read(4)[:3] != b"ply":
+            raise InputError(f"{path}: not a .ply file; expected a point cloud")
+        size = stream.seek(0, 2)
+        stream.seek(0)
+        header = read_header(path, stream)
+        points = np.stack([read_property(path, stream, header, size, name) for name in "xyz"], axis=1)
+        vertex = header.element("vertex")
+        assert vertex is not None
+        assert vertex.dtype is not None
+        if not set(_COLORS) <= set(vertex.dtype.names or ()):
+            return points, None
+        scale = 1 if vertex.dtype["red"].kind in "iu" else 255
+        colors = [read_property(path, stream, header, size, name) * scale for name in _COLORS]
+    return points, np.stack(colors, axis=1).round().clip(0, 255).astype(np.uint8)
 
 
 def read_property(path: Path, stream: BinaryIO, header: PlyHeader, size: int, name: str) -> Float64[np.ndarray, " N"]:

@@ -35,6 +35,7 @@ class RawSplat:
         logit_opacities: logits; formats that store 0 … 255 give ±20 at the two ends.
         sh: color coefficients, degree-major, K = 1, 4, 9 or 16.
         format: the file format in words.
+        unused: properties and other parts of the file that were not read, in words.
     """
 
     means: Float64[np.ndarray, "N 3"]
@@ -43,6 +44,7 @@ class RawSplat:
     logit_opacities: Float32[np.ndarray, " N"]
     sh: Float32[np.ndarray, "N K 3"]
     format: str
+    unused: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.means)

@@ -53,6 +53,7 @@ class SplatReport:
         robust_min, robust_max: the box between the 1st and 99th percentile of each axis.
         median_scale: median over all axes of all Gaussians, None where there is none or it is infinite.
         opacity_quantiles: opacity by quantile, "0.0" to "1.0".
+        unused: parts of the file that were not read.
         defects: every kind that occurs, in the order of `FIXES`.
     """
 
@@ -66,6 +67,7 @@ class SplatReport:
     median_scale: float | None
     opacity_quantiles: dict[str, float]
     defects: tuple[Defect, ...]
+    unused: tuple[str, ...] = ()
 
     @property
     def loadable(self) -> bool:
@@ -132,6 +134,7 @@ def inspect_splat(raw: RawSplat) -> SplatReport:
         median_scale=median_scale if np.isfinite(median_scale) else None,
         opacity_quantiles={str(q): float(value) for q, value in zip(_QUANTILES, quantiles, strict=False)},
         defects=tuple(defects),
+        unused=raw.unused,
     )
 
 

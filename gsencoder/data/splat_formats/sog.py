@@ -20,6 +20,7 @@ from gsencoder.data.splat_formats.raw import RawSplat, check_expansion, logits_f
 
 MAX_META = 4 << 20
 _PALETTE_COLUMNS = 64
+_KEYS = ("version", "asset", "count", "means", "scales", "quats", "sh0", "shN")
 _QUAT_TAG = 252
 
 Load = Callable[[str, int], bytes]
@@ -132,6 +133,7 @@ def _read(path: Path, load: Load, size: int) -> RawSplat:
         logit_opacities=logits_from_opacities(colors[:, 3] / 255),
         sh=sh,
         format="SOG version 2",
+        unused=tuple(f"key {str(key)[:40]}" for key in meta if key not in _KEYS),
     )
 
 

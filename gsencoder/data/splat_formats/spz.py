@@ -34,7 +34,7 @@ GZIP_MAGIC = b"\x1f\x8b"
 _COLOR_SCALE = 0.15
 _QUAT_STEP = np.sqrt(0.5) / 511
 _ZSTD_LEVEL = 9
-_EXTENSIONS = 2
+_ANTIALIASED, _EXTENSIONS = 1, 2
 
 
 def read_spz(path: Path, stream: BinaryIO, size: int) -> RawSplat:
@@ -76,7 +76,7 @@ def read_spz(path: Path, stream: BinaryIO, size: int) -> RawSplat:
             raise InputError(f"{path}: stream {number} unpacks to {len(part):,} bytes, expected {expected_size:,}")
         parts.append(part)
         offset += packed
-    return _decode(b"".join(parts), count, degree, bits, version)
+    return _decode(b"".join(parts), count, degree, bits, version, flags)
 
 
 def _read_gzip(path: Path, data: bytes) -> RawSplat:
@@ -101,7 +101,7 @@ def _read_gzip(path: Path, data: bytes) -> RawSplat:
         )
     if flags & _EXTENSIONS:
         _warn_extensions(path, None)
-    return _decode(body, count, degree, bits, version)
+    return _decode(body, count, degree, bits, version, flags)
 
 
 def _warn_extensions(path: Path, size: int | None) -> None:
@@ -117,7 +117,7 @@ def _section_sizes(path: Path, count: int, degree: int, bits: int, *, rotation_b
     return [9 * count, count, 3 * count, 3 * count, rotation_bytes * count, 3 * ((degree + 1) ** 2 - 1) * count]
 
 
-def _decode(data: bytes, count: int, degree: int, bits: int, version: int) -> RawSplat:
+def _decode(data: bytes, count: int, degree: int, bits: int, version: int, flags: int) -> RawSplat:
     """Sections to values. Opacity is the byte over 255, log-scale byte/16 − 10, SH (byte − 128)/128."""
     coefficients = (degree + 1) ** 2 - 1
     kept_coefficients = min(coefficients + 1, SH_COEFFICIENTS[-1])
@@ -156,6 +156,7 @@ def _decode(data: bytes, count: int, degree: int, bits: int, version: int) -> Ra
         logit_opacities=logits_from_opacities(alphas[:, 0] / 255),
         sh=sh,
         format=f".spz version {version}",
+        unused=("flag antialiased",) if flags & _ANTIALIASED else (),
     )
 
 

@@ -25,6 +25,7 @@ from gsencoder.fusion.teachers.build import build_teacher, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.knobs import EncoderSettings
 from gsencoder.types import FeatureMap, FeatureSpace, Gaussians, Scene, Views
+from gsencoder.types.orientation import upright_views
 
 Factor = Literal["gaussians", "views", "channels", "pixels"]
 DENSE_CELL = 8
@@ -101,6 +102,7 @@ class DenseTeacher:
 
     def __init__(self, teacher: Teacher, views: Views, channels: int) -> None:
         self.space: FeatureSpace = replace(teacher.space, channels=channels, text_encoder="")
+        views = upright_views(views, unmirror=True)
         self._maps = {view: self._dense(teacher.feature_map(views, view)) for view in range(len(views))}
 
     def _dense(self, coded: FeatureMap) -> FeatureMap:

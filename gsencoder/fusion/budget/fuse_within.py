@@ -19,7 +19,7 @@ from gsencoder.fusion.checkpoint import open_checkpoint
 from gsencoder.fusion.feature_error import FieldError, judge
 from gsencoder.fusion.fuse import FuseConfig, Fusion, checked_scene, fuse
 from gsencoder.fusion.lift import FeatureSums, view_matrix
-from gsencoder.fusion.teacher_maps import CachedTeacher, WrappedTeacher
+from gsencoder.fusion.teacher_maps import CachedTeacher, WrappedTeacher, upright
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import resolve
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
@@ -81,7 +81,7 @@ def fuse_within(
     if not budget.promised:
         raise InputError("budget: expected budget.error=, budget.seconds= or budget.megabytes=, got none of them")
     check_budget(budget, config)
-    start = clock()
+    start, teacher = clock(), upright(teacher)
     gaussians, views = checked_scene(scene, teacher)
     if views.depths is not None:
         views = replace(views, depths=_CachedDepths(views.depths))

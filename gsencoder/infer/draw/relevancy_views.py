@@ -13,6 +13,7 @@ from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import render_image
 from gsencoder.render.zbuffer import visible_shares
 from gsencoder.types import Cameras, Gaussians, Localization, Scene
+from gsencoder.types.orientation import upright_views
 
 SPARE = 4
 """At least so many views beside the wanted ones are blended before the best are chosen."""
@@ -71,7 +72,8 @@ def relevancy_pictures(
     """
     if scene.gaussians is None or scene.views is None:
         raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")
-    cameras = scene.views.cameras
+    views = upright_views(scene.views)
+    cameras, images = views.cameras, views.images
     boxes_of = {word: [box for box in localization.boxes if box.query == word] for word in localization.queries}
     groups = [
         boxes_of[word][0].rows if boxes_of[word] else np.flatnonzero(relevancy >= threshold)
@@ -84,7 +86,6 @@ def relevancy_pictures(
     for view in sorted({view for views in chosen for view in views}):
         b = blend(scene.gaussians, cameras, view, config=config)
         rgb = render_image(scene.gaussians, cameras, view, blended=b)
-        images = scene.views.images
         seen = rgb if images is None else images[view]
         kind = "rendered" if images is None else "photograph"
         pose, K = cameras.cam_from_world[view], cameras.Ks[view]
@@ -96,7 +97,7 @@ def relevancy_pictures(
             heat = relevancy_overlay(rgb, heats[:, column].reshape(b.shape))
             halves = [draw_boxes(half, boxes_of[word], pose, K, origin=scene.origin) for half in (seen, heat)]
             titles = (
-                f"{scene.views.names[view]}, {kind}",
+                f"{views.names[view]}, {kind}",
                 f"relevancy of {word!r}, threshold {localization.thresholds[index]:.2f}",
             )
             picture = contact_sheet(halves, titles, columns=2, width=halves[0].shape[1])

@@ -19,7 +19,7 @@ from gsencoder.infer.views.closeups import closeups
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.frames import frames_on
 from gsencoder.infer.views.free_space import FreeSpace
-from gsencoder.infer.views.photographs import photograph_cameras
+from gsencoder.infer.views.photographs import photograph_cameras, with_upright_frames
 from gsencoder.infer.views.scores import ViewScores, replace_with_photographs, score_views
 from gsencoder.infer.views.selection import SelectedView, TargetScore, ViewsConfig, ViewSet
 from gsencoder.infer.views.shells import shell_cameras, up_of
@@ -84,6 +84,7 @@ def judge_candidates(
     scene: Scene, gaussians: Gaussians, targets: Sequence[Target], free: FreeSpace, config: ViewsConfig
 ) -> Judged:
     """Places candidates and judges them by small renders; arguments and errors are those of `choose_views`."""
+    scene = with_upright_frames(scene)
     judged = replace(CONSTANTS.score_blend, near=min(CONSTANTS.score_blend.near, free.cell / 2))
     if config.method == "uniform":
         candidates = _uniform(scene, gaussians, config)

@@ -10,6 +10,7 @@ from PIL import Image
 
 from gsencoder.core.errors import InputError, listed
 from gsencoder.types import Cameras, Scene, Views
+from gsencoder.types.orientation import upright_scene, upright_views
 
 ANGLE_TOLERANCE, POSITION_TOLERANCE = 0.01, 1e-3
 """How far two readings of one camera may be from each other: radians or parts of a focal length, and parts of the
@@ -23,32 +24,41 @@ class FramePhotographs(Sequence[UInt8[np.ndarray, "H W 3"]]):
     """Pictures of a scene in the order and the sizes of other cameras, read on access."""
 
     def __init__(self, views: Views, rows: Int64[np.ndarray, " n"], cameras: Cameras) -> None:
-        self._views, self._rows, self._cameras = views, rows, cameras
+        self.views, self.rows, self._cameras = views, rows, cameras
 
     def __len__(self) -> int:
-        return len(self._rows)
+        return len(self.rows)
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
-            return FramePhotographs(self._views, self._rows[index], self._cameras.select(index))
+            return FramePhotographs(self.views, self.rows[index], self._cameras.select(index))
         size = int(self._cameras.widths[index]), int(self._cameras.heights[index])
         return resized_picture(self.photograph_at(index), size)
 
     def photograph_at(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         """A picture in the size that it was taken in."""
-        assert self._views.images is not None
-        return self._views.images[int(self._rows[index])]
+        assert self.views.images is not None
+        return self.views.images[int(self.rows[index])]
 
     @property
     def cameras(self) -> Cameras:
         """The cameras in the sizes that the pictures were taken in."""
-        photograph_at = self._views.cameras.select(self._rows)
+        photograph_at = self.views.cameras.select(self.rows)
         return self._cameras.resized_to(photograph_at.widths, photograph_at.heights)
 
 
 def photograph_cameras(views: Views) -> Cameras:
     """The cameras of views in the sizes that their photographs were taken in."""
     return views.images.cameras if isinstance(views.images, FramePhotographs) else views.cameras
+
+
+def with_upright_frames(scene: Scene) -> Scene:
+    """The scene with upright frames, and photographs in the sizes that they were taken in."""
+    upright, images = upright_scene(scene), scene.views.images if scene.views is not None else None
+    if upright.views is None or upright is scene or not isinstance(images, FramePhotographs):
+        return upright
+    images = FramePhotographs(upright_views(images.views), images.rows, upright.views.cameras)
+    return replace(upright, views=replace(upright.views, images=images))
 
 
 def resized_picture(picture: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
@@ -134,7 +144,9 @@ def with_photographs(scene: Scene, photographed: Scene) -> Scene:
             f"photos: the cameras of scene {photographed.name} are not those of the features: {len(apart)} of "
             f"{len(scene.views)} differ, {listed(apart, MAX_NAMED)}; give the scene that the features were made from"
         )
-    return replace(scene, views=replace(scene.views, images=FramePhotographs(photographed.views, rows, scene_cameras)))
+    images = FramePhotographs(photographed.views, rows, scene_cameras)
+    orientations = photographed.views.select(rows).orientations
+    return replace(scene, views=replace(scene.views, images=images, orientations=orientations))
 
 
 def _differ(scene_cameras: Cameras, photo_cameras: Cameras, offset: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Literal
 from gsencoder.core.errors import InputError
 from gsencoder.infer.draw.pictures import Picture, contact_sheet, draw_boxes
 from gsencoder.infer.views.marks import draw_marks
-from gsencoder.infer.views.photographs import photograph_of
+from gsencoder.infer.views.photographs import photograph_of, with_upright_frames
 from gsencoder.infer.views.selection import SelectedView, ViewSet
 from gsencoder.infer.views.targets import Target
 from gsencoder.render import BlendConfig, blend
@@ -41,6 +41,7 @@ def view_pictures(
     """
     if scene.gaussians is None:
         raise InputError(f"views: scene {scene.name} has no Gaussians")
+    gaussians, scene = scene.gaussians, with_upright_frames(scene)
     config = replace(config, near=min(config.near, views.near))
     pictures: list[Picture] = []
     numbers: frozenset[int] = frozenset()
@@ -49,8 +50,8 @@ def view_pictures(
         if photograph is not None and not marked:
             pictures.append(photograph)
             continue
-        b = blend(scene.gaussians, views.cameras, view, config=config)
-        picture = render_image(scene.gaussians, views.cameras, view, blended=b) if photograph is None else photograph
+        b = blend(gaussians, views.cameras, view, config=config)
+        picture = render_image(gaussians, views.cameras, view, blended=b) if photograph is None else photograph
         picture, drawn = draw_marks(picture, b, marked)
         pictures.append(picture)
         numbers |= drawn

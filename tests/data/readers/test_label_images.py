@@ -78,7 +78,7 @@ def test_labels_have_the_size_of_the_photograph(tmp_path: Path) -> None:
     path = save(tmp_path / "m.png", np.ones((HEIGHT, WIDTH + 1), np.uint8))
     views = region_scene().views
     assert views is not None
-    with pytest.raises(InputError, match="33×24 pixels, expected 32×24, as the file of the photograph has"):
+    with pytest.raises(InputError, match="33×24 pixels, expected 32×24, as the photograph had"):
         label_files([path] * 2, views)[0]
 
 

@@ -14,6 +14,7 @@ from gsencoder.core.files.model_files import digest_files
 from gsencoder.data.readers.label_images import LABEL_SUFFIXES, label_files
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.types import Scene, Views
+from gsencoder.types.orientation import turned
 
 ENDINGS = tuple(ending for suffix in LABEL_SUFFIXES for ending in (suffix, suffix.upper()))
 """Of label images, as cameras and people write them."""
@@ -110,6 +111,7 @@ class FileMasks:
         self._paths = label_paths(self.folder, scene.views.names)
         self._files = label_files(self._paths, scene.views)
         self._row_of = {name: row for row, name in enumerate(scene.views.names)}
+        self._orientations = scene.views.orientations
 
     def labels(self, views: Views, view: int) -> Int32[np.ndarray, "H W"]:
         """The label image of a view.
@@ -117,7 +119,12 @@ class FileMasks:
         Raises:
             InputError: it cannot be read, or has another size than the photograph.
         """
-        return self._files[self._row_of[views.names[view]]]
+        row = self._row_of[views.names[view]]
+        labels: Int32[np.ndarray, "H W"] = self._files[row]
+        # Files lie as photographs are stored; upright views have no orientations.
+        if self._orientations is None or views.orientations is not None:
+            return labels
+        return turned(labels, self._orientations[row])
 
     def settings(self) -> dict[str, Any]:
         return {"masks": "files", "labels": digest_files(*self._paths)}
