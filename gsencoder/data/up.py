@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.enclosure import enclosure_of
 from gsencoder.data.surfaces import Surfaces, planes_of_gaussians, surfaces_of_depth, surfaces_of_gaussians
 from gsencoder.types import Cameras, Scene
 from gsencoder.types.orientation import upright_views
@@ -119,10 +120,17 @@ def up_of_scene(scene: Scene) -> Up | None:
 
 
 def with_up(scene: Scene) -> tuple[Scene, Up | None]:
-    """The scene with `up` filled in where its files do not state it, and how it is known; None, and the scene as it
-    is, where nothing says or where the surfaces of a bare splat lean nowhere (`MIN_CONFIDENCE`)."""
+    """The scene with `up` filled in where its files do not state it, and how it is known.
+
+    It is None, and the scene is as it was, where nothing says, where the surfaces of a bare splat lean nowhere
+    (`MIN_CONFIDENCE`), or where it is no room: the largest flat surface of a table or a cupboard is no floor.
+    """
     up = up_of_scene(scene)
-    if up is None or (up.source == "surfaces" and up.confidence < _needed_confidence(up.direction)):
+    if up is None:
+        return scene, None
+    if up.source == "surfaces" and up.confidence < _needed_confidence(up.direction):
+        return scene, None
+    if up.source == "surfaces" and scene.gaussians is not None and not enclosure_of(scene.gaussians).is_room:
         return scene, None
     return (scene if scene.up is not None else replace(scene, up=up.direction)), up
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Literal
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.enclosure import enclosure_of
 from gsencoder.data.orbits import orbit_cameras
 from gsencoder.fusion.interior_views import ROOM, interior_views
 from gsencoder.render import BlendConfig
@@ -35,7 +36,8 @@ def with_views(
         scene: with Gaussians, where it has no views.
         count: largest number of cameras.
         config: accuracy of the rendering.
-        cameras: around the splat, inside it, or "auto": inside if that shows most of it, as of a room.
+        cameras: around the splat, inside it, or "auto": inside if it is a room (`gsencoder.data.enclosure`) and that
+            shows most of it.
 
     Raises:
         InputError: cameras inside are wanted, and nowhere in the splat is there room for one.
@@ -43,7 +45,9 @@ def with_views(
     if scene.views is not None:
         return scene
     assert scene.gaussians is not None
-    inside = None if cameras == "around" else interior_views(scene.gaussians, count, up=scene.up)
+    inside = None
+    if cameras == "inside" or (cameras == "auto" and enclosure_of(scene.gaussians).is_room):
+        inside = interior_views(scene.gaussians, count, up=scene.up)
     if inside is None and cameras == "inside":
         raise InputError(f"cameras=inside: no camera in {scene.name} would see surfaces all over its picture")
     if inside is not None and (cameras == "inside" or inside.covered >= ROOM):

@@ -12,7 +12,7 @@ import pytest
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer.draw.boxes_ply import EDGES, box_corners, write_boxes_ply
 from gsencoder.infer.localize.localization_json import localization_to_json
-from gsencoder.infer.localize.localize import LocalizeConfig, localize, with_eps
+from gsencoder.infer.localize.localize import LocalizeConfig, localize, spacing_of
 from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.text.encoder import TextEncoder
 from gsencoder.text.table import TextTable, make_text_table
@@ -111,14 +111,13 @@ def test_words_asked_together_are_found_as_they_are_one_by_one() -> None:
     ]
 
 
-def test_a_radius_that_was_computed_before_gives_the_same_boxes() -> None:
+def test_a_spacing_that_was_computed_before_gives_the_same_boxes() -> None:
     assert SCENE.gaussians is not None
-    config = LocalizeConfig(eps_spacings=2.0)
-    known = with_eps(config, SCENE.gaussians)
-    assert known.eps == pytest.approx(2 * STEP, rel=1e-5)
-    assert with_eps(known, SCENE.gaussians) is known
-    ours, theirs = (localize(SCENE, ["mug", "chair"], TABLE, each) for each in (known, config))
-    assert localization_to_json(ours) == localization_to_json(theirs)
+    known = spacing_of(SCENE.gaussians)
+    assert known == pytest.approx(STEP, rel=1e-5)
+    for config in (LocalizeConfig(), LocalizeConfig(eps_spacings=2.0)):
+        ours, theirs = (localize(SCENE, ["mug", "chair"], TABLE, config, spacing=each) for each in (known, None))
+        assert localization_to_json(ours) == localization_to_json(theirs)
 
 
 def test_the_order_of_the_gaussians_does_not_matter(rng: np.random.Generator) -> None:

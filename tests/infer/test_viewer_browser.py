@@ -255,7 +255,8 @@ def test_thresholds_boxes_and_probabilities_of_a_file_are_those_of_localize_for_
         for cutoff in (None, between):
             threshold = config.threshold if cutoff is None else ThresholdConfig(kind="fixed", fixed=cutoff)
             # The page knows the spacing of the scene before its positions were rounded.
-            expected = localize(held, [word], search.words, replace(config, threshold=threshold, eps=loose.eps))
+            judged = replace(config, threshold=threshold)
+            expected = localize(held, [word], search.words, judged, spacing=loose.spacing)
             default, probability, count, boxes = page.evaluate(ANSWERED, [word, cutoff])
             if cutoff is None:
                 assert default == pytest.approx(float(expected.thresholds[0]), abs=2e-3)

@@ -5,6 +5,12 @@ import type { LocalizeSettings } from "./types";
 /** So many pairs of neighbors are looked at; above, points are clustered by occupied cells of eps / 4. */
 const MAX_PAIRS = 3e7;
 
+/** Radii that are compared where the radius follows gaps: gsencoder/infer/localize/cluster.py. */
+const RADII = 6;
+const GROWTH = Math.SQRT2;
+const SPARSE_RADII = 8;
+const LARGE = 0.05;
+
 export interface Cluster {
   rows: Int32Array;
   score: number;
@@ -160,6 +166,37 @@ function labelsOf(points: Float32Array, eps: number, minSamples: number): Int32A
   return labels;
 }
 
+function countLarge(labels: Int32Array): number {
+  const sizes: number[] = [];
+  for (const label of labels) if (label >= 0) sizes[label] = (sizes[label] ?? 0) + 1;
+  const least = LARGE * sizes.reduce((a, b) => Math.max(a, b), 0);
+  return sizes.filter((size) => size >= least).length;
+}
+
+/** DBSCAN at the radius that separates gaps within things from gaps between them (`cluster_by_gaps`). */
+function labelsByGaps(points: Float32Array, smallest: number, minSamples: number): Int32Array {
+  let labels = labelsOf(points, smallest, minSamples);
+  for (let step = 0; step < SPARSE_RADII; step++) {
+    const clustered = labels.reduce((sum, label) => sum + (label >= 0 ? 1 : 0), 0);
+    if (4 * clustered >= labels.length) break;
+    smallest *= GROWTH;
+    labels = labelsOf(points, smallest, minSamples);
+  }
+  const runs = [{ count: countLarge(labels), length: 1, labels }];
+  for (let step = 1; step < RADII; step++) {
+    const run = runs[runs.length - 1];
+    if (!run) break;
+    // One thing remains one at larger radii.
+    if (run.count !== 1) labels = labelsOf(points, smallest * GROWTH ** step, minSamples);
+    const count = countLarge(labels);
+    if (count === run.count) run.length += 1;
+    else runs.push({ count, length: 1, labels });
+  }
+  let best = runs[0];
+  for (const run of runs) if (run.count && (!best?.count || run.length > best.length)) best = run;
+  return best?.labels ?? labels;
+}
+
 /** The clusters of the Gaussians at or above a threshold, best first. */
 export function findClusters(
   relevancy: Float32Array,
@@ -174,7 +211,7 @@ export function findClusters(
   }
   const points = new Float32Array(3 * picked.length);
   picked.forEach((row, place) => points.set(means.subarray(3 * row, 3 * row + 3), 3 * place));
-  const labels = labelsOf(points, settings.eps, settings.minSamples);
+  const labels = (settings.followsGaps ? labelsByGaps : labelsOf)(points, settings.eps, settings.minSamples);
   const groups = new Map<number, number[]>();
   let total = 0;
   picked.forEach((row, place) => {

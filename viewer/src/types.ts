@@ -9,7 +9,9 @@ export interface ThresholdSettings {
 }
 
 export interface LocalizeSettings {
+  /** The radius of clusters, or the smallest one where it follows gaps. */
   eps: number;
+  followsGaps: boolean;
   minSamples: number;
   minShare: number;
   minWeight: number;

@@ -41,7 +41,7 @@ def room_frame(views: Views) -> Float64[np.ndarray, "4 4"] | None:
     if not len(normals):
         return None
     poses = views.cameras.cam_from_world.astype(np.float64)
-    fits = [_fit_axes(normals, poses[view, :3, :3]) for view in even_indices(len(views), STARTS)]
+    fits = [fit_axes(normals, poses[view, :3, :3]) for view in even_indices(len(views), STARTS)]
     axes = max(fits, key=lambda each: float(np.square(np.square(normals @ each.T)).sum()))
     frame = np.eye(4)
     frame[:3, :3] = _nearest_order(axes)
@@ -67,7 +67,7 @@ def _normals(views: Views) -> Float64[np.ndarray, "n 3"]:
     return np.concatenate(parts)
 
 
-def _fit_axes(normals: Float64[np.ndarray, "n 3"], axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
+def fit_axes(normals: Float64[np.ndarray, "n 3"], axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
     """Orthonormal rows with a large Σ (n · axis)⁴, from a first guess. The sum is convex in the axes, so that the
     orthonormal matrix nearest to its gradient never has a smaller one."""
     for _ in range(STEPS):

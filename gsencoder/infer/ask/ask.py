@@ -13,7 +13,7 @@ from gsencoder.infer.ask.prompts import Task, messages, number_in, prompt_text
 from gsencoder.infer.ask.question_words import ENGLISH, WordRules, words_in
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.draw.pictures import Picture
-from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, with_eps
+from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, spacing_of
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
@@ -139,6 +139,7 @@ class Asker:
         self.table = closed_table(words) if words is not None else None
         self.config, self.localization, self.views, self.vlm = config, localization, views, vlm
         self.word_rules = word_rules
+        self._spacing: float | None = None
         self._free: FreeSpace | None = None
         self._lookups: dict[Hashable, Lookup] = {}
         self._picture_cache: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
@@ -239,8 +240,10 @@ class Asker:
         if self.words is None:
             raise InputError(f"query: no words lead into the features of {self.scene.name}; give words= or aabb=")
         # The spacing of the scene is computed once, for the first question that has words.
-        self.localization = with_eps(self.localization, gaussians)
-        localization = localize(self.scene, words, self.words, self.localization, space=self.space)
+        self._spacing = self._spacing or spacing_of(gaussians)
+        localization = localize(
+            self.scene, words, self.words, self.localization, space=self.space, spacing=self._spacing
+        )
         # A caption is of one thing.
         boxes = self.config.boxes if question.task != "caption" else 1
         targets, distinct = _distinct(targets_of(gaussians, localization, boxes), best_boxes(localization, boxes))

@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.spacing import scene_spacing
 from gsencoder.infer.localize.boxes import Cluster, boxes_of_word, score_clusters
-from gsencoder.infer.localize.cluster import cluster
+from gsencoder.infer.localize.cluster import cluster, cluster_by_gaps
 from gsencoder.infer.localize.presence import Evidence, Presence, probability
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
@@ -21,6 +21,9 @@ from gsencoder.text.encoder import TextEncoder, check_space
 from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Gaussians, Localization, Scene
+
+EPS_SPACINGS = 1.5
+"""Smallest radius of clusters, in spacings: a surface on a square grid holds together at √2."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +55,13 @@ class LocalizeConfig:
     eps: float | None = field(
         default=None, metadata={"help": "DBSCAN radius in world units; empty = eps_spacings times the spacing"}
     )
-    eps_spacings: float = field(default=1.5, metadata={"help": "DBSCAN radius in spacings, where eps is not given"})
+    eps_spacings: float | None = field(
+        default=None,
+        metadata={
+            "help": "DBSCAN radius in spacings, where eps is not given; empty = from 1.5 spacings on it follows the "
+            "gaps between the Gaussians that were selected"
+        },
+    )
     min_samples: int = field(
         default=3, metadata={"help": "Gaussians within the radius that make a core point of a cluster"}
     )
@@ -81,8 +90,8 @@ class LocalizeConfig:
             raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
         if self.extent not in ("means", "sigma"):
             raise InputError(f"extent: expected means or sigma, got {self.extent!r}")
-        for name in ("temperature", "eps_spacings", *(("eps",) if self.eps is not None else ())):
-            if not 0 < getattr(self, name) < math.inf:
+        for name in ("temperature", "eps", "eps_spacings"):
+            if getattr(self, name) is not None and not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("min_weight", "sigmas"):
             if not 0 <= getattr(self, name) < math.inf:
@@ -96,6 +105,16 @@ class LocalizeConfig:
             raise InputError(f"min_probability: expected a probability in [0, 1], got {self.min_probability}")
 
 
+    @property
+    def follows_gaps(self) -> bool:
+        """Whether each word has a radius of its own (`gsencoder.infer.localize.cluster.cluster_by_gaps`)."""
+        return self.eps is None and self.eps_spacings is None
+
+    def radius(self, spacing: float) -> float:
+        """The radius of DBSCAN, or the smallest one where it follows gaps, in the unit of the scene's spacing."""
+        return self.eps or (self.eps_spacings or EPS_SPACINGS) * spacing
+
+
 _DEFAULT = LocalizeConfig()
 
 
@@ -107,6 +126,7 @@ def localize(
     *,
     space: str | None = None,
     rivals: TextTable | None = None,
+    spacing: float | None = None,
 ) -> Localization:
     """Finds words in a scene.
 
@@ -125,6 +145,7 @@ def localize(
         space: name of the feature set; None where the scene has only one.
         rivals: words that may fit the Gaussians better than those asked; None = the names that
             `text` knows, if it knows any.
+        spacing: `spacing_of` the Gaussians, for callers that localize in one scene more than once; None = computed.
 
     Returns:
         Relevancy, thresholds, probabilities, and the boxes best first within each word.
@@ -136,7 +157,7 @@ def localize(
         InputError: no Gaussians or features, no or unknown words, words of another space.
     """
     gaussians, _ = select_features(scene, space)
-    candidates = find_candidates(scene, queries, text, config, space=space, rivals=rivals)
+    candidates = find_candidates(scene, queries, text, config, space=space, rivals=rivals, spacing=spacing)
     probabilities = [[probability(each) for each in candidate.evidence] for candidate in candidates.words]
     boxes = []
     for word, candidate, values in zip(queries, candidates.words, probabilities, strict=True):
@@ -201,6 +222,7 @@ def find_candidates(
     *,
     space: str | None = None,
     rivals: TextTable | None = None,
+    spacing: float | None = None,
 ) -> Candidates:
     """Clusters of Gaussians for each word, with the evidence for them; arguments and errors are those of `localize`."""
     gaussians, features = select_features(scene, space)
@@ -223,14 +245,14 @@ def find_candidates(
             mode=config.mode,
         )
     presence = Presence(features, text.mean, rivals)
-    eps = with_eps(config, gaussians).eps
-    assert eps is not None
+    radius = config.radius(spacing_of(gaussians) if spacing is None and config.eps is None else spacing or 1.0)
+    find_clusters = cluster_by_gaps if config.follows_gaps else cluster
     words = []
     for number in range(len(queries)):
         cutoff = threshold(scores[number], config.threshold)
         # Comparisons with NaN are false: Gaussians never seen are never taken.
         rows = np.flatnonzero((scores[number] >= cutoff) & (features.weights > config.min_weight))
-        labels = cluster(gaussians.means[rows], eps, config.min_samples)
+        labels = find_clusters(gaussians.means[rows], radius, config.min_samples)
         ranked = score_clusters(labels, rows, scores[number][rows], features.weights[rows], min_share=config.min_share)[
             : config.max_boxes
         ]
@@ -240,13 +262,9 @@ def find_candidates(
     return Candidates(relevancy=scores, words=tuple(words))
 
 
-def with_eps(config: LocalizeConfig, gaussians: Gaussians) -> LocalizeConfig:
-    """The settings with the radius of DBSCAN in world units, which takes the spacing of a scene to compute; for callers
-    that localize in one scene more than once."""
-    if config.eps is not None:
-        return config
-    spacing = scene_spacing(gaussians.means) or (float(np.median(gaussians.scales)) if len(gaussians) else 1.0)
-    return replace(config, eps=config.eps_spacings * spacing)
+def spacing_of(gaussians: Gaussians) -> float:
+    """The spacing that radii are multiples of; of Gaussians in one place their median size."""
+    return scene_spacing(gaussians.means) or (float(np.median(gaussians.scales)) if len(gaussians) else 1.0)
 
 
 def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, GaussianFeatures]:

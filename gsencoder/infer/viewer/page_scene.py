@@ -71,7 +71,8 @@ def scene_container(search: SceneSearch, objects: tuple[SceneObject, ...], *, sh
         "photographs": scene.views is not None and scene.views.images is not None,
         "words": [] if search.table is None else list(search.table.names),
         "localize": {
-            "eps": search.eps,
+            "eps": config.radius(search.spacing),
+            "followsGaps": config.follows_gaps,
             "minSamples": config.min_samples,
             "minShare": config.min_share,
             "minWeight": config.min_weight,

@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Float32, Int16, Int64, UInt16
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.seeding.spacing import scene_spacing
 from gsencoder.infer.localize.gaussian_products import GaussianProducts
 from gsencoder.infer.localize.localization_json import localization_to_json
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.infer.localize.localize import LocalizeConfig, localize, spacing_of
 from gsencoder.infer.localize.relevancy import word_directions
 from gsencoder.infer.localize.threshold import threshold
 from gsencoder.infer.viewer.shown import ShownScene
@@ -86,12 +85,7 @@ class SceneSearch:
         if self.words is not None:
             check_space(self.shown.features.space, self.words.space)
         self.products = GaussianProducts(self.shown.features)
-        self.spacing = scene_spacing(self.shown.gaussians.means) or float(np.median(self.shown.gaussians.scales))
-
-    @property
-    def eps(self) -> float:
-        """Radius of the clusters, world units."""
-        return self.config.eps if self.config.eps is not None else self.config.eps_spacings * self.spacing
+        self.spacing = spacing_of(self.shown.gaussians)
 
     @property
     def table(self) -> TextTable | None:
@@ -130,10 +124,9 @@ class SceneSearch:
         """
         words = self._encoder()
         # The spacing, which takes most of the time, is known; what is asked meanwhile does not wait.
-        config = replace(self.config, eps=self.eps)
         with self._boxes_lock, warnings.catch_warnings():
             warnings.simplefilter("ignore", SceneWarning)
-            localized = localize(self.shown.scene, [word], words, config)
+            localized = localize(self.shown.scene, [word], words, self.config, spacing=self.spacing)
         return {"boxes": localization_to_json(localized), "probability": float(localized.probabilities[0])}
 
     def best_words(self, rows: Sequence[int]) -> list[tuple[str, float]]:
