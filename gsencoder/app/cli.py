@@ -170,7 +170,7 @@ def _dispatch(words: Sequence[str]) -> int:
     if "--cfg" in flags:
         from omegaconf import OmegaConf
 
-        print(OmegaConf.to_yaml(settings(config)), end="")
+        print(printable(OmegaConf.to_yaml(settings(config))), end="")
         return 0
     _run(command, config, "--debug" in flags)
     return 0
