@@ -34,6 +34,8 @@ FLAGS = {
 }
 TOO_LARGE = (
     "not enough memory",
+    "t allocate memory",
+    "cannot fit 'int'",
     "out of memory",
     "array is too big",
     "Maximum allowed dimension exceeded",

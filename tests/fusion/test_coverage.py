@@ -122,9 +122,9 @@ def test_balls_that_a_ray_meets_are_near_it_in_pictures_of_unequal_steps() -> No
     for dx, dy in ((1.0, 1.0), (2.0, 4.0), (4.0, 2.0)):
         shape = (int(64 / dx / 8), int(64 / dy / 8))
         for number, (x, y, z) in enumerate(centers[:3]):
-            ends = np.zeros((shape[1], shape[0]))
+            ends = np.zeros(shape[0] * shape[1])
             column, row = (40 * x / z + 32) / dx, (40 * y / z + 32) / dy
-            ends[int(row) // 8, int(column) // 8] = 9.0
+            ends[int(row) // 8 * shape[0] + int(column) // 8] = 9.0
             out = np.zeros(4, np.int64)
             parts = np.array([[0, 4]])
             lattice = (0.0, 0.0, dx, dy)

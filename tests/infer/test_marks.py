@@ -1,7 +1,5 @@
 """Numbered marks: which are drawn, where they stand, and that none hides another."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -118,4 +116,5 @@ def with_weights(b: Blend, rows: np.ndarray, share: float) -> Blend:
     """A blend in which the target has a share of the weight of some pixels, and nothing of others."""
     of_row = np.bincount(rows_of(b), b.weight.numpy(), minlength=b.rows)
     scale = np.where(np.isin(np.arange(b.rows), rows), share / np.maximum(of_row, 1e-9), 0)
-    return replace(b, weight=b.weight * torch.from_numpy(scale[rows_of(b)]).to(b.weight))
+    weight = b.weight * torch.from_numpy(scale[rows_of(b)]).to(b.weight)
+    return Blend(b.crow, b.col, weight, b.depths, b.lattice, b.config)

@@ -143,8 +143,7 @@ def test_a_process_among_several_says_at_once_why_it_stops(
     monkeypatch.setattr(Reader, "weights_of_teachers", lambda *_: {})
     config = SourceConfig(teacher=PaletteConfig(), prepare=PREPARE)
     monkeypatch.setattr(Reader, "teacher", lambda *_: TEACHERS["coded"])
-    with warnings.catch_warnings(record=True) as said, pytest.raises(InputError, match="its own"):
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as said, pytest.raises(InputError, match="its own"):
         prepare_scenes(WALLS[:1], [], {}, config, tmp_path, voxel=0.1, process=ProcessRank(world_size=world))
     assert [str(each.message) for each in said] == ["process 0 stops: its own"] * (world - 1)
 
