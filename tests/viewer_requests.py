@@ -33,9 +33,14 @@ def at(server: ViewServer, rest: str) -> str:
     return f"/{server.token}/{rest}"
 
 
+def connected(server: ViewServer) -> socket.socket:
+    """A connection on which nothing was sent."""
+    return socket.create_connection((str(server.server_address[0]), server.server_address[1]), timeout=10)
+
+
 def sent(server: ViewServer, text: str) -> bytes:
     """All that comes back for the bytes of a request, until the server closes the connection."""
-    with socket.create_connection(server.server_address[:2], timeout=10) as stream:
+    with connected(server) as stream:
         stream.sendall(text.encode())
         parts = []
         while part := stream.recv(1 << 16):

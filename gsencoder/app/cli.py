@@ -32,6 +32,24 @@ FLAGS = {
     "--debug": "show where an error or a warning came from",
     "--multirun": "run every combination of values, key=1,2,3 (-m); run k writes to OUT/k",
 }
+TOO_LARGE = (
+    "not enough memory",
+    "t allocate memory",
+    "cannot fit 'int'",
+    "out of memory",
+    "array is too big",
+    "Maximum allowed dimension exceeded",
+    "Maximum allowed size exceeded",
+    "negative dimensions",
+    "calculation overflowed",
+    "multiplication overflow",
+    "Overflow when unpacking",
+    "too large to convert",
+    "too large to be converted",
+)
+"""Words of the errors of torch, numpy and Python for sizes that cannot be allocated or counted."""
+LARGE = 10**7
+"""Settings from here on are named where memory lacks."""
 SHORT = {"-h": "--help", "-m": "--multirun"}
 
 
@@ -91,6 +109,37 @@ def _fault_of_system(error: OSError) -> str | None:
         ]
         return f"{' to '.join(names)}: {error.strerror}"
     return f"a file or a device failed: {error.strerror}" if error.errno in (errno.EIO, errno.EROFS) else None
+
+
+@contextmanager
+def _impossible_sizes(values: Any) -> Iterator[None]:
+    """Turns the errors of sizes that no memory holds, and of links to themselves, into one line.
+
+    Raises:
+        InputError: in their place.
+    """
+    try:
+        yield
+    except (MemoryError, OverflowError, RuntimeError, ValueError) as error:
+        text = " ".join(str(error).split())
+        if text.startswith("Symlink loop from "):
+            raise InputError(f"{text.removeprefix('Symlink loop from ')}: is a link that leads to itself") from error
+        if not isinstance(error, MemoryError) and not any(words in text for words in TOO_LARGE):
+            raise
+        large = ", ".join(_large_numbers("", values))
+        raise InputError(
+            f"{f'{large}: ' if large else ''}the machine has not enough memory for a size in the settings or the "
+            f"input ({text[:200]}); give smaller numbers, or less input"
+        ) from error
+
+
+def _large_numbers(key: str, value: Any) -> Iterator[str]:
+    """The settings that are large numbers, as they are typed."""
+    if isinstance(value, dict):
+        for name, each in value.items():
+            yield from _large_numbers(f"{key}.{name}" if key else name, each)
+    elif any(type(each) is int and abs(each) >= LARGE for each in (value if isinstance(value, list) else [value])):
+        yield f"{key}={value}"
 
 
 def _stopped(stop: Stopped | KeyboardInterrupt, debug: bool) -> int:
@@ -170,7 +219,7 @@ def _dispatch(words: Sequence[str]) -> int:
     if "--cfg" in flags:
         from omegaconf import OmegaConf
 
-        print(OmegaConf.to_yaml(settings(config)), end="")
+        print(printable(OmegaConf.to_yaml(settings(config))), end="")
         return 0
     _run(command, config, "--debug" in flags)
     return 0
@@ -189,7 +238,7 @@ def _run(command: Command, config: Any, debug: bool) -> None:
     values = settings(config)
     refuse_to_replace_inputs(config.out, values)
     summary = Summary(command.name, values)
-    with _collected_warnings(summary.add_warning, debug):
+    with _collected_warnings(summary.add_warning, debug), _impossible_sizes(values):
         run(config, summary)
 
 

@@ -48,8 +48,8 @@ class EncoderConfig:
             raise InputError(f"voxel: expected a positive length in metres, got {self.voxel}")
         if self.stem not in (3, 5):
             raise InputError(f"stem: expected 3 or 5 cells, got {self.stem}")
-        if self.projector < 0:
-            raise InputError(f"projector: expected 0 or more channels, got {self.projector}")
+        if not 0 <= self.projector <= 1 << 16:
+            raise InputError(f"projector: expected 0 to 65,536 channels, got {self.projector}")
         unknown = [name for name in self.inputs if name not in ATTRIBUTE_CHANNELS]
         if not self.inputs or unknown or len(set(self.inputs)) < len(self.inputs):
             raise InputError(

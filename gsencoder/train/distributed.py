@@ -19,6 +19,7 @@ from gsencoder.core.runtime.device import choose_device
 from gsencoder.core.runtime.device_names import Device
 from gsencoder.core.runtime.process_rank import ProcessRank, rank_from_environment
 from gsencoder.core.runtime.threads import available_cores
+from gsencoder.train.presence import Presence, named
 
 T = TypeVar("T")
 
@@ -29,6 +30,9 @@ STEP_MINUTES = 30.0
 """Longest wait for other processes within a step of training; a step takes seconds."""
 LOST = ("timed out", "timeout", "connection closed", "connection reset", "broken pipe", "socket closed")
 """Words of the errors of collectives whose other side died or does not answer; gloo and NCCL have no type for it."""
+
+_presence: Presence | None = None
+"""What this process knows of the others, while it is joined with them."""
 
 
 def gpu_index(process: ProcessRank, init_method: str) -> int:
@@ -69,23 +73,31 @@ def join_processes(
     # functions would hold the group until the interpreter ends, which may abort the process.
     from torch.distributed import nn  # noqa: F401
 
+    global _presence
+    wait, done = timedelta(hours=WAIT_HOURS), False
     try:
-        distributed.init_process_group(
-            backend,
-            init_method=init_method,
-            rank=process.rank,
-            world_size=process.world_size,
-            timeout=timedelta(hours=WAIT_HOURS),
-        )
-    except (RuntimeError, ValueError) as error:
-        message = " ".join(str(error).split())[:200]
-        ranks = f"process {process.rank} of {process.world_size}"
-        raise InputError(f"training: {ranks} cannot reach the others: {message}") from error
-    with lost_processes(process):
-        if settings is not None:
-            shared = {name: value for name, value in settings.items() if name not in ("quiet", "device")}
-            check_agreement("the settings", digest_of(shared), advice="give all processes the same command")
-        yield process, chosen
+        try:
+            _presence = Presence(process, init_method, wait=wait)
+            with _presence.links():
+                distributed.init_process_group(
+                    backend, store=_presence.store, rank=process.rank, world_size=process.world_size, timeout=wait
+                )
+        except InputError:
+            raise
+        except (RuntimeError, ValueError, OSError) as error:
+            message = " ".join(str(error).split())[:200]
+            ranks = f"process {process.rank} of {process.world_size}"
+            raise InputError(f"training: {ranks} cannot reach the others: {message}") from error
+        with lost_processes(process):
+            if settings is not None:
+                shared = {name: value for name, value in settings.items() if name not in ("quiet", "device")}
+                check_agreement("the settings", digest_of(shared), advice="give all processes the same command")
+            yield process, chosen
+        done = True
+    finally:
+        if _presence is not None:
+            _presence.leave(done=done)
+            _presence = None
     # Not after an error: other processes may be waiting in a reduction, and leaving the group would wait for them.
     # A wrapped network holds a reference cycle with the group, which must be collected before the group is destroyed.
     gc.collect()
@@ -116,10 +128,11 @@ def lost_processes(process: ProcessRank, minutes: float | None = None) -> Iterat
         if process.world_size == 1 or not any(words in message.lower() for words in LOST):
             raise
         hung = "timed out" in message.lower() or "timeout" in message.lower()
-        waited = f"has not answered for {minutes:g} minutes" if hung and minutes is not None else "has not answered"
+        waited = f"did not answer for {minutes:g} minutes" if hung and minutes is not None else "did not answer"
+        lost = _presence.find_lost(waits=not hung) if _presence is not None else []
         raise InputError(
-            f"training: process {process.rank} of {process.world_size}: another process "
-            f"{waited if hung else 'has ended'}; its own message, if there is one, says why; start all of them again "
+            f"training: process {process.rank} of {process.world_size}: {named(lost) if lost else 'another process'} "
+            f"{waited if hung else 'ended'}; its own message, if there is one, says why; start all of them again "
             "to continue"
         ) from error
     finally:

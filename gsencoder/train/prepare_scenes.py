@@ -2,8 +2,8 @@
 
 import hashlib
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -76,52 +76,57 @@ def prepare_scenes(
     reader = SceneReader(config, words, voxel)
     several = len(teachers) > 1
     unmeasured: dict[str, list[Head]] = {}
-    with fail_together():
-        if process.is_first:
-            with_heads = teacher_of_heads(teachers, heads)
-            for name, path in folders.items():
-                dataset = PreparedDataset(path, settings[name])
-                dataset.remove_stale_maps()
-                # Read first, since a head that is not there is an error before the teacher has made a map.
-                with _about_teacher(config, name):
-                    unmeasured[name] = missing_heads(dataset, heads, teachers[name]) if name == with_heads else []
-    datasets = {name: PreparedDataset(path, settings[name]) for name, path in folders.items()}
-    for name, dataset in datasets.items():
-        open_scene, views = partial(reader.with_views, name), config.prepare.basis_views
-        with _about_teacher(config, name):
-            fit_space(dataset, training, open_scene, config.prepare, optional=several, process=process, track=track)
-            with fail_together():
-                if process.is_first:
-                    measure_dataset_heads(dataset, unmeasured[name], training, open_scene, views, optional=several)
-    # Before hours of preparation, since the encoder could not have such columns.
-    check_distinct({name: dataset.load_space()[0].space for name, dataset in datasets.items()})
-    missing = {
-        path: [name for name, dataset in datasets.items() if not dataset.has_scene(path)]
-        for path in [*training, *held_out]
-    }
-    with fail_together():
-        pass  # No process may start to prepare before all have listed the missing scenes.
-    with fail_together():
-        share = [path for path, names in missing.items() if names][process.rank :: process.world_size]
-        weights = reader.weights_of_teachers(share[0]) if share and process.world_size > 1 else {}
-    for name in teachers:
-        check_agreement(f"the weights of teacher {name}" if several else "the teacher's weights", weights.get(name, ""))
-    with fail_together():
-        assigned: Iterable[Path] = track(share, "preparing scenes")
-        for path in assigned:
-            trained = path in training
-            try:
-                _prepare_scene(path, missing[path], datasets, reader, config, device, trained=trained, optional=several)
-            except InputError as error:
-                # The error is raised when all processes have ended their shares, which may take hours.
-                if process.world_size > 1:
-                    warnings.warn(f"process {process.rank} stops: {error}", SceneWarning, stacklevel=2)
-                raise
-    with fail_together():
-        if process.is_first:
-            _check_teachers(datasets, training, held_out)
-    for dataset in datasets.values():
-        dataset.count_classes([path.name for path in training], track, process)
+    with _without_remains(folder, folders.values()):
+        with fail_together():
+            if process.is_first:
+                with_heads = teacher_of_heads(teachers, heads)
+                for name, path in folders.items():
+                    dataset = PreparedDataset(path, settings[name])
+                    dataset.remove_stale_maps()
+                    # Read first, since a head that is not there is an error before the teacher has made a map.
+                    with _about_teacher(config, name):
+                        unmeasured[name] = missing_heads(dataset, heads, teachers[name]) if name == with_heads else []
+        datasets = {name: PreparedDataset(path, settings[name]) for name, path in folders.items()}
+        for name, dataset in datasets.items():
+            open_scene, views = partial(reader.with_views, name), config.prepare.basis_views
+            with _about_teacher(config, name):
+                fit_space(dataset, training, open_scene, config.prepare, optional=several, process=process, track=track)
+                with fail_together():
+                    if process.is_first:
+                        measure_dataset_heads(dataset, unmeasured[name], training, open_scene, views, optional=several)
+        # Before hours of preparation, since the encoder could not have such columns.
+        check_distinct({name: dataset.load_space()[0].space for name, dataset in datasets.items()})
+        missing = {
+            path: [name for name, dataset in datasets.items() if not dataset.has_scene(path)]
+            for path in [*training, *held_out]
+        }
+        with fail_together():
+            pass  # No process may start to prepare before all have listed the missing scenes.
+        with fail_together():
+            share = [path for path, names in missing.items() if names][process.rank :: process.world_size]
+            weights = reader.weights_of_teachers(share[0]) if share and process.world_size > 1 else {}
+        for name in teachers:
+            check_agreement(
+                f"the weights of teacher {name}" if several else "the teacher's weights", weights.get(name, "")
+            )
+        with fail_together():
+            assigned: Iterable[Path] = track(share, "preparing scenes")
+            for path in assigned:
+                trained = path in training
+                try:
+                    _prepare_scene(
+                        path, missing[path], datasets, reader, config, device, trained=trained, optional=several
+                    )
+                except InputError as error:
+                    # The error is raised when all processes have ended their shares, which may take hours.
+                    if process.world_size > 1:
+                        warnings.warn(f"process {process.rank} stops: {error}", SceneWarning, stacklevel=2)
+                    raise
+        with fail_together():
+            if process.is_first:
+                _check_teachers(datasets, training, held_out)
+        for dataset in datasets.values():
+            dataset.count_classes([path.name for path in training], track, process)
     return datasets
 
 
@@ -153,6 +158,20 @@ def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
             f"the teacher's folder in one (FOLDER/{names[0]})"
         )
     return {name: folder / name for name in names}
+
+
+@contextmanager
+def _without_remains(folder: Path, folders: Collection[Path]) -> Iterator[None]:
+    """Removes, when a preparation fails, the folders in which nothing was prepared."""
+    try:
+        yield
+    except BaseException:
+        for each in (*folders, folder):
+            with suppress(OSError):
+                if [entry.name for entry in each.iterdir()] == [DATASET_SETTINGS_FILE]:
+                    (each / DATASET_SETTINGS_FILE).unlink()
+                each.rmdir()
+        raise
 
 
 def _preparation_settings(

@@ -3,8 +3,10 @@
 import io
 
 import pytest
+from rich.table import Table
 
-from gsencoder.app.runs.progress import Progress
+from gsencoder.app.runs import progress
+from gsencoder.app.runs.progress import Progress, console
 
 
 class Stream(io.StringIO):
@@ -52,3 +54,41 @@ def test_a_loop_left_early_puts_the_bar_away() -> None:
             break
     assert track._depth == 0
     assert list(track(range(2), "again")) == [0, 1]
+
+
+def test_control_characters_of_names_are_not_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    name = "a\x1b[2J\x07\x9b31m\u202eb"
+    table = Table("method", title=name)
+    table.add_row(name)
+    console().print(f"{name}: written")
+    console().print(table)
+    for terminal in (False, True):
+        stream = Stream(terminal)
+        list(Progress(stream=stream, every=0.0)(range(1), name))
+        assert "\x1b[2J" not in stream.getvalue()
+        assert "\x07" not in stream.getvalue()
+    printed = capsys.readouterr().out
+    assert not {"\x1b", "\x07", "\x9b", "\u202e"} & set(printed)
+    assert printed.count("a\N{REPLACEMENT CHARACTER}[2J") == 3
+    console().print("Grün [red] 中\n\tb")
+    assert "Grün [red] 中\n" in capsys.readouterr().out
+
+
+def test_lines_come_from_the_stated_seconds_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert "after" in "".join(_lines(monkeypatch, 10.0))
+    assert _lines(monkeypatch, 9.9) == []
+
+
+def _lines(monkeypatch: pytest.MonkeyPatch, seconds: float) -> list[str]:
+    times = iter([0.0, seconds, seconds, seconds])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(times))
+    stream = Stream(terminal=False)
+    list(Progress(stream=stream)(range(1), "views"))
+    return stream.getvalue().splitlines()
+
+
+def test_results_that_go_to_no_terminal_have_two_hundred_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert console().width == 200
+    monkeypatch.setattr(progress.sys, "stdout", Stream(terminal=True))
+    monkeypatch.setenv("COLUMNS", "90")
+    assert console().width == 90

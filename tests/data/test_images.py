@@ -37,6 +37,17 @@ def test_color_of_every_mode_becomes_rgb(tmp_path: Path) -> None:
     assert read_rgba(tmp_path / "cmyk.jpg")[0].shape == rgb.shape
 
 
+@pytest.mark.parametrize("value", [-1, 65_536])
+def test_grey_values_beyond_sixteen_bits_on_either_side_are_refused(tmp_path: Path, value: int) -> None:
+    grey = np.full((24, 32), 65_535, np.int32)
+    Image.fromarray(grey).save(tmp_path / "grey.tif")
+    assert (read_rgba(tmp_path / "grey.tif")[0] == 255).all()
+    grey[3, 4] = value
+    Image.fromarray(grey).save(tmp_path / "grey.tif")
+    with pytest.raises(InputError, match="grey values beyond 16 bits"):
+        read_rgba(tmp_path / "grey.tif")
+
+
 def test_alpha_composites_over_black_and_becomes_the_mask(tmp_path: Path) -> None:
     rgba = np.dstack([photograph(0), np.full((24, 32), 255, np.uint8)])
     rgba[:, :8, 3], rgba[:, 8:16, 3], rgba[:, 16:20, 3] = 0, 127, 128

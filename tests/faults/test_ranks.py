@@ -13,7 +13,7 @@ from pathlib import Path
 from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 import torch
 from gsencoder.core.errors import InputError
-from gsencoder.train import distributed
+from gsencoder.train import distributed, presence
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.trainer_config import TrainerConfig
 
@@ -43,6 +43,7 @@ def train(how, process, device):
     trainer.run()
 
 distributed.STEP_MINUTES = 1 / 30
+presence.BEAT_SECONDS = 0.3
 for how in sys.argv[2:]:
     said = "ended"
     try:
@@ -94,7 +95,7 @@ def test_processes_that_disagree_stop_at_the_start_and_one_that_hangs_is_not_wai
             assert each.endswith(advice)
         assert messages[how][0] == messages[how][1]
     assert messages["hangs"] == [
-        "training: process 0 of 2: another process has not answered for 0.0333333 minutes; its own message, if there "
+        "training: process 0 of 2: another process did not answer for 0.0333333 minutes; its own message, if there "
         "is one, says why; start all of them again to continue",
         "",
     ]
@@ -106,7 +107,7 @@ def test_processes_that_disagree_stop_at_the_start_and_one_that_hangs_is_not_wai
 def test_a_process_whose_other_dies_ends_at_once(tmp_path: Path, ranks: RankServer) -> None:
     began = time.monotonic()
     messages = outcomes(ranks, tmp_path, "dies")["dies"]
-    assert messages[0].startswith("training: process 0 of 2: another process has ended")
+    assert messages[0].startswith("training: process 0 of 2: process 1 ended; ")
     assert messages[1] == ""
     assert time.time() - (tmp_path / "lost").stat().st_mtime < 30
     assert time.monotonic() - began < 120

@@ -7,6 +7,7 @@ import pytest
 from fixed_teachers import EXACT, FixedTeacher, make_scene
 
 from gsencoder.fusion.coverage.covering import covering_views
+from gsencoder.fusion.coverage.kernels import count_rays, list_rays, near_rays
 from gsencoder.fusion.coverage.order import view_order
 from gsencoder.fusion.coverage.sight import pixels_of, trace_sight
 from gsencoder.fusion.fuse import chosen_views, fuse
@@ -88,3 +89,56 @@ def test_views_are_judged_by_gaussians_that_they_were_not_chosen_by() -> None:
     whole = trace_sight(splat, views, pixels_of(views), OPEN, BlendConfig())
     assert whole.complete
     assert whole.halves() == (whole, whole)
+
+
+def test_rays_of_slanted_ellipses_are_those_within_them() -> None:
+    """Counted against the inequality itself, at every pixel, of an ellipse whose axes are not the picture's."""
+    a, b, c, r2, u, v = 0.3, 0.14, 0.2, 3.0, 20.3, 15.6
+    projected = np.array([[u, v, 8.0, 8.0, a, b, c, r2]])
+    side, width, height = 4, 10, 8
+    index, depths = np.zeros(1, np.int64), np.array([2.0])
+    least, most = np.zeros(width * height), np.full(width * height, 9.0)
+    counts = np.zeros(1, np.int64)
+    shape = (height, width, side)
+    count_rays(projected, index, depths, least, most, shape, counts)
+    y, x = np.mgrid[0 : height * side, 0 : width * side]
+    dx, dy = x - u, y - v
+    inside = (a * dx * dx + 2 * b * dx * dy + c * dy * dy <= r2) & (abs(dx) <= 8) & (abs(dy) <= 8)
+    assert counts[0] == inside.sum() > 30
+    rays, owners = np.zeros(999, np.int64), np.zeros(999, np.int64)
+    total = list_rays(projected, index, depths, least, most, shape, counts, 999, rays, owners)
+    assert set(rays[:total].tolist()) == set((y * width * side + x)[inside].tolist())
+    # A sample is evenly spread over the list.
+    some = np.zeros(999, np.int64)
+    assert list_rays(projected, index, depths, least, most, shape, counts, 5, some, owners) == 5
+    ranks = [rays[:total].tolist().index(each) for each in some[:5].tolist()]
+    assert ranks == [(2 * k + 1) * total // 10 for k in range(5)]
+
+
+def test_balls_that_a_ray_meets_are_near_it_in_pictures_of_unequal_steps() -> None:
+    centers = np.array([[0.0, 0.0, 2.0], [0.0, 0.62, 2.0], [0.62, 0.0, 2.0], [0.0, 0.0, -1.0]])
+    reaches = np.array([0.05, 0.05, 0.05, 0.05])
+    K = np.array([[40.0, 0, 32.0], [0, 40.0, 32.0], [0, 0, 1]])
+    for dx, dy in ((1.0, 1.0), (2.0, 4.0), (4.0, 2.0)):
+        shape = (int(64 / dx / 8), int(64 / dy / 8))
+        for number, (x, y, z) in enumerate(centers[:3]):
+            ends = np.zeros(shape[0] * shape[1])
+            column, row = (40 * x / z + 32) / dx, (40 * y / z + 32) / dy
+            ends[int(row) // 8 * shape[0] + int(column) // 8] = 9.0
+            out = np.zeros(4, np.int64)
+            parts = np.array([[0, 4]])
+            lattice = (0.0, 0.0, dx, dy)
+            count = near_rays(centers, reaches, 1.0, parts, np.eye(4), K, 0.01, lattice, ends, shape, out)
+            assert number in out[:count].tolist()
+            assert 3 not in out[:count].tolist()
+
+
+def test_groups_count_as_much_as_single_gaussians() -> None:
+    """Two views: one sees all groups, one all single Gaussians; of the latter there are more."""
+    weights = np.zeros((2, 6), np.float32)
+    weights[0, 4:], weights[1, :4] = 1, 1
+    weights[1, 4] = 0.5
+    assert view_order(weights, 4, 0.05).tolist() == [1, 0]
+    # Weights below nothing and of nothing gain nothing, whatever their order.
+    assert view_order(np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.float32), 1, 0.05)[0] == 3
+    assert view_order(np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.float32), 1, 0.05, first=(1,))[0] == 1

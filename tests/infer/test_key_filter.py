@@ -76,6 +76,15 @@ def test_long_text_of_escapes_takes_no_longer_than_other_text() -> None:
     assert time.monotonic() - begun < 10
 
 
+def test_a_long_key_is_recognised_as_fast_and_whole() -> None:
+    begun = time.monotonic()
+    for long in (KEY * 3300, KEY * 20):
+        text = f"a {quote(long, safe='')} b {long} c {long[:600]} d"
+        assert KeyFilter(long).clean(text) == "a (key) b (key) c (key) d"
+        assert KeyFilter(long).clean("no key") == "no key"
+    assert time.monotonic() - begun < 5
+
+
 def test_every_field_of_an_answer_is_without_the_key() -> None:
     whole = completion(f"a {KEY} b", KEY)
     whole["model"] = KEY

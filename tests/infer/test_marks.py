@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from rooms import UP, splat
 
 from gsencoder.data.orbits import looking_cameras
@@ -92,3 +93,28 @@ def test_things_that_are_hidden_or_too_small_carry_no_mark() -> None:
     picture, drawn = draw_marks(BLACK, blend(both, cameras, 0), [hidden, front, speck])
     assert drawn == {2}
     assert np.isnan(discs(picture, 1)[0]).all()
+
+
+def test_a_thing_is_marked_from_twelve_pixels_of_half_weight_on() -> None:
+    _, (target,), b = scene((160.0, 120.0), half=40)
+    rows = target_rows(b, target)
+    for kept, drawn in ((11, set()), (12, {1})):
+        assert draw_marks(BLACK, with_weights(b, rows[:kept], 0.6), [target])[1] == drawn
+    assert draw_marks(BLACK, with_weights(b, rows[:12], 0.4), [target])[1] == set()
+
+
+def target_rows(b: Blend, target: Target) -> np.ndarray:
+    solid = np.bincount(rows_of(b), b.weight.numpy() * np.isin(b.col.numpy(), target.rows), minlength=b.rows)
+    return np.flatnonzero(solid > 0.9)
+
+
+def rows_of(b: Blend) -> np.ndarray:
+    return np.repeat(np.arange(b.rows), b.crow.diff().numpy())
+
+
+def with_weights(b: Blend, rows: np.ndarray, share: float) -> Blend:
+    """A blend in which the target has a share of the weight of some pixels, and nothing of others."""
+    of_row = np.bincount(rows_of(b), b.weight.numpy(), minlength=b.rows)
+    scale = np.where(np.isin(np.arange(b.rows), rows), share / np.maximum(of_row, 1e-9), 0)
+    weight = b.weight * torch.from_numpy(scale[rows_of(b)]).to(b.weight)
+    return Blend(b.crow, b.col, weight, b.depths, b.lattice, b.config)

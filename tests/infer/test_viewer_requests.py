@@ -17,6 +17,7 @@ from viewer_requests import at, call, head, sent
 
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.infer.viewer import server as viewer_server
 from gsencoder.infer.viewer.container import read_container
 from gsencoder.infer.viewer.page import served_page
 from gsencoder.infer.viewer.page_scene import scene_container
@@ -160,9 +161,8 @@ def test_a_length_is_a_number_and_not_too_large(server: ViewServer, lines: tuple
 def test_a_body_that_does_not_come_is_waited_for_and_then_refused(
     server: ViewServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    handler: Any = server.RequestHandlerClass
-    assert 0 < handler.timeout <= 60
-    monkeypatch.setattr(handler, "timeout", 0.2)
+    assert 0 < viewer_server.TIMEOUT <= 60
+    monkeypatch.setattr(viewer_server, "TIMEOUT", 0.2)
     lines = ("Content-Type: application/json", "Content-Length: 10")
     assert sent(server, head(server, "POST", "ask", *lines)).startswith(b"HTTP/1.1 400")
     assert sent(server, "") == b""

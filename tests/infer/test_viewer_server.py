@@ -2,17 +2,21 @@
 
 import json
 import socket
+import struct
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from viewed_rooms import STUB, room_scene, save_viewed_room, search_of
-from viewer_requests import at, call
+from viewer_requests import at, call, connected, head
 
 from gsencoder.core.errors import InputError
+from gsencoder.infer.viewer import server as viewer_server
 from gsencoder.infer.viewer.container import read_container
 from gsencoder.infer.viewer.page import served_page
 from gsencoder.infer.viewer.page_scene import scene_container
@@ -220,3 +224,51 @@ def test_questions_from_many_threads_have_their_own_answers(server: ViewServer, 
         thread.join()
     for number, word in enumerate(words):
         np.testing.assert_array_equal(answers[number], search.ask(word).relevancy)
+
+
+def test_a_request_that_comes_byte_by_byte_is_ended(server: ViewServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer_server, "TIMEOUT", 0.4)
+    for text in ("G" * 100, head(server, "POST", "ask", "Content-Type: application/json", "Content-Length: 99") + "{"):
+        with connected(server) as stream:
+            begun = time.monotonic()
+            with suppress(ConnectionError):
+                stream.sendall(text.encode())
+                while time.monotonic() - begun < 5:
+                    time.sleep(0.05)
+                    stream.sendall(b"G")
+            assert 0.3 < time.monotonic() - begun < 4
+    # A request that is there in time is answered, whatever its answer takes.
+    assert call(server, "GET", at(server, ""))[0] == 200
+
+
+def test_strangers_take_no_place_from_the_page(server: ViewServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(viewer_server, "MAX_CONNECTIONS", 8)
+    threads = threading.active_count()
+    request = head(server, "GET", "").encode()
+    with connected(server) as page:
+        strangers = []
+        for _ in range(2):
+            page.sendall(request)
+            answer = b""
+            while server.page[0] not in answer:
+                part = page.recv(1 << 16)
+                assert part
+                answer += part
+            strangers += [connected(server) for _ in range(30)]
+        assert call(server, "GET", at(server, ""))[0] == 200
+        assert threading.active_count() <= threads + 9
+    for each in strangers:
+        each.close()
+
+
+def test_a_client_that_resets_its_connection_prints_nothing(
+    server: ViewServer, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for text in ("", "GET / HT", head(server, "GET", "scene/0")):
+        stream = connected(server)
+        stream.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        stream.sendall(text.encode())
+        stream.close()
+    time.sleep(0.2)
+    assert call(server, "GET", at(server, ""))[0] == 200
+    assert capfd.readouterr().err == ""

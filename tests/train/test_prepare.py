@@ -24,6 +24,13 @@ from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 
+@pytest.mark.parametrize("name", ["render_cell", "basis_views"])
+def test_cells_and_views_are_one_or_more(name: str) -> None:
+    assert getattr(PrepareConfig(**{name: 1}), name) == 1
+    with pytest.raises(InputError, match=f"{name}: expected 1 or more, got 0"):
+        PrepareConfig(**{name: 0})
+
+
 def test_targets_are_the_fused_features_in_standard_units(tmp_path: Path) -> None:
     dataset, names = prepared(tmp_path, count=1)
     outputs, codebook = dataset.load_space()

@@ -1,5 +1,6 @@
 """Preparation for several teachers: scenes for each teacher that they have, and classes of training scenes alone."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from joint_training import DenseTeacher
 from training_scenes import PREPARE, SideTeacher, scene
 
 from gsencoder.core.errors import InputError, SceneWarning, renamed_options
+from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -128,3 +130,29 @@ def test_options_are_renamed_at_the_beginning_of_words_in_errors_of_the_same_kin
 def test_names_of_teachers_that_differ_only_in_case_are_refused() -> None:
     with pytest.raises(InputError, match="teachers: labels and LABELS differ only in case"):
         SourceConfig(teachers={name: PaletteConfig() for name in ("labels", "colors", "LABELS")})
+
+
+@pytest.mark.parametrize("world", [1, 2])
+def test_a_process_among_several_says_at_once_why_it_stops(
+    world: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise InputError("its own")
+
+    monkeypatch.setattr(module, "_prepare_scene", fails)
+    monkeypatch.setattr(Reader, "weights_of_teachers", lambda *_: {})
+    config = SourceConfig(teacher=PaletteConfig(), prepare=PREPARE)
+    monkeypatch.setattr(Reader, "teacher", lambda *_: TEACHERS["coded"])
+    with warnings.catch_warnings(record=True, action="always") as said, pytest.raises(InputError, match="its own"):
+        prepare_scenes(WALLS[:1], [], {}, config, tmp_path, voxel=0.1, process=ProcessRank(world_size=world))
+    assert [str(each.message) for each in said] == ["process 0 stops: its own"] * (world - 1)
+
+
+def test_a_preparation_that_is_refused_at_once_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuses(*_: object, **__: object) -> None:
+        raise InputError("no scene")
+
+    monkeypatch.setattr(module, "fit_space", refuses)
+    with pytest.raises(InputError, match="no scene"):
+        prepare_scenes(WALLS, [], {}, SourceConfig(prepare=PREPARE), tmp_path / "out.prepared", voxel=0.1)
+    assert list(tmp_path.iterdir()) == []

@@ -29,6 +29,8 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
     if not isinstance(config.protocol, BenchmarkProtocol):
         advice = "start it once; recognition, instances, semantics and referring are what processes share the scenes of"
         refuse_several(f"protocol={config.protocol.name}", advice)
+    if config.space and not (config.weights or config.features):
+        raise InputError("space: names a teacher of weights= or features=; leave it out, or give one of the two")
     check_names(find_scenes(config.paths))
     if config.features:
         source, words = stored_features(config)

@@ -35,6 +35,9 @@ from gsencoder.infer.onnx.memory import export_memory
 from gsencoder.infer.onnx.runtime import SUFFIX
 from gsencoder.types import QueryMemory
 
+MAX_SIZE = 10_000_000
+"""Largest number of Gaussians of a random cloud; torch and the graph hold each in memory at once."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExportConfig(CommonConfig):
@@ -97,8 +100,8 @@ class ExportConfig(CommonConfig):
     seeds: SeedConfig = field(default_factory=SeedConfig)
 
     def __post_init__(self) -> None:
-        if not self.sizes or min(self.sizes) < 1:
-            raise InputError(f"sizes: expected one or more numbers from 1, got {list(self.sizes)}")
+        if not self.sizes or min(self.sizes) < 1 or max(self.sizes) > MAX_SIZE:
+            raise InputError(f"sizes: expected one or more numbers from 1 to {MAX_SIZE:,}, got {list(self.sizes)}")
         if not 0 < self.tolerance < 1:
             raise InputError(f"tolerance: expected a share between 0 and 1, got {self.tolerance}")
         if not -1 <= self.cosine <= 1:

@@ -9,6 +9,7 @@ from pathlib import Path
 from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_file import check_output_files, sole_writer
+from gsencoder.app.runs.printable import printable
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
@@ -165,7 +166,7 @@ def _serve(
     scenes = [scene_container(search, objects) for search in searches]
     with ViewServer(page, searches, scenes, host=config.host, port=config.port) as server:
         # The address is the result: it is printed also where there is no terminal, at once.
-        print(f"{server.address} shows {name}; Ctrl-C ends it", flush=True)
+        print(f"{server.address} shows {printable(name)}; Ctrl-C ends it", flush=True)
         if config.open or (config.open is None and sys.stdout.isatty()):
             webbrowser.open(server.address)
         try:

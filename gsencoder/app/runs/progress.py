@@ -9,19 +9,29 @@ import time
 from collections.abc import Iterable, Iterator, Sized
 from typing import Any, TypeVar
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
+from rich.segment import Segment
 
+from gsencoder.app.runs.printable import printable
 from gsencoder.core.runtime.signals import raise_dropped_stop
 
 T = TypeVar("T")
 
 
+class Screen(Console):
+    """A console that prints no control characters of the text that it is given: file names and texts of users."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        for text, style, control in super().render(renderable, options):
+            yield Segment(text if control else printable(text), style, control)
+
+
 def console(quiet: bool = False) -> Console:
     """The console for results and tables: standard output without markup, 200 columns wide if it is not a terminal."""
     width = None if sys.stdout.isatty() else 200
-    return Console(file=sys.stdout, quiet=quiet, markup=False, highlight=False, emoji=False, width=width)
+    return Screen(file=sys.stdout, quiet=quiet, markup=False, highlight=False, emoji=False, width=width)
 
 
 class Progress:
@@ -57,7 +67,7 @@ class Progress:
     def _on_terminal(self, items: Iterable[T], label: str, total: int | None) -> Iterator[T]:
         if self._bars is None:
             columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
-            screen = Console(file=self._stream, markup=False, highlight=False)
+            screen = Screen(file=self._stream, markup=False, highlight=False)
             self._bars = Bars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=screen, transient=True)
         # Nested loops share one display, since rich draws one at a time.
         if self._depth == 0:
@@ -76,7 +86,7 @@ class Progress:
 
     def _in_lines(self, items: Iterable[T], label: str, total: int | None) -> Iterator[T]:
         start = last = time.monotonic()
-        of = f"/{total}" if total is not None else ""
+        of, label = f"/{total}" if total is not None else "", printable(label)
         count = 0
         for item in items:
             yield item

@@ -68,6 +68,23 @@ def rank_from_environment(environment: Mapping[str, str]) -> tuple[ProcessRank, 
     )
 
 
+def store_address(environment: Mapping[str, str], init_method: str) -> tuple[str, int]:
+    """The host and the port at which the processes of a launcher meet.
+
+    Raises:
+        InputError: the variables do not say it.
+    """
+    if init_method.startswith("tcp://"):
+        host, _, port = init_method.removeprefix("tcp://").rpartition(":")
+        environment = {"MASTER_ADDR": host, "MASTER_PORT": port}
+    if not (environment.get("MASTER_ADDR") and environment.get("MASTER_PORT")):
+        raise InputError(
+            "RANK and WORLD_SIZE are set, and MASTER_ADDR or MASTER_PORT is not: give the host of process 0 and a free "
+            "port there to all processes, or unset RANK and WORLD_SIZE for one process"
+        )
+    return environment["MASTER_ADDR"], _read_number(environment, "MASTER_PORT", "")
+
+
 def refuse_several(subject: str, advice: str) -> None:
     """Checks that a launcher started this process alone, for work that is not shared: all would write the same results.
 

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float64
 
 from gsencoder.data.truth.seen_objects import SeenObject
 
@@ -47,21 +48,19 @@ def interlocked(a: SeenObject, b: SeenObject) -> bool:
     return bool(smaller > 0 and shared > SAME_PLACE * smaller)
 
 
-def is_structure(scene_object: SeenObject, others: Sequence[SeenObject]) -> bool:
-    """Whether a thing without a name is part of the building: its box holds the middle of half of all the others."""
-    if scene_object.name is not None or not others:
+def is_structure(scene_object: SeenObject, others: Float64[np.ndarray, "N 2"]) -> bool:
+    """Whether a thing without a name is part of the building: its box holds half of the centers of all the others."""
+    if scene_object.name is not None or not len(others):
         return False
-    xy = np.array([other.center[:2] for other in others])
-    inside = ((xy >= scene_object.aabb_min[:2]) & (xy <= scene_object.aabb_max[:2])).all(axis=1)
+    inside = ((others >= scene_object.aabb_min[:2]) & (others <= scene_object.aabb_max[:2])).all(axis=1)
     return bool(inside.mean() >= 0.5)
 
 
 def movables(scene_objects: Sequence[SeenObject]) -> tuple[SeenObject, ...]:
     """All things that are no part of the building."""
+    centers = np.array([each.center[:2] for each in scene_objects]).reshape(-1, 2)
     return tuple(
-        scene_object
-        for scene_object in scene_objects
-        if not is_structure(scene_object, [other for other in scene_objects if other is not scene_object])
+        each for row, each in enumerate(scene_objects) if not is_structure(each, np.delete(centers, row, axis=0))
     )
 
 

@@ -1,12 +1,16 @@
 """Removal of the API key from everything that a server sends."""
 
 import re
+from functools import cache
 from html.entities import html5
 
 LEAST_KEY = 6
 """Shorter keys are placeholders, which servers at home are given; any text may hold their letters."""
 LEAST_PART = 12
 """Shorter beginnings of a key are no secret, and mostly its maker's name."""
+LONGEST_PART = 256
+"""Longer keys, which are compiled for minutes, are recognized by their beginning; what follows is compared letter by
+letter."""
 REDACTED = "(key)"
 
 
@@ -16,20 +20,35 @@ class KeyFilter:
 
     def __init__(self, key: str) -> None:
         self._pattern: re.Pattern[str] | None = None
+        self._rest = key[LONGEST_PART:]
         if len(key) >= LEAST_KEY:
-            least = max(LEAST_PART, (len(key) + 1) // 2)
-            spelt = [_spellings(letter) for letter in key]
+            spelt = [_spellings(letter) for letter in key[:LONGEST_PART]]
+            least = max(LEAST_PART, (len(spelt) + 1) // 2)
             self._pattern = re.compile("".join(spelt[:least]) + "".join(f"{each}?" for each in spelt[least:]))
 
     def clean(self, text: str, longest: int | None = None) -> str:
         """Text without the key, and only then cut to `longest` characters."""
-        return (self._pattern.sub(REDACTED, text) if self._pattern else text)[:longest]
+        parts, at = [], 0
+        while self._pattern and (match := self._pattern.search(text, at)):
+            parts += [text[at : match.start()], REDACTED]
+            at = match.end()
+            for letter in self._rest:
+                if not (match := _pattern_of(letter).match(text, at)):
+                    break
+                at = match.end()
+        return "".join([*parts, text[at:]])[:longest]
 
     def is_in(self, text: str) -> bool:
         """Whether text holds the key."""
         return self._pattern is not None and self._pattern.search(text) is not None
 
 
+@cache
+def _pattern_of(letter: str) -> re.Pattern[str]:
+    return re.compile(_spellings(letter))
+
+
+@cache
 def _spellings(letter: str) -> str:
     """A pattern of one character, escaped never, once, or several times; no part of it repeats without end, as time
     would grow with the square of the text."""

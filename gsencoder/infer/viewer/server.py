@@ -14,10 +14,15 @@ path names a file: there are
 """
 
 import hmac
+import io
 import json
 import secrets
 import socket
+import sys
+import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -35,7 +40,14 @@ MAX_WORD = 500
 MAX_ROWS = 4096
 PHOTOGRAPH_SIDE = 1280
 TIMEOUT = 30.0
-"""Seconds that a connection may be silent."""
+"""Seconds from the connection, or from the answer before it, until a request must be complete; and those in which a
+client must take a chunk of an answer."""
+CHUNK = 1 << 20
+"""Bytes of an answer that are sent at once."""
+MAX_CONNECTIONS = 64
+"""Largest number of open connections; a browser has six. One more closes the one that has waited longest."""
+STRANGE, WAITING, BUSY = range(3)
+"""A connection that has not sent the token, one that has and waits for its next request, and one that is answered."""
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 BINARY = "application/octet-stream"
 
@@ -53,6 +65,7 @@ class ViewServer(ThreadingHTTPServer):
 
     daemon_threads = True
     allow_reuse_address = True
+    request_queue_size = MAX_CONNECTIONS
 
     def __init__(
         self,
@@ -76,6 +89,7 @@ class ViewServer(ThreadingHTTPServer):
         self.page, self.searches = page, tuple(searches)
         self.scene_bytes = [scene.to_bytes() for scene in scenes]
         self.token = secrets.token_urlsafe(24)
+        self._lock, self._connections = threading.Lock(), dict[socket.socket, int]()
         if ":" in host:
             self.address_family = socket.AF_INET6
         try:
@@ -91,6 +105,39 @@ class ViewServer(ThreadingHTTPServer):
         shown = f"[{host}]" if ":" in host else host
         self.address = f"http://{shown}:{number}/{self.token}/"
 
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answers a connection in a thread; where there are too many it is closed, or the least known of them."""
+        with self._lock:
+            self._connections[request] = STRANGE
+            if len(self._connections) > MAX_CONNECTIONS:
+                least = min(self._connections, key=self._connections.__getitem__)
+                del self._connections[least]
+                # Its thread, if it has one, closes it.
+                with suppress(OSError):
+                    least.shutdown(socket.SHUT_RDWR)
+            is_taken = request in self._connections
+        if is_taken:
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def shutdown_request(self, request: Any) -> None:
+        """Closes a connection."""
+        with self._lock:
+            self._connections.pop(request, None)
+        super().shutdown_request(request)
+
+    def mark(self, request: Any, state: int) -> None:
+        """Sets the state of a connection, which becomes the newest of those in it."""
+        with self._lock:
+            if self._connections.pop(request, None) is not None:
+                self._connections[request] = state
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Reports a bug; a client that has gone is none."""
+        if not isinstance(sys.exc_info()[1], OSError):
+            super().handle_error(request, client_address)
+
     def search_of(self, value: Any) -> SceneSearch:
         """The scene of a request.
 
@@ -102,11 +149,34 @@ class ViewServer(ThreadingHTTPServer):
         return self.searches[value]
 
 
+class _TimedReader(socket.SocketIO):
+    """Reads a connection until a deadline: a timeout of the socket alone begins again with each byte."""
+
+    deadline = 0.0
+
+    def readinto(self, buffer: Any) -> int | None:
+        left = self.deadline - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        self._sock.settimeout(left)  # type: ignore[attr-defined]
+        return super().readinto(buffer)
+
+
 class _Handler(BaseHTTPRequestHandler):
     server: ViewServer
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "gsencoder", ""
     timeout = TIMEOUT
+
+    def setup(self) -> None:
+        super().setup()
+        self.rfile.close()
+        self._reader = _TimedReader(self.connection, "r")
+        self.rfile = io.BufferedReader(self._reader)
+
+    def handle_one_request(self) -> None:
+        self._reader.deadline = time.monotonic() + TIMEOUT
+        super().handle_one_request()
 
     def do_GET(self) -> None:
         self._answer(self._get)
@@ -128,6 +198,7 @@ class _Handler(BaseHTTPRequestHandler):
             status, (data, kind) = error.status, _json({"error": str(error)})
         except InputError as error:
             status, (data, kind) = HTTPStatus.UNPROCESSABLE_ENTITY, _json({"error": str(error)})
+        self.connection.settimeout(TIMEOUT)
         if status != HTTPStatus.OK:
             # A body that was not read would be taken for the next request.
             self.close_connection = True
@@ -148,8 +219,10 @@ class _Handler(BaseHTTPRequestHandler):
                 self.send_header("Connection", "close")
             self.end_headers()
             if self.command != "HEAD":
-                self.wfile.write(data)
-        except ConnectionError:
+                for start in range(0, len(data), CHUNK):
+                    self.wfile.write(memoryview(data)[start : start + CHUNK])
+            self.server.mark(self.connection, WAITING if status == HTTPStatus.OK else STRANGE)
+        except OSError:
             self.close_connection = True
 
     def _checked_path(self) -> list[str]:
@@ -161,6 +234,7 @@ class _Handler(BaseHTTPRequestHandler):
         first, *rest = self.path.partition("?")[0].removeprefix("/").split("/")
         if not hmac.compare_digest(first.encode("utf-8", "replace"), self.server.token.encode()):
             raise RefusedError(HTTPStatus.FORBIDDEN, "another token than that of this server's address")
+        self.server.mark(self.connection, BUSY)
         return rest
 
     def _get(self, path: list[str]) -> tuple[bytes, str]:

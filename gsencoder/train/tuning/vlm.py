@@ -199,6 +199,9 @@ def save_adapters(folder: Path, adapted: Any, processor: Any) -> None:
         OSError: the disk is full, which the output folder says.
     """
     try:
+        for each in adapted.peft_config.values():
+            # A set of peft, whose order changes from run to run.
+            each.target_modules = sorted(each.target_modules)
         with quiet_peft():
             adapted.save_pretrained(str(folder))
             processor.save_pretrained(str(folder))
