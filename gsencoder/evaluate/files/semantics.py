@@ -17,6 +17,9 @@ from gsencoder.evaluate.files.scan_truth import classes_of_scan
 from gsencoder.evaluate.files.scene_folders import scene_files
 from gsencoder.evaluate.scores.semantics import LabelCounts, count_labels
 
+MIN_INSTANCE_ID = 2 * IDS_PER_CLASS
+"""Raw ids of ScanNet's categories end at 1357; a scene of instances has larger numbers unless it is all of class 1."""
+
 
 def count_label_files(
     predictions: Path,
@@ -51,7 +54,11 @@ def _labels(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
     if not len(labels):
         raise InputError(f"{path}: no vertices; expected one class id for each")
     instances = labels[labels >= IDS_PER_CLASS] // IDS_PER_CLASS
-    if not (classes.rows(labels) >= 0).any() and (classes.rows(instances) >= 0).any():
+    if (
+        labels.max() >= MIN_INSTANCE_ID
+        and not (classes.rows(labels) >= 0).any()
+        and (classes.rows(instances) >= 0).any()
+    ):
         raise InputError(
             f"{path}: ids such as {labels.max()} are those of instances, class id · {IDS_PER_CLASS} + number; expected "
             "class ids"
