@@ -2,8 +2,8 @@
 
 ScanQA (scripts/predict.py; its benchmark's submission): a list of {scene_id, question_id, answer_top10, bbox}, the box
 being optional. SQA3D (LLM/eval_sqa3d_llm.py): a list of {scene_id, situation, question, answer, agent_rot, agent_pos},
-which are recognized by these five, or by a question_id where there is one; equal questions are answered in their order. Both scripts write pickles besides; those
-are refused.
+which are recognized by these five, or by a question_id where there is one; equal questions are
+answered in their order. Both scripts write pickles besides; those are refused.
 """
 
 import warnings

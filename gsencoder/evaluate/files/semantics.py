@@ -17,8 +17,8 @@ from gsencoder.evaluate.files.scan_truth import classes_of_scan
 from gsencoder.evaluate.files.scene_folders import scene_files
 from gsencoder.evaluate.scores.semantics import LabelCounts, count_labels
 
-MIN_INSTANCE_ID = 2 * IDS_PER_CLASS
-"""Raw ids of ScanNet's categories end at 1357; a scene of instances has larger numbers unless it is all of class 1."""
+RAW_IDS = range(1100, 1358)
+"""Ids from here to the end of ScanNet's raw ones are no instances: no scene has a hundred of class 1."""
 
 
 def count_label_files(
@@ -53,7 +53,8 @@ def _labels(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
     labels = read_whole_numbers(path)
     if not len(labels):
         raise InputError(f"{path}: no vertices; expected one class id for each")
-    instances = labels[labels >= IDS_PER_CLASS] // IDS_PER_CLASS
+    large = labels[(labels >= IDS_PER_CLASS) & ((labels < RAW_IDS.start) | (labels >= RAW_IDS.stop))]
+    instances = large // IDS_PER_CLASS
     if (
         labels.max() >= MIN_INSTANCE_ID
         and not (classes.rows(labels) >= 0).any()
