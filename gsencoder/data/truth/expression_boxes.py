@@ -37,7 +37,7 @@ def boxes_from_scans(expressions: Sequence[Expression], scans: Path) -> tuple[Ex
         labels = read_scannet_labels(scans / scene)
         if labels.aligned_from_world is None:
             warnings.warn(
-                f"{scans / scene}: has no axisAlignment (in {scene}.txt), so its boxes are in the frame of the raw scan",
+                f"{scans / scene}: has no axisAlignment (in {scene}.txt), so boxes are in the raw scan's frame",
                 SceneWarning,
                 stacklevel=2,
             )

@@ -55,11 +55,7 @@ def _labels(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
         raise InputError(f"{path}: no vertices; expected one class id for each")
     large = labels[(labels >= IDS_PER_CLASS) & ((labels < RAW_IDS.start) | (labels >= RAW_IDS.stop))]
     instances = large // IDS_PER_CLASS
-    if (
-        labels.max() >= MIN_INSTANCE_ID
-        and not (classes.rows(labels) >= 0).any()
-        and (classes.rows(instances) >= 0).any()
-    ):
+    if not (classes.rows(labels) >= 0).any() and (classes.rows(instances) >= 0).any():
         raise InputError(
             f"{path}: ids such as {labels.max()} are those of instances, class id · {IDS_PER_CLASS} + number; expected "
             "class ids"
