@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, readable
+from gsencoder.core.files.foreign_file import check_foreign
 from gsencoder.core.files.model_files import check_fetched
 
 SILENT = 4
@@ -29,6 +30,8 @@ def open_session(path: Path, subject: str, *, threads: int = 0) -> Any:
     options.log_severity_level = SILENT
     if threads:
         options.intra_op_num_threads = threads
+    with readable(path):
+        check_foreign(path)
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime raises its own classes, which share only this base

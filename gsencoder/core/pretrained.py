@@ -7,7 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.errors import InputError, SceneWarning, listed, readable
+from gsencoder.core.files.foreign_file import check_foreign, read_foreign_text
 from gsencoder.core.files.model_files import check_fetched
 
 EXTRA = "pip install 'gsencoder[teachers]'"
@@ -112,7 +113,7 @@ def weight_files(folder: Path, subject: str) -> list[Path]:
     index = folder / INDEX_FILE
     if index.is_file():
         try:
-            stated = json.loads(index.read_text(encoding="utf-8"))
+            stated = json.loads(read_foreign_text(index))
         except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{subject}: {index} cannot be read: {error}") from error
         shards = stated.get("weight_map") if isinstance(stated, dict) else None
@@ -126,6 +127,9 @@ def weight_files(folder: Path, subject: str) -> list[Path]:
     files = sorted(folder.glob("*.safetensors"))
     if not files:
         raise InputError(f"{subject}: {folder} has no weights as safetensors, and files of pickles are not opened")
+    for path in files:
+        with readable(path):
+            check_foreign(path)
     return files
 
 

@@ -19,6 +19,7 @@ from PIL import Image
 
 from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.foreign_file import MODEL_BYTES, read_foreign
 from gsencoder.core.files.json_values import write_bytes
 from gsencoder.core.files.sealed_rows import sealed, unsealed
 
@@ -64,7 +65,7 @@ class PromptStore:
             return
         with readable(path):
             # What follows the last line break was cut off.
-            lines = path.read_bytes().split(b"\n")[:-1]
+            lines = read_foreign(path, MODEL_BYTES).split(b"\n")[:-1]
         for number, line in enumerate(lines, start=1):
             try:
                 self._take(unsealed(json.loads(line)))
@@ -154,7 +155,7 @@ class PromptStore:
         """
         path = self.folder / PICTURES_FOLDER / name
         try:
-            data = path.read_bytes()
+            data = read_foreign(path)
             if sha256(data).hexdigest()[:32] != path.stem:
                 raise InputError(f"{path}: is damaged; remove {self.folder} to prepare it anew")
             return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))

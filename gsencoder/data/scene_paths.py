@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.written_files import SUMMARY_NAME
 from gsencoder.data.readers.layouts import describe_layouts, layout_of
 from gsencoder.data.readers.scene_splat import SPLAT_SUFFIXES
@@ -95,7 +96,7 @@ def listed_paths(paths: Iterable[str | Path]) -> list[Path]:
             result.append(path)
             continue
         try:
-            lines = path.read_text(encoding="utf-8-sig").splitlines()
+            lines = read_foreign_text(path).splitlines()
         except (OSError, ValueError) as error:
             raise InputError(f"{path}: not a readable list of scenes ({type(error).__name__})") from error
         names = [line.strip() for line in lines if line.strip() and not line.strip().startswith("#")]
@@ -175,7 +176,7 @@ def kind_of_path(path: str | Path) -> str:
 
 def _kind_of_folder(folder: Path) -> str:
     with suppress(OSError, ValueError, TypeError, AttributeError):
-        command = json.loads((folder / SUMMARY_NAME).read_text(encoding="utf-8"))["command"]
+        command = json.loads(read_foreign_text(folder / SUMMARY_NAME))["command"]
         if isinstance(command, str) and command.isalpha() and len(command) < 20:
             return f"a folder that `gsencoder {command}` wrote"
     if (folder / UNFINISHED_FILE).is_file():

@@ -21,6 +21,7 @@ from jaxtyping import Float32, Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.foreign_file import open_foreign
 from gsencoder.core.files.written_files import check_written
 from gsencoder.data.splat_formats.compressed_ply import is_compressed, morton_order, packed_bytes, read_compressed
 from gsencoder.data.splat_formats.dotsplat import read_dotsplat
@@ -39,6 +40,8 @@ from gsencoder.types import Gaussians
 __all__ = ["RawSplat", "fingerprint", "gaussians_from_raw", "load_property", "load_splat", "read_raw", "save_splat"]
 
 READABLE = ".ply, .compressed.ply, .spz, .splat, .sog or a SOG folder"
+HEADER_BYTES = 1 << 16
+"""The names of a splat's properties stand in these first bytes of a .ply."""
 WRITABLE = ".ply, .compressed.ply or .spz"
 _WHY = {
     "nonfinite": "with NaN or Inf",
@@ -111,12 +114,12 @@ def gaussians_from_raw(
     )
 
 
-def _is_ply_of_splat(path: Path) -> bool:
+def is_ply_of_splat(path: Path) -> bool:
     """Whether a file is a .ply with Gaussians, by the names of its properties; boxes and meshes are not."""
     if not (path.name.lower().endswith(".ply") and path.is_file()):
         return False
-    with path.open("rb") as stream:
-        header = stream.read(4096)
+    with open_foreign(path) as stream:
+        header = stream.read(HEADER_BYTES)
     return b" opacity" in header or b" packed_position" in header
 
 
@@ -136,14 +139,12 @@ def read_raw(path: str | Path) -> RawSplat:
         status = os.stat(path)
         if stat.S_ISDIR(status.st_mode):
             if not (path / "meta.json").is_file():
-                inner = sorted(each.name for each in path.iterdir() if _is_ply_of_splat(each))
+                inner = sorted(each.name for each in path.iterdir() if is_ply_of_splat(each))
                 hint = (
                     f"; give its {', '.join(inner)}" if inner else ", such as the splat.ply of `gsencoder reconstruct`"
                 )
                 raise InputError(f"{path}: is a folder without meta.json; expected a splat file or a SOG folder{hint}")
             return read_sog_folder(path)
-        if not stat.S_ISREG(status.st_mode):
-            raise InputError(f"{path}: is not a regular file; expected {READABLE}")
         if path.name == "meta.json":
             return read_sog_folder(path.parent)
         return _read_file(path, status.st_size)
@@ -158,7 +159,7 @@ def read_raw(path: str | Path) -> RawSplat:
 
 def _read_file(path: Path, size: int) -> RawSplat:
     suffix = path.suffix.lower()
-    with open(path, "rb") as stream:
+    with open_foreign(path) as stream:
         start = stream.read(4)
         stream.seek(0)
         if size == 0:
@@ -190,7 +191,7 @@ def load_property(path: str | Path, name: str) -> Float64[np.ndarray, " N"]:
     """
     path = Path(path)
     try:
-        with open(path, "rb") as stream:
+        with open_foreign(path) as stream:
             if stream.read(4)[:3] != b"ply":
                 raise InputError(f"{path}: is no .ply, and only these have further properties")
             stream.seek(0)

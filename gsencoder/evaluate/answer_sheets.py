@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from gsencoder.core.files.foreign_file import read_foreign
 from gsencoder.data.truth.expressions import Expression
 from gsencoder.data.truth.made_questions import kind_of
 from gsencoder.data.truth.questions import Question
@@ -45,7 +46,7 @@ def add_pictures(sheet: AnswerSheet, dry: Path, truth: PictureTruth) -> None:
         truth: of that scene.
     """
     for row in read_answers(dry / ANSWERS).values():
-        body = json.loads((dry / row["folder"] / REQUEST).read_bytes())
+        body = json.loads(read_foreign(dry / row["folder"] / REQUEST))
         digests = request_pictures(body)
         for digest, view in zip(digests, row["views"], strict=True):
             sheet.pictures[digest] = SentPicture(scene=truth.scene.name, pixels=truth.pixels(view))

@@ -10,6 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.truth.class_table import ClassTable
@@ -159,7 +160,7 @@ def merge_lists(folder: Path, protocol: BenchmarkProtocol, *, parts: int = 1) ->
         return
     for name in (PREDICTIONS, TRUTH):
         files = [folder / f"{name}.{part}.json" for part in range(parts)]
-        rows = [row for file in files for row in json.loads(file.read_text())]
+        rows = [row for file in files for row in json.loads(read_foreign_text(file))]
         rows.sort(key=lambda row: row["scene_id"])
         write_json(folder / f"{name}.json", rows)
         for file in files:

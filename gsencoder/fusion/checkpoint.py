@@ -13,6 +13,7 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.first_difference import first_difference
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.teacher_maps import CachedTeacher
@@ -165,7 +166,7 @@ def open_checkpoint(
 
 def _read_settings(path: Path) -> dict[str, Any]:
     try:
-        settings = json.loads(path.read_text(encoding="utf-8"))
+        settings = json.loads(read_foreign_text(path))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read ({error}); delete {path.parent} to start anew") from error
     if not isinstance(settings, dict):

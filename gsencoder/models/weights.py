@@ -11,6 +11,7 @@ import torch
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.foreign_file import open_foreign
 from gsencoder.core.files.model_files import find_file
 from gsencoder.data.scene_paths import kind_of_path
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
@@ -72,7 +73,7 @@ def find_weights(source: str, option: str = "weights") -> Path:
 
 def _begins_as_archive(path: Path) -> bool:
     """Whether a file begins as safetensors do, whatever it is called."""
-    with path.open("rb") as stream:
+    with open_foreign(path) as stream:
         return stream.read(9)[8:] == b"{"
 
 

@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.written_files import sha256_of
 from gsencoder.data.readers.image_file import check_picture
 from gsencoder.data.readers.undistort import load_pycolmap
@@ -163,7 +164,7 @@ def load_placement(folder: Path, work: Path, config: SfmConfig = SfmConfig()) ->
     """
     model = work / "sparse" / "0"
     try:
-        record = json.loads((work / PLACED_FILE).read_text(encoding="utf-8"))
+        record = json.loads(read_foreign_text(work / PLACED_FILE))
         same = model.is_dir() and record["asked"] == _inputs(folder, photographs_in(folder), config)
         sound = record.pop("digest") == _digest(record) and record["files"] == _digests(model)
         placed = _placed(model, record["found"])

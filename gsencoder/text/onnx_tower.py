@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.model_files import SENTENCE_ENCODER, digest_files, find_file, sentence_encoder_graph
 from gsencoder.core.onnx_session import open_session
 from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
@@ -263,7 +264,7 @@ def _read_json(path: Path, kind: type = dict) -> Any:
     if not path.is_file():
         return kind()
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(read_foreign_text(path))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as JSON: {str(error)[:80]}") from error
     if not isinstance(value, kind):

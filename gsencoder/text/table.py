@@ -14,6 +14,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, about, readable
 from gsencoder.core.files.archive import open_archive, warn_without_checksums, write_archive
+from gsencoder.core.files.foreign_file import open_foreign
 from gsencoder.core.files.npz import read_npz
 from gsencoder.text.towers import TowerRecord
 from gsencoder.types import FeatureSpace
@@ -199,7 +200,7 @@ def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
     file = Path(path)
     if not file.is_file():
         raise InputError(f"{file}: no such file; expected a text table (.npz or .safetensors)")
-    with readable(file), file.open("rb") as stream:
+    with readable(file), open_foreign(file) as stream:
         zipped = stream.read(2) == b"PK"
     if zipped or file.suffix == ".npz":
         return _read_npz(file, encoder)

@@ -19,6 +19,7 @@ from jaxtyping import Float32
 from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files.archive import open_archive, write_archive
+from gsencoder.core.files.foreign_file import read_foreign
 from gsencoder.core.files.json_values import plain, write_json
 from gsencoder.core.first_difference import first_difference
 from gsencoder.core.runtime.tracking import Track, untracked
@@ -176,7 +177,7 @@ def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
             write_json(path, settings)
             return
         try:
-            stored = with_added_options(json.loads(path.read_bytes()))
+            stored = with_added_options(json.loads(read_foreign(path)))
         except (OSError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: cannot be read ({type(error).__name__})") from error
         if stored != settings:

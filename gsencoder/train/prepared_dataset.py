@@ -17,6 +17,7 @@ from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError, advised, listed, readable
 from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.core.files.atomic import atomic_file, locked
+from gsencoder.core.files.foreign_file import read_foreign, read_foreign_text
 from gsencoder.core.first_difference import first_difference
 from gsencoder.core.runtime.process_rank import ProcessRank
 from gsencoder.core.runtime.tracking import Track
@@ -59,7 +60,7 @@ class PreparedDataset:
         try:
             if settings is not None:
                 folder.mkdir(parents=True, exist_ok=True)
-            stored: Any = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+            stored: Any = json.loads(read_foreign_text(path)) if path.is_file() else None
         except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{path}: cannot be used: {error}; give another folder as prepared=") from error
         if path.is_file() and not isinstance(stored, dict):
@@ -88,7 +89,7 @@ class PreparedDataset:
             InputError: its file cannot be read.
         """
         with readable(self.folder / SPACE_FILE):
-            return hashlib.sha256((self.folder / SPACE_FILE).read_bytes()).hexdigest()[:16]
+            return hashlib.sha256(read_foreign(self.folder / SPACE_FILE)).hexdigest()[:16]
 
     def digest_of_scenes(self, names: Sequence[str]) -> str:
         """A hash of the headers of prepared scenes, which hold the checksums of all arrays, by which processes compare

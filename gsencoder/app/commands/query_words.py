@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.model_files import find_file
 from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.fusion.store.words import table_path
@@ -34,15 +35,9 @@ def query_words(query: Sequence[str], queries: str) -> list[str]:
 
 def _lines_of(file: Path) -> list[str]:
     """The lines of a text file, which may begin with a byte order mark."""
-    if not file.is_file():
-        raise InputError(f"queries: {file} is no file; expected a text file with one query a line")
     try:
-        with file.open("rb") as stream:
-            data = stream.read(MAX_QUERIES_BYTES + 1)
-        if len(data) > MAX_QUERIES_BYTES:
-            raise InputError(f"queries: {file} holds more than {MAX_QUERIES_BYTES:,} bytes; expected one word a line")
-        return data.decode("utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        return read_foreign_text(file, MAX_QUERIES_BYTES).splitlines()
+    except (OSError, ValueError) as error:
         raise InputError(f"queries: {file} cannot be read as text: {error}") from error
 
 

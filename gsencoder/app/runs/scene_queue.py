@@ -12,6 +12,7 @@ from rich.console import Console
 from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import BusyError, InputError, listed
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.json_values import plain
 from gsencoder.core.files.written_files import SUMMARY_NAME
 from gsencoder.core.runtime.process_rank import refuse_several
@@ -121,7 +122,7 @@ def _is_finished(target: Path, summary: Summary) -> bool:
         InputError: it holds results of others.
     """
     try:
-        record = json.loads((target / SUMMARY_NAME).read_text(encoding="utf-8"))
+        record = json.loads(read_foreign_text(target / SUMMARY_NAME))
     except FileNotFoundError:
         return False
     except (OSError, ValueError) as error:

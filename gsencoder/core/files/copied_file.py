@@ -6,6 +6,7 @@ from pathlib import Path
 from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.checksums import BLOCK_BYTES
+from gsencoder.core.files.foreign_file import open_foreign
 
 
 def copy_checked(source: Path, target: Path, check: Callable[[Path], object]) -> None:
@@ -31,6 +32,6 @@ def copy_checked(source: Path, target: Path, check: Callable[[Path], object]) ->
 
 
 def _blocks(path: Path) -> Iterator[bytes]:
-    with readable(path), path.open("rb") as stream:
+    with readable(path), open_foreign(path) as stream:
         while block := stream.read(BLOCK_BYTES):
             yield block

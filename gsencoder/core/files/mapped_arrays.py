@@ -11,6 +11,7 @@ from jaxtyping import Int, Int64, UInt8
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.files.archive import DAMAGED, open_archive
 from gsencoder.core.files.checksums import BLOCK_BYTES, damaged_blocks
+from gsencoder.core.files.foreign_file import open_foreign
 from gsencoder.core.files.safetensors_bytes import array_offsets
 
 
@@ -38,7 +39,7 @@ class MappedArrays:
         with open_archive(path) as file:
             shapes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in types.items()}
             self._checksums = file.checksums
-        with about(path), path.open("rb") as stream:
+        with about(path), open_foreign(path) as stream:
             state, offsets = os.fstat(stream.fileno()), array_offsets(stream)
             self._map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         self._stamp = (state.st_ino, state.st_size, state.st_mtime_ns)

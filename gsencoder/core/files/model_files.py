@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, advised, readable
+from gsencoder.core.files.foreign_file import open_foreign
 
 MODELS_VARIABLE = "GSENCODER_MODELS"
 INSTALLED_MODELS = Path(__file__).resolve().parents[2] / "weights" / "models"
@@ -36,7 +37,7 @@ def check_fetched(path: Path) -> None:
     Raises:
         InputError: it is, or cannot be read.
     """
-    with readable(path), path.open("rb") as stream:
+    with readable(path), open_foreign(path) as stream:
         if stream.read(len(POINTER)) == POINTER:
             raise InputError(f"{path}: is a pointer of git-lfs and not the file itself; fetch it with git lfs pull")
 
@@ -112,7 +113,7 @@ def digest_files(*files: Path, settings: object = None) -> str:
     """
     digest = hashlib.sha256(b"" if settings is None else repr(settings).encode("utf-8", "backslashreplace"))
     for path in files:
-        with readable(path), path.open("rb") as stream:
+        with readable(path), open_foreign(path) as stream:
             while block := stream.read(BLOCK_BYTES):
                 digest.update(block)
     return digest.hexdigest()[:16]

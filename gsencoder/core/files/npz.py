@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import check_foreign
 
-LARGEST_ARRAY = 1 << 30
-"""Largest size of an array, bytes."""
+LARGEST_ARRAY = 1 << 29
+"""Largest size of an array, bytes: a thousand masks of half a million vertices."""
 MAX_TEXT = 1 << 12
 """Largest number of characters of an entry of a text array; numpy stores all entries with the length of the longest."""
 
@@ -39,6 +40,7 @@ def read_npz(
         InputError: damaged or hostile, or an array is missing or of another kind.
     """
     try:
+        check_foreign(file)
         with zipfile.ZipFile(file) as archive:
             present = set(archive.namelist())
             missing = [name for name in required if f"{name}.npy" not in present]

@@ -12,6 +12,7 @@ import numpy as np
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.atomic import atomic_file
 from gsencoder.core.files.event_file import EventFile
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.picture_file import write_picture
 
 LOG_FILE, EVENTS_FOLDER = "log.csv", "tensorboard"
@@ -100,7 +101,7 @@ class Log:
 
 def read_log(path: Path) -> list[dict[str, str]]:
     """The rows of a log, as text, without empty cells and without an incomplete last line that a kill left."""
-    lines = path.read_text(encoding="utf-8").rpartition("\n")[0]
+    lines = read_foreign_text(path).rpartition("\n")[0]
     return [{name: cell for name, cell in row.items() if name and cell} for row in csv.DictReader(lines.splitlines())]
 
 

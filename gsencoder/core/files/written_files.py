@@ -6,7 +6,8 @@ import json
 import warnings
 from pathlib import Path
 
-from gsencoder.core.errors import SceneWarning, readable
+from gsencoder.core.errors import InputError, SceneWarning, readable
+from gsencoder.core.files.foreign_file import open_foreign, read_foreign
 
 SUMMARY_NAME = "summary.json"
 BLOCK_BYTES = 1 << 22
@@ -19,7 +20,7 @@ LEVELS = 3
 def sha256_of(path: Path) -> str:
     """The SHA-256 of a file, in hexadecimal digits."""
     digest = hashlib.sha256()
-    with path.open("rb") as stream:
+    with open_foreign(path) as stream:
         while block := stream.read(BLOCK_BYTES):
             digest.update(block)
     return digest.hexdigest()
@@ -44,7 +45,7 @@ def _is_archive(path: Path) -> bool:
     """Whether a file is an archive of this package (`core.files.archive`), which has checksums."""
     if path.suffix != ".safetensors":
         return False
-    with path.open("rb") as stream:
+    with open_foreign(path) as stream:
         length = int.from_bytes(stream.read(8), "little")
         return length <= LARGEST_HEADER and b'"gsencoder"' in stream.read(length)
 
@@ -64,7 +65,7 @@ def check_written(path: str | Path) -> None:
             continue
         try:
             same = sha256_of(file) == stated
-        except OSError:
+        except (OSError, InputError):
             # Whoever reads it says so.
             return
         if not same:
@@ -79,9 +80,7 @@ def check_written(path: str | Path) -> None:
 
 def _stated(summary: Path, file: Path) -> str | None:
     try:
-        if summary.stat().st_size > LARGEST_SUMMARY:
-            return None
-        files = json.loads(summary.read_bytes())["files"]
+        files = json.loads(read_foreign(summary, LARGEST_SUMMARY))["files"]
         stated = files.get(file.relative_to(summary.parent).as_posix())
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None

@@ -1,5 +1,6 @@
 """COLMAP models, binary and text, with or without rigs and frames, read by pycolmap."""
 
+import io
 import itertools
 import math
 import re
@@ -9,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning, readable
+from gsencoder.core.files.foreign_file import MODEL_BYTES, check_foreign, open_foreign
 from gsencoder.data.readers.colmap_binary import check_binary_model
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.undistort import CameraModel, check_camera, load_pycolmap
@@ -132,7 +134,7 @@ def _pose_file(model: Path) -> str:
 
 def _check_text_poses(file: Path) -> None:
     """Names the image whose pose is not finite, where pycolmap names none. Each image has two lines."""
-    with file.open(encoding="utf-8", errors="replace") as lines:
+    with io.TextIOWrapper(open_foreign(file), encoding="utf-8", errors="replace") as lines:
         for line in lines:
             words = line.split(maxsplit=9)
             if not words or words[0].startswith("#"):
@@ -150,6 +152,9 @@ def _check_text_poses(file: Path) -> None:
 def _load(model: Path) -> Any:
     pycolmap = load_pycolmap()
     binary = (model / "cameras.bin").is_file()
+    for path in sorted(model.glob("*.bin" if binary else "*.txt")):
+        with readable(path):
+            check_foreign(path, MODEL_BYTES)
     if binary:
         check_binary_model(model)
     else:
@@ -174,7 +179,7 @@ def _check_text_counts(model: Path, reconstruction: Any) -> None:
     """Compares what was read with the counts in the files' comments: a text file cut short has no other sign."""
     entries = {"cameras": reconstruction.cameras, "images": reconstruction.images, "points3D": reconstruction.points3D}
     for name, values in entries.items():
-        with (model / f"{name}.txt").open(encoding="utf-8", errors="replace") as lines:
+        with io.TextIOWrapper(open_foreign(model / f"{name}.txt"), encoding="utf-8", errors="replace") as lines:
             for line in itertools.takewhile(lambda line: line.startswith("#"), lines):
                 promised = re.match(r"# Number of \w+: (\d{1,15})\b", line)
                 if promised and int(promised[1]) != len(values):

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import MODEL_BYTES, read_foreign
 from gsencoder.data.readers.undistort import load_pycolmap
 
 CAMERA_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12)
@@ -22,7 +23,7 @@ class _Walker:
     """A position in one file's bytes; every step checks that the bytes are there."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at = path, path.read_bytes(), 0
+        self.path, self.data, self.at = path, read_foreign(path, MODEL_BYTES), 0
 
     def take(self, layout: struct.Struct, field: str) -> tuple[int, ...]:
         self.skip(layout.size, field)

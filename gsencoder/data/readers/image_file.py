@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import check_foreign
 from gsencoder.types.orientation import EXCHANGED
 
 if TYPE_CHECKING:
@@ -53,7 +54,11 @@ def open_picture(path: Path, data: io.BytesIO | None = None) -> "Image":
 
     # Pillow raises nearly any error on hostile files.
     try:
+        if data is None:
+            check_foreign(path)
         picture = Image.open(path if data is None else data, formats=FORMATS)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except Exception as error:
@@ -128,6 +133,7 @@ def load_npy(path: Path, *, header_only: bool = False) -> np.ndarray:
 
 def _checked_npy(path: Path, mapped: Literal["r"] | None) -> np.ndarray:
     try:
+        check_foreign(path)
         values = np.load(path, mmap_mode=mapped, allow_pickle=False)
     except Exception as error:
         raise InputError(f"{path}: not a readable .npy array ({_brief(error)})") from error

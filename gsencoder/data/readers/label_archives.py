@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import check_foreign
 from gsencoder.data.readers.image_file import open_picture, read_integers
 from gsencoder.data.readers.label_images import LabelFiles
 
@@ -37,6 +38,7 @@ def members_by_stem(archive: Path) -> dict[str, Path]:
         InputError: it cannot be read as .zip, or two files have one stem.
     """
     try:
+        check_foreign(archive)
         with zipfile.ZipFile(archive) as file:
             names = [name for name in file.namelist() if name.lower().endswith(".png")]
     except (zipfile.BadZipFile, OSError, ValueError) as error:
@@ -74,6 +76,7 @@ def member_bytes(path: Path) -> io.BytesIO:
     archive = archive_of(path)
     name = path.relative_to(archive).as_posix()
     try:
+        check_foreign(archive)
         with zipfile.ZipFile(archive) as file:
             size = file.getinfo(name).file_size
             if size > MAX_MEMBER_BYTES:

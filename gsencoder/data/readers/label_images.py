@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import check_foreign
 from gsencoder.data.readers.image_file import check_picture_size, load_npy, read_integers
 from gsencoder.data.readers.images import PictureFiles, PixelGrid
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache
@@ -94,6 +95,7 @@ def _load_safetensors(path: Path) -> np.ndarray:
     from safetensors import SafetensorError, safe_open
 
     try:
+        check_foreign(path)
         with safe_open(path, framework="np") as stored:
             names = list(stored.keys())
             shape = tuple(stored.get_slice(names[0]).get_shape()) if len(names) == 1 else ()

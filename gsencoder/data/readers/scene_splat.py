@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.layouts import describe_layouts
 from gsencoder.data.readers.posed import choose_origin
-from gsencoder.data.splats import gaussians_from_raw, read_raw
+from gsencoder.data.splats import gaussians_from_raw, is_ply_of_splat, read_raw
 from gsencoder.data.video.decode import refuse_video
 from gsencoder.types import Gaussians
 
@@ -32,11 +32,14 @@ def find_splat(root: Path) -> Path:
     if (root / "meta.json").is_file():
         return root
     files = sorted(path for path in root.iterdir() if path.is_file() and path.suffix.lower() in SPLAT_SUFFIXES)
-    if len(files) == 1:
-        return files[0]
-    if files:
-        names = ", ".join(path.name for path in files[:5])
-        raise InputError(f"{root}: holds {len(files)} splats ({names}) and no views; give one of them")
+    splats = [path for path in files if path.suffix.lower() != ".ply" or is_ply_of_splat(path)]
+    if len(splats) == 1 or len(files) == 1:
+        return (splats or files)[0]
+    if files and not splats:
+        raise InputError(f"{root}: holds {len(files)} .ply files, meshes or points, and no splat and no views")
+    if splats:
+        names = ", ".join(path.name for path in splats[:5])
+        raise InputError(f"{root}: holds {len(splats)} splats ({names}) and no views; give one of them")
     raise InputError(f"{root}: not a scene; a scene holds one of: {describe_layouts()}; a splat")
 
 

@@ -6,9 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
-
-MAX_TABLE_BYTES = 256 << 20
-"""Larger files are no trajectories."""
+from gsencoder.core.files.foreign_file import read_foreign_text
 
 
 def table_lines(path: Path) -> list[list[str]]:
@@ -18,11 +16,7 @@ def table_lines(path: Path) -> list[list[str]]:
         InputError: unreadable, too large, or not text.
     """
     try:
-        if path.stat().st_size > MAX_TABLE_BYTES:
-            raise InputError(
-                f"{path}: {path.stat().st_size:,} bytes, at most {MAX_TABLE_BYTES:,} in a table of numbers"
-            )
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_foreign_text(path)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except InputError:

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.written_files import check_written
 from gsencoder.data.readers.image_file import picture_info, picture_size
 from gsencoder.data.readers.posed import (
@@ -75,7 +76,7 @@ def read_json(path: Path, *, unique_keys: bool = False) -> Any:
 
     check_written(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_foreign_text(path)
         return json.loads(text, object_pairs_hook=unique if unique_keys else None)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import read_foreign
 from gsencoder.data.splat_formats.raw import RawSplat, check_expansion, logits_from_opacities, quats_from_smallest_three
 
 MAX_META = 4 << 20
@@ -35,13 +36,9 @@ def read_sog_folder(path: Path) -> RawSplat:
         if not file.is_file() or not file.resolve().is_relative_to(path.resolve()):
             raise InputError(f"{path}: the file {name!r} is missing, or leads out of the folder")
         try:
-            with open(file, "rb") as stream:
-                data = stream.read(limit + 1)
+            return read_foreign(file, limit)
         except OSError as error:
             raise InputError(f"{file}: cannot be read: {error.strerror}") from error
-        if len(data) > limit:
-            raise InputError(f"{file}: is larger than the {limit:,} bytes that the scene's count allows")
-        return data
 
     size = sum(file.stat().st_size for file in path.iterdir() if file.is_file())
     return _read(path, load, size)

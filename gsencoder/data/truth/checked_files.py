@@ -1,8 +1,10 @@
 """Files that others wrote: of a limited size, and never a pickle, which runs code when it is read."""
 
+import os
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, readable
+from gsencoder.core.files.foreign_file import open_foreign, read_foreign
 from gsencoder.core.files.written_files import check_written
 
 SCENE_BYTES = 256 << 20
@@ -20,12 +22,8 @@ def check_file(path: Path, *, max_bytes: int = SCENE_BYTES) -> None:
         InputError: there is no such file, it is a folder, it is too large, or it is a pickle or an archive.
     """
     try:
-        size = path.stat().st_size
-        if path.is_dir():
-            raise InputError(f"{path}: is a folder; expected a file")
-        if not path.is_file():
-            raise InputError(f"{path}: is no ordinary file")
-        with path.open("rb") as stream:
+        with open_foreign(path) as stream:
+            size = os.fstat(stream.fileno()).st_size
             start = stream.read(4)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
@@ -52,7 +50,7 @@ def read_checked(path: Path, *, max_bytes: int = SCENE_BYTES) -> bytes:
     """
     check_file(path, max_bytes=max_bytes)
     with readable(path):
-        return path.read_bytes()
+        return read_foreign(path, max_bytes)
 
 
 def read_checked_text(path: Path, *, max_bytes: int = SCENE_BYTES) -> str:

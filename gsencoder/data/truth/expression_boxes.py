@@ -4,11 +4,12 @@ ScanRefer's own files have no boxes. Its scripts take that of an object's vertic
 (data/scannet/load_scannet_data.py), and so does this module.
 """
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.truth.expressions import Expression
 from gsencoder.data.truth.scannet_labels import read_scannet_labels
 from gsencoder.types import MeshLabels
@@ -34,6 +35,12 @@ def boxes_from_scans(expressions: Sequence[Expression], scans: Path) -> tuple[Ex
     result = list(expressions)
     for scene, rows in lacking.items():
         labels = read_scannet_labels(scans / scene)
+        if labels.aligned_from_world is None:
+            warnings.warn(
+                f"{scans / scene}: has no axisAlignment (in {scene}.txt), so boxes are in the raw scan's frame",
+                SceneWarning,
+                stacklevel=2,
+            )
         for row, each in zip(rows, boxes_from_labels([expressions[row] for row in rows], labels), strict=True):
             result[row] = each
     return tuple(result)

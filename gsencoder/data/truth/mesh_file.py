@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
 from gsencoder.core.errors import InputError, readable
+from gsencoder.core.files.foreign_file import open_foreign
 from gsencoder.data.splat_formats.ply import PlyElement, PlyHeader, read_header, read_property
 
 MAX_VERTICES = 100_000_000
@@ -63,7 +64,7 @@ def read_vertex_labels(path: Path) -> Int32[np.ndarray, " V"]:
 
 def _opened(path: Path) -> BinaryIO:
     with readable(path):
-        return path.open("rb")
+        return open_foreign(path)
 
 
 def _header(path: Path, stream: BinaryIO) -> tuple[PlyHeader, int]:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gsencoder.core.errors import InputError, listed
+from gsencoder.core.files.foreign_file import check_foreign
 
 TIME_BASE = 1_000_000
 """Parts of a second in which files state how long they are."""
@@ -73,6 +74,7 @@ class Video:
 
     def _open(self) -> Any:
         try:
+            check_foreign(self.path)
             container = self._av.open(str(self.path), metadata_errors="replace")
         except (self._av.FFmpegError, OSError, ValueError) as error:
             raise InputError(f"{self.path}: not a video that can be decoded ({_reason(error)})") from error

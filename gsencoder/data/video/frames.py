@@ -13,6 +13,7 @@ from jaxtyping import UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.written_files import sha256_of
 from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.video.choose import SIZE, choose_frames, follow
@@ -123,7 +124,7 @@ def _small_pictures(video: Video, track: Track) -> Iterator[UInt8[np.ndarray, "H
 def _taken(folder: Path, inputs: dict[str, Any]) -> tuple[str, ...] | None:
     """Names of the frames that an earlier call has written, if they are whole and were asked for as now."""
     try:
-        record = json.loads((folder / RECORD_FILE).read_text(encoding="utf-8"))
+        record = json.loads(read_foreign_text(folder / RECORD_FILE))
         files = record["files"]
         if record["asked"] != inputs or any(sha256_of(folder / name) != digest for name, digest in files.items()):
             return None

@@ -2,15 +2,16 @@
 
 ScanQA (scripts/predict.py; its benchmark's submission): a list of {scene_id, question_id, answer_top10, bbox}, the box
 being optional. SQA3D (LLM/eval_sqa3d_llm.py): a list of {scene_id, situation, question, answer, agent_rot, agent_pos},
-which are recognized by these five, or by a question_id where there is one. Both scripts write pickles besides; those
-are refused.
+which are recognized by these five, or by a question_id where there is one; equal questions are
+answered in their order. Both scripts write pickles besides; those are refused.
 """
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning, counted
 from gsencoder.core.files.json_values import write_json
 from gsencoder.data.truth.entries import (
     Corner,
@@ -57,6 +58,13 @@ def read_answer_predictions(path: str | Path, questions: Sequence[Question]) -> 
     answers = [
         (finder.question(entry, where).id, _answers(entry, where)) for entry, where in entries_of(rows, file, EXPECTED)
     ]
+    if finder.equal:
+        warnings.warn(
+            f"{file}: {counted(finder.equal, 'entry', 'entries')} without question_id could be those of several equal "
+            "questions, and were taken in the order of the truth",
+            SceneWarning,
+            stacklevel=2,
+        )
     refuse_repeated(file, [name for name, _ in answers], lambda name: name[:60], what="question_id")
     return dict(answers)
 
@@ -122,6 +130,8 @@ class _Finder:
     def __init__(self, questions: Sequence[Question]) -> None:
         self.by_id = {each.id: each for each in questions}
         self.scenes = {each.scene for each in questions}
+        self.equal = 0
+        self._answered: set[str] = set()
         self.by_words: dict[tuple[str, str | None, str], list[Question]] = {}
         for each in questions:
             self.by_words.setdefault((each.scene, each.situation, each.text), []).append(each)
@@ -152,6 +162,11 @@ class _Finder:
             for each in self.by_words.get((scene, situation, text), [])
             if None in (position, each.position) or (position == each.position and turns in (None, each.rotation))
         ]
+        # SQA3D's test split has pairs of questions that differ in nothing but their ids.
+        if len(fitting) > 1 and len({(each.position, each.rotation) for each in fitting}) == 1:
+            self.equal += 1
+            fitting = [each for each in fitting if each.id not in self._answered][:1] or fitting[:1]
+            self._answered.add(fitting[0].id)
         if len(fitting) != 1:
             fault = f"{len(fitting)} questions; give its question_id" if fitting else "no question of the truth"
             raise InputError(f"{where}: scene, situation, question and place are those of {fault}: {shown(text)}")

@@ -1,10 +1,12 @@
 """Folders with one file for each scene, of predictions and of truth."""
 
+import os
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsencoder.core.errors import InputError, counted, listed
+from gsencoder.core.errors import InputError, counted, listed, readable
+from gsencoder.core.files.foreign_file import check_foreign
 from gsencoder.data.truth.checked_files import PICKLE_SUFFIXES
 from gsencoder.data.truth.scannet_labels import AGGREGATION
 from gsencoder.data.truth.scannetpp_labels import ANNOTATION
@@ -89,7 +91,7 @@ def _true_files(truth: Path, scans: bool) -> dict[str, Path]:
     folders = {
         path.name: path
         for path in sorted(truth.iterdir())
-        if (path / f"{path.name}{AGGREGATION}").is_file() or (path / "scans" / ANNOTATION).is_file()
+        if any(os.path.lexists(path / name) for name in (f"{path.name}{AGGREGATION}", f"scans/{ANNOTATION}"))
     }
     if scans:
         if not folders:
@@ -112,8 +114,12 @@ def _true_files(truth: Path, scans: bool) -> dict[str, Path]:
 
 
 def _files(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    return sorted(
+    files = sorted(
         path
         for path in folder.iterdir()
-        if path.suffix in suffixes and path.name not in RESULT_FILES and path.is_file()
+        if path.suffix in suffixes and path.name not in RESULT_FILES and not path.is_dir()
     )
+    for path in files:
+        with readable(path):
+            check_foreign(path)
+    return files

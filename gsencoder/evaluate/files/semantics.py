@@ -17,6 +17,9 @@ from gsencoder.evaluate.files.scan_truth import classes_of_scan
 from gsencoder.evaluate.files.scene_folders import scene_files
 from gsencoder.evaluate.scores.semantics import LabelCounts, count_labels
 
+RAW_IDS = range(1100, 1358)
+"""Ids from here to the end of ScanNet's raw ones are no instances: no scene has a hundred of class 1."""
+
 
 def count_label_files(
     predictions: Path,
@@ -50,7 +53,8 @@ def _labels(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
     labels = read_whole_numbers(path)
     if not len(labels):
         raise InputError(f"{path}: no vertices; expected one class id for each")
-    instances = labels[labels >= IDS_PER_CLASS] // IDS_PER_CLASS
+    large = labels[(labels >= IDS_PER_CLASS) & ((labels < RAW_IDS.start) | (labels >= RAW_IDS.stop))]
+    instances = large // IDS_PER_CLASS
     if not (classes.rows(labels) >= 0).any() and (classes.rows(instances) >= 0).any():
         raise InputError(
             f"{path}: ids such as {labels.max()} are those of instances, class id · {IDS_PER_CLASS} + number; expected "

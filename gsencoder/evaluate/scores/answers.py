@@ -31,7 +31,7 @@ _WORDS = (
     ("letf", "left"),
     ("let", "left"),
     ("tehre", "there"),
-    ("brigth", "right"),
+    ("rigth", "right"),
     ("rght", "right"),
     ("behine", "behind"),
     ("tv", "TV"),

@@ -9,6 +9,7 @@ from typing import Any
 
 from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files.atomic import is_full_disk
+from gsencoder.core.files.foreign_file import MODEL_BYTES, read_foreign
 from gsencoder.core.files.json_values import plain, write_bytes
 from gsencoder.core.knobs import describe_values
 from gsencoder.evaluate.tradeoff.stage import Judged, Score
@@ -92,7 +93,7 @@ class Records:
         self._identity = json.dumps(plain(dict(identity)), sort_keys=True).encode()
         path = folder / IDENTITY_FILE
         with readable(path):
-            other = path.is_file() and path.read_bytes() != self._identity
+            other = path.is_file() and read_foreign(path) != self._identity
         if other and (folder / RECORDS_FILE).is_file():
             raise InputError(
                 f"{folder}: holds measurements of a sweep with other settings; give resume=false to begin anew, or "
@@ -106,7 +107,7 @@ class Records:
             return
         # A kill may have left an incomplete last line, which is measured again.
         with readable(self._path):
-            complete = self._path.read_bytes().rpartition(b"\n")
+            complete = read_foreign(self._path, MODEL_BYTES).rpartition(b"\n")
         lines = complete[0].splitlines()
         for number, line in enumerate(lines, start=1):
             try:

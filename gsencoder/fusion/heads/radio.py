@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.core.errors import InputError, about, listed
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.model_files import check_fetched
 from gsencoder.core.pretrained import weight_files
 from gsencoder.fusion.heads.layers import Residual
@@ -89,7 +90,7 @@ def read_radio_heads(folder: Path, names: Sequence[str], channels: int) -> list[
 
 def _read_config(folder: Path) -> dict[str, Any]:
     try:
-        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        config = json.loads(read_foreign_text(folder / "config.json"))
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"config.json cannot be read: {error}") from error
     if not isinstance(config, dict) or not isinstance(config.get("adaptor_configs"), dict):

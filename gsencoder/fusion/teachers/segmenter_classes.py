@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.files.foreign_file import read_foreign
 
 MAX_CLASSES_BYTES = 1 << 22
 
@@ -52,7 +53,7 @@ def read_classes(path: Path) -> tuple[str, ...]:
         InputError: the file is none of these, or a name is empty.
     """
     try:
-        data = path.read_bytes()[: MAX_CLASSES_BYTES + 1]
+        data = read_foreign(path, MAX_CLASSES_BYTES)
         text = data.decode("utf-8-sig")
         values = json.loads(text) if path.suffix.lower() == ".json" else text.splitlines()
     except (OSError, ValueError, RecursionError) as error:

@@ -10,6 +10,7 @@ from jaxtyping import Float32, Float64, UInt8
 from PIL import Image
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.fusion.teachers.resize import fit_to_patches, normalized, patches_of
 
 FILES = ("processor_config.json", "preprocessor_config.json")
@@ -110,7 +111,7 @@ def read_preprocessing(folder: Path, subject: str, *, floats: bool = False) -> P
 def _stated(folder: Path, subject: str) -> tuple[Path, dict[str, Any]]:
     for path in (folder / name for name in FILES):
         try:
-            stated = json.loads(path.read_text(encoding="utf-8"))
+            stated = json.loads(read_foreign_text(path))
         except FileNotFoundError:
             continue
         except (OSError, ValueError) as error:

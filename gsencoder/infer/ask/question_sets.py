@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed
+from gsencoder.core.files.foreign_file import open_foreign
 from gsencoder.data.truth.entries import Corner, corner_bounds, entries_of, object_of, read_benchmark_json, scene_name
 from gsencoder.data.truth.expressions import Expression, read_scanrefer
 from gsencoder.data.truth.questions import Question as TruthQuestion
@@ -66,7 +67,7 @@ def is_question_set(path: Path) -> bool:
     A file that cannot be read is no set; whoever reads it as lines says what is wrong.
     """
     try:
-        with path.open("rb") as stream:
+        with open_foreign(path) as stream:
             start = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
             if not start.startswith(b"{"):
                 return start.startswith(b"[")

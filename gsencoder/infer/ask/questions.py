@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError, about, readable
+from gsencoder.core.files.foreign_file import MODEL_BYTES, read_foreign
 from gsencoder.core.files.written_files import check_written
 from gsencoder.data.truth.checked_files import read_checked_text
 from gsencoder.infer.ask.ask import Question
@@ -113,7 +114,7 @@ def read_answers(path: Path) -> dict[str, dict[str, Any]]:
         return {}
     check_written(path)
     with readable(path):
-        lines = path.read_bytes().split(b"\n")
+        lines = read_foreign(path, MODEL_BYTES).split(b"\n")
     questions = {}
     for number, line in enumerate(lines[:-1], start=1):
         try:

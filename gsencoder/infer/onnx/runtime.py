@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning, about, readable
+from gsencoder.core.files.foreign_file import MODEL_BYTES, read_foreign
 from gsencoder.core.files.model_files import find_file
 from gsencoder.core.runtime.device_names import Device, Precision
 from gsencoder.core.runtime.tracking import Track, untracked
@@ -47,7 +48,7 @@ class OnnxEncoder:
         """
         self.name = "the model" if isinstance(file, bytes) else str(find_file(str(file), "weights"))
         with readable(self.name):
-            model = file if isinstance(file, bytes) else Path(self.name).read_bytes()
+            model = file if isinstance(file, bytes) else read_foreign(self.name, MODEL_BYTES)
         with about(self.name):
             summed = check_sum(model)
         self._session = open_session(model, self.name, device, threads)

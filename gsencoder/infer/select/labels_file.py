@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import read_foreign_text
 from gsencoder.core.files.json_values import write_json
 from gsencoder.core.files.written_files import check_written
 from gsencoder.data.splats import load_property, load_splat, save_splat
@@ -122,7 +123,7 @@ def read_labels(folder: str | Path) -> LabeledSplat:
     path = Path(folder) / LABELS_JSON
     check_written(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_foreign_text(path))
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{path}: cannot be read: {reason}; expected a file that gsencoder select wrote") from error

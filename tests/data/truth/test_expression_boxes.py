@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from labeled_scans import group, write_scannet_labels
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.truth.expression_boxes import boxes_from_labels, boxes_from_scans
 from gsencoder.data.truth.expressions import Expression
 from gsencoder.data.truth.scannet_labels import read_scannet_labels
@@ -55,7 +55,8 @@ def test_expressions_of_several_scans_stay_in_order_and_scans_that_nothing_needs
         meaning(2, "s1"),
         meaning(0, "s0"),
     ]
-    boxes = boxes_from_scans(expressions, tmp_path)
+    with pytest.warns(SceneWarning, match="axisAlignment"):
+        boxes = boxes_from_scans(expressions, tmp_path)
     assert [(each.scene, each.object_id) for each in boxes] == [(each.scene, each.object_id) for each in expressions]
     assert [each.aabb and each.aabb[0] for each in boxes] == [
         (0.0, 0.0, 0.0),

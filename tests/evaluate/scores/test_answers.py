@@ -241,3 +241,11 @@ def test_columns_on_other_tokens_say_so_in_their_heads() -> None:
     assert list(given_tokens.columns()) == ["BLEU-1", "BLEU-2", "BLEU-3", "BLEU-4", "METEOR", "ROUGE-L", "CIDEr"]
     with pytest.raises(InputError, match="no Java here; or take tokens=python"):
         score_sentences(["a"], [["a"]], tokens="ptb", tools=NO_JAVA)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "right"), [("rigth", "right"), ("letf", "left"), ("tehre", "there"), ("12", "twelve")]
+)
+def test_typing_errors_are_words_and_not_parts_of_words(wrong: str, right: str) -> None:
+    assert clean_answer(f"to {wrong} side") == f"to {right} side"
+    assert clean_answer(f"b{wrong} side") != f"{right} side"

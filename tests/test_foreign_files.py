@@ -1,0 +1,123 @@
+"""What a scene or an option names is a regular file: pipes and devices end with an error, within a second."""
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.files.foreign_file import open_foreign, read_foreign, read_foreign_text
+from gsencoder.core.files.npz import read_npz
+from gsencoder.core.files.written_files import check_written
+from gsencoder.data.readers.colmap_binary import check_binary_model
+from gsencoder.data.readers.image_file import load_npy, open_picture
+from gsencoder.data.readers.tables import table_lines
+from gsencoder.data.readers.transforms_json import read_json
+from gsencoder.data.scene_paths import kind_of_path
+from gsencoder.data.splats import load_property, load_splat
+from gsencoder.data.truth.checked_files import read_checked
+from gsencoder.data.truth.mesh_file import read_mesh
+from gsencoder.evaluate.files.scene_folders import scene_files
+from gsencoder.infer.ask.question_sets import is_question_set
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "picture.png": open_picture,
+    "depth.npy": load_npy,
+    "poses.txt": table_lines,
+    "pose.json": read_json,
+    "splat.ply": load_splat,
+    "further.ply": lambda path: load_property(path, "x"),
+    "truth.txt": read_checked,
+    "mesh.ply": read_mesh,
+    "masks.npz": lambda path: read_npz(path, {"pred_masks": ("b", 2)}),
+    "bytes": read_foreign,
+    "text": read_foreign_text,
+}
+
+
+@pytest.fixture(autouse=True)
+def _ends() -> Iterator[None]:
+    def late(*_: object) -> None:
+        raise TimeoutError("reading did not end")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.setitimer(signal.ITIMER_REAL, 1.0)
+    yield
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def endless(path: Path, kind: str) -> Path:
+    if kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.symlink_to("/dev/zero")
+    return path
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+@pytest.mark.parametrize("name", READERS)
+def test_a_pipe_and_a_device_are_refused_by_every_reader(tmp_path: Path, name: str, kind: str) -> None:
+    path = endless(tmp_path / name, kind)
+    with pytest.raises(InputError, match="not a regular file") as caught:
+        READERS[name](path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_a_summary_that_is_no_file_is_no_summary(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "views.json").write_text("{}")
+    endless(tmp_path / "summary.json", kind)
+    check_written(tmp_path / "views.json")
+    assert kind_of_path(tmp_path) == "a folder of other files"
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_questions_that_are_no_file_are_no_set(tmp_path: Path, kind: str) -> None:
+    assert not is_question_set(endless(tmp_path / "questions.json", kind))
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_a_binary_model_that_is_no_file_is_refused(tmp_path: Path, kind: str) -> None:
+    for name in ("cameras.bin", "images.bin", "points3D.bin"):
+        endless(tmp_path / name, kind)
+    with pytest.raises(InputError):
+        check_binary_model(tmp_path)
+
+
+def test_links_to_files_are_read_and_large_files_are_not(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"\xef\xbb\xbfa\r\nb")
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    assert read_foreign_text(tmp_path / "link") == "a\nb"
+    with pytest.raises(InputError, match="8 bytes?|at most 3"):
+        read_foreign(tmp_path / "link", 3)
+    with pytest.raises(InputError, match="is a folder"):
+        open_foreign(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        open_foreign(tmp_path / "missing")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "dangling"])
+def test_truth_of_a_scene_that_cannot_be_read_is_named_and_not_left_out(tmp_path: Path, kind: str) -> None:
+    for folder in ("predictions", "truth"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.txt").write_text("1\n")
+    path = tmp_path / "truth" / "b.txt"
+    if kind == "dangling":
+        path.symlink_to(tmp_path / "gone")
+    else:
+        endless(path, kind)
+    with pytest.raises(InputError, match=r"b\.txt"):
+        scene_files(tmp_path / "predictions", tmp_path / "truth")
+
+
+def test_masks_are_refused_by_their_declared_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    np.savez_compressed(tmp_path / "a.npz", pred_masks=np.zeros((2048, 1024), bool))
+    kinds = {"pred_masks": ("b", 2)}
+    assert read_npz(tmp_path / "a.npz", kinds)["pred_masks"].shape == (2048, 1024)
+    monkeypatch.setattr("gsencoder.core.files.npz.LARGEST_ARRAY", 1 << 20)
+    with pytest.raises(InputError, match="claims"):
+        read_npz(tmp_path / "a.npz", kinds)
