@@ -154,6 +154,8 @@ def report_table(path: str, report: SplatReport) -> Table:
         first = ", ".join(map(str, defect.first_rows)) + (", …" if defect.count > len(defect.first_rows) else "")
         stops = "; stops loading" if defect.stops_loading else ""
         table.add_row(defect.name, f"{defect.count:,} rows ({first}){stops}")
+    for finding in report.findings:
+        table.add_row("wrong", finding)
     table.add_row("loads", "yes" if report.loadable else "no; see gsencoder repair")
     return table
 
