@@ -42,8 +42,8 @@ def orbit(seed: int) -> Views:
     """Photographs of something colorful on a pedestal in a room whose walls all have one wallpaper."""
     rng = np.random.default_rng(seed)
     count, radius = int(rng.integers(5, 14)), rng.uniform(0.6, 1.2)
-    turns = rng.uniform(0, 2 * np.pi) + np.deg2rad(rng.uniform(5, 15)) * np.arange(count)
-    centers = np.stack((radius * np.cos(turns), radius * np.sin(turns), rng.uniform(-0.1, 0.5, count)), axis=1)
+    turns = rng.uniform(0, 2 * np.pi) + np.deg2rad(rng.uniform(5, 12)) * np.arange(count)
+    centers = np.stack((radius * np.cos(turns), radius * np.sin(turns), rng.uniform(0, 0.4) + rng.uniform(-0.04, 0.04, count)), axis=1)
     forward = rng.normal(size=(count, 3)) * 0.05 - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
     cameras = looking_cameras(centers, forward, np.array([0.0, 0, 1]), width=320, height=240, focal=280.0)
@@ -118,3 +118,107 @@ def matched(name: str, views: Views, cache: Path) -> tuple[Cameras, list[PairMat
         )
         for (first, second, n), end in zip(table, ends, strict=True)
     ]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Views to judge: rows of a scene, its cameras as they are given and the matches of all its views."""
+
+    scene: str
+    rows: np.ndarray
+    cameras: Cameras
+    matches: list[PairMatches]
+    stray: int | None = None
+
+    def judge(self) -> EpipolarCheck:
+        names = [str(row) for row in self.rows]
+        cameras = self.cameras.select(self.rows)
+        return judge_matches(of_rows(self.matches, self.rows), cameras, cameras, np.arange(len(self.rows)), names)
+
+
+def of_rows(matches: list[PairMatches], rows: np.ndarray) -> list[PairMatches]:
+    """The matches between some views, numbered as these are."""
+    number = {int(row): index for index, row in enumerate(rows)}
+    chosen = [pair for pair in matches if pair.first in number and pair.second in number]
+    return [replace(pair, first=number[pair.first], second=number[pair.second]) for pair in chosen]
+
+
+def good_cases(scenes: dict[str, tuple[Cameras, list[PairMatches]]], count: int) -> Iterator[Case]:
+    """Random subsets of 3 to 24 views; half of them are neighbors in the order of the files. Rooms of the house are as
+    frequent as all others together."""
+    rng = np.random.default_rng(0)
+    names = [name for name in scenes if name.startswith("train")], [name for name in scenes if name[:5] != "train"]
+    for index in range(count):
+        name = str(rng.choice(names[index % 2]))
+        cameras, matches = scenes[name]
+        size = int(rng.integers(3, min(24, len(cameras)) + 1))
+        rows = rng.permutation(len(cameras))[:size]
+        if rng.uniform() < 0.5:
+            rows = rng.integers(len(cameras) - size + 1) + np.arange(size)
+        yield Case(scene=name, rows=np.sort(rows), cameras=cameras, matches=matches)
+
+
+def stray_cases(scenes: dict[str, tuple[Cameras, list[PairMatches]]], count: int) -> Iterator[Case]:
+    """The same with one view turned by 3° to 15° and moved by 3 to 15 % of the distance to what it looks at, where it
+    has matches with two others that have matches with a third each, and three pairs remain without it."""
+    rng = np.random.default_rng(1)
+    found = 0
+    for case in good_cases(scenes, 100 * count):
+        pairs = np.array([(pair.first, pair.second) for pair in of_rows(case.matches, case.rows)]).reshape(-1, 2)
+        suitable = []
+        for view in range(len(case.rows)):
+            with_view = (pairs == view).any(axis=1)
+            partners = np.setdiff1d(pairs[with_view], view)
+            if np.isin(partners, pairs[~with_view]).sum() >= 2 and (~with_view).sum() >= 3:
+                suitable.append(view)
+        if not suitable:
+            continue
+        stray = int(case.rows[rng.choice(suitable)])
+        axis, way = (direction / np.linalg.norm(direction) for direction in rng.normal(size=(2, 3)))
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_rotvec(np.deg2rad(rng.uniform(3, 15)) * axis).as_matrix()
+        pose[:3, 3] = rng.uniform(0.03, 0.15) * typical_distance(case.cameras) * way
+        poses = case.cameras.cam_from_world.copy()
+        poses[stray] = pose @ poses[stray]
+        yield replace(case, cameras=replace(case.cameras, cam_from_world=poses), stray=stray)
+        found += 1
+        if found == count:
+            return
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="shared scenes")
+    parser.add_argument("--cache", type=Path, required=True, help="folder of matches, made if they are not there")
+    parser.add_argument("--cases", type=int, default=200)
+    parser.add_argument("--orbits", type=int, default=100)
+    add_json_option(parser)
+    arguments = parser.parse_args()
+    arguments.cache.mkdir(parents=True, exist_ok=True)
+    real = {name: matched(name, views, arguments.cache) for name, views in scenes(arguments.folder)}
+    rings = {f"orbit_{seed:03d}": matched(f"orbit_{seed:03d}", orbit(seed), arguments.cache) for seed in range(arguments.orbits)}
+    whole = [
+        Case(scene=name, rows=np.arange(len(cameras)), cameras=cameras, matches=matches)
+        for name, (cameras, matches) in rings.items()
+    ]
+    figures: dict[str, float] = {}
+    for kind, cases in (("subsets", list(good_cases(real, arguments.cases))), ("orbits", whole)):
+        checks = [(case, case.judge()) for case in cases]
+        for case, check in checks:
+            for finding in check.findings:
+                print(f"accused: {case.scene}, views {case.rows.tolist()}: {finding.cause} {finding.view}: {finding.message}")
+        figures[f"{kind}"] = len(checks)
+        figures[f"{kind} accused"] = sum(bool(check.findings) for _, check in checks)
+        figures[f"{kind} undecided"] = sum(not check.decided for _, check in checks)
+    strays = [(case, case.judge()) for case in stray_cases(real, arguments.cases)]
+    named = [{finding.view for finding in check.findings} for _, check in strays]
+    figures["strays"] = len(strays)
+    figures["strays named"] = sum(str(case.stray) in views for (case, _), views in zip(strays, named, strict=True))
+    figures["others named with them"] = sum(bool(views - {str(case.stray)}) for (case, _), views in zip(strays, named, strict=True))
+    for name, value in figures.items():
+        print(f"{name}: {value}")
+    write_figures(arguments.json, figures)
+
+
+if __name__ == "__main__":
+    main()
