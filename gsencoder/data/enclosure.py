@@ -1,7 +1,7 @@
 """Is a bare splat a room or an object? Its free space says: what encloses it, and what stands in it.
 
-A cupboard, a bust or a box is as closed as a room, so that being enclosed is not enough. Rays in 26 directions through a
-coarse grid tell rooms apart in two ways. A scan without a ceiling is flat and open: most of its surface is free on one
+A cupboard, a bust or a box is as closed as a room, so that being enclosed is not enough. Rays in 26 directions through
+a coarse grid tell rooms apart in two ways. A scan without a ceiling is flat and open: most of its surface is free on one
 side, and no part of its space is enclosed. A room with walls has one large space, and something stands in it: rays that
 leave this space at a surface enter the same space again behind it. They do not where an empty shell ends.
 """
@@ -34,14 +34,14 @@ FILLED = 0.1
 ENCLOSED = 0.65
 """Share of the directions in which a free cell's rays end at a surface, from which on the cell is enclosed."""
 OPEN_FLATNESS, OPEN_SURFACES, OPEN_SPACE = 0.35, 0.5, 0.3
-"""An open scan's smallest side is at most this share of its largest one; rays from its surfaces get out in at least this
-share of the directions; and at most this share of it is one enclosed space. House rooms have 0.06 to 0.3, 0.53 to 0.68
+"""An open scan's smallest side is at most this share of its largest one; rays from its surfaces get out in at least
+this share of the directions; and at most this share of it is one enclosed space. House rooms have 0.06 to 0.3, 0.53 to 0.68
 and 0.0 to 0.12; a window has 0.13, 0.58 and 0.47, a bowl 0.41, 0.48 and 0.0."""
 ROOM_FLATNESS = 0.55
 """A room with walls is at most this high, as a share of its length."""
 ROOM_SPACE, ROOM_SURFACES, ROOM_CONTENT = 0.3, 0.36, 0.01
-"""The same of the enclosed space of a room with walls, at least, and of its surfaces (a piece of furniture has boards in
-it and behind it, 0.2 to 0.35); and the share of the rays from its space that enter it again. A corridor with a few
+"""The same of the enclosed space of a room with walls, at least, and of its surfaces (a piece of furniture has boards
+in it and behind it, 0.2 to 0.35); and the share of the rays from its space that enter it again. A corridor with a few
 cupboards has 0.013, rooms with tables and shelves 0.08 to 0.14; a scanned packet 0.008, boxes and bathtubs none."""
 FULL_SPACE, FULL_CONTENT = 0.05, 0.04
 """Where less space is enclosed, since things stand everywhere, more rays must enter it again: a kitchen has 0.07 and
@@ -93,9 +93,7 @@ def enclosure_of(gaussians: Gaussians) -> Enclosure:
         space = numbers == 1 + int(np.bincount(numbers.ravel())[1:].argmax())
     content = float(_entering_again(surface, space)[space].sum()) / max(1, len(DIRECTIONS) * int(space.sum()))
     sides = surface.shape
-    return Enclosure(
-        flatness=min(sides) / max(sides), openness=openness, space=float(space.mean()), content=content
-    )
+    return Enclosure(flatness=min(sides) / max(sides), openness=openness, space=float(space.mean()), content=content)
 
 
 def _surface_areas(gaussians: Gaussians) -> Float64[np.ndarray, "x y z"]:
@@ -164,9 +162,7 @@ def _blocked(surface: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "x y z"]:
     return count
 
 
-def _entering_again(
-    surface: Bool[np.ndarray, "x y z"], space: Bool[np.ndarray, "x y z"]
-) -> Int64[np.ndarray, "x y z"]:
+def _entering_again(surface: Bool[np.ndarray, "x y z"], space: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "x y z"]:
     """The number of directions in which a ray from each free cell meets a surface, and `space` right behind it."""
     count = np.zeros(surface.shape, np.int64)
     for direction in DIRECTIONS:

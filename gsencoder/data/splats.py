@@ -30,6 +30,7 @@ from gsencoder.data.splat_formats.raw import (
     RawSplat,
     logits_from_opacities,
     logs_from_scales,
+    odd_values,
     opacities_from_logits,
     unusable_rows,
 )
@@ -69,7 +70,8 @@ def load_splat(path: str | Path, *, origin: Float64[np.ndarray, "3"] | None = No
             (counted; `gsencoder repair` mends those).
 
     Warns:
-        SceneWarning: SH of degree 4 was cut, extensions were left out, or positions lose precision without an origin.
+        SceneWarning: SH of degree 4 was cut, extensions were left out, positions lose precision without an origin, or
+            values look as if they were stored otherwise (see `odd_values`).
     """
     check_written(path)
     return gaussians_from_raw(read_raw(path), origin=origin, where=str(path))
@@ -103,6 +105,8 @@ def gaussians_from_raw(
             SceneWarning,
             stacklevel=3,
         )
+    for fault in odd_values(raw):
+        warnings.warn(f"{where}: {fault}", SceneWarning, stacklevel=3)
     quats = raw.quats.astype(np.float64)
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
     return Gaussians(

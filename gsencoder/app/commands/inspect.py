@@ -156,6 +156,8 @@ def report_table(path: str, report: SplatReport) -> Table:
         table.add_row(defect.name, f"{defect.count:,} rows ({first}){stops}")
     if report.unused:
         table.add_row("not used", ", ".join(report.unused))
+    for finding in report.findings:
+        table.add_row("wrong", finding)
     table.add_row("loads", "yes" if report.loadable else "no; see gsencoder repair")
     return table
 

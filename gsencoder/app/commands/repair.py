@@ -30,7 +30,7 @@ from gsencoder.data.splats import (
 )
 from gsencoder.types import Scene
 
-Fix = Literal["nonfinite", "quats", "scales", "opacities", "huge", "duplicates", "floaters", "all"]
+Fix = Literal["activated", "nonfinite", "quats", "scales", "opacities", "huge", "duplicates", "floaters", "all"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,8 +54,8 @@ class RepairConfig(CommonConfig):
     fix: tuple[Fix, ...] = field(
         default=("nonfinite", "quats", "scales", "opacities"),
         metadata={
-            "help": "defects of a splat to repair: the four that prevent loading, and huge, duplicates, floaters, "
-            "or all"
+            "help": "defects of a splat to repair: the four that prevent loading, activated (scales or opacities that "
+            "are no logarithms or logits), huge, duplicates, floaters, or all"
         },
     )
     views: int = field(

@@ -1,11 +1,14 @@
 """Whether photographs fit their poses, where there is no depth: how far matched features lie from the epipolar lines of
 the poses (Hartley and Zisserman 2004, ch. 9).
 
-Which matches are right is decided without the poses, by a fundamental matrix of each pair alone.
+Which matches are right is decided without the poses, by a fundamental matrix of each pair alone. That is no proof: far
+views of a wallpaper match well where its motif repeats, while wrong poses fit right matches nowhere. So each view is
+judged by the pairs with its nearest neighbors, and it is called astray only if it has another pose that fits them.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -21,6 +24,7 @@ from gsencoder.data.seeding.feature_matches import (
     fundamental_matrix,
     match_photographs,
 )
+from gsencoder.data.seeding.view_pairs import typical_distance
 from gsencoder.types import Cameras, Views
 
 PICTURE_SIZE = 640
@@ -43,10 +47,29 @@ UNFIT = 3.0
 """Photographs whose matches lie farther than so many pixels from their lines do not fit their poses."""
 FOCAL_FACTORS: tuple[float, ...] = tuple(np.round(np.geomspace(0.7, 1.43, 31), 4).tolist())
 SMALLEST_FACTOR = 1.03
+NEAREST = 3
+"""Pairs that count are among this many of one of their views that are nearest to each other …"""
+FEWEST_PAIRS = 3
+"""… and nothing is said of fewer."""
+FIT_FACTOR, FIT_RANGE = 3.0, (1.0, 6.0)
+"""A pair fits if the median error of its matches is at most this many times that of the middle pair, and a number of
+pixels in this range: poses of tracked sequences are off by 3 pixels, those of structure from motion by 0.3."""
+UNKNOWN_PAIRS = 6
+"""Without another reading that fits, poses are only called wrong by so many pairs, of whose matches …"""
+UNKNOWN_SHARE = 0.1
+"""… less than this share is in pairs that fit."""
 STRAY_ERROR = 3.0
-"""A view is astray if the median error of its pairs is above so many pixels, and above …"""
+"""A view may be astray if the error of its pairs is above so many pixels, and above …"""
 STRAY_FACTOR = 3.0
-"""… this many times that of the other pairs."""
+"""… this many times that of the other pairs, and less than …"""
+STRAY_SHARE = 0.25
+"""… this share of their matches is in pairs that fit. It is astray if it has another pose under which two pairs fit
+and …"""
+MOVED_SHARE = 0.6
+"""… this share of the matches is in pairs that do."""
+STEPS = 12
+STARTS = 4
+"""Poses from which that one is looked for, the best of those that two pairs give."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,8 +83,10 @@ class EpipolarCheck:
         error: mean distance of a pair's matches from their epipolar lines, in pixels of pictures of `PICTURE_SIZE`,
             averaged over pairs; at most `CLIP`; NaN without pairs.
         share: of the matches that lie within `TOLERANCE`.
-        best_error: the same under the reading that fits best.
+        best_error: the same under the reading that fits best, over the pairs that count.
         findings: what is wrong.
+        decided: False if there are too few pairs to say anything, or most of the matches do not fit and it cannot be said
+            why.
         worst: the pair with the largest error, for a picture; None without pairs.
         cameras: of the views that were looked at, at the size of the matched pictures, as the files give them.
     """
@@ -73,6 +98,7 @@ class EpipolarCheck:
     share: float
     best_error: float
     findings: tuple[Finding, ...]
+    decided: bool
     worst: PairMatches | None
     cameras: Cameras
 
@@ -93,6 +119,25 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
     subset = views.select(rows)
     pairs = [(first, second) for first in range(len(rows)) for second in range(first + 1, len(rows))]
     matches = consistent_matches(match_photographs(subset, cameras, pairs, features=FEATURES, track=track))
+    return judge_matches(matches, cameras, views.cameras, rows, subset.names)
+
+
+def judge_matches(
+    matches: Sequence[PairMatches],
+    cameras: Cameras,
+    all_cameras: Cameras,
+    rows: Int64[np.ndarray, " V"],
+    names: Sequence[str],
+) -> EpipolarCheck:
+    """Holds consistent matches of views against their poses, and against other readings of them.
+
+    Args:
+        matches: of pairs of the views.
+        cameras: of the views, at the size of the matched pictures.
+        all_cameras: of the scene.
+        rows: of the views in it.
+        names: of the views.
+    """
     if not matches:
         nan = float("nan")
         return EpipolarCheck(
@@ -103,29 +148,31 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
             share=nan,
             best_error=nan,
             findings=(),
+            decided=False,
             worst=None,
             cameras=cameras,
         )
-    errors = pair_errors(cameras, matches)
-    error_as_stated = float(np.mean(errors))
+    near = near_pairs(cameras, matches)
+    best, best_error = cameras, mean_error(cameras, near)
     findings: list[Finding] = []
-    best, best_error = cameras, error_as_stated
-    if error_as_stated > BAD:
-        cause, factor, other, error = _best_reading(cameras, views.cameras, rows, matches)
+    limit = _fit_limit(cameras, near)
+    enough = len(near) >= FEWEST_PAIRS
+    if enough and best_error > BAD:
+        cause, factor, other, error = _best_reading(cameras, all_cameras, rows, near)
         # One view astray among few raises the mean of all pairs, and no reading of all poses mends that.
-        if error < BETTER * error_as_stated:
+        if error < BETTER * best_error and share_that_fits(other, near, _fit_limit(other, near)) >= 0.5:
             findings.append(
                 Finding(
                     cause=cause,
-                    message=f"{ADVICE[cause].format(factor=factor)} (matches lie {error_as_stated:.1f} pixels "
+                    message=f"{ADVICE[cause].format(factor=factor)} (matches lie {best_error:.1f} pixels "
                     f"from their epipolar lines, {error:.1f} if so read)",
                     factor=factor,
                 )
             )
-            best, best_error = other, error
-    stray = _stray_views(pair_errors(best, matches), matches, subset.names)
-    findings += stray
-    if best_error > UNFIT and not stray and not findings:
+            best, best_error, limit = other, error, _fit_limit(other, near)
+    findings += _stray_views(best, matches, names, limit)
+    fitting = share_that_fits(best, near, limit)
+    if best_error > UNFIT and not findings and len(near) >= UNKNOWN_PAIRS and fitting < UNKNOWN_SHARE:
         findings.append(
             Finding(
                 cause="unknown",
@@ -133,16 +180,18 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
                 "epipolar lines, and no other reading of the poses fits",
             )
         )
-    distances = np.concatenate([_distances(cameras, match) for match in matches])
+    distances = [_distances(cameras, pair) for pair in matches]
+    all_distances = np.concatenate(distances)
     return EpipolarCheck(
         views=rows,
         pairs=len(matches),
-        matches=len(distances),
-        error=error_as_stated,
-        share=float((distances <= TOLERANCE).mean()),
+        matches=len(all_distances),
+        error=float(np.mean([_clipped(each) for each in distances])),
+        share=float((all_distances <= TOLERANCE).mean()),
         best_error=best_error,
         findings=tuple(findings),
-        worst=matches[int(np.argmax(errors))],
+        decided=bool(findings) or (enough and fitting >= 0.5),
+        worst=max(zip(distances, matches, strict=True), key=lambda pair: _clipped(pair[0]))[1],
         cameras=cameras,
     )
 
@@ -180,11 +229,6 @@ def _distances(cameras: Cameras, pair: PairMatches) -> Float64[np.ndarray, " M"]
     return epipolar_distances(fundamental, pair.first_pixels, pair.second_pixels)
 
 
-def pair_errors(cameras: Cameras, matches: Sequence[PairMatches]) -> Float64[np.ndarray, " n"]:
-    """The mean clipped distance of each pair's matches from their epipolar lines, pixels."""
-    return np.array([np.minimum(_distances(cameras, pair), CLIP).mean() for pair in matches])
-
-
 def _best_reading(
     cameras: Cameras, all_cameras: Cameras, rows: Int64[np.ndarray, " V"], matches: Sequence[PairMatches]
 ) -> tuple[str, float | None, Cameras, float]:
@@ -202,34 +246,183 @@ def _best_reading(
             Ks = cameras.Ks.copy()
             Ks[:, :2, :2] *= np.float32(factor)
             readings.append(("focal length", float(factor), replace(cameras, Ks=Ks)))
-    candidates = [(*reading, float(pair_errors(reading[2], matches).mean())) for reading in readings]
+    candidates = [(*reading, mean_error(reading[2], matches)) for reading in readings]
     return min(candidates, key=lambda reading: reading[3])
 
 
-def _stray_views(
-    errors: Float64[np.ndarray, " n"], matches: Sequence[PairMatches], names: Sequence[str]
-) -> list[Finding]:
-    """Views whose pairs have clearly larger errors than those of the others; of fewer than four views it cannot be said
-    which one it is."""
+def near_pairs(cameras: Cameras, matches: Sequence[PairMatches], view: int | None = None) -> list[PairMatches]:
+    """The pairs that are among the `NEAREST` of one of their views, or of one view: the turn between them in radians
+    and their distance, as a share of the distance to what they look at, are smallest together."""
+    forward, centers = cameras.cam_from_world[:, 2, :3], cameras.centers
+    first, second = np.array([(pair.first, pair.second) for pair in matches], np.int64).reshape(-1, 2).T
+    turns = np.arccos(np.einsum("pi,pi->p", forward[first], forward[second]).clip(-1, 1))
+    apart = turns + np.linalg.norm(centers[first] - centers[second], axis=1) / typical_distance(cameras)
+    near: set[int] = set()
+    for each in np.unique((first, second)) if view is None else (view,):
+        own = np.flatnonzero((first == each) | (second == each))
+        near |= set(own[np.argsort(apart[own], kind="stable")[:NEAREST]].tolist())
+    return [matches[row] for row in sorted(near)]
+
+
+def mean_error(cameras: Cameras, matches: Sequence[PairMatches]) -> float:
+    """The mean clipped distance of all matches from their epipolar lines, pixels."""
+    return _clipped(np.concatenate([_distances(cameras, pair) for pair in matches]))
+
+
+def _clipped(distances: Float64[np.ndarray, " n"]) -> float:
+    return float(np.minimum(distances, CLIP).mean())
+
+
+def _fit_limit(cameras: Cameras, matches: Sequence[PairMatches]) -> float:
+    """The largest median error in pixels of a pair that fits."""
+    usual = float(np.median([np.median(_distances(cameras, pair)) for pair in matches]))
+    return float(np.clip(FIT_FACTOR * usual, *FIT_RANGE))
+
+
+def share_that_fits(cameras: Cameras, matches: Sequence[PairMatches], limit: float) -> float:
+    """The share of matches that are in pairs that fit."""
+    counts = np.array([len(pair.first_pixels) for pair in matches])
+    return float(counts[[_fits(cameras, pair, limit) for pair in matches]].sum() / counts.sum())
+
+
+def _fits(cameras: Cameras, pair: PairMatches, limit: float) -> bool:
+    return float(np.median(_distances(cameras, pair))) <= limit
+
+
+def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequence[str], limit: float) -> list[Finding]:
+    """Views whose nearest pairs do not fit, those of the others do, and which have another pose that fits; of fewer than
+    four views it cannot be said which one it is."""
     findings: list[Finding] = []
-    remaining = np.ones(len(matches), bool)
-    pair_views = np.array([(pair.first, pair.second) for pair in matches])
+    remaining = [(pair, _fits(cameras, pair, limit)) for pair in matches]
+    views = {view for pair in matches for view in (pair.first, pair.second)}
     while True:
-        worst = None
-        for view in np.unique(pair_views[remaining]):
-            of_view = remaining & (pair_views == view).any(axis=1)
-            others = remaining & ~of_view
-            if of_view.sum() < 2 or others.sum() < 3:
+        suspects = []
+        for view in views:
+            others = [(pair, fits) for pair, fits in remaining if view not in (pair.first, pair.second)]
+            # A neighbor that fits nobody else may itself be the one that is astray.
+            trusted = {end for pair, fits in others if fits for end in (pair.first, pair.second)}
+            own = [pair for pair, _ in remaining if view in (pair.first, pair.second)]
+            own = near_pairs(cameras, [pair for pair in own if trusted & {pair.first, pair.second}], view)
+            if len(own) < 2 or len(others) < 3 or share_that_fits(cameras, own, limit) >= STRAY_SHARE:
                 continue
-            error, usual = float(np.median(errors[of_view])), float(np.median(errors[others]))
-            if error > max(STRAY_ERROR, STRAY_FACTOR * usual) and (worst is None or error > worst[1]):
-                worst = int(view), error, usual
-        if worst is None:
+            error, usual = mean_error(cameras, own), mean_error(cameras, near_pairs(cameras, [p for p, _ in others]))
+            if error > max(STRAY_ERROR, STRAY_FACTOR * usual):
+                suspects.append((error, usual, view, own))
+        for error, usual, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
+            moved = fit_pose_to_matches(cameras, view, own)
+            fitting = sum(_fits(moved, pair, limit) for pair in own)
+            if (
+                fitting >= 2
+                and share_that_fits(moved, own, limit) >= MOVED_SHARE
+                and mean_error(moved, own) < error / 2
+            ):
+                break
+        else:
             return findings
-        view, error, usual = worst
         message = (
             f"its photograph does not fit its pose: its matches lie {error:.1f} pixels from their epipolar lines, "
-            f"those of the other views {usual:.1f}"
+            f"{mean_error(moved, own):.1f} if it is moved, and those of the other views {usual:.1f}"
         )
         findings.append(Finding(cause="stray view", message=message, view=names[view]))
-        remaining &= ~(pair_views == view).any(axis=1)
+        remaining = [(pair, fits) for pair, fits in remaining if view not in (pair.first, pair.second)]
+        views -= {view}
+
+
+def fit_pose_to_matches(cameras: Cameras, view: int, matches: Sequence[PairMatches]) -> Cameras:
+    """The cameras with the pose of one view under which its matches lie nearest to their epipolar lines.
+
+    Its turn against each other view comes from the essential matrix of the pair; it stands where the directions of two of
+    them meet, or where it is said to be, or where one of the others is. The best of these is refined.
+
+    Args:
+        cameras: at the size of the matched pictures.
+        view: its row.
+        matches: pairs of it and others, whose poses stay.
+    """
+    from scipy.spatial.transform import Rotation
+
+    def with_pose(rotation: np.ndarray, center: np.ndarray) -> Cameras:
+        poses = cameras.cam_from_world.copy()
+        poses[view, :3, :3], poses[view, :3, 3] = rotation, -rotation @ center
+        return replace(cameras, cam_from_world=poses)
+
+    centers = cameras.centers.astype(np.float64)
+    relative = [_relative_pose(cameras, view, pair) for pair in matches]
+    rays = [(centers[other], rotation, direction) for other, rotation, direction in filter(None, relative)]
+    candidates = [(rotation, center) for start, rotation, _ in rays for center in (centers[view], start)] + [
+        (rotation, _nearest_point(first, direction, second, other))
+        for (first, rotation, direction), (second, turned, other) in permutations(rays, 2)
+        for rotation in (rotation, turned)
+    ]
+    own = cameras.cam_from_world[view, :3, :3].astype(np.float64)
+    candidates.append((own, centers[view]))
+    candidates.sort(key=lambda candidate: mean_error(with_pose(*candidate), matches))
+    reach = typical_distance(cameras)
+    fitted = [with_pose(*candidates[0])]
+    for rotation, center in candidates[:STARTS]:
+        for _ in range(STEPS):
+
+            def distances(step: np.ndarray, rotation: np.ndarray = rotation, center: np.ndarray = center) -> np.ndarray:
+                turned = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
+                moved = with_pose(turned, center + reach * step[3:])
+                return np.concatenate([_sampson(moved, pair) for pair in matches])
+
+            # float32 of the poses leaves four digits of differences over this step.
+            here = distances(np.zeros(6))
+            jacobian = np.stack([(distances(1e-3 * unit) - here) / 1e-3 for unit in np.eye(6)], axis=1)
+            weighted = jacobian / (1 + np.square(here))[:, None]
+            system = jacobian.T @ weighted
+            step = np.linalg.solve(system + 1e-6 * np.trace(system) * np.eye(6), -weighted.T @ here)
+            rotation, center = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation, center + reach * step[3:]
+        fitted.append(with_pose(rotation, center))
+    return min(fitted, key=lambda moved: mean_error(moved, matches))
+
+
+def _sampson(cameras: Cameras, pair: PairMatches) -> Float64[np.ndarray, " M"]:
+    """Signed distances of matches from their epipolar geometry to first order (Hartley and Zisserman, eq. 11.9)."""
+    matrix = fundamental_matrix(cameras, pair.first, pair.second)
+    first, second = (np.column_stack((each, np.ones(len(each)))) for each in (pair.first_pixels, pair.second_pixels))
+    lines, other = first @ matrix.T, second @ matrix
+    length = np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (other[:, :2] ** 2).sum(axis=1))
+    return np.einsum("mi,mi->m", second, lines) / np.maximum(length, 1e-12)
+
+
+def _relative_pose(
+    cameras: Cameras, view: int, pair: PairMatches
+) -> tuple[int, Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]] | None:
+    """The other view of a pair, the rotation cam_from_world that the view has against it, and the direction in which it
+    stands from there."""
+    pycolmap = load_pycolmap()
+    options = pycolmap.RANSACOptions()
+    options.max_error, options.random_seed, options.max_num_trials = INLIER_ERROR, 0, 2000
+    ends = [(pair.first, pair.first_pixels), (pair.second, pair.second_pixels)]
+    (other, there), (_, here) = ends if pair.second == view else ends[::-1]
+    models = [
+        pycolmap.Camera(
+            model="PINHOLE",
+            width=int(cameras.widths[row]),
+            height=int(cameras.heights[row]),
+            params=cameras.Ks[row][(0, 1, 0, 1), (0, 1, 2, 2)].astype(float).tolist(),
+        )
+        for row in (other, view)
+    ]
+    found = pycolmap.estimate_essential_matrix(there, here, *models, options)
+    if found is None:
+        return None
+    matrix = found["cam2_from_cam1"].matrix()
+    of_other = cameras.cam_from_world[other, :3, :3].astype(np.float64)
+    return other, matrix[:, :3] @ of_other, of_other.T @ (-matrix[:, :3].T @ matrix[:, 3])
+
+
+def _nearest_point(
+    first: Float64[np.ndarray, "3"],
+    direction: Float64[np.ndarray, "3"],
+    second: Float64[np.ndarray, "3"],
+    other: Float64[np.ndarray, "3"],
+) -> Float64[np.ndarray, "3"]:
+    """The point nearest to two lines; of nearly parallel ones the middle between their starts."""
+    across = [np.eye(3) - np.outer(ray, ray) for ray in (direction, other)]
+    system = across[0] + across[1]
+    if np.linalg.cond(system) > 1e6:
+        return (first + second) / 2
+    return np.asarray(np.linalg.solve(system, across[0] @ first + across[1] @ second))

@@ -4,8 +4,10 @@ import io
 import itertools
 import math
 import re
+import shutil
 import warnings
 from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -132,21 +134,61 @@ def _pose_file(model: Path) -> str:
     return f"frames.{suffix}" if (model / f"frames.{suffix}").is_file() else f"images.{suffix}"
 
 
-def _check_text_poses(file: Path) -> None:
-    """Names the image whose pose is not finite, where pycolmap names none. Each image has two lines."""
-    with io.TextIOWrapper(open_foreign(file), encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            words = line.split(maxsplit=9)
-            if not words or words[0].startswith("#"):
+def _image_lines(file: Path) -> tuple[list[str], bool]:
+    """The lines of an images.txt, two for each image, and whether the file itself has them.
+
+    pycolmap takes the line after an image for its points, whatever it holds. Where no image has points, every line is an
+    image, and empty ones may be missing.
+
+    Raises:
+        InputError: a line that is no image, a pose that is not finite, or an image in the line of another one's points;
+            the message names the line.
+    """
+    lines: list[str] = []
+    lost, with_points, complete = 0, 0, True
+    with io.TextIOWrapper(open_foreign(file), encoding="utf-8", errors="replace") as stream:
+        for number, line in enumerate(stream, 1):
+            words = line.split()
+            comment = not words or words[0].startswith("#")
+            if len(lines) % 2:
+                if comment or _are_points(words):
+                    lines.append("" if comment else line.strip())
+                    with_points += not comment
+                    continue
+                lost, complete = lost or number, False
+                lines.append("")
+            elif comment:
                 continue
-            next(lines, None)
-            try:
-                finite = bool(np.isfinite([float(word) for word in words[1:8]]).all())
-            except ValueError:
-                continue
-            if not finite:
-                name = words[9].strip() if len(words) > 9 else ""
-                raise InputError(f"{file}: image {name[:120]!r}: the pose has values that are not finite")
+            _check_image_line(words, f"{file}: line {number}")
+            lines.append(line.strip())
+    if lost and with_points:
+        raise InputError(
+            f"{file}: line {lost} holds no points of the image above it; expected two lines an image, of which the "
+            "second may be empty (X Y POINT3D_ID …)"
+        )
+    return ([*lines, ""], False) if len(lines) % 2 else (lines, complete)
+
+
+def _are_points(words: list[str]) -> bool:
+    """Whether a line may hold X Y POINT3D_ID triples; the first and the last are looked at."""
+    try:
+        return len(words) % 3 == 0 and all(
+            np.isfinite([float(x), float(y), int(point)]).all() for x, y, point in (words[:3], words[-3:])
+        )
+    except ValueError:
+        return False
+
+
+def _check_image_line(words: list[str], where: str) -> None:
+    try:
+        [int(words[0]), int(words[8])]
+        name, pose = words[9], [float(word) for word in words[1:8]]
+    except (ValueError, IndexError):
+        raise InputError(
+            f"{where} is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME: {' '.join(words)[:80]!r}"
+        ) from None
+    if not np.isfinite(pose).all():
+        raise InputError(f"{where}: image {name[:120]!r}: the pose has values that are not finite")
 
 
 def _load(model: Path) -> Any:
@@ -161,18 +203,35 @@ def _load(model: Path) -> Any:
         for name in ("cameras.txt", "images.txt", "points3D.txt"):
             if not (model / name).is_file():
                 raise InputError(f"{model}: {name} is missing; a COLMAP model has cameras, images and points3D")
-        _check_text_poses(model / "images.txt")
     reconstruction = pycolmap.Reconstruction()
     try:
-        (reconstruction.read_binary if binary else reconstruction.read_text)(str(model))
+        if binary:
+            reconstruction.read_binary(str(model))
+        else:
+            _read_text(reconstruction, model)
         # Names are decoded when they are asked for, so a name that is not UTF-8 shows only here.
         [image.name for image in reconstruction.images.values()]
+    except InputError:
+        raise
     except Exception as error:
         message = " ".join(str(error).split())[:200]
         raise InputError(f"{model}: pycolmap cannot read this model ({type(error).__name__}: {message})") from error
     if not binary:
         _check_text_counts(model, reconstruction)
     return reconstruction
+
+
+def _read_text(reconstruction: Any, model: Path) -> None:
+    """Reads a text model, also one whose images.txt has one line an image."""
+    lines, complete = _image_lines(model / "images.txt")
+    if complete:
+        reconstruction.read_text(str(model))
+        return
+    with TemporaryDirectory(prefix="gsencoder_model_") as folder:
+        for file in model.glob("[cprf]*.txt"):
+            shutil.copy(file, folder)
+        Path(folder, "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        reconstruction.read_text(folder)
 
 
 def _check_text_counts(model: Path, reconstruction: Any) -> None:

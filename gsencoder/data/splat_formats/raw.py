@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Integer
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.even_indices import even_indices
 
 LOGIT_LIMIT = 20.0
 """Opacities 0 and 1 are written as this logit: 2e-9 away from the true value, and finite."""
@@ -22,6 +23,20 @@ ALWAYS_ALLOWED = 16 << 20
 """… or to this many bytes, whichever is more."""
 
 SH_COEFFICIENTS = (1, 4, 9, 16)
+
+ENOUGH = 100
+"""Fewer Gaussians say nothing about how their values were stored."""
+
+SAMPLE = 4096
+"""Gaussians whose neighbors and coordinates are looked at."""
+
+OVERLAP = 3.0
+"""Scales are 0.4 to 0.8 times the distance to the nearest neighbor in real splats (median of both), and up to 1.5 where
+they were just made."""
+
+COARSE, COARSE_LATTICE = 0.5, 4.0
+"""Median scales in a step of float32, or of another lattice, that moves Gaussians visibly. Gaussians on a regular grid
+that leave no gaps have about two in a step."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -127,6 +142,76 @@ def unusable_rows(raw: RawSplat) -> dict[str, Bool[np.ndarray, " N"]]:
         defects[name] = defects[name] & ~reported_rows
         reported_rows = reported_rows | defects[name]
     return defects
+
+
+def linear_columns(raw: RawSplat) -> dict[str, str]:
+    """Which of "scales" and "opacities" are stored as they are, where logarithms and logits are expected, and why.
+
+    Scales, if all are 0 or more, and read as logarithms are over `OVERLAP` times the distance between Gaussians, but
+    not as lengths. Opacities, if all lie in [0, 1]: as logits they would all be between 0.5 and 0.73.
+    """
+    columns: dict[str, str] = {}
+    if len(raw) < ENOUGH or not np.isfinite(raw.means).all():
+        return columns
+    if raw.log_scales.min() >= 0 and raw.log_scales.max() < np.inf:
+        from scipy.spatial import cKDTree
+
+        rows = even_indices(len(raw), SAMPLE)
+        apart = float(np.median(cKDTree(raw.means).query(raw.means[rows], k=2)[0][:, 1]))
+        length = float(np.median(raw.log_scales))
+        if length < OVERLAP * apart < math.exp(min(length, LOGIT_LIMIT)):
+            columns["scales"] = f"all are 0 or more, and e^scale is {math.exp(length) / apart:.3g} times the distance"
+            columns["scales"] += " between Gaussians"
+    logits = raw.logit_opacities
+    if logits.min() >= 0 and 0 < logits.max() <= 1:
+        columns["opacities"] = f"all are between {logits.min():.3g} and {logits.max():.3g}"
+    return columns
+
+
+def odd_values(raw: RawSplat) -> list[str]:
+    """What is wrong with values that can be read, and what to do: scales or opacities that are not logarithms and
+    logits, and coordinates that were rounded to steps as large as Gaussians. Nothing of a good splat."""
+    columns = linear_columns(raw)
+    odd = [
+        f"{name} seem to be stored as they are, not as {'logarithms' if name == 'scales' else 'logits'} ({why}); "
+        "gsencoder repair with fix=[activated] converts them"
+        for name, why in columns.items()
+    ]
+    sample = raw.select(even_indices(len(raw), SAMPLE))
+    positions, stored = sample.means, sample.log_scales[np.isfinite(sample.log_scales)]
+    if len(raw) < ENOUGH or not np.isfinite(positions).all() or not len(stored):
+        return odd
+    middle = float(np.median(stored))
+    scale = middle if "scales" in columns else math.exp(min(middle, LOGIT_LIMIT))
+    steps = [_step(positions[:, axis], scale) for axis in range(3)]
+    if any(steps):
+        axis = int(np.argmax(steps))
+        far = np.round(np.median(positions, axis=0), -3) + 0.0
+        cause = (
+            f"so far from zero float32 has no finer ones: export again with an offset of about {far.tolist()} "
+            "subtracted in double precision"
+            if far.any()
+            else "export again without rounding"
+        )
+        odd.append(
+            f"positions were rounded to steps of {steps[axis]:.3g} along {'xyz'[axis]}, {steps[axis] / scale:.2g} times "
+            f"the median scale; {cause} (the digits are not in this file)"
+        )
+    return odd
+
+
+def _step(values: Float64[np.ndarray, " n"], scale: float) -> float:
+    """The step of coordinates that is coarse beside a scale; 0 where there is none."""
+    step = float(np.spacing(np.float32(np.median(np.abs(values)))))
+    if step > COARSE * scale and (values == values.astype(np.float32)).all():
+        return step
+    levels = np.unique(values)
+    if not 4 <= len(levels) <= len(values) / 4:
+        return 0.0
+    gaps = np.diff(levels)
+    multiples = gaps / gaps.min()
+    regular = np.abs(multiples - np.round(multiples)).max() < 0.01
+    return float(gaps.min()) if regular and gaps.min() > COARSE_LATTICE * scale else 0.0
 
 
 def check_expansion(path: Path, unpacked: int, size: int) -> None:

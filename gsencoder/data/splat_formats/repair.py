@@ -11,6 +11,10 @@ Four kinds of rows cannot become Gaussians and stop loading; three more are odd 
     duplicates   every stored value equal to an earlier row's                fix: row dropped
     floaters     distance from the median point above 10 times the 90th      fix: row dropped
                  percentile of all distances
+
+Values of all rows may be stored otherwise than a splat's are; `odd_values` says so, and one of these can be mended:
+
+    activated    scales that are no logarithms, opacities that are no logits     fix: converted
 """
 
 from collections.abc import Sequence
@@ -21,10 +25,20 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt64
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.splat_formats.raw import LOGIT_LIMIT, RawSplat, opacities_from_logits, unusable_rows
+from gsencoder.data.splat_formats.raw import (
+    LOGIT_LIMIT,
+    RawSplat,
+    linear_columns,
+    logits_from_opacities,
+    logs_from_scales,
+    odd_values,
+    opacities_from_logits,
+    unusable_rows,
+)
 
 BLOCKING = ("nonfinite", "quats", "scales", "opacities")
-FIXES = (*BLOCKING, "huge", "duplicates", "floaters")
+OF_ROWS = (*BLOCKING, "huge", "duplicates", "floaters")
+FIXES = ("activated", *OF_ROWS)
 SMALLEST_SCALE = 1e-9
 FLOATER_FACTOR = 10.0
 _QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
@@ -33,7 +47,7 @@ _SHOWN = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Defect:
-    """One kind of defect: its name in `FIXES`, how many rows have it, the first of them, and if it stops loading."""
+    """One kind of defect: its name in `OF_ROWS`, how many rows have it, the first of them, and if it stops loading."""
 
     name: str
     count: int
@@ -54,7 +68,8 @@ class SplatReport:
         median_scale: median over all axes of all Gaussians, None where there is none or it is infinite.
         opacity_quantiles: opacity by quantile, "0.0" to "1.0".
         unused: parts of the file that were not read.
-        defects: every kind that occurs, in the order of `FIXES`.
+        defects: every kind that occurs, in the order of `OF_ROWS`.
+        findings: of `odd_values`.
     """
 
     count: int
@@ -68,6 +83,7 @@ class SplatReport:
     opacity_quantiles: dict[str, float]
     defects: tuple[Defect, ...]
     unused: tuple[str, ...] = ()
+    findings: tuple[str, ...] = ()
 
     @property
     def loadable(self) -> bool:
@@ -118,7 +134,7 @@ def inspect_splat(raw: RawSplat) -> SplatReport:
     median_scale = float(np.exp(np.float64(np.median(scales)))) if scales.size else np.inf
     quantiles = np.quantile(opacities, _QUANTILES) if len(opacities) else ()
     defects = []
-    for name in FIXES:
+    for name in OF_ROWS:
         rows = np.flatnonzero(_find(name, raw, unusable))
         if rows.size:
             first = tuple(map(int, rows[:_SHOWN]))
@@ -135,6 +151,7 @@ def inspect_splat(raw: RawSplat) -> SplatReport:
         opacity_quantiles={str(q): float(value) for q, value in zip(_QUANTILES, quantiles, strict=False)},
         defects=tuple(defects),
         unused=raw.unused,
+        findings=tuple(odd_values(raw)),
     )
 
 
@@ -160,6 +177,14 @@ def repair_splat(raw: RawSplat, fixes: Sequence[str]) -> tuple[RawSplat, RepairR
 
 
 def _mend(fix: str, raw: RawSplat) -> tuple[RawSplat, list[RepairChange]]:
+    if fix == "activated":
+        columns = linear_columns(raw)
+        if "scales" in columns:
+            raw = replace(raw, log_scales=logs_from_scales(raw.log_scales))
+        if "opacities" in columns:
+            raw = replace(raw, logit_opacities=logits_from_opacities(raw.logit_opacities))
+        names = " and ".join(columns) or "scales and opacities"
+        return raw, [RepairChange(fix=fix, count=len(raw) if columns else 0, action=f"{names} converted")]
     rows = _find(fix, raw, unusable_rows(raw))
     count = int(rows.sum())
     if fix == "quats":

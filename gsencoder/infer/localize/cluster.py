@@ -12,8 +12,8 @@ computed on a grid of eps / 4."""
 NEIGHBOR_CELLS = 4.2
 """Volume of a ball of radius eps, in cubes of edge eps."""
 RADII, GROWTH = 6, 2**0.5
-"""`cluster_by_gaps` compares this many radii, each this factor above the one before: 1 to 5.7 times the smallest. Things
-of one name stood 16 spacings apart or more in house rooms; parts of one thing that is fitted or seen in patches come
+"""`cluster_by_gaps` compares this many radii, each this factor above the one before: 1 to 5.7 times the smallest.
+Things of one name stood 16 spacings apart or more in house rooms; parts of one thing that is fitted or seen in patches come
 together at 2 to 6 spacings."""
 SPARSE_RADII = 8
 """Where the smallest radius leaves three of four points without a cluster, it grows by at most this many steps (16
@@ -21,7 +21,7 @@ times)."""
 LARGE = 0.05
 """Clusters with this share of the largest one's points are counted; less are floaters."""
 COARSE = 10
-"""Above the smallest radius, neighbors are held for `MAX_NEIGHBORS` / this, since only the number of clusters counts."""
+"""Above the smallest radius, neighbors are held for `MAX_NEIGHBORS` / this, as only the number of clusters counts."""
 
 
 def cluster_by_gaps(points: Float32[np.ndarray, "n 3"], smallest: float, min_samples: int) -> Int64[np.ndarray, " n"]:

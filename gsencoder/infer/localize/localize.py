@@ -104,7 +104,6 @@ class LocalizeConfig:
         if not 0 <= self.min_probability <= 1:
             raise InputError(f"min_probability: expected a probability in [0, 1], got {self.min_probability}")
 
-
     @property
     def follows_gaps(self) -> bool:
         """Whether each word has a radius of its own (`gsencoder.infer.localize.cluster.cluster_by_gaps`)."""
