@@ -215,7 +215,8 @@ def main() -> None:
         for case, check in checks:
             for finding in check.findings:
                 print(
-                    f"accused: {case.scene}, views {case.rows.tolist()}: {finding.cause} {finding.view}: {finding.message}"
+                    f"accused: {case.scene}, views {case.rows.tolist()}: "
+                    f"{finding.cause} {finding.view}: {finding.message}"
                 )
         figures[f"{kind}"] = len(checks)
         figures[f"{kind} accused"] = sum(bool(check.findings) for _, check in checks)

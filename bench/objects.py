@@ -4,8 +4,8 @@
         [--rooms FILE …]
 
 Objects are pieces of furniture of Debian's `sweethome3d-furniture` (their surfaces sampled evenly, whatever covers
-them), the splats of the fixtures, and instances cut from the seeds of house rooms. Rooms are seeds of house rooms, of the
-kitchen, of synthetic rooms, and of a corridor; rooms without a side or a ceiling, and halves. Each is turned by chance,
+them), the splats of the fixtures, and instances cut from the seeds of house rooms. Rooms are seeds of house rooms, of
+the kitchen, of synthetic rooms, and of a corridor; rooms without a side or a ceiling, and halves. Each is turned by chance,
 every other one about its vertical only; none says which way is up. Wrong are a room from around, an object from inside,
 and a camera within an object.
 

@@ -1,8 +1,8 @@
 """Is a bare splat a room or an object? Its free space says: what encloses it, and what stands in it.
 
 A cupboard, a bust or a box is as closed as a room, so that being enclosed is not enough. Rays in 26 directions through
-a coarse grid tell rooms apart in two ways. A scan without a ceiling is flat and open: most of its surface is free on one
-side, and no part of its space is enclosed. A room with walls has one large space, and something stands in it: rays that
+a coarse grid tell rooms apart in two ways. A scan without a ceiling is flat and open: most of its surface is free on
+one side, and no part of its space is enclosed. A room with walls has one large space, and something stands in it: rays that
 leave this space at a surface enter the same space again behind it. They do not where an empty shell ends.
 """
 
@@ -35,8 +35,8 @@ ENCLOSED = 0.65
 """Share of the directions in which a free cell's rays end at a surface, from which on the cell is enclosed."""
 OPEN_FLATNESS, OPEN_SURFACES, OPEN_SPACE = 0.35, 0.5, 0.3
 """An open scan's smallest side is at most this share of its largest one; rays from its surfaces get out in at least
-this share of the directions; and at most this share of it is one enclosed space. House rooms have 0.06 to 0.3, 0.53 to 0.68
-and 0.0 to 0.12; a window has 0.13, 0.58 and 0.47, a bowl 0.41, 0.48 and 0.0."""
+this share of the directions; and at most this share of it is one enclosed space. House rooms have 0.06 to 0.3, 0.53 to
+0.68 and 0.0 to 0.12; a window has 0.13, 0.58 and 0.47, a bowl 0.41, 0.48 and 0.0."""
 ROOM_FLATNESS = 0.55
 """A room with walls is at most this high, as a share of its length."""
 ROOM_SPACE, ROOM_SURFACES, ROOM_CONTENT = 0.3, 0.36, 0.01
@@ -132,7 +132,7 @@ def _frame(gaussians: Gaussians, means: Float64[np.ndarray, "n 3"]) -> Float64[n
     return min(candidates, key=lambda axes: float(np.prod(np.ptp(np.quantile(means @ axes.T, EXTENT, axis=0), axis=0))))
 
 
-def _slices(direction: tuple[int, int, int], *grids: np.ndarray) -> Iterator[tuple[tuple[int, int], list[np.ndarray]]]:
+def _slices(direction: tuple[int, ...], *grids: np.ndarray) -> Iterator[tuple[tuple[int, int], list[np.ndarray]]]:
     """Slices of grids across an axis of the direction, the one that rays reach last first; each with the step within
     slices to the next cell of a ray."""
     axis = next(number for number in range(3) if direction[number])

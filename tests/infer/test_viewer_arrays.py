@@ -181,7 +181,8 @@ def test_the_page_computes_with_the_settings_of_the_search(search: SceneSearch) 
     other = SceneSearch(shown=replace(search.shown, scene=scene), words=search.words, config=config)
     made = read_container(file_container(other, (), replace(OPTIONS, photographs=0)).to_bytes())
     assert made.meta["localize"] == {
-        "eps": pytest.approx(2.5 * other.spacing), "followsGaps": False, "minSamples": 4, "minShare": 0.11, "minWeight": 0.2, "maxBoxes": 7,
+        "eps": pytest.approx(2.5 * other.spacing), "followsGaps": False,
+        "minSamples": 4, "minShare": 0.11, "minWeight": 0.2, "maxBoxes": 7,
         "minProbability": 0.03,
         "threshold": {"kind": "quantile", "fixed": 0.7, "relative": 0.4, "noise": 3.5, "quantile": 0.93},
     }  # fmt: skip

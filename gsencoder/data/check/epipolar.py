@@ -85,8 +85,8 @@ class EpipolarCheck:
         share: of the matches that lie within `TOLERANCE`.
         best_error: the same under the reading that fits best, over the pairs that count.
         findings: what is wrong.
-        decided: False if there are too few pairs to say anything, or most of the matches do not fit and it cannot be said
-            why.
+        decided: False if there are too few pairs to say anything, or most of the matches do not fit and it cannot be
+            said why.
         worst: the pair with the largest error, for a picture; None without pairs.
         cameras: of the views that were looked at, at the size of the matched pictures, as the files give them.
     """
@@ -290,8 +290,8 @@ def _fits(cameras: Cameras, pair: PairMatches, limit: float) -> bool:
 
 
 def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequence[str], limit: float) -> list[Finding]:
-    """Views whose nearest pairs do not fit, those of the others do, and which have another pose that fits; of fewer than
-    four views it cannot be said which one it is."""
+    """Views whose nearest pairs do not fit, those of the others do, and which have another pose that fits; of fewer
+    than four views it cannot be said which one it is."""
     findings: list[Finding] = []
     remaining = [(pair, _fits(cameras, pair, limit)) for pair in matches]
     views = {view for pair in matches for view in (pair.first, pair.second)}
@@ -308,7 +308,7 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
             error, usual = mean_error(cameras, own), mean_error(cameras, near_pairs(cameras, [p for p, _ in others]))
             if error > max(STRAY_ERROR, STRAY_FACTOR * usual):
                 suspects.append((error, usual, view, own))
-        for error, usual, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
+        for error, _, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
             moved = fit_pose_to_matches(cameras, view, own)
             fitting = sum(_fits(moved, pair, limit) for pair in own)
             if (
@@ -331,8 +331,8 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
 def fit_pose_to_matches(cameras: Cameras, view: int, matches: Sequence[PairMatches]) -> Cameras:
     """The cameras with the pose of one view under which its matches lie nearest to their epipolar lines.
 
-    Its turn against each other view comes from the essential matrix of the pair; it stands where the directions of two of
-    them meet, or where it is said to be, or where one of the others is. The best of these is refined.
+    Its turn against each other view comes from the essential matrix of the pair; it stands where the directions of two
+    of them meet, or where it is said to be, or where one of the others is. The best of these is refined.
 
     Args:
         cameras: at the size of the matched pictures.

@@ -137,8 +137,8 @@ def _pose_file(model: Path) -> str:
 def _image_lines(file: Path) -> tuple[list[str], bool]:
     """The lines of an images.txt, two for each image, and whether the file itself has them.
 
-    pycolmap takes the line after an image for its points, whatever it holds. Where no image has points, every line is an
-    image, and empty ones may be missing.
+    pycolmap takes the line after an image for its points, whatever it holds. Where no image has points, every line is
+    an image, and empty ones may be missing.
 
     Raises:
         InputError: a line that is no image, a pose that is not finite, or an image in the line of another one's points;

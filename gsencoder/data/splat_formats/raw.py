@@ -194,8 +194,8 @@ def odd_values(raw: RawSplat) -> list[str]:
             else "export again without rounding"
         )
         odd.append(
-            f"positions were rounded to steps of {steps[axis]:.3g} along {'xyz'[axis]}, {steps[axis] / scale:.2g} times "
-            f"the median scale; {cause} (the digits are not in this file)"
+            f"positions were rounded to steps of {steps[axis]:.3g} along {'xyz'[axis]}, {steps[axis] / scale:.2g} "
+            f"times the median scale; {cause} (the digits are not in this file)"
         )
     return odd
 

@@ -13,8 +13,8 @@ NEIGHBOR_CELLS = 4.2
 """Volume of a ball of radius eps, in cubes of edge eps."""
 RADII, GROWTH = 6, 2**0.5
 """`cluster_by_gaps` compares this many radii, each this factor above the one before: 1 to 5.7 times the smallest.
-Things of one name stood 16 spacings apart or more in house rooms; parts of one thing that is fitted or seen in patches come
-together at 2 to 6 spacings."""
+Things of one name stood 16 spacings apart or more in house rooms; parts of one thing that is fitted or seen in patches
+come together at 2 to 6 spacings."""
 SPARSE_RADII = 8
 """Where the smallest radius leaves three of four points without a cluster, it grows by at most this many steps (16
 times)."""
