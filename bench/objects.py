@@ -5,9 +5,9 @@
 
 Objects are pieces of furniture of Debian's `sweethome3d-furniture` (their surfaces sampled evenly, whatever covers
 them), the splats of the fixtures, and instances cut from the seeds of house rooms. Rooms are seeds of house rooms, of
-the kitchen, of synthetic rooms, and of a corridor; rooms without a side or a ceiling, and halves. Each is turned by chance,
-every other one about its vertical only; none says which way is up. Wrong are a room from around, an object from inside,
-and a camera within an object.
+the kitchen, of synthetic rooms, and of a corridor; rooms without a side or a ceiling, and halves. Each is turned by
+chance, every other one about its vertical only; none says which way is up. Wrong are a room from around, an object from
+inside, and a camera within an object.
 
 --more takes so many other pieces by chance. --fit photographs pieces from around (40 pictures), reconstructs them in
 FOLDER with `gsencoder reconstruct`, where they are not there yet, and judges these too. --objects and --rooms are other

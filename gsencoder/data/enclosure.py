@@ -2,8 +2,8 @@
 
 A cupboard, a bust or a box is as closed as a room, so that being enclosed is not enough. Rays in 26 directions through
 a coarse grid tell rooms apart in two ways. A scan without a ceiling is flat and open: most of its surface is free on
-one side, and no part of its space is enclosed. A room with walls has one large space, and something stands in it: rays that
-leave this space at a surface enter the same space again behind it. They do not where an empty shell ends.
+one side, and no part of its space is enclosed. A room with walls has one large space, and something stands in it: rays
+that leave this space at a surface enter the same space again behind it. They do not where an empty shell ends.
 """
 
 from collections.abc import Iterator
