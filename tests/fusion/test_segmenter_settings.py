@@ -184,5 +184,5 @@ def test_a_file_of_names_is_no_larger_than_four_megabytes(tmp_path: Path) -> Non
     path.write_bytes(b"a\nb\n".ljust(MAX_CLASSES_BYTES))
     assert read_classes(path) == ("a", "b")
     path.write_bytes(b"a\nb\n".ljust(MAX_CLASSES_BYTES + 1))
-    with pytest.raises(InputError, match="holds more than 4,194,304 bytes"):
+    with pytest.raises(InputError, match="at most 4,194,304 are read"):
         read_classes(path)

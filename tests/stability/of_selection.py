@@ -88,14 +88,15 @@ def cluster_errors(points: np.ndarray, labels: np.ndarray, eps: float, count: in
     "splat",
     domain="any origin that float32 resolves the scene at; distances from 1e-6 to 1e9 times the radius",
     promise=0.0,
-    measure="share of the points that are together, apart or noise against the rule",
+    measure="share of the points that are against the rule for every radius within the rounding of their coordinates",
     oracle="all pairs, in longdouble",
 )
 def dbscan_error(case: Case) -> float:
     points = few(case).gaussians.means
     errors = []
+    rounding = 4 * float(np.spacing(np.abs(points).max(initial=0)))
     for eps in (3 * case.voxel, 1e-6 * case.voxel):
-        errors.append(cluster_errors(points, cluster(points, eps, 4), eps, 4))
+        errors.append(cluster_errors(points, cluster(points, eps, 4), eps, 4, slack=rounding / eps))
     return max(errors)
 
 

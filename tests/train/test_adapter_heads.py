@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from textured_box import box_cameras
 from torch import nn
 
 from gsencoder.core.errors import InputError
@@ -30,7 +31,7 @@ from gsencoder.train.adapter_heads import (
 )
 from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.sampled_maps import sampled_maps, views_of_scenes
-from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace
+from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Views
 
 SPACE = FeatureSpace(name="s", channels=6)
 
@@ -136,6 +137,11 @@ class MapTeacher:
 
     space = SPACE
     asked = 0
+    table = mean = None
+    needs_images = cheap = False
+
+    def settings(self) -> dict[str, Any]:
+        return {}
 
     def feature_map(self, views: Any, view: int) -> FeatureMap:
         MapTeacher.asked += 1
@@ -147,7 +153,7 @@ class MapTeacher:
 class ThreeViews:
     """A scene with three views, of which nothing is looked at."""
 
-    views = (0, 1, 2)
+    views = Views(cameras=box_cameras(3, width=8, height=6, focal=5.0), names=("0", "1", "2"))
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, ClassVar
 
 import pytest
 from tuning_pairs import SHORT, make_pairs
@@ -96,6 +97,8 @@ def test_without_peft_a_sentence_says_so(model: Path, monkeypatch: pytest.Monkey
 
 class Broken:
     """Something whose files cannot be written."""
+
+    peft_config: ClassVar[dict[str, Any]] = {}
 
     def __init__(self, error: Exception) -> None:
         self.error = error

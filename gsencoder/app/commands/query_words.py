@@ -37,6 +37,8 @@ def _lines_of(file: Path) -> list[str]:
     """The lines of a text file, which may begin with a byte order mark."""
     try:
         return read_foreign_text(file, MAX_QUERIES_BYTES).splitlines()
+    except InputError as error:
+        raise InputError(f"queries: {error}") from error
     except (OSError, ValueError) as error:
         raise InputError(f"queries: {file} cannot be read as text: {error}") from error
 

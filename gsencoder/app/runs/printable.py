@@ -7,14 +7,14 @@ MAX_LINE, END_OF_LINE = 2000, 500
 
 
 def printable(text: str) -> str:
-    """Replaces characters that control a terminal instead of being shown: control characters, lone surrogates, and
-    overrides of the direction of writing."""
+    """Replaces control characters and overrides of the direction of writing, which change what a terminal displays; lone
+    surrogates, bytes of file names that are not UTF-8, are escaped."""
     direction_overrides = {*map(chr, range(0x202A, 0x202F)), *map(chr, range(0x2066, 0x206A))}
     return "".join(
         "\N{REPLACEMENT CHARACTER}"
-        if letter in direction_overrides or (unicodedata.category(letter) in ("Cc", "Cs") and letter not in "\n\t")
+        if letter in direction_overrides or (unicodedata.category(letter) == "Cc" and letter not in "\n\t")
         else letter
-        for letter in text.replace("\r\n", "\n")
+        for letter in text.replace("\r\n", "\n").encode(errors="backslashreplace").decode()
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
-from gsencoder.core.files.foreign_file import read_foreign
+from gsencoder.core.files.foreign_file import read_foreign_text
 
 MAX_CLASSES_BYTES = 1 << 22
 
@@ -53,9 +53,10 @@ def read_classes(path: Path) -> tuple[str, ...]:
         InputError: the file is none of these, or a name is empty.
     """
     try:
-        data = read_foreign(path, MAX_CLASSES_BYTES)
-        text = data.decode("utf-8-sig")
+        text = read_foreign_text(path, MAX_CLASSES_BYTES)
         values = json.loads(text) if path.suffix.lower() == ".json" else text.splitlines()
+    except InputError as error:
+        raise InputError(f"teacher.classes: {error}") from error
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"teacher.classes: {path} cannot be read: {str(error)[:80]}") from error
     if isinstance(values, dict):
@@ -65,6 +66,4 @@ def read_classes(path: Path) -> tuple[str, ...]:
         values = [line for line in values if line.strip()]
     if not isinstance(values, list) or not all(isinstance(name, str) and name.strip() for name in values):
         raise InputError(f"teacher.classes: {path}: expected a list of names, in the order of the network's classes")
-    if len(data) > MAX_CLASSES_BYTES:
-        raise InputError(f"teacher.classes: {path} holds more than {MAX_CLASSES_BYTES:,} bytes")
     return tuple(name.strip() for name in values)

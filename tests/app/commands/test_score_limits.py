@@ -118,7 +118,7 @@ def test_a_mask_that_is_a_link_to_itself_and_a_pipe_are_refused(
     assert "s.txt: line 1: the mask 'masks/0.txt' cannot be read" in refusal(capsys, *words)
     mask.unlink()
     os.mkfifo(mask)
-    assert "is no ordinary file" in refusal(capsys, *words)
+    assert "is not a regular file" in refusal(capsys, *words)
 
 
 def test_scenes_without_captions_are_refused_or_count_as_empty(
