@@ -29,7 +29,7 @@ MAX_GAUSSIANS = 200_000
 """Of more Gaussians, a random choice of so many fills cells."""
 MAX_FRAME_MEANS, STARTS = 5000, 4
 """Means and normals of which the grid's axes are fitted, and random axes from which on."""
-FILLED = 0.1
+FILLED = 0.05
 """Area of the discs in a cell, in areas of its side, from which on the cell is a surface."""
 ENCLOSED = 0.65
 """Share of the directions in which a free cell's rays end at a surface, from which on the cell is enclosed."""

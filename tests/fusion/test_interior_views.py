@@ -70,7 +70,11 @@ def test_a_splat_without_any_room_refuses_cameras_inside(rng: np.random.Generato
 
 
 def test_where_cameras_stand_can_be_stated(rng: np.random.Generator) -> None:
-    scene = Scene(name="room", gaussians=box_of_discs(rng, (5.0, 4.0, 2.5)), up=UP)
+    walls, shelf = box_of_discs(rng, (5.0, 4.0, 2.5)), box_of_discs(rng, (2.0, 0.3, 1.5))
+    shelf = replace(shelf, means=shelf.means + np.float32([0.3, 0.4, -0.4]))
+    names = ("means", "quats", "scales", "opacities", "sh")
+    both = {name: np.concatenate((getattr(walls, name), getattr(shelf, name))) for name in names}
+    scene = Scene(name="room", gaussians=Gaussians(**both), up=UP)
     for cameras, begin in (("auto", "inside_000"), ("inside", "inside_000"), ("around", "orbit_000")):
         views = with_views(scene, 6, cameras=cameras).views  # type: ignore[arg-type]
         assert views is not None
