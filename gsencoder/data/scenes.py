@@ -68,6 +68,10 @@ class SceneConfig:
             "taken for empty space; none = photographs are used as they are (transparency is masked in any case)"
         },
     )
+    check_fit: bool = field(
+        default=True,
+        metadata={"help": "refuse a splat that does not fit the photographs, where it fits in another frame"},
+    )
     intrinsics: tuple[float, float, float, float] | None = field(
         default=None,
         metadata={"help": "fx, fy, cx, cy of the photographs, pixels, no distortion; empty = those of the files"},

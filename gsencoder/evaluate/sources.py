@@ -9,6 +9,7 @@ from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
+from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.heads.apply import head_features
 from gsencoder.fusion.heads.measure import HeadSet, MeasuredHead, measure_heads
@@ -149,7 +150,7 @@ def load_scenes(
     """
     for path in track([Path(path) for path in paths], "scenes"):
         start = time.perf_counter()
-        scene = load_scene(path, splat=splat or None, options=data)
+        scene = with_fitting_splat(load_scene(path, splat=splat or None, options=data), splat, data)
         yield scene, time.perf_counter() - start
 
 

@@ -11,6 +11,7 @@ from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import READABLE
+from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits, with_views
 from gsencoder.fusion.store.folder import TEACHER_NAME
 from gsencoder.fusion.teachers import MissingInput, Teacher
@@ -124,6 +125,7 @@ class SceneReader:
         """A scene with views, as it is on disk; cameras are placed in a splat without any."""
         config = self.config
         scene = load_scene(path, splat=config.splat or None, options=config.data)
+        scene = with_fitting_splat(scene, config.splat, config.data)
         if scene.views is None:
             scene = with_views(scene, config.orbits, config.prepare.fusion.blend, cameras=config.cameras)
         return scene

@@ -110,6 +110,10 @@ def run(config: EncodeCommandConfig, summary: Summary) -> None:
         with output_folder(out, overwrite=config.overwrite, summary=scene_summary) as folder:
             with scene_summary.step("load"):
                 scene = load_scene(path, splat=config.splat or None, options=config.data)
+                if config.splat and scene.views is not None:
+                    from gsencoder.fusion.fit import with_fitting_splat  # with torch
+
+                    scene = with_fitting_splat(scene, config.splat, config.data)
             if scene.gaussians is None:
                 with scene_summary.step("seeds"):
                     scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))

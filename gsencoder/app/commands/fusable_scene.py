@@ -9,6 +9,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.orbit_views import INSIDE, CamerasOfSplat, with_views
 from gsencoder.render import BlendConfig
 from gsencoder.types import Scene
@@ -48,6 +49,7 @@ def load_fusable(
         scene = load_scene(path, splat=splat or None, options=data)
     with summary.step("check"):
         warn_of_faults(scene)
+        scene = with_fitting_splat(scene, splat, data)
     if scene.views is None and labels:
         raise InputError(
             f"{path}: a splat without views has no labels for teacher=labels; give a teacher that looks at pictures, "

@@ -27,6 +27,7 @@ from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splats import READABLE, save_splat
 from gsencoder.data.video.frames import RECORD_FILE, VideoConfig
+from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.infer.draw.pictures import contact_sheet
 from gsencoder.reconstruct.budget import choose_scale
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, IMAGE_SCALE, image_scale_of
@@ -99,6 +100,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
         summary.add_seconds(opened.seconds)
         with summary.step("check"):
             warn_of_faults(opened.scene)
+            opened = replace(opened, scene=with_fitting_splat(opened.scene, config.splat, config.data))
         if opened.sfm is not None:
             sfm = opened.sfm
             summary.results.update(placed=len(sfm.placed), missing=list(sfm.missing), sfm_error=sfm.error)
