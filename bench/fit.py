@@ -103,7 +103,11 @@ def main() -> None:
         print(f"{name}: {dict(counts)}")
     write_figures(
         args.json,
-        {"good": dict(good), "smallest": min(correlations), "wrong": {name: dict(each) for name, each in wrong.items()}},
+        {
+            "good": dict(good),
+            "smallest": min(correlations),
+            "wrong": {name: dict(each) for name, each in wrong.items()},
+        },
     )
 
 

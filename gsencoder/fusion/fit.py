@@ -34,7 +34,7 @@ choose views."""
 EDGES = (1.0, 4.0)
 """Standard deviations of the band pass, pixels of the small pictures."""
 FITS, CLEAR, BETTER = 0.45, 0.5, 0.2
-"""Correlation from which on a splat fits; and that of another frame that is named, which must also be better by this."""
+"""Correlation from which on a splat fits; that of another frame which is named, and by how much it must be better."""
 COVERED, CONTRAST = 0.04, 0.01
 """Views with a smaller opaque share, or whose photograph has less contrast there, say nothing."""
 

@@ -7,8 +7,8 @@ MAX_LINE, END_OF_LINE = 2000, 500
 
 
 def printable(text: str) -> str:
-    """Replaces control characters and overrides of the direction of writing, which change what a terminal displays; lone
-    surrogates, bytes of file names that are not UTF-8, are escaped."""
+    """Replaces control characters and overrides of the direction of writing, which change what a terminal displays, and
+    escapes lone surrogates, which are bytes of file names that are not UTF-8."""
     direction_overrides = {*map(chr, range(0x202A, 0x202F)), *map(chr, range(0x2066, 0x206A))}
     return "".join(
         "\N{REPLACEMENT CHARACTER}"
