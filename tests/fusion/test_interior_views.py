@@ -70,7 +70,7 @@ def test_a_splat_without_any_room_refuses_cameras_inside(rng: np.random.Generato
 
 
 def test_where_cameras_stand_can_be_stated(rng: np.random.Generator) -> None:
-    walls, shelf = box_of_discs(rng, (5.0, 4.0, 2.5)), box_of_discs(rng, (2.0, 0.02, 1.5))
+    walls, shelf = box_of_discs(rng, (5.0, 4.0, 2.5)), box_of_discs(rng, (2.0, 0.02, 1.5), 400)
     shelf = replace(shelf, means=shelf.means + np.float32([0.3, 0.4, -0.4]))
     names = ("means", "quats", "scales", "opacities", "sh")
     both = {name: np.concatenate((getattr(walls, name), getattr(shelf, name))) for name in names}
