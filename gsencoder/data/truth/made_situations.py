@@ -26,6 +26,8 @@ SMALLEST_PLACE = 0.5
 """Meters across the box of what one stands at."""
 CLEAR_ANGLE = np.radians(20)
 CLEAR_DISTANCE = 0.5
+MAX_TRIPLES = 50_000
+"""Triples of things that are tried: all of 36 things, a random choice of more."""
 
 
 def make_situations(scenes: Iterable[SeenScene], *, seed: int = 0, per_kind: int = 10) -> tuple[Question, ...]:
@@ -56,22 +58,23 @@ def _of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
         for scene_object in single
         if np.linalg.norm(scene_object.aabb_max - scene_object.aabb_min) >= SMALLEST_PLACE
     ]
-    triples = [
-        each for each in product(landmarks, single, single) if len({scene_object.id for scene_object in each}) == 3
-    ]
-    shuffled = [triples[row] for row in rng.permutation(len(triples))]
+    shuffled = _shuffled_triples(landmarks, single, rng)
     sides: dict[str, list[Question]] = {"left": [], "right": []}
     nearer: list[Question] = []
     pairs: set[tuple[int, int]] = set()
     for at, facing, other in shuffled:
+        if min(map(len, sides.values())) == per_kind // 2:
+            break
         side = side_of(at, facing, other)
         if side is not None and len(sides[side]) < per_kind // 2 and (at.id, other.id) not in pairs:
             pairs.add((at.id, other.id))
             text = f"Is the {other.name} on my left or on my right?"
             sides[side].append(_question(scene, at, facing, [other], text, side))
     for number, (at, near, other) in enumerate(shuffled):
+        if len(nearer) == per_kind:
+            break
         first, second = gap(at, near), gap(at, other)
-        if first > second or (at.id, near.id) in pairs or len(nearer) == per_kind:
+        if first > second or (at.id, near.id) in pairs:
             continue
         if clearly_nearer(first, second) and second - first >= CLEAR_DISTANCE:
             pairs.add((at.id, near.id))
@@ -87,6 +90,20 @@ def _of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
         replace(each, id=f"{scene.name}-{kind}-{row}")
         for row, (kind, each) in enumerate(zip(kinds, questions, strict=True))
     ]
+
+
+def _shuffled_triples(
+    landmarks: Sequence[SeenObject], single: Sequence[SeenObject], rng: np.random.Generator
+) -> list[tuple[SeenObject, SeenObject, SeenObject]]:
+    """A landmark and two other things, each another one, in random order; of very many a random choice."""
+    count = len(landmarks) * len(single) ** 2
+    if count <= MAX_TRIPLES:
+        triples = [each for each in product(landmarks, single, single) if len({one.id for one in each}) == 3]
+        return [triples[row] for row in rng.permutation(len(triples))]
+    numbers = rng.choice(count, MAX_TRIPLES, replace=False) if count < 2**24 else rng.integers(0, count, MAX_TRIPLES)
+    rows = np.unravel_index(numbers, (len(landmarks), len(single), len(single)))
+    chosen = [(landmarks[at], single[facing], single[other]) for at, facing, other in zip(*rows, strict=True)]
+    return [each for each in chosen if len({one.id for one in each}) == 3]
 
 
 def side_of(at: SeenObject, facing: SeenObject, other: SeenObject) -> str | None:
