@@ -44,6 +44,12 @@ def test_the_first_views_cover_most_and_one_that_adds_nothing_comes_last() -> No
     assert order[-1] == 1
 
 
+@pytest.mark.parametrize("weight", [0.01, 0.5, 1.0, 3.0])
+def test_a_view_of_the_same_gaussians_comes_after_one_that_shows_another(weight: float) -> None:
+    weights = weight * np.array([[1, 1, 1, 0], [1, 1, 1, 0], [0, 0, 0, 1]], np.float32)
+    assert view_order(weights, 4, 0.05).tolist() == [0, 2, 1]
+
+
 def test_views_by_coverage_see_more_than_evenly_spaced_ones() -> None:
     """All but two cameras stand together and look at one end; evenly spaced ones are of these."""
     scene = make_scene(n=600, count=9)
@@ -131,6 +137,33 @@ def test_balls_that_a_ray_meets_are_near_it_in_pictures_of_unequal_steps() -> No
             count = near_rays(centers, reaches, 1.0, parts, np.eye(4), K, 0.01, lattice, ends, shape, out)
             assert number in out[:count].tolist()
             assert 3 not in out[:count].tolist()
+
+
+def test_balls_are_near_every_square_that_they_touch_and_few_others(rng: np.random.Generator) -> None:
+    """Against points on their surfaces, at slants of up to 60 degrees and depths on both sides of 1."""
+    count = 60
+    depths = rng.uniform(0.3, 4, count)
+    centers = np.column_stack((*(rng.uniform(-1.2, 1.2, (2, count)) * depths), depths))
+    reaches = rng.uniform(0.02, 0.1, count) * depths
+    directions = rng.normal(size=(2000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    K, side = np.array([[200.0, 0, 256], [0, 300, 256], [0, 0, 1]]), 64
+    for number in range(count):
+        points = centers[number] + reaches[number] * directions
+        columns, rows = np.floor((points[:, :2] / points[:, 2:] * (200, 300) + 256) / 8).astype(int).T
+        inside = (columns >= 0) & (columns < side) & (rows >= 0) & (rows < side)
+        touched = set(zip(columns[inside].tolist(), rows[inside].tolist(), strict=True))
+        middle = (columns.min() + columns.max()) // 2, (rows.min() + rows.max()) // 2
+        width, height = columns.max() - columns.min() + 1, rows.max() - rows.min() + 1
+        apart = {(middle[0] + 2 * width + 3, middle[1]), (middle[0], middle[1] - 2 * height - 3)}
+        for square, found in [(each, True) for each in touched] + [(each, False) for each in apart]:
+            if not (0 <= square[0] < side and 0 <= square[1] < side):
+                continue
+            ends, out = np.zeros(side * side), np.zeros(1, np.int64)
+            ends[square[1] * side + square[0]] = 9.0
+            ball = centers[number : number + 1], reaches[number : number + 1]
+            lattice, shape, one = (0.0, 0.0, 1.0, 1.0), (side, side), np.array([[0, 1]])
+            assert bool(near_rays(*ball, 1.0, one, np.eye(4), K, 0.01, lattice, ends, shape, out)) == found
 
 
 def test_groups_count_as_much_as_single_gaussians() -> None:

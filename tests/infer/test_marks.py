@@ -65,6 +65,14 @@ def test_marks_of_small_things_stand_beside_them_with_a_line_to_them() -> None:
     assert (picture[115:126, 155:166] != 0).any()
 
 
+@pytest.mark.parametrize(("half", "on"), [(10, False), (14, True)])
+def test_a_mark_stands_on_a_thing_of_which_it_hides_a_quarter_at_most(half: int, on: bool) -> None:
+    """A disc has 154 pixels, the plates have 441 and 841."""
+    _, targets, b = scene((160.0, 120.0), half=half)
+    (disc,) = discs(draw_marks(BLACK, b, targets)[0], 1)
+    assert (np.abs(disc - (160, 120)).max() < half) == on
+
+
 @pytest.mark.parametrize("half", [4, 30])
 def test_no_mark_hides_another_or_leaves_the_picture(half: int) -> None:
     places = ((8.0, 8.0), (14.0, 10.0), (20.0, 12.0), (310.0, 232.0), (312.0, 120.0), (160.0, 236.0))
