@@ -200,7 +200,9 @@ def test_far_pairs_that_do_not_fit_accuse_nobody(cameras: Cameras, matches: list
     near = {(pair.first, pair.second) for pair in near_pairs(cameras, matches)}
     assert 3 <= len(near) < len(matches)
     wallpaper = [
-        pair if (pair.first, pair.second) in near else replace(pair, second_pixels=pair.second_pixels + (40, 25))
+        pair
+        if (pair.first, pair.second) in near
+        else replace(pair, second_pixels=pair.second_pixels + np.array([40, 25]))
         for pair in matches
     ]
     assert judged(cameras, wallpaper) == ([], True)
@@ -244,7 +246,6 @@ def test_nothing_is_said_on_little_evidence(cameras: Cameras, matches: list[Pair
 def test_poses_that_fit_nowhere_are_called_wrong_by_six_pairs_and_not_by_five(
     cameras: Cameras, matches: list[PairMatches]
 ) -> None:
-    rng = np.random.default_rng(3)
     poses = cameras.cam_from_world.astype(np.float64)
     poses[:, :3, :3] = Rotation.random(6, random_state=3).as_matrix() @ poses[:, :3, :3]
     wrong = with_poses(cameras, poses)
