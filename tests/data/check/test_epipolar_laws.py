@@ -1,4 +1,4 @@
-"""Matches of projected points, without photographs: distances from epipolar lines, readings, views astray."""
+"""Matches of projected points, without photographs: distances from epipolar lines, readings, views astray, evidence."""
 
 from dataclasses import replace
 
@@ -15,7 +15,10 @@ from gsencoder.data.check.epipolar import (
     _spread_triples,
     _stray_views,
     consistent_matches,
-    pair_errors,
+    fit_pose_to_matches,
+    judge_matches,
+    mean_error,
+    near_pairs,
 )
 from gsencoder.data.check.pose_readings import other_poses
 from gsencoder.data.seeding.feature_matches import PairMatches, epipolar_distances, fundamental_matrix
@@ -45,15 +48,53 @@ def with_poses(cameras: Cameras, poses: np.ndarray) -> Cameras:
     return replace(cameras, cam_from_world=poses.astype(np.float32))
 
 
+def turned(cameras: Cameras, degrees: dict[int, float]) -> Cameras:
+    """Some views turned about the diagonal of their pictures."""
+    poses = cameras.cam_from_world.astype(np.float64)
+    for view, size in degrees.items():
+        turn = np.eye(4)
+        turn[:3, :3] = Rotation.from_rotvec(np.deg2rad([size, size, 0])).as_matrix()
+        poses[view] = turn @ poses[view]
+    return with_poses(cameras, poses)
+
+
+def turned_to_error(cameras: Cameras, matches: list[PairMatches], view: int, error: float) -> Cameras:
+    """A view turned so far that the pairs by which it is judged have this mean error."""
+    own = [pair for pair in matches if view in (pair.first, pair.second)]
+    degrees, wrong = 1.0, cameras
+    for _ in range(20):
+        wrong = turned(cameras, {view: degrees})
+        degrees *= error / mean_error(wrong, near_pairs(wrong, own, view))
+    return wrong
+
+
+def shifted(pair: PairMatches, cameras: Cameras, pixels: float) -> PairMatches:
+    """The matches with half of those of the second view moved to the right and half to the left, to this mean error."""
+    size, moved = pixels, pair
+    for _ in range(20):
+        moved = replace(pair, second_pixels=pair.second_pixels + size * np.resize([1, -1], 60)[:, None] * (1, 0))
+        size *= pixels / mean_error(cameras, [moved])
+    return moved
+
+
+def astray(cameras: Cameras, matches: list[PairMatches], limit: float = 1.0) -> list[str | None]:
+    return [finding.view for finding in _stray_views(cameras, matches, NAMES, limit)]
+
+
+def judged(cameras: Cameras, matches: list[PairMatches]) -> tuple[list[tuple[str, str | None]], bool]:
+    check = judge_matches(matches, cameras, cameras, np.arange(6), NAMES)
+    return [(finding.cause, finding.view) for finding in check.findings], check.decided
+
+
 def test_matches_of_one_point_lie_on_their_lines_and_errors_are_clipped(
     cameras: Cameras, matches: list[PairMatches]
 ) -> None:
-    assert pair_errors(cameras, matches).max() < 0.01
+    assert max(mean_error(cameras, [pair]) for pair in matches) < 0.01
     far = replace(
         matches[0], second_pixels=matches[0].second_pixels + np.random.default_rng(0).normal(size=(60, 2)) * 1e4
     )
-    assert pair_errors(cameras, [far])[0] > 0.9 * CLIP
-    assert pair_errors(cameras, [far])[0] <= CLIP
+    assert 0.9 * CLIP < mean_error(cameras, [far]) <= CLIP
+    assert mean_error(cameras, [far, matches[1]]) == pytest.approx(mean_error(cameras, [far]) / 2, abs=0.01)
 
 
 def test_the_distance_from_a_line_is_the_larger_of_both() -> None:
@@ -102,45 +143,118 @@ def test_another_focal_length_is_read_back(cameras: Cameras, matches: list[PairM
 
 
 def test_two_views_astray_are_both_named_the_worse_one_first(cameras: Cameras, matches: list[PairMatches]) -> None:
-    poses = cameras.cam_from_world.astype(np.float64)
-    for view, size in ((1, 3.0), (4, 6.0)):
-        turn = np.eye(4)
-        turn[:3, :3] = Rotation.from_rotvec(np.deg2rad([size, size, 0])).as_matrix()
-        poses[view] = turn @ poses[view]
-    errors = pair_errors(with_poses(cameras, poses), matches)
-    assert [finding.view for finding in _stray_views(errors, matches, NAMES)] == ["4.png", "1.png"]
-    assert _stray_views(pair_errors(cameras, matches), matches, NAMES) == []
+    assert astray(turned(cameras, {1: 3.0, 4: 6.0}), matches) == ["4.png", "1.png"]
+    assert astray(cameras, matches) == []
 
 
 @pytest.mark.parametrize(("error", "named"), [(2.9, False), (3.1, True)])
-def test_a_view_is_astray_above_three_pixels(matches: list[PairMatches], error: float, named: bool) -> None:
-    errors = np.array([error if 2 in (pair.first, pair.second) else 0.5 for pair in matches])
-    assert bool(_stray_views(errors, matches, NAMES)) == named
-
-
-@pytest.mark.parametrize(("usual", "named"), [(2.0, True), (3.5, False)])
-def test_a_view_is_astray_above_three_times_what_is_usual(
-    matches: list[PairMatches], usual: float, named: bool
+def test_a_view_is_astray_above_three_pixels(
+    cameras: Cameras, matches: list[PairMatches], error: float, named: bool
 ) -> None:
-    errors = np.array([10.0 if 2 in (pair.first, pair.second) else usual for pair in matches])
-    assert bool(_stray_views(errors, matches, NAMES)) == named
+    assert astray(turned_to_error(cameras, matches, 2, error), matches) == ["2.png"] * named
 
 
-def test_of_few_views_none_is_astray(matches: list[PairMatches]) -> None:
+@pytest.mark.parametrize(("usual", "named"), [(2.2, True), (2.7, False)])
+def test_a_view_is_astray_above_three_times_what_is_usual(
+    cameras: Cameras, matches: list[PairMatches], usual: float, named: bool
+) -> None:
+    rough = [pair if 2 in (pair.first, pair.second) else shifted(pair, cameras, usual) for pair in matches]
+    assert astray(turned_to_error(cameras, matches, 2, 7.5), rough, limit=4.0) == ["2.png"] * named
+
+
+def test_of_few_views_none_is_astray(cameras: Cameras, matches: list[PairMatches]) -> None:
     """With three views each has two pairs, and the others one."""
-    three = [pair for pair in matches if pair.second < 3]
-    assert _stray_views(np.array([9.0, 9.0, 0.1]), three, NAMES) == []
-    four = [pair for pair in matches if pair.second < 4]
-    errors = np.array([9.0 if pair.first == 0 else 0.1 for pair in four])
-    assert [finding.view for finding in _stray_views(errors, four, NAMES)] == ["0.png"]
+    wrong = turned(cameras, {0: 5.0})
+    assert astray(wrong, [pair for pair in matches if pair.second < 3]) == []
+    assert astray(wrong, [pair for pair in matches if pair.second < 4]) == ["0.png"]
 
 
-def test_two_pairs_are_enough_to_call_a_view_astray_and_one_is_not(matches: list[PairMatches]) -> None:
+def test_two_pairs_are_enough_to_call_a_view_astray_and_one_is_not(
+    cameras: Cameras, matches: list[PairMatches]
+) -> None:
+    wrong = turned(cameras, {0: 5.0})
     two = [pair for pair in matches if pair.second < 4 and (pair.first, pair.second) != (0, 3)]
-    errors = np.array([9.0 if pair.first == 0 else 0.1 for pair in two])
-    assert [finding.view for finding in _stray_views(errors, two, NAMES)] == ["0.png"]
-    one = [pair for pair in two if (pair.first, pair.second) != (0, 2)]
-    assert _stray_views(np.array([9.0 if pair.first == 0 else 0.1 for pair in one]), one, NAMES) == []
+    assert astray(wrong, two) == ["0.png"]
+    assert astray(wrong, [pair for pair in two if (pair.first, pair.second) != (0, 2)]) == []
+
+
+def test_a_view_without_a_pose_that_fits_is_not_astray(cameras: Cameras, matches: list[PairMatches]) -> None:
+    """Each of its pairs fits a fundamental matrix, but they fit no one pose: a motif that repeats itself."""
+    poses = turned(cameras, {2: 8.0}), turned(cameras, {2: -8.0}), cameras
+    assert all(astray(wrong, matches) == ["2.png"] for wrong in poses[:2])
+    motif = []
+    for index, pair in enumerate(matches):
+        if 2 in (pair.first, pair.second):
+            # What this pair shows is where it would be from a pose of its own.
+            points = np.random.default_rng(index).uniform(-0.5, 0.5, (60, 3)) + cameras.centers.mean(axis=0)
+            own = turned(cameras, {2: (-12.0, 4.0, 12.0, -4.0, 8.0)[(pair.first + pair.second - 2) % 5]})
+            pixels = own.project(points)[0].astype(np.float64)
+            pair = replace(pair, first_pixels=pixels[pair.first], second_pixels=pixels[pair.second])
+        motif.append(pair)
+    assert mean_error(cameras, [pair for pair in motif if 2 in (pair.first, pair.second)]) > 5
+    assert len(consistent_matches(motif)) == len(motif)
+    assert astray(cameras, motif) == []
+
+
+def test_far_pairs_that_do_not_fit_accuse_nobody(cameras: Cameras, matches: list[PairMatches]) -> None:
+    near = {(pair.first, pair.second) for pair in near_pairs(cameras, matches)}
+    assert 3 <= len(near) < len(matches)
+    wallpaper = [
+        pair
+        if (pair.first, pair.second) in near
+        else replace(pair, second_pixels=pair.second_pixels + np.array([40, 25]))
+        for pair in matches
+    ]
+    assert judged(cameras, wallpaper) == ([], True)
+    assert judge_matches(wallpaper, cameras, cameras, np.arange(6), NAMES).error > 3
+
+
+def test_a_view_is_judged_by_the_pairs_with_the_views_next_to_it(matches: list[PairMatches]) -> None:
+    """Places on a line that look the same way: the nearest three of the first one are those next to it."""
+    poses = np.tile(np.eye(4), (6, 1, 1))
+    poses[:, 0, 3] = -np.array([0, 1, 2, 4, 8, 16])
+    line = with_poses(box_cameras(6, width=320, height=240, focal=200.0), poses)
+    assert [(pair.first, pair.second) for pair in near_pairs(line, matches, 0)] == [(0, 1), (0, 2), (0, 3)]
+    assert [(pair.first, pair.second) for pair in near_pairs(line, matches, 5)] == [(2, 5), (3, 5), (4, 5)]
+    poses[1, :3, :3] = Rotation.from_euler("y", 120, degrees=True).as_matrix()
+    line = with_poses(line, poses)
+    assert (0, 1) not in [(pair.first, pair.second) for pair in near_pairs(line, matches, 0)]
+
+
+def test_a_pose_is_found_from_matches(cameras: Cameras, matches: list[PairMatches]) -> None:
+    poses = turned(cameras, {3: 12.0}).cam_from_world.astype(np.float64)
+    poses[3, :3, 3] += 0.3
+    own = [pair for pair in matches if 3 in (pair.first, pair.second)]
+    wrong = with_poses(cameras, poses)
+    assert mean_error(wrong, own) > 5
+    found = fit_pose_to_matches(wrong, 3, own)
+    assert mean_error(found, own) < 0.05
+    np.testing.assert_allclose(found.cam_from_world[3], cameras.cam_from_world[3], atol=2e-3)
+    others = np.arange(6) != 3
+    np.testing.assert_array_equal(found.cam_from_world[others], wrong.cam_from_world[others])
+
+
+def test_nothing_is_said_on_little_evidence(cameras: Cameras, matches: list[PairMatches]) -> None:
+    wrong = turned(cameras, {0: 9.0, 2: -9.0, 4: 5.0})
+    assert judged(wrong, []) == ([], False)
+    for pairs in (1, 2):
+        assert judged(wrong, matches[:pairs]) == ([], False)
+        assert judged(cameras, matches[:pairs]) == ([], False)
+    assert judged(cameras, matches[:3]) == ([], True)
+
+
+def test_poses_that_fit_nowhere_are_called_wrong_by_six_pairs_and_not_by_five(
+    cameras: Cameras, matches: list[PairMatches]
+) -> None:
+    poses = cameras.cam_from_world.astype(np.float64)
+    poses[:, :3, :3] = Rotation.random(6, random_state=3).as_matrix() @ poses[:, :3, :3]
+    wrong = with_poses(cameras, poses)
+    path = [pair for pair in matches if pair.second - pair.first == 1]
+    assert judged(wrong, path) == ([], False)
+    assert judged(wrong, [*path, *(pair for pair in matches if (pair.first, pair.second) == (0, 5))]) == (
+        [("unknown", None)],
+        True,
+    )
 
 
 def test_groups_of_three_neighbors_are_spread_over_all_views() -> None:
