@@ -148,7 +148,9 @@ def test_a_halo_is_as_many_metres_wide_in_every_unit_of_length() -> None:
 
     for scene, unit in ((one, 1.0), (replace(one, means=one.means * np.float32(4)), 0.25)):
         config = EncodeConfig(chunk=700, halo=0.1)
-        encode_by_chunks(scene, run, lambda: None, config, metres_per_unit=unit, columns={"s": slice(0, 1)})
+        encode_by_chunks(
+            scene, run, lambda means: None, config, voxel=0.1 / unit, metres_per_unit=unit, columns={"s": slice(0, 1)}
+        )
     assert seen[: len(seen) // 2] == seen[len(seen) // 2 :]
 
 
@@ -161,7 +163,9 @@ def test_chunks_that_take_many_times_the_work_of_a_scene_are_warned_of_with_thei
         return np.zeros((count, 1), np.float32)
 
     def encoded(config: EncodeConfig, unit: float = 1.0) -> None:
-        encode_by_chunks(one, run, lambda: None, config, metres_per_unit=unit, columns={"s": slice(0, 1)})
+        encode_by_chunks(
+            one, run, lambda means: None, config, voxel=0.1, metres_per_unit=unit, columns={"s": slice(0, 1)}
+        )
 
     encoded(EncodeConfig(chunk=700, halo=0.1))
     monkeypatch.setattr(chunks_module, "MUCH_WORK", 10_000)
