@@ -21,8 +21,8 @@ MUCH_WORK, MANY_TIMES = 100_000, 3.0
 WORK_OF_CHUNK = 200
 """Gaussians that take as long as a chunk by itself: 30 ms against 0.14 ms a Gaussian, on one thread."""
 REGION_CELL = 256
-"""Edge in voxels of the cells that separate regions: the convolutions of the shipped encoders reach 73 voxels, and a patch
-of attention on a surface is 180 voxels wide at their coarsest level; what a wider gap separates is no context."""
+"""Edge in voxels of the cells that separate regions: convolutions of the shipped encoders reach 73 voxels, and a patch
+of attention on a surface is 180 voxels wide at their coarsest level, so no context lies beyond a gap of 256."""
 LEAST_REGION = 1_000
 """Gaussians of a region that is encoded by itself; smaller ones are strays, and are encoded together."""
 LAST_CELL = 2**20

@@ -17,8 +17,8 @@ CPU_BLOCK_ROWS = 8192
 """Rows whose neighborhoods are gathered together on a CPU, few enough that what they gather stays in its cache."""
 
 FEW_CELLS = 9
-"""A block of tokens that needs at most one in so many cells of a neighborhood multiplies these alone: isolated tokens and
-lines of them. It changes rounding only; surfaces, which need a third of the cells, keep every bit."""
+"""A block of tokens that needs at most one in so many cells of a neighborhood multiplies these alone: isolated tokens,
+and lines of them. It changes rounding only; surfaces, which need a third of the cells, keep every bit."""
 
 
 def forward_columns(size: KernelSize) -> tuple[tuple[int, int], ...]:
