@@ -7,8 +7,8 @@ Cosine: centered, with the features of the whole scene in float32. Names: `evalu
 alone, warm.
 
 --apart: that many Gaussians on surfaces, and as isolated ones on a line of 20 km; and the scene with itself 100 m away:
-how far the features of the first move by the second, relative to their deviation from the mean. Each as one region, with complete
-neighborhoods in convolutions, and as `encode` does it.
+how far the features of the first move by the second, relative to their deviation from the mean. Each as one region with
+complete neighborhoods in convolutions, and as `encode` does it.
 """
 
 import argparse
