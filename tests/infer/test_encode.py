@@ -12,7 +12,7 @@ from training_scenes import SMALL
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer.encode import chunks as chunks_module
-from gsencoder.infer.encode.chunks import EncodeConfig, cut, encode_by_chunks
+from gsencoder.infer.encode.chunks import EncodeConfig, cut, encode_by_chunks, scene_regions
 from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
@@ -148,7 +148,9 @@ def test_a_halo_is_as_many_metres_wide_in_every_unit_of_length() -> None:
 
     for scene, unit in ((one, 1.0), (replace(one, means=one.means * np.float32(4)), 0.25)):
         config = EncodeConfig(chunk=700, halo=0.1)
-        encode_by_chunks(scene, run, lambda: None, config, metres_per_unit=unit, columns={"s": slice(0, 1)})
+        encode_by_chunks(
+            scene, run, lambda means: None, config, voxel=0.1 / unit, metres_per_unit=unit, columns={"s": slice(0, 1)}
+        )
     assert seen[: len(seen) // 2] == seen[len(seen) // 2 :]
 
 
@@ -161,7 +163,9 @@ def test_chunks_that_take_many_times_the_work_of_a_scene_are_warned_of_with_thei
         return np.zeros((count, 1), np.float32)
 
     def encoded(config: EncodeConfig, unit: float = 1.0) -> None:
-        encode_by_chunks(one, run, lambda: None, config, metres_per_unit=unit, columns={"s": slice(0, 1)})
+        encode_by_chunks(
+            one, run, lambda means: None, config, voxel=0.1, metres_per_unit=unit, columns={"s": slice(0, 1)}
+        )
 
     encoded(EncodeConfig(chunk=700, halo=0.1))
     monkeypatch.setattr(chunks_module, "MUCH_WORK", 10_000)
@@ -195,6 +199,98 @@ def test_much_work_is_over_100000_gaussians_and_over_three_times_those_of_the_sc
     """A chunk by itself counts as 200."""
     assert chunks_module._is_much_work(chunks, seen, count) == much
     assert chunks_module._is_much_work(chunks + 1, seen - 200, count) == much
+
+
+def joined(*splats: Gaussians) -> Gaussians:
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return Gaussians(**{name: np.concatenate([getattr(one, name) for one in splats]) for name in names})
+
+
+def moved(one: Gaussians, x: float) -> Gaussians:
+    return replace(one, means=one.means + np.float32([x, 0, 0]))
+
+
+def strays(count: int) -> Gaussians:
+    """Further from one another, and from a room at the origin, than two cells."""
+    return replace(random_gaussians(count), means=np.float32([[5e3 + 1e2 * i, 0, 0] for i in range(count)]))
+
+
+@given(st.integers(1, 60), st.integers(1, 30), st.integers(0, 9), st.floats(-1e6, 1e6))
+@settings(max_examples=40)
+def test_regions_are_touching_cells_and_the_small_ones_are_one(count: int, least: int, seed: int, far: float) -> None:
+    """As a flood fill finds them."""
+    rng = np.random.default_rng(seed)
+    voxel, edge = 0.1, 0.1 * chunks_module.REGION_CELL
+    means = (rng.integers(0, 5, (count, 3)) * edge * (2, 1, 1) + rng.uniform(0, edge, (count, 3)) + far).astype(
+        np.float32
+    )
+    cells = [tuple(cell) for cell in np.floor(means.astype(np.float64) / edge).astype(int)]
+    unseen, components = set(cells), []
+    while unseen:
+        pending = [unseen.pop()]
+        components.append(set(pending))
+        while pending:
+            here = pending.pop()
+            near = {cell for cell in unseen if max(abs(a - b) for a, b in zip(cell, here, strict=True)) <= 1}
+            components[-1] |= near
+            unseen -= near
+            pending += near
+    rows = [[row for row, cell in enumerate(cells) if cell in component] for component in components]
+    large = [one for one in rows if len(one) >= least]
+    small = sorted(row for one in rows if len(one) < least for row in one)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chunks_module, "LEAST_REGION", least)
+        numbers = scene_regions(means, voxel)
+    found = [np.flatnonzero(numbers == number).tolist() for number in range(numbers.max() + 1)]
+    assert sorted(found) == sorted([*large, *([small] if small else [])]) or len(components) == 1
+    assert not small or found[-1] == small or not large
+    assert len(components) > 1 or not numbers.any()
+
+
+@pytest.mark.parametrize("chunk", [0, 700])
+def test_rooms_that_are_far_apart_have_the_bits_that_each_has_alone(chunk: int) -> None:
+    """Among strays, and with their rows mixed."""
+    parts = [random_gaussians(1500), moved(random_gaussians(1100, 1), 100), strays(3)]
+    part_of = np.random.default_rng(0).permutation(np.repeat(range(3), [len(part) for part in parts]))
+    mixed = joined(*parts).select(np.argsort(np.argsort(part_of, kind="stable")))
+    config, network = replace(WHOLE, chunk=chunk, halo=0.3), encoder()
+    features = encode(mixed, network, OUTPUTS, config).features
+    for number, part in enumerate(parts):
+        assert np.array_equal(features[part_of == number], encode(part, network, OUTPUTS, config).features)
+
+
+def seen_by(scene: Gaussians, config: EncodeConfig = WHOLE) -> list[Gaussians]:
+    """What the encoder is run on."""
+    seen = []
+
+    def run(subset: Gaussians, curves: object, count: int) -> np.ndarray:
+        seen.append(subset)
+        return np.zeros((count, 1), np.float32)
+
+    encode_by_chunks(scene, run, lambda means: None, config, voxel=0.1, metres_per_unit=1.0, columns={"s": slice(0, 1)})
+    return seen
+
+
+def test_what_is_one_region_is_encoded_as_it_is() -> None:
+    """A room, one Gaussian, all at one place, a line as long as the world, and small regions however far apart."""
+    line = random_gaussians(2000)
+    line = replace(line, means=np.arange(2000, dtype=np.float32)[:, None] * np.float32([10, 0, 0]))
+    at_one_place = replace(line, means=np.zeros_like(line.means))
+    halls = joined(*(moved(random_gaussians(99, seed), 100 * seed) for seed in range(5)))
+    for scene in (random_gaussians(1500), random_gaussians(1), at_one_place, line, halls):
+        (seen,) = seen_by(scene)
+        assert seen is scene
+
+
+def test_twenty_rooms_are_encoded_one_by_one_and_all_strays_together() -> None:
+    rooms = [moved(random_gaussians(1000 + seed, seed), 100 * seed) for seed in range(20)]
+    assert [len(one) for one in seen_by(joined(*rooms, strays(50)))] == [*range(1000, 1020), 50]
+
+
+def test_a_stray_is_no_reason_to_refuse_a_room_though_it_lies_further_than_cells_can_be_numbered() -> None:
+    room = random_gaussians(1500)
+    for far in (1e6, 1e12, 3e38):
+        assert [len(one) for one in seen_by(joined(room, moved(random_gaussians(1), far)))] == [1500, 1]
 
 
 def test_a_rerun_gives_the_same_bits() -> None:

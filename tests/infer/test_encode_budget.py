@@ -19,7 +19,7 @@ from gsencoder.infer.encode.chunks import EncodeConfig, cut
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.encode_budget import encode_within as encode_within_module
 from gsencoder.infer.encode_budget.config import EncodeBudget, check_encode_budget, exact_encoding
-from gsencoder.infer.encode_budget.encode_within import BudgetEncoding, encode_within
+from gsencoder.infer.encode_budget.encode_within import BudgetEncoding, all_settings, encode_within
 from gsencoder.infer.encode_budget.principal_axes import principal_axes
 from gsencoder.types import Gaussians, Scene
 
@@ -100,6 +100,28 @@ def test_where_error_and_other_budgets_conflict_the_error_is_kept_and_each_confl
     assert measured(made, gaussians, encoder) <= 1e-3
     assert [note.split(" takes")[0] for note in made.notes] == ["budget.error=0.001"] * 2
     assert ["budget.seconds" in made.notes[0], "budget.megabytes" in made.notes[1]] == [True, True]
+
+
+def test_rooms_that_are_far_apart_are_chosen_for_as_they_are_encoded_and_each_as_if_alone(
+    gaussians: Gaussians, encoder: TorchEncoder
+) -> None:
+    """Of two that fit into a chunk each, and not together, there is nothing to cut; of a larger chunk's there is."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    far = replace(gaussians, means=gaussians.means + np.float32([1000, 0, 0]))
+    both = Gaussians(**{name: np.concatenate((getattr(gaussians, name), getattr(far, name))) for name in names})
+    made = within(both, encoder, EncodeConfig(chunk=len(gaussians)), error=1e-7)
+    assert "halo" not in made.setting.knobs
+    alone = encoder.encode_spaces(gaussians, made.exact)["labels"].features
+    np.testing.assert_array_equal(made.features["labels"].features[: len(gaussians)], alone)
+    exact = replace(made.exact, chunk=1500)
+    both_settings, alone_settings = (
+        all_settings(splat, encoder, exact, EncodeBudget(error=1e-7), metres_per_unit=1.0)[0]
+        for splat in (both, gaussians)
+    )
+    assert [each.knobs for each in both_settings] == [each.knobs for each in alone_settings]
+    assert "halo" in both_settings[0].knobs
+    costs = [2 * each.cost for each in alone_settings]
+    assert [each.cost for each in both_settings] == pytest.approx(costs)
 
 
 class Clock:

@@ -82,6 +82,20 @@ def test_parts_are_cut_as_torch_cuts_them(both: tuple[TorchEncoder, OnnxEncoder]
     assert not np.array_equal(both[1].encode(cloud, ALONE).features, parts)
 
 
+@pytest.mark.parametrize("chunk", [0, 900])
+def test_rooms_that_are_far_apart_have_the_bits_that_each_has_alone(
+    both: tuple[TorchEncoder, OnnxEncoder], chunk: int
+) -> None:
+    near, far = random_cloud(1500, 0.05), random_cloud(1200, 0.05, seed=1)
+    far = moved(far, far.means + np.float32([100, 0, 0]))
+    names = ("means", "quats", "scales", "opacities", "sh")
+    rooms = Gaussians(**{name: np.concatenate((getattr(near, name), getattr(far, name))) for name in names})
+    config = EncodeConfig(chunk=chunk, halo=0.2, precision="float32", device="cpu")
+    for encoder in both:
+        alone = [encoder.encode(room, config).features for room in (near, far)]
+        np.testing.assert_array_equal(encoder.encode(rooms, config).features, np.concatenate(alone))
+
+
 def test_a_rerun_gives_the_same_bits_on_any_number_of_threads(folder: Path) -> None:
     cloud = random_cloud(4000, 0.05)
     encoded = [

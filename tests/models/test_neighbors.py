@@ -96,6 +96,28 @@ def test_the_convolution_is_that_of_its_plain_twin_in_values_and_gradients(
         torch.testing.assert_close(mine, theirs, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize("line", [False, True])
+def test_cells_that_no_token_of_a_block_needs_are_left_out_and_nothing_but_rounding_changes(
+    line: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Isolated tokens, or a line of them, after a block of neighbors."""
+    monkeypatch.setattr(neighbors, "CPU_BLOCK_ROWS", 64)
+    dense = torch.cartesian_prod(*[torch.arange(4)] * 3)
+    apart = torch.arange(100, 200)[:, None] * torch.tensor([1 if line else 3, 0, 0])
+    table, widths = neighbor_table(torch.cat((dense, apart))), []
+    plain_gather = neighbors._gather_neighborhoods
+
+    def gather(padded: torch.Tensor, cells: torch.Tensor) -> torch.Tensor:
+        widths.append(cells.shape[1])
+        return plain_gather(padded, cells)
+
+    monkeypatch.setattr(neighbors, "_gather_neighborhoods", gather)
+    layer, x = NeighborConv(3, 5).double(), torch.randn(len(table), 3, dtype=torch.float64)
+    plain = convolve_reference(x, table, layer.weight) + layer.bias
+    torch.testing.assert_close(layer(x, table), plain, rtol=1e-12, atol=1e-12)
+    assert widths == [27, 3, 3] if line else [27, 1, 1]
+
+
 def test_moving_all_cells_changes_nothing() -> None:
     cells = distinct_cells(200, 10)
     assert torch.equal(neighbor_table(cells), neighbor_table(cells + torch.tensor([7, 1000, 64])))

@@ -1,9 +1,10 @@
-"""Scenes of any size in chunks: boxes of Gaussians with a halo of their surroundings, which an encoder sees at once."""
+"""Scenes of any size, region by region, in chunks: boxes of Gaussians with a halo, which an encoder sees at once."""
 
 import math
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
@@ -19,6 +20,13 @@ MUCH_WORK, MANY_TIMES = 100_000, 3.0
 """A warning is given where chunks take the work of so many Gaussians, and of so many times those of the scene."""
 WORK_OF_CHUNK = 200
 """Gaussians that take as long as a chunk by itself: 30 ms against 0.14 ms a Gaussian, on one thread."""
+REGION_CELL = 256
+"""Edge in voxels of the cells that separate regions: convolutions of the shipped encoders reach 73 voxels, and a patch
+of attention on a surface is 180 voxels wide at their coarsest level, so no context lies beyond a gap of 256."""
+LEAST_REGION = 1_000
+"""Gaussians of a region that is encoded by itself; smaller ones are strays, and are encoded together."""
+LAST_CELL = 2**20
+"""Further cells along an axis count as this one, so that three numbers of cells fit into one integer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,8 +62,9 @@ class Chunk:
     Attributes:
         core_rows: rows whose features come from this chunk.
         rows: what the network sees, `core_rows` first.
-        low, high: the box that it was cut to, world units; infinite where the scene was not cut.
+        low, high: the box that it was cut to, world units; infinite where the region was not cut.
         halo: width of what the network sees around the box.
+        region: number of the region that it is a part of.
     """
 
     core_rows: Int64[np.ndarray, " n"]
@@ -63,6 +72,7 @@ class Chunk:
     low: Float[np.ndarray, "3"]
     high: Float[np.ndarray, "3"]
     halo: float
+    region: int = 0
 
     def seen_around(self, means: Float32[np.ndarray, "N 3"]) -> Float[np.ndarray, " n"]:
         """How far the network sees around each row of the core before the scene is cut off; infinite where it is not.
@@ -77,22 +87,24 @@ class Chunk:
 def encode_by_chunks(
     gaussians: Gaussians,
     run: Callable[[Gaussians, SceneCurves | None, int], Float32[np.ndarray, "n channels"]],
-    curves: Callable[[], SceneCurves | None],
+    curves: Callable[[Float32[np.ndarray, "n 3"]], SceneCurves | None],
     config: EncodeConfig,
     *,
+    voxel: float,
     metres_per_unit: float,
     columns: Mapping[str, slice],
     track: Track = untracked,
 ) -> dict[str, Float32[np.ndarray, "N _channels"]]:
     """Features of every Gaussian, computed chunk by chunk, by space: an array each, since they are gigabytes, which are
-    not copied.
+    not copied. Each region is a scene of its own: its features do not depend on what else the splat holds.
 
     Args:
         gaussians: the splat.
         run: the encoder: features of the first n Gaussians of a subset, given the subset, the curves of the complete
-            scene where there are several chunks, and n.
-        curves: computes these curves.
+            region where it has several chunks, and n.
+        curves: computes these curves, given the centers of a region.
         config: settings.
+        voxel: edge of the encoder's finest cells, world units.
         metres_per_unit: unit of length of the splat.
         columns: of each space in the encoder's output.
         track: wraps the loops that cut and encode to show progress.
@@ -107,13 +119,15 @@ def encode_by_chunks(
         raise InputError("encode: the splat has no Gaussians")
     results = {space: np.zeros((len(gaussians), part.stop - part.start), np.float32) for space, part in columns.items()}
     bad = 0
-    chunks = _planned(gaussians.means, config, metres_per_unit, track)
-    scene_curves = curves() if len(chunks) > 1 else None
+    regions = scene_regions(gaussians.means, voxel)
+    chunks = _planned(gaussians.means, regions, config, metres_per_unit, track)
+    parts = Counter(chunk.region for chunk in chunks)
+    region_curves = {region: curves(gaussians.means[regions == region]) for region in parts if parts[region] > 1}
 
     def run_chunk(number: int) -> Float32[np.ndarray, "n channels"]:
         chunk = chunks[number]
         subset = gaussians if len(chunks) == 1 else gaussians.select(chunk.rows)
-        return run(subset, scene_curves, len(chunk.core_rows))
+        return run(subset, region_curves.get(chunk.region), len(chunk.core_rows))
 
     # Checking and storing a chunk takes one thread, while the next one is computed.
     numbers = range(len(chunks))
@@ -127,22 +141,65 @@ def encode_by_chunks(
     return results
 
 
-def cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> list[Chunk]:
-    """Cuts a scene into boxes, halved along their longest side until each fits into a chunk with its halo.
+def scene_regions(means: Float32[np.ndarray, "N 3"], voxel: float) -> Int64[np.ndarray, " N"]:
+    """Numbers from 0 of the region of each Gaussian. Regions are cells of `REGION_CELL` voxels that touch one another,
+    by corners as well; those of fewer than `LEAST_REGION` Gaussians count as one, the last.
+
+    Args:
+        means: centers in world units.
+        voxel: edge of the encoder's finest cells, world units.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    keys = np.zeros(len(means), np.int64)
+    for column in means.T:
+        # Borders lie at multiples of the edge in the world, so that a region is the same whatever else there is.
+        cells = np.floor(column.astype(np.float64) / (REGION_CELL * voxel)).clip(-(2.0**50), 2.0**50)
+        keys = keys * (LAST_CELL + 1) + np.minimum(cells - cells.min(), LAST_CELL).astype(np.int64)
+    occupied = np.unique(keys)
+    tree = cKDTree(np.stack(np.unravel_index(occupied, (LAST_CELL + 1,) * 3), axis=1))
+    pairs = tree.query_pairs(1.5, p=np.inf, output_type="ndarray")
+    touching = coo_array((np.ones(len(pairs), bool), pairs.T), shape=(len(occupied), len(occupied)))
+    count, components = connected_components(touching, directed=False)
+    if count == 1:
+        return np.zeros(len(means), np.int64)
+    numbers = components[np.searchsorted(occupied, keys)]
+    is_large = np.bincount(numbers) >= LEAST_REGION
+    return np.where(is_large, np.cumsum(is_large) - 1, np.count_nonzero(is_large))[numbers]
+
+
+def cut(
+    means: Float32[np.ndarray, "N 3"], chunk: int, halo: float, regions: Int64[np.ndarray, " N"] | None = None
+) -> list[Chunk]:
+    """Cuts the regions of a scene into boxes, halved along their longest side until each fits into a chunk with its
+    halo.
 
     Every row is in the core of exactly one chunk. Where a box has become small beside its halo, the halo is cut
     instead: the nearest rows that fit remain in it.
 
     Args:
         means: centers in world units.
-        chunk: largest number of rows of a chunk; 0 = one chunk.
+        chunk: largest number of rows of a chunk; 0 = one chunk a region.
         halo: width of the halo in world units.
+        regions: from `scene_regions`; None = all is one.
     """
-    return list(_cut(means, chunk, halo))
+    return list(_cut_regions(means, np.zeros(len(means), np.int64) if regions is None else regions, chunk, halo))
+
+
+def _cut_regions(
+    means: Float32[np.ndarray, "N 3"], regions: Int64[np.ndarray, " N"], chunk: int, halo: float
+) -> Iterator[Chunk]:
+    """The chunks of `cut`, one after the other: thousands of them take a while."""
+    by_region, counts = np.argsort(regions, kind="stable"), np.bincount(regions)
+    for region, rows in enumerate(np.split(by_region, np.cumsum(counts)[:-1])):
+        for part in _cut(means[rows], chunk, halo) if len(rows) else ():
+            yield replace(part, core_rows=rows[part.core_rows], rows=rows[part.rows], region=region)
 
 
 def _cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> Iterator[Chunk]:
-    """The chunks of `cut`, one after the other: thousands of them take a while."""
+    """The chunks of one region."""
     all_rows = np.arange(len(means))
     if chunk == 0 or len(means) <= chunk:
         yield Chunk(core_rows=all_rows, rows=all_rows, low=np.full(3, -np.inf), high=np.full(3, np.inf), halo=halo)
@@ -182,7 +239,11 @@ def _is_much_work(chunks: int, seen: int, count: int) -> bool:
 
 
 def _planned(
-    means: Float32[np.ndarray, "N 3"], config: EncodeConfig, metres_per_unit: float, track: Track
+    means: Float32[np.ndarray, "N 3"],
+    regions: Int64[np.ndarray, " N"],
+    config: EncodeConfig,
+    metres_per_unit: float,
+    track: Track,
 ) -> list[Chunk]:
     """The chunks of a scene; warns where they take many times its work, before it is cut where that is certain then:
     to cut it into thousands of chunks takes minutes."""
@@ -197,7 +258,8 @@ def _planned(
             SceneWarning,
             stacklevel=3,
         )
-    chunks = list(track(_cut(means, config.chunk, config.halo / metres_per_unit), "cutting into chunks"))
+    parts = _cut_regions(means, regions, config.chunk, config.halo / metres_per_unit)
+    chunks = list(track(parts, "cutting into chunks"))
     seen = sum(len(chunk.rows) for chunk in chunks)
     if _is_much_work(len(chunks), seen, count) and not certain:
         narrow = sum(chunk.halo * metres_per_unit < 0.99 * config.halo for chunk in chunks)

@@ -164,8 +164,9 @@ def _restored(
     return encode_by_chunks(
         gaussians,
         run,
-        lambda: cut_scene_curves(gaussians.means, voxel, levels=shape.levels, orders=shape.orders, patch=shape.patch),
+        lambda means: cut_scene_curves(means, voxel, levels=shape.levels, orders=shape.orders, patch=shape.patch),
         config,
+        voxel=voxel,
         metres_per_unit=metres_per_unit,
         columns={teacher: outputs.columns[teacher] for teacher in teachers},
         track=track,

@@ -16,7 +16,7 @@ from gsencoder.core.runtime.tracking import Track, untracked
 from gsencoder.core.setting_choice import best_setting, within_seconds
 from gsencoder.fusion.feature_error import FieldError, judge
 from gsencoder.fusion.store.folder import features_bytes
-from gsencoder.infer.encode.chunks import EncodeConfig, cut
+from gsencoder.infer.encode.chunks import EncodeConfig, cut, scene_regions
 from gsencoder.infer.encode_budget.config import EncodeBudget, exact_encoding
 from gsencoder.infer.encode_budget.principal_axes import PrincipalAxes, principal_axes
 from gsencoder.infer.encode_budget.sample import ROUNDING_ROWS, measure_parts, measure_rounding, seen_around
@@ -157,7 +157,8 @@ def all_settings(
     clock: Callable[[], float] = time.perf_counter,
 ) -> tuple[list[Setting], int]:
     """All settings, the exact one first, and the number of Gaussians that were encoded to predict them."""
-    is_cut = bool(exact.chunk) and len(gaussians) > exact.chunk
+    regions = scene_regions(gaussians.means, encoder.voxel / metres_per_unit)
+    is_cut = 0 < exact.chunk < int(np.bincount(regions).max())
     precisions, timed = encoder.precisions(exact.device), budget.seconds is not None
     if len(gaussians) < SMALL_SCENE and not is_cut and not timed:
         precisions = precisions[:1]
@@ -173,10 +174,11 @@ def all_settings(
         seed=seed,
         clock=clock if timed else None,
     )
-    means, settings = gaussians.means[even_indices(len(gaussians), CUT_ROWS)], []
+    rows, settings = even_indices(len(gaussians), CUT_ROWS), []
+    means = gaussians.means[rows]
     scale = len(gaussians) / len(means)
     for halo in reversed(HALOS) if is_cut else (exact.halo,):
-        chunks = cut(means, math.ceil(exact.chunk / scale), halo / metres_per_unit)
+        chunks = cut(means, math.ceil(exact.chunk / scale), halo / metres_per_unit, regions[rows])
         sizes = scale * np.array([len(chunk.rows) for chunk in chunks], np.float64)
         cutting = np.zeros(1)
         # Where the exact setting cuts the scene is right by definition.

@@ -13,7 +13,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 
 from gsencoder.core.runtime.device_names import Precision
 from gsencoder.fusion.feature_error import row_cosines
-from gsencoder.infer.encode.chunks import Chunk, EncodeConfig, cut
+from gsencoder.infer.encode.chunks import Chunk, EncodeConfig, cut, scene_regions
 from gsencoder.infer.load_encoder import Encoder
 from gsencoder.types import GaussianFeatures, Gaussians
 
@@ -98,7 +98,7 @@ def measure_parts(
         encoder: whose teachers count as the worst of them.
         config: whose device and precision are used.
         precisions: whose seconds are measured; the cheapest one last.
-        is_cut: whether the scene has several chunks.
+        is_cut: whether a region of the scene has several chunks.
         metres_per_unit: see `Encoder.encode`.
         seed: of the parts.
         clock: seconds; None if they do not matter.
@@ -121,7 +121,8 @@ def measure_parts(
             exact = encoder.encode_spaces(part, uncut, metres_per_unit=metres_per_unit)
             halves = replace(uncut, chunk=max(len(part) * 2 // 3, 1), halo=0.0)
             halved = encoder.encode_spaces(part, halves, metres_per_unit=metres_per_unit)
-            seen = seen_around(part.means, cut(part.means, halves.chunk, 0.0)) * metres_per_unit
+            regions = scene_regions(part.means, encoder.voxel / metres_per_unit)
+            seen = seen_around(part.means, cut(part.means, halves.chunk, 0.0, regions)) * metres_per_unit
             distances, cutting = _never_rising(seen, _errors(halved, exact))
         parts.append(Part(rows=len(part), seconds=seconds, distances=distances, cutting=cutting))
     return parts

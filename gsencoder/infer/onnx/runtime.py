@@ -164,10 +164,11 @@ class OnnxEncoder:
         return encode_by_chunks(
             gaussians,
             run,
-            lambda: cut_scene_curves(
-                gaussians.means, voxel, levels=header.levels, orders=header.orders, patch=header.patch
+            lambda means: cut_scene_curves(
+                means, voxel, levels=header.levels, orders=header.orders, patch=header.patch
             ),
             config,
+            voxel=voxel,
             metres_per_unit=metres_per_unit,
             columns={teacher: header.outputs.columns[teacher] for teacher in teachers},
             track=track,
