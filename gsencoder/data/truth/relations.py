@@ -73,7 +73,7 @@ def near_things(scene_objects: Sequence[SeenObject]) -> dict[int, tuple[SeenObje
     near = {}
     for row, each in enumerate(scene_objects):
         apart = np.maximum(lower - upper[row], lower[row] - upper).max(axis=1)
-        near[each.id] = tuple(scene_objects[other] for other in np.flatnonzero(apart <= REACH))
+        near[each.id] = tuple(scene_objects[other] for other in np.flatnonzero(apart <= REACH).tolist())
     return near
 
 

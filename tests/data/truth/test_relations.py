@@ -142,9 +142,10 @@ def test_a_thing_is_supported_by_the_only_named_thing_under_it_unless_it_is_in_s
 
 def test_what_is_within_reach_decides_relations_as_all_things_do() -> None:
     rng = np.random.default_rng(0)
-    lower, size = rng.uniform(0, (6, 6, 0.6), (150, 3)), rng.uniform(0.02, 0.6, (150, 3))
-    # Some stand on others.
-    lower[::3, 2] = (lower + size)[rng.permutation(150)[:50], 2]
+    lower, size = rng.uniform(0, (8, 8, 0.3), (150, 3)), rng.uniform(0.1, 0.6, (150, 3))
+    # A third of them stands on another third.
+    size[::3, :2] /= 4
+    lower[::3] = lower[1::3] + size[1::3] * (0.2, 0.2, 1)
     names = [None if number % 9 == 8 else f"kind {number % 40}" for number in range(150)]
     things = [box(number, tuple(lower[number]), tuple(size[number]), names[number]) for number in range(150)]
     near = near_things(things)
