@@ -34,7 +34,7 @@ FLAGS = {
     "--multirun": "run every combination of values, key=1,2,3 (-m); run k writes to OUT/k",
 }
 TOO_LARGE = re.compile(
-    "(enough|allocate|out of) memory|cannot fit 'int'|too big|too large to|Maximum allowed|negative dimensions|overflow",
+    "(enough|allocate|out of) memory|cannot fit 'int'|too big|too large to|Maximum allowed|negative dim|overflow",
     re.IGNORECASE,
 )
 """Words of the errors of torch, numpy and Python for sizes that cannot be allocated or counted."""
