@@ -177,11 +177,11 @@ def read_config(folder: Path, subject: str) -> Any:
     Raises:
         InputError: transformers is missing, or does not know the model without the folder's own code.
     """
+    _check_files(folder)
     try:
         from transformers import AutoConfig
     except ImportError as error:
         raise InputError(f"{subject}: needs the package transformers ({EXTRA})") from error
-    _check_files(folder)
     try:
         with quiet_transformers():
             return AutoConfig.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False)
