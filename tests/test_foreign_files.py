@@ -12,16 +12,20 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files.foreign_file import open_foreign, read_foreign, read_foreign_text
 from gsencoder.core.files.npz import read_npz
 from gsencoder.core.files.written_files import check_written
+from gsencoder.core.onnx_session import open_session
+from gsencoder.core.pretrained import load_companion, read_config
 from gsencoder.data.readers.colmap_binary import check_binary_model
 from gsencoder.data.readers.image_file import load_npy, open_picture
 from gsencoder.data.readers.tables import table_lines
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.scene_paths import kind_of_path
+from gsencoder.data.splat_formats.ply import read_points
 from gsencoder.data.splats import load_property, load_splat
 from gsencoder.data.truth.checked_files import read_checked
 from gsencoder.data.truth.mesh_file import read_mesh
 from gsencoder.evaluate.files.scene_folders import scene_files
 from gsencoder.infer.ask.question_sets import is_question_set
+from gsencoder.text.onnx_tower import _load_tokenizer
 
 READERS: dict[str, Callable[[Path], object]] = {
     "picture.png": open_picture,
@@ -32,6 +36,11 @@ READERS: dict[str, Callable[[Path], object]] = {
     "further.ply": lambda path: load_property(path, "x"),
     "truth.txt": read_checked,
     "mesh.ply": read_mesh,
+    "points.ply": read_points,
+    "model.onnx": lambda path: open_session(path, "a test"),
+    "tokenizer.json": _load_tokenizer,
+    "config.json": lambda path: read_config(path.parent, "a test"),
+    "chat_template.jinja": lambda path: load_companion(object, path.parent, "a test", "template"),
     "masks.npz": lambda path: read_npz(path, {"pred_masks": ("b", 2)}),
     "bytes": read_foreign,
     "text": read_foreign_text,

@@ -7,6 +7,7 @@ terminated. Warnings and errors go to standard error, one line each; results go 
 import errno
 import faulthandler
 import os
+import re
 import signal
 import sys
 import textwrap
@@ -32,20 +33,9 @@ FLAGS = {
     "--debug": "show where an error or a warning came from",
     "--multirun": "run every combination of values, key=1,2,3 (-m); run k writes to OUT/k",
 }
-TOO_LARGE = (
-    "not enough memory",
-    "t allocate memory",
-    "cannot fit 'int'",
-    "out of memory",
-    "array is too big",
-    "Maximum allowed dimension exceeded",
-    "Maximum allowed size exceeded",
-    "negative dimensions",
-    "calculation overflowed",
-    "multiplication overflow",
-    "Overflow when unpacking",
-    "too large to convert",
-    "too large to be converted",
+TOO_LARGE = re.compile(
+    "(enough|allocate|out of) memory|cannot fit 'int'|too big|too large to|Maximum allowed|negative dim|overflow",
+    re.IGNORECASE,
 )
 """Words of the errors of torch, numpy and Python for sizes that cannot be allocated or counted."""
 LARGE = 10**7
@@ -124,7 +114,7 @@ def _impossible_sizes(values: Any) -> Iterator[None]:
         text = " ".join(str(error).split())
         if text.startswith("Symlink loop from "):
             raise InputError(f"{text.removeprefix('Symlink loop from ')}: is a link that leads to itself") from error
-        if not isinstance(error, MemoryError) and not any(words in text for words in TOO_LARGE):
+        if not isinstance(error, MemoryError) and not TOO_LARGE.search(text):
             raise
         large = ", ".join(_large_numbers("", values))
         raise InputError(

@@ -127,10 +127,16 @@ def weight_files(folder: Path, subject: str) -> list[Path]:
     files = sorted(folder.glob("*.safetensors"))
     if not files:
         raise InputError(f"{subject}: {folder} has no weights as safetensors, and files of pickles are not opened")
-    for path in files:
-        with readable(path):
-            check_foreign(path)
+    _check_files(folder)
     return files
+
+
+def _check_files(folder: Path) -> None:
+    """Checks that what a library may open in a folder are files."""
+    with readable(folder):
+        for path in folder.glob("*"):
+            if path.exists() and not path.is_dir():
+                check_foreign(path)
 
 
 def _from_pretrained(loader: Any, source: str | None, **options: Any) -> tuple[Any, dict[str, Any]]:
@@ -171,6 +177,7 @@ def read_config(folder: Path, subject: str) -> Any:
     Raises:
         InputError: transformers is missing, or does not know the model without the folder's own code.
     """
+    _check_files(folder)
     try:
         from transformers import AutoConfig
     except ImportError as error:
@@ -215,6 +222,7 @@ def load_companion(loader: Any, folder: Path, subject: str, noun: str, **options
     Raises:
         InputError: transformers cannot read it.
     """
+    _check_files(folder)
     try:
         with quiet_transformers():
             return loader.from_pretrained(str(folder), local_files_only=True, trust_remote_code=False, **options)

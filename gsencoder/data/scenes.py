@@ -1,6 +1,7 @@
 """Loading of scenes in any supported layout, or of a splat alone."""
 
 import math
+import os
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -166,7 +167,7 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
         warn_of_unused_splat(folder)
     objects_file = folder / "objects.json"
     beside_transforms = root.suffix.lower() == ".json" or any((folder / file).is_file() for file in TRANSFORMS)
-    objects = read_objects(objects_file) if beside_transforms and objects_file.is_file() else ()
+    objects = read_objects(objects_file) if beside_transforms and os.path.lexists(objects_file) else ()
     labels = labels_of_layout(folder, layout)
     if labels is not None:
         if layout == "ScanNet":

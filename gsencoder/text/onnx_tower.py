@@ -9,8 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import read_foreign_text
+from gsencoder.core.errors import InputError, readable
+from gsencoder.core.files.foreign_file import check_foreign, read_foreign_text
 from gsencoder.core.files.model_files import SENTENCE_ENCODER, digest_files, find_file, sentence_encoder_graph
 from gsencoder.core.onnx_session import open_session
 from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
@@ -217,6 +217,8 @@ def _load_tokenizer(path: Path) -> Any:
         from tokenizers import Tokenizer
     except ImportError as error:
         raise InputError("text towers need the package tokenizers (pip install tokenizers)") from error
+    with readable(path):
+        check_foreign(path)
     try:
         return Tokenizer.from_file(str(path))
     except Exception as error:  # tokenizers raises plain Exceptions

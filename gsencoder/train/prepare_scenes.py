@@ -2,7 +2,7 @@
 
 import hashlib
 import warnings
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
@@ -76,7 +76,7 @@ def prepare_scenes(
     reader = SceneReader(config, words, voxel)
     several = len(teachers) > 1
     unmeasured: dict[str, list[Head]] = {}
-    with _without_remains(folder, folders.values()):
+    with _without_remains([*folders.values(), folder]):
         with fail_together():
             if process.is_first:
                 with_heads = teacher_of_heads(teachers, heads)
@@ -161,16 +161,19 @@ def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
 
 
 @contextmanager
-def _without_remains(folder: Path, folders: Collection[Path]) -> Iterator[None]:
-    """Removes, when a preparation fails, the folders in which nothing was prepared."""
+def _without_remains(folders: Sequence[Path]) -> Iterator[None]:
+    """Removes, when a preparation fails, what it made of folders in which nothing was prepared."""
+    there = {path for each in folders for path in (each, each / DATASET_SETTINGS_FILE) if path.exists()}
     try:
         yield
     except BaseException:
-        for each in (*folders, folder):
+        for each in folders:
             with suppress(OSError):
-                if [entry.name for entry in each.iterdir()] == [DATASET_SETTINGS_FILE]:
-                    (each / DATASET_SETTINGS_FILE).unlink()
-                each.rmdir()
+                stated = each / DATASET_SETTINGS_FILE
+                if stated not in there and list(each.iterdir()) == [stated]:
+                    stated.unlink()
+                if each not in there:
+                    each.rmdir()
         raise
 
 

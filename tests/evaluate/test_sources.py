@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from splats import random_gaussians
 
+from gsencoder.app.cli import main
 from gsencoder.app.commands import evaluate_sources
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, space_of_words
@@ -94,3 +95,9 @@ def test_words_state_the_names_trained_on_where_the_table_beside_them_does() -> 
     assert stating_trained(other, TRAINED["a"]).trained == ("mug",)  # type: ignore[union-attr]
     for table in (WORDS["a"], None):
         assert stating_trained(WORDS["a"], table).trained is None  # type: ignore[union-attr]
+
+
+def test_a_space_without_weights_and_features_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["evaluate", str(tmp_path), "space=a", f"out={tmp_path / 'out'}"]) == 2
+    assert capsys.readouterr().err.startswith("error: space: names a teacher of weights= or features=")
+    assert not (tmp_path / "out").exists()

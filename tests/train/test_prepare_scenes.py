@@ -1,6 +1,7 @@
 """Preparation for several teachers: scenes for each teacher that they have, and classes of training scenes alone."""
 
 import warnings
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +154,18 @@ def test_a_preparation_that_is_refused_at_once_leaves_nothing(tmp_path: Path, mo
         raise InputError("no scene")
 
     monkeypatch.setattr(module, "fit_space", refuses)
-    with pytest.raises(InputError, match="no scene"):
-        prepare_scenes(WALLS, [], {}, SourceConfig(prepare=PREPARE), tmp_path / "out.prepared", voxel=0.1)
-    assert list(tmp_path.iterdir()) == []
+    folder = tmp_path / "out.prepared"
+
+    def refused() -> list[str]:
+        with pytest.raises(InputError, match="no scene"):
+            prepare_scenes(WALLS, [], {}, SourceConfig(prepare=PREPARE), folder, voxel=0.1)
+        return [path.name for path in tmp_path.rglob("*")]
+
+    assert refused() == []
+    # A folder that was there stays, and so do the settings of an earlier preparation.
+    folder.mkdir()
+    assert refused() == ["out.prepared"]
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_without_remains", lambda _: nullcontext())
+        refused()
+    assert sorted(refused()) == ["out.prepared", "settings.json"]

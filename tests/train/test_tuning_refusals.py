@@ -6,6 +6,7 @@ import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import pytest
@@ -122,6 +123,18 @@ class Broken:
 def test_adapters_that_cannot_be_written_are_a_named_error(tmp_path: Path, error: Exception, message: str) -> None:
     with pytest.raises(InputError, match=message):
         save_adapters(tmp_path / "adapters", Broken(error), Broken(error))
+
+
+def test_layers_are_written_in_order_whatever_the_hashes_of_a_process_are(tmp_path: Path) -> None:
+    # Peft holds them as a set.
+    names = {f"layers.{number}.{part}_proj" for number in range(8) for part in "qkvo"}
+    settings = SimpleNamespace(target_modules=names)
+    written: list[list[str]] = []
+    adapted = SimpleNamespace(
+        peft_config={"default": settings}, save_pretrained=lambda _: written.append([*settings.target_modules])
+    )
+    save_adapters(tmp_path, adapted, SimpleNamespace(save_pretrained=lambda _: None))
+    assert written == [sorted(names)]
 
 
 @pytest.mark.parametrize("error", [OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), RuntimeError("a defect")])

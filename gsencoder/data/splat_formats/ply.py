@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning, readable
+from gsencoder.core.files.foreign_file import open_foreign
 from gsencoder.data.splat_formats.raw import SH_COEFFICIENTS, RawSplat, logits_from_opacities, opacities_from_logits
 
 MAX_HEADER = 1 << 18
@@ -227,7 +228,7 @@ def read_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarra
     Raises:
         InputError: unreadable, not a .ply, truncated, or without x, y and z.
     """
-    with readable(path), path.open("rb") as stream:
+    with readable(path), open_foreign(path) as stream:
         if stream.read(4)[:3] != b"ply":
             raise InputError(f"{path}: not a .ply file; expected a point cloud")
         size = stream.seek(0, 2)

@@ -1,6 +1,5 @@
 """The color word of a thing, from its pixels in photographs, where nearly all of them agree on one."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,20 +35,17 @@ MOST_OTHER = 0.15
 """… and no other color has more than this share."""
 
 
-def color_name(pictures: Sequence[tuple[UInt8[np.ndarray, "_ _ 3"], Bool[np.ndarray, "_ _"]]]) -> str | None:
-    """The color of a thing, of `RANGES`; None where it is not clear.
+def color_word(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]) -> str | None:
+    """The color of a thing in a photograph, of `RANGES`; None where it is not clear.
 
-    It is clear where in every picture, of the pixels that do not touch others than the thing's, at least 60 % have the
-    color, and of no other color there are more than 15 %.
+    It is clear where, of the pixels that do not touch others than the thing's, at least 60 % have the color, and of no
+    other color there are more than 15 %.
 
     Args:
-        pictures: photographs, sRGB, with the pixels of the thing in each.
+        picture: sRGB.
+        mask: the pixels of the thing.
     """
-    words = {_word_of(picture[inner_pixels(mask)]) for picture, mask in pictures}
-    return words.pop() if len(words) == 1 else None
-
-
-def _word_of(pixels: UInt8[np.ndarray, "n 3"]) -> str | None:
+    pixels = picture[inner_pixels(mask)]
     if not len(pixels):
         return None
     shares = color_counts(pixels) / len(pixels)

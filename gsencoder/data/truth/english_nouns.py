@@ -1,5 +1,7 @@
 """English around nouns: articles, plurals, numbers, and names that may stand for the same thing."""
 
+from functools import lru_cache
+
 NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 PLURAL_ONLY = ("scissors", "dice", "pants", "glasses", "products", "utensils")
 """Last words of names that are plurals."""
@@ -56,5 +58,10 @@ def alike(a: str, b: str) -> bool:
     """Whether two different names may be used for one thing: by `SAME_THINGS`, or as one has all words of the other."""
     if a == b:
         return False
-    words_a, words_b = set(a.split()), set(b.split())
-    return words_a <= words_b or words_b <= words_a or any(a in group and b in group for group in SAME_THINGS)
+    (words_a, groups_a), (words_b, groups_b) = _words_and_groups(a), _words_and_groups(b)
+    return words_a <= words_b or words_b <= words_a or not groups_a.isdisjoint(groups_b)
+
+
+@lru_cache(maxsize=4096)
+def _words_and_groups(name: str) -> tuple[frozenset[str], frozenset[int]]:
+    return frozenset(name.split()), frozenset(row for row, group in enumerate(SAME_THINGS) if name in group)

@@ -8,7 +8,7 @@ An object that some photograph shows well enough is described in each way in whi
 - as the largest of its name, if all are shown well enough and its box is 1.3 times as long across as any other.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from gsencoder.core.errors import InputError
@@ -22,6 +22,7 @@ from gsencoder.data.truth.relations import (
     interlocked,
     largest,
     movables,
+    near_things,
     neighbor,
     supporter,
 )
@@ -74,10 +75,11 @@ def make_expressions(
 def _of_scene(scene: SeenScene, seed: int, per_object: int, per_scene: int) -> list[MadeExpression]:
     rng = scene_rng(seed, scene.name, PART)
     scene_objects = movables(scene.objects)
+    near = near_things(scene_objects)
     described = [
         (scene_object, ways)
         for scene_object in scene_objects
-        if scene_object.name and scene.shown(scene_object) and (ways := ways_to_say(scene, scene_object))
+        if scene_object.name and scene.shown(scene_object) and (ways := _ways_to_say(scene, scene_object, near))
     ]
     shuffled = rng.permutation(len(described)).tolist()
     expressions = []
@@ -89,22 +91,23 @@ def _of_scene(scene: SeenScene, seed: int, per_object: int, per_scene: int) -> l
     return expressions
 
 
-def ways_to_say(scene: SeenScene, scene_object: SeenObject) -> list[tuple[str, tuple[SeenObject, ...]]]:
+def _ways_to_say(
+    scene: SeenScene, scene_object: SeenObject, near: Mapping[int, Sequence[SeenObject]]
+) -> list[tuple[str, tuple[SeenObject, ...]]]:
     """All clear descriptions of a thing, and the other things that each speaks of."""
-    scene_objects = movables(scene.objects)
     name = str(scene_object.name)
-    others = [other for other in scene_objects if other.name == name and other is not scene_object]
+    others = [other for other in scene.objects if other.name == name and other is not scene_object]
     ways: list[tuple[str, tuple[SeenObject, ...]]] = []
     if scene.unique(name) is scene_object:
         ways.append((f"the only {name} in the room", ()))
-    anchor = _anchor(scene, scene_object, others, scene_objects)
+    anchor = _anchor(scene, scene_object, others, near[scene_object.id])
     if anchor is not None:
         ways.append((f"the {name} next to the {anchor.name}", (anchor,)))
-    below = supporter(scene_object, scene_objects)
+    below = supporter(scene_object, near[scene_object.id])
     if (
         below is not None
         and scene.shown(below)
-        and not any(_may_be_on(other, below, scene_objects) for other in others)
+        and not any(_may_be_on(other, below, near[other.id]) for other in others)
     ):
         ways.append((f"the {name} on the {below.name}", (below,)))
     if others and all(scene.shown(other) for other in others) and largest([scene_object, *others]) is scene_object:

@@ -23,7 +23,7 @@ import numpy as np
 from gsencoder.core.errors import InputError
 from gsencoder.data.truth.english_nouns import NUMBERS, alike, is_plural, plural, with_article
 from gsencoder.data.truth.questions import Question
-from gsencoder.data.truth.relations import movables, neighbor, supporter
+from gsencoder.data.truth.relations import movables, near_things, neighbor, supporter
 from gsencoder.data.truth.seen_objects import SeenObject, SeenScene
 
 Kind = Literal["next_to", "how_many", "color", "where", "is_there"]
@@ -146,14 +146,14 @@ def clear_names(scene: SeenScene) -> tuple[str, ...]:
 
 def _candidates(scene: SeenScene, absent: Sequence[str]) -> dict[Kind, list[Question]]:
     """All that can be asked, kind by kind, sorted by name."""
-    scene_objects = movables(scene.objects)
+    near = near_things(movables(scene.objects))
     clear = clear_names(scene)
     single = [scene_object for scene_object in map(scene.unique, clear) if scene_object is not None]
     return {
         "next_to": [
             question
             for scene_object in single
-            if (beside := neighbor(scene_object, scene_objects)) is not None and scene.shown(beside)
+            if (beside := neighbor(scene_object, near[scene_object.id])) is not None and scene.shown(beside)
             for question in [
                 _question(
                     scene, f"What is next to the {scene_object.name}?", [str(beside.name)], [scene_object, beside]
@@ -175,7 +175,9 @@ def _candidates(scene: SeenScene, absent: Sequence[str]) -> dict[Kind, list[Ques
             if scene_object.color is not None
         ],
         "where": [
-            question for scene_object in single if (question := _where(scene, scene_object, scene_objects)) is not None
+            question
+            for scene_object in single
+            if (question := _where(scene, scene_object, near[scene_object.id])) is not None
         ],
         "is_there": [
             *(_question(scene, _there(name), ["yes"], list(scene.named(name))) for name in clear),

@@ -17,6 +17,8 @@ ON_SHARE = 0.6
 """… and this share of its outline lies within the other's."""
 SAME_PLACE = 0.3
 """Things whose boxes share more than this of the smaller one's volume are in or around each other, not beside."""
+REACH = 1.0
+"""Things farther apart than this, which is beyond what `clearly_nearer` asks of `NEAR`, do not decide any relation."""
 LARGEST = 1.3
 """The largest of some things is so many times as long, across its box, as any other."""
 
@@ -62,6 +64,17 @@ def movables(scene_objects: Sequence[SeenObject]) -> tuple[SeenObject, ...]:
     return tuple(
         each for row, each in enumerate(scene_objects) if not is_structure(each, np.delete(centers, row, axis=0))
     )
+
+
+def near_things(scene_objects: Sequence[SeenObject]) -> dict[int, tuple[SeenObject, ...]]:
+    """For the id of each thing, the things within `REACH` of its box and itself, in order: `neighbor` and `supporter`
+    find the same among them as among all."""
+    lower, upper = (np.array([getattr(each, f"aabb_{end}") for each in scene_objects]) for end in ("min", "max"))
+    near = {}
+    for row, each in enumerate(scene_objects):
+        apart = np.maximum(lower - upper[row], lower[row] - upper).max(axis=1)
+        near[each.id] = tuple(scene_objects[other] for other in np.flatnonzero(apart <= REACH).tolist())
+    return near
 
 
 def beside(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> list[tuple[float, SeenObject]]:

@@ -1,13 +1,12 @@
 """The objects of a labeled scene, and how well its photographs show them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.color_names import color_name
+from gsencoder.data.truth.color_names import color_word
 from gsencoder.types import Scene
 
 COLOR_VIEWS = 4
@@ -114,6 +113,7 @@ def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
     counts = np.stack(
         [np.bincount(np.minimum(labels.ravel(), largest), minlength=largest + 1)[ids] for labels in views.instances]
     )
+    colors = _colors(scene, counts, min_pixels)
     unit = scene.metres_per_unit
     scene_objects = [
         SeenObject(
@@ -122,7 +122,7 @@ def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
             aabb_min=scene_object.aabb_min * unit,
             aabb_max=scene_object.aabb_max * unit,
             pixels=int(counts[:, row].max()),
-            color=_color(scene, scene_object.id, counts[:, row], min_pixels) if scene_object.name else None,
+            color=colors[row],
         )
         for row, scene_object in enumerate(scene.objects)
     ]
@@ -134,12 +134,19 @@ def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
     )
 
 
-def _color(scene: Scene, label: int, pixels: Sequence[int] | np.ndarray, min_pixels: int) -> str | None:
-    """The color in the photographs that show most of a thing, each with enough of it."""
+def _colors(scene: Scene, counts: Int64[np.ndarray, "V objects"], min_pixels: int) -> list[str | None]:
+    """The color of each named object that the photographs agree on that show most of it, each with enough of it."""
     views = scene.views
     assert views is not None
     assert views.images is not None
     assert views.instances is not None
-    order = np.argsort(-np.asarray(pixels), kind="stable")[:COLOR_VIEWS]
-    best = [int(view) for view in order if pixels[view] >= max(min_pixels, 1)]
-    return color_name([(views.images[view], views.instances[view] == label) for view in best])
+    words: list[set[str | None]] = [set() for _ in scene.objects]
+    best = np.zeros(counts.shape, bool)
+    np.put_along_axis(best, np.argsort(-counts, axis=0, kind="stable")[:COLOR_VIEWS], True, axis=0)
+    best &= (counts >= max(min_pixels, 1)) & np.array([bool(each.name) for each in scene.objects])
+    # Each photograph is decoded once.
+    for view in np.flatnonzero(best.any(axis=1)).tolist():
+        picture, labels = views.images[view], views.instances[view]
+        for row in np.flatnonzero(best[view]):
+            words[row].add(color_word(picture, labels == scene.objects[row].id))
+    return [next(iter(each)) if len(each) == 1 else None for each in words]

@@ -114,11 +114,7 @@ def _true_files(truth: Path, scans: bool) -> dict[str, Path]:
 
 
 def _files(folder: Path, suffixes: Collection[str]) -> list[Path]:
-    files = sorted(
-        path
-        for path in folder.iterdir()
-        if path.suffix in suffixes and path.name not in RESULT_FILES and not path.is_dir()
-    )
+    files = sorted(path for path in folder.iterdir() if path.suffix in suffixes and path.name not in RESULT_FILES)
     for path in files:
         with readable(path):
             check_foreign(path)

@@ -20,7 +20,7 @@ class KeyFilter:
 
     def __init__(self, key: str) -> None:
         self._pattern: re.Pattern[str] | None = None
-        self._rest = key[LONGEST_PART:]
+        self._key, self._rest = key, key[LONGEST_PART:]
         if len(key) >= LEAST_KEY:
             spelt = [_spellings(letter) for letter in key[:LONGEST_PART]]
             least = max(LEAST_PART, (len(spelt) + 1) // 2)
@@ -29,6 +29,8 @@ class KeyFilter:
     def clean(self, text: str, longest: int | None = None) -> str:
         """Text without the key, and only then cut to `longest` characters."""
         parts, at = [], 0
+        # Of a long key with letters that begin escapes, the letters are not always told apart.
+        text = text.replace(self._key, REDACTED) if self._pattern else text
         while self._pattern and (match := self._pattern.search(text, at)):
             parts += [text[at : match.start()], REDACTED]
             at = match.end()

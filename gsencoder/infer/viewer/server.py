@@ -14,7 +14,6 @@ path names a file: there are
 """
 
 import hmac
-import io
 import json
 import secrets
 import socket
@@ -40,14 +39,11 @@ MAX_WORD = 500
 MAX_ROWS = 4096
 PHOTOGRAPH_SIDE = 1280
 TIMEOUT = 30.0
-"""Seconds from the connection, or from the answer before it, until a request must be complete; and those in which a
-client must take a chunk of an answer."""
+"""Seconds until a request must be complete, from the connection or the answer before it, and a chunk be taken."""
 CHUNK = 1 << 20
 """Bytes of an answer that are sent at once."""
 MAX_CONNECTIONS = 64
-"""Largest number of open connections; a browser has six. One more closes the one that has waited longest."""
-STRANGE, WAITING, BUSY = range(3)
-"""A connection that has not sent the token, one that has and waits for its next request, and one that is answered."""
+"""Largest number of connections that wait for a request to come; a browser has six."""
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 BINARY = "application/octet-stream"
 
@@ -89,7 +85,7 @@ class ViewServer(ThreadingHTTPServer):
         self.page, self.searches = page, tuple(searches)
         self.scene_bytes = [scene.to_bytes() for scene in scenes]
         self.token = secrets.token_urlsafe(24)
-        self._lock, self._connections = threading.Lock(), dict[socket.socket, int]()
+        self._lock, self._waiting = threading.Lock(), dict[socket.socket, tuple[bool, float]]()
         if ":" in host:
             self.address_family = socket.AF_INET6
         try:
@@ -106,32 +102,35 @@ class ViewServer(ThreadingHTTPServer):
         self.address = f"http://{shown}:{number}/{self.token}/"
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answers a connection in a thread; where there are too many it is closed, or the least known of them."""
-        with self._lock:
-            self._connections[request] = STRANGE
-            if len(self._connections) > MAX_CONNECTIONS:
-                least = min(self._connections, key=self._connections.__getitem__)
-                del self._connections[least]
-                # Its thread, if it has one, closes it.
-                with suppress(OSError):
-                    least.shutdown(socket.SHUT_RDWR)
-            is_taken = request in self._connections
-        if is_taken:
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
+        """Answers a connection in a thread."""
+        self.wait_for(request, False)
+        super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
         """Closes a connection."""
-        with self._lock:
-            self._connections.pop(request, None)
+        self.has_come(request)
         super().shutdown_request(request)
 
-    def mark(self, request: Any, state: int) -> None:
-        """Sets the state of a connection, which becomes the newest of those in it."""
+    def wait_for(self, connection: socket.socket, is_known: bool) -> None:
+        """Begins the time in which a request must come; `is_known`: one with the token came before it."""
         with self._lock:
-            if self._connections.pop(request, None) is not None:
-                self._connections[request] = state
+            self._waiting[connection] = (is_known, time.monotonic() + TIMEOUT)
+
+    def has_come(self, connection: socket.socket) -> None:
+        """Ends what `wait_for` began."""
+        with self._lock:
+            self._waiting.pop(connection, None)
+
+    def service_actions(self) -> None:
+        """Lets late connections read no more, nor, where too many wait, unknown ones and those that wait longest."""
+        now = time.monotonic()
+        with self._lock:
+            ranked = sorted(self._waiting.items(), key=lambda entry: entry[1])
+            for row, (connection, (_, deadline)) in enumerate(ranked, MAX_CONNECTIONS - len(ranked)):
+                if row < 0 or deadline < now:
+                    del self._waiting[connection]
+                    with suppress(OSError):
+                        connection.shutdown(socket.SHUT_RD)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Reports a bug; a client that has gone is none."""
@@ -149,34 +148,11 @@ class ViewServer(ThreadingHTTPServer):
         return self.searches[value]
 
 
-class _TimedReader(socket.SocketIO):
-    """Reads a connection until a deadline: a timeout of the socket alone begins again with each byte."""
-
-    deadline = 0.0
-
-    def readinto(self, buffer: Any) -> int | None:
-        left = self.deadline - time.monotonic()
-        if left <= 0:
-            raise TimeoutError
-        self._sock.settimeout(left)  # type: ignore[attr-defined]
-        return super().readinto(buffer)
-
-
 class _Handler(BaseHTTPRequestHandler):
     server: ViewServer
     protocol_version = "HTTP/1.1"
     server_version, sys_version = "gsencoder", ""
     timeout = TIMEOUT
-
-    def setup(self) -> None:
-        super().setup()
-        self.rfile.close()
-        self._reader = _TimedReader(self.connection, "r")
-        self.rfile = io.BufferedReader(self._reader)
-
-    def handle_one_request(self) -> None:
-        self._reader.deadline = time.monotonic() + TIMEOUT
-        super().handle_one_request()
 
     def do_GET(self) -> None:
         self._answer(self._get)
@@ -198,7 +174,6 @@ class _Handler(BaseHTTPRequestHandler):
             status, (data, kind) = error.status, _json({"error": str(error)})
         except InputError as error:
             status, (data, kind) = HTTPStatus.UNPROCESSABLE_ENTITY, _json({"error": str(error)})
-        self.connection.settimeout(TIMEOUT)
         if status != HTTPStatus.OK:
             # A body that was not read would be taken for the next request.
             self.close_connection = True
@@ -221,7 +196,7 @@ class _Handler(BaseHTTPRequestHandler):
             if self.command != "HEAD":
                 for start in range(0, len(data), CHUNK):
                     self.wfile.write(memoryview(data)[start : start + CHUNK])
-            self.server.mark(self.connection, WAITING if status == HTTPStatus.OK else STRANGE)
+            self.server.wait_for(self.connection, status == HTTPStatus.OK)
         except OSError:
             self.close_connection = True
 
@@ -234,11 +209,11 @@ class _Handler(BaseHTTPRequestHandler):
         first, *rest = self.path.partition("?")[0].removeprefix("/").split("/")
         if not hmac.compare_digest(first.encode("utf-8", "replace"), self.server.token.encode()):
             raise RefusedError(HTTPStatus.FORBIDDEN, "another token than that of this server's address")
-        self.server.mark(self.connection, BUSY)
         return rest
 
     def _get(self, path: list[str]) -> tuple[bytes, str]:
         server = self.server
+        server.has_come(self.connection)
         match path:
             case [""]:
                 return server.page[0], "text/html; charset=utf-8"
@@ -296,6 +271,7 @@ class _Handler(BaseHTTPRequestHandler):
             request = json.loads(self.rfile.read(int(length)))
         except (ValueError, RecursionError, TimeoutError) as error:
             raise RefusedError(HTTPStatus.BAD_REQUEST, "the body is not JSON") from error
+        self.server.has_come(self.connection)
         if not isinstance(request, dict):
             raise RefusedError(HTTPStatus.BAD_REQUEST, "expected a JSON object")
         return request

@@ -12,6 +12,7 @@ from gsencoder.data.truth.relations import (
     is_structure,
     largest,
     movables,
+    near_things,
     neighbor,
     outline_share,
     stands_on,
@@ -137,6 +138,23 @@ def test_a_thing_is_supported_by_the_only_named_thing_under_it_unless_it_is_in_s
     assert supporter(mug, [mug, box(2, (0, 0, 0), name=None)]) is None
     assert supporter(mug, [mug, table, box(3, (0, 0, 1.02), (1, 1, 1))]) is None
     assert supporter(mug, [mug]) is None
+
+
+def test_what_is_within_reach_decides_relations_as_all_things_do() -> None:
+    rng = np.random.default_rng(0)
+    lower, size = rng.uniform(0, (8, 8, 0.3), (150, 3)), rng.uniform(0.1, 0.6, (150, 3))
+    # A third of them stands on another third.
+    size[::3, :2] /= 4
+    lower[::3] = lower[1::3] + size[1::3] * (0.2, 0.2, 1)
+    names = [None if number % 9 == 8 else f"kind {number % 40}" for number in range(150)]
+    things = [box(number, tuple(lower[number]), tuple(size[number]), names[number]) for number in range(150)]
+    near = near_things(things)
+    assert all(each in near[each.id] for each in things)
+    assert max(map(len, near.values())) < 100
+    found = [(neighbor(each, near[each.id]), supporter(each, near[each.id])) for each in things]
+    assert found == [(neighbor(each, things), supporter(each, things)) for each in things]
+    assert min(sum(pair[kind] is not None for pair in found) for kind in (0, 1)) >= 5
+    assert near_things([]) == {}
 
 
 def test_the_largest_is_longer_across_by_three_tenths_than_any_other() -> None:

@@ -3,13 +3,14 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.color_names import RANGES, color_counts, color_name, hsv
+from gsencoder.data.truth.color_names import RANGES, color_counts, color_word, hsv
 from gsencoder.data.truth.made_expressions import make_expressions
 from gsencoder.data.truth.made_questions import QuestionsConfig, make_questions
 from gsencoder.data.truth.made_situations import make_situations, side_of
@@ -87,6 +88,23 @@ def test_the_color_is_that_of_the_photographs_that_show_most_of_a_thing() -> Non
     assert see_objects(photographed(few), min_pixels=241).objects[0].color is None
 
 
+def test_each_photograph_is_decoded_once_for_the_colors_of_all_things() -> None:
+    class Counted(list[np.ndarray]):
+        reads = 0
+
+        def __getitem__(self, row: Any) -> Any:
+            self.reads += 1
+            return super().__getitem__(row)
+
+    labels = np.repeat(np.arange(40, dtype=np.int32)[None], 20, axis=0)[:, :30]
+    scene = photographed([(np.full((20, 30, 3), RED, np.uint8), labels)] * 3, ids=tuple(range(1, 30)))
+    images = Counted(scene.views.images)  # type: ignore[union-attr, arg-type]
+    scene = replace(scene, views=replace(scene.views, images=images))  # type: ignore[type-var]
+    images.reads = 0
+    assert len(see_objects(scene, min_pixels=5).objects) == 29
+    assert images.reads == 3
+
+
 @pytest.mark.parametrize(
     ("rgb", "expected"),
     [
@@ -124,7 +142,7 @@ def test_a_color_needs_six_tenths_and_no_other_has_more_than_three_twentieths() 
         inner = image[1:11, 1:11].reshape(100, 3).copy()
         inner[:reds], inner[reds : reds + blues] = RED, BLUE
         image[1:11, 1:11] = inner.reshape(10, 10, 3)
-        return color_name([(image, np.ones((12, 12), bool))])
+        return color_word(image, np.ones((12, 12), bool))
 
     assert (of(60, 0), of(59, 0), of(60, 15), of(60, 16), of(0, 60)) == ("red", None, "red", None, "blue")
 

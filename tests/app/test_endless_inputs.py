@@ -1,0 +1,144 @@
+"""What a command is given, or a scene names, and is no file: exit code 2 within seconds, and a line that names it."""
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from viewed_rooms import save_viewed_room
+
+from gsencoder.app.cli import main
+from gsencoder.app.commands import COMMANDS
+
+SECONDS = 10.0
+OUT = {"export": "out.onnx", "repair": "out.ply"}
+KINDS = ("pipe", "device", "folder", "dangling")
+OPTIONS = [
+    "fuse ROOM splat=BAD.ply teacher=palette",
+    "fuse ROOM teacher=labels teacher.words=BAD.npz",
+    "fuse ROOM basis=BAD.safetensors",
+    "encode BAD.ply",
+    "encode ROOM weights=BAD.safetensors",
+    "pack FEATURES/BAD.safetensors",
+    "localize FEATURES query=mug words=BAD.npz",
+    "localize FEATURES query=mug pose=BAD.json",
+    "localize FEATURES queries=BAD.txt",
+    "select FEATURES queries=BAD.txt",
+    "views FEATURES queries=BAD.txt",
+    "view FEATURES words=BAD.npz",
+    "ask FEATURES dry_run=true questions=BAD.json",
+    "ask FEATURES dry_run=true questions=BAD.jsonl",
+    "export weights=BAD.safetensors",
+    "evaluate ROOM protocol=instances classes=BAD.csv",
+    "train ROOM split=BAD.txt",
+    "memory ROOM splat=BAD.ply",
+    "repair BAD.ply",
+    "inspect BAD.ply",
+    "inspect BAD.sog",
+    "reconstruct BAD.mp4",
+    "score instances predictions=TABLES truth=TABLES classes=BAD.csv",
+    "score instances predictions=TABLES truth=TABLES classes=scannet20 label_map=BAD.tsv",
+    "score answers predictions=BAD.json truth=TRUTH/answers.json",
+    "score answers predictions=TABLES/a.txt truth=BAD.json",
+    "score referring predictions=BAD.json truth=TABLES/a.txt",
+    "score captions predictions=TABLES/a.txt truth=BAD.json",
+    "score recognition predictions=BAD.json truth=TRUTH/labels.json",
+    "score retrieval predictions=BAD.npz truth=TRUTH/captions.json",
+    "score semantics predictions=TABLES truth=TABLES classes=scannet20 scenes=BAD.txt",
+]
+"""Commands, and what stands for the thing that is no file."""
+CONTENTS = [
+    ("fuse ROOM teacher=palette", "room/transforms.json"),
+    ("fuse ROOM", "room/objects.json"),
+    ("questions ROOM", "room/objects.json"),
+    ("inspect ROOM", "room/transforms.json"),
+    ("localize FEATURES query=mug", "features/features.safetensors"),
+    ("pack FEATURES", "features/scene.safetensors"),
+    ("score instances predictions=TABLES truth=TRUTH classes=scannet20", "truth/a.txt"),
+    ("score semantics predictions=TABLES truth=TRUTH classes=scannet20", "truth/a.txt"),
+    ("score instances predictions=TABLES truth=TRUTH classes=scannet20", "tables/a.txt"),
+]
+"""Commands, and the file of their inputs that is no file."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    save_viewed_room(folder)
+    for name in ("tables", "truth"):
+        (folder / name).mkdir()
+        (folder / name / "a.txt").write_text("1\n")
+    for name, entry in (
+        ("answers", {"question_id": "1", "question": "What?", "answers": ["mug"]}),
+        ("labels", {"object_id": 1, "label": "mug"}),
+        ("captions", {"view": "a", "caption": "a mug"}),
+    ):
+        (folder / "truth" / f"{name}.json").write_text(json.dumps([{"scene_id": "a", **entry}]))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _ends() -> Iterator[None]:
+    def late(*_: object) -> None:
+        raise TimeoutError("the command did not end")
+
+    before = signal.signal(signal.SIGALRM, late)
+    yield
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def make_no_file(path: Path, kind: str) -> None:
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to("/dev/zero" if kind == "device" else path.parent / "gone")
+
+
+def refusal(words: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    """What a command says that ends with exit code 2, in one line."""
+    for name in ("room", "features", "tables", "truth"):
+        words = words.replace(name.upper(), str(folder / name))
+    command, *rest = words.replace("BAD", str(folder / "bad")).split()
+    out = () if command in ("inspect", "view") else (f"out={folder / OUT.get(command, 'out')}",)
+    COMMANDS[command].load()  # Which takes longer than a refusal may.
+    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    code = main([command, *rest, *out])
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    error = capsys.readouterr().err
+    lines = [line for line in error.splitlines() if line.startswith("error: ")]
+    assert (code, len(lines)) == (2, 1), (code, error)
+    assert "Traceback" not in error
+    return lines[0]
+
+
+@pytest.mark.parametrize("words", OPTIONS)
+def test_an_option_that_names_no_file_is_refused(
+    made: Path, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = next(part for part in words.replace("=", " ").replace("/", " ").split() if part.startswith("BAD"))
+    for part in ("room", "features", "tables", "truth"):
+        (tmp_path / part).symlink_to(made / part)
+    path = tmp_path / name.replace("BAD", "bad")
+    for kind in KINDS:
+        make_no_file(path, kind)
+        assert path.name in refusal(words, tmp_path, capsys), kind
+        path.rmdir() if kind == "folder" else path.unlink()
+
+
+@pytest.mark.parametrize(("words", "name"), CONTENTS)
+def test_a_file_of_a_scene_that_is_none_is_refused(
+    made: Path, words: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(made, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / name
+    path.unlink()
+    for kind in KINDS:
+        make_no_file(path, kind)
+        assert path.name in refusal(words, tmp_path, capsys), kind
+        path.rmdir() if kind == "folder" else path.unlink()
