@@ -321,3 +321,10 @@ def test_a_scene_that_is_given_twice_is_refused_under_whatever_name(tmp_path: Pa
     with pytest.raises(InputError, match="two: is the same as .*one, which is given as well; give one of them"):
         find_scenes([tmp_path / "scenes"])
     assert find_scenes([scene]) == (scene,)
+
+
+def test_a_folder_of_meshes_alone_is_said_to_hold_meshes(tmp_path: Path) -> None:
+    for name in ("scene0000_00_vh_clean_2.ply", "scene0000_00_vh_clean_2.labels.ply"):
+        trimesh.creation.box().export(tmp_path / name)
+    with pytest.raises(InputError, match=r"holds 2 \.ply files, meshes or points, and no splat and no views$"):
+        load_scene(tmp_path)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.truth.questions import Question
 from gsencoder.evaluate.files.answer_predictions import read_answer_predictions, write_answer_predictions
 
@@ -136,3 +136,20 @@ def test_situations_at_one_place_are_told_apart_by_where_one_faces(tmp_path: Pat
     assert entry["agent_rot"] == {"_x": 0.0, "_y": 0.0, "_z": 0.8, "_w": 0.6}
     assert entry["agent_pos"] == {"x": 0.0, "y": 0.5, "z": 0.0}
     assert (entry["answer"], entry["situation"], entry["question"]) == ("right", "I stand.", "Which?")
+
+
+def test_equal_questions_are_answered_in_the_order_of_the_file(tmp_path: Path) -> None:
+    twin = replace(SQA3D[0], id="7")
+    place = {"agent_pos": {"x": 0.0, "y": 0.5, "z": 0}, "agent_rot": {"_x": 0, "_y": 0, "_z": 0.6, "_w": 0.8}}
+    rows = [
+        {"scene_id": "s0", "situation": "I stand.", "question": "Which?", "answer": answer} | place
+        for answer in ("left", "right", "up")
+    ]
+    truth = (SQA3D[0], SQA3D[1], twin)
+    with pytest.warns(SceneWarning, match="2 entries without question_id could be those of several equal questions"):
+        predictions = read_answer_predictions(written(tmp_path, rows[:2]), truth)
+    assert predictions == {"0": ("left",), "7": ("right",)}
+    with pytest.warns(SceneWarning, match="1 entry without"):
+        assert read_answer_predictions(written(tmp_path, rows[2:]), truth) == {"0": ("up",)}
+    with pytest.warns(SceneWarning, match="3 entries"), pytest.raises(InputError, match="have one question_id: 0"):
+        read_answer_predictions(written(tmp_path, rows), truth)
