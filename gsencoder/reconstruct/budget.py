@@ -83,6 +83,11 @@ class BudgetConfig(Budget):
         """The option that chooses the number of steps."""
         return next((f"budget.{name}" for name in ("error", "seconds") if name in self.promised), "budget.minutes")
 
+    @property
+    def clock(self) -> float | None:
+        """Promised seconds that the clock keeps; a promised error comes before them."""
+        return self.seconds if self.error is None else None
+
     def minutes_left(self, spent: float = 0.0) -> float:
         """The minutes that sizes and steps are chosen for; 0 = all that they want.
 
@@ -145,7 +150,7 @@ def affordable_steps(optimizer: Optimizer, minutes: float) -> int:
     """The number of steps that the formula allows; those of the settings where they are not the default, or for 0
     minutes."""
     config = optimizer.config
-    if not minutes or config.steps != OptimizeConfig().steps:
+    if not minutes or config.steps != OptimizeConfig().steps or config.earlier:
         return config.steps
     views = trial_views(optimizer.training)
     gaussians = float(np.mean([optimizer.rows_seen(view) for view in views]))
