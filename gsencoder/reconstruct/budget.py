@@ -120,6 +120,13 @@ def steps_for_minutes(minutes: float, config: OptimizeConfig) -> int:
     return max(LEAST_STEPS, round(config.steps * (minutes / DEFAULT_MINUTES) ** (1 / 3)))
 
 
+def least_pixels(device: torch.device, config: OptimizeConfig) -> float:
+    """Pixels of a photograph that is made no smaller: where they are a third of a step, even half of them would hardly
+    save time."""
+    none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
+    return none / (one - none) / 2
+
+
 def choose_scale(
     cameras: Cameras, budget: BudgetConfig, device: torch.device, config: OptimizeConfig, *, spent: float = 0.0
 ) -> float:
@@ -139,9 +146,7 @@ def choose_scale(
     none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
     steps = steps_for_minutes(minutes, config) if budget.seconds is None else PROMISED_STEPS
     seconds = (1 - SEED_SHARE) * 60 * minutes / steps
-    # Where pixels are a third of a step, even half of them would hardly save time.
-    least = none / (one - none) / 2
-    affordable = max(least, (seconds - none) / (one - none))
+    affordable = max(least_pixels(device, config), (seconds - none) / (one - none))
     scale = math.sqrt(affordable / pixels)
     return 1.0 if scale > SMALLEST_REDUCTION else round(scale, 3)
 

@@ -109,7 +109,7 @@ class OptimizeConfig:
         """Where in the schedule of how many steps a step is: a plan stretches what the one before has left over all of
         its own steps. It depends on the plans until then alone."""
         planned, begun, done = self._plan_at(step)
-        return planned * (done + (1 - done) * (step - begun) / (planned - begun)) if begun else step, planned
+        return planned * (done + (1 - done) * (step - begun) / (planned - begun)) if begun else float(step), planned
 
     def completes(self, share: float, step: int) -> bool:
         """Whether a share of the schedule is done after so many steps, and was not before."""

@@ -10,10 +10,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from gsencoder.core.errors import InputError
 from gsencoder.core.promises import MEGABYTE
 from gsencoder.data.splat_formats.ply import inria_row_bytes
-from gsencoder.reconstruct.budget import BudgetConfig, affordable_steps
+from gsencoder.reconstruct.budget import SMALLEST_REDUCTION, BudgetConfig, affordable_steps, least_pixels
 from gsencoder.reconstruct.checkpoint import PLANNED_DEGREE
 from gsencoder.reconstruct.expected_time import Costs
 from gsencoder.reconstruct.optimize import Optimizer
@@ -30,8 +32,10 @@ AIMED = 0.98
 """Share of promised seconds that the clock steers to."""
 FEW_STEPS = STEPS[1]
 """Where promised seconds have no time for so many steps, photographs are made smaller once more."""
-SMALLEST_FACTOR = 0.4
+SMALLEST_SHARE = 0.2
+"""Of the pixels, which smaller photographs keep at least."""
 LATE = 1.5
+"""So many times the aim in minutes is said."""
 HEADER_BYTES = 2048
 """Of a .ply file, at most."""
 PLAN = "plan"
@@ -221,8 +225,10 @@ def _within_seconds(
         # How often is validated depends on the steps.
         other = expected.other + costs.validation * validations(steps) + MAX_COMPARISONS * costs.picture
         steps = min(max(int((AIMED * seconds - before - other) / each), 1), STEPS[-1])
-    factor = max(SMALLEST_FACTOR, round(math.sqrt(steps / (2 * FEW_STEPS)), 3))
-    if may_shrink and steps < FEW_STEPS and before + factor * begun < seconds / 2:
+    cameras, shares = optimizer.photographs.cameras, (SMALLEST_SHARE, steps / (2 * FEW_STEPS))
+    least = least_pixels(optimizer.device, optimizer.config) / float(np.median(cameras.widths * cameras.heights))
+    factor = math.sqrt(max(*shares, least))
+    if may_shrink and steps < FEW_STEPS and factor < SMALLEST_REDUCTION and before + factor * begun < seconds / 2:
         raise PhotographsTooLargeError(factor)
     total = before + other + steps * each
     notes: tuple[str, ...] = ()
