@@ -216,7 +216,7 @@ def _within_seconds(
 ) -> Plan:
     """As many steps as there is time for, by trial steps of each kind."""
     begun = spent()
-    refuse_late(budget, begun, "reading the photographs and seeding")
+    refuse_late(budget, begun, "reading photographs and seeding")
     costs, steps = measure(), plan.steps
     before = spent()
     expected = costs.expected(optimizer.config, optimizer.pruning, 0, steps, 0)

@@ -3,7 +3,7 @@
 import os
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache
@@ -30,7 +30,7 @@ from gsencoder.reconstruct.exposure_prediction import predict_exposures
 from gsencoder.reconstruct.fit import fit
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.plan import AIMED, PLAN, STEPS, Plan, follow, late_notes, make_plan
+from gsencoder.reconstruct.plan import AIMED, PLAN, STEPS, Plan, follow, late_notes, make_plan, refuse_late
 from gsencoder.reconstruct.report import MAX_COMPARISONS, Comparison, LogRow, compare, describe_exposure, describe_plan
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.score import MIN_PHOTOGRAPHS, drop_masked_views, split
@@ -117,25 +117,36 @@ def reconstruct(
     """
     if scene.views is None:
         raise InputError(f"reconstruct: scene {scene.name} has no photographs to fit a splat to")
-    clock, began = Clock(), now()
+    clock, first = Clock(), now() - spent
+
+    def elapsed() -> float:
+        return now() - first
+
+    def in_time(items: Iterable[Any], label: str) -> Iterator[Any]:
+        for item in track(items, label):
+            if not continued:
+                refuse_late(config.budget, elapsed(), "reading photographs and seeding")
+            yield item
+
     with ExitStack() as stack:
         folder = work or Path(stack.enter_context(TemporaryDirectory()))
+        continued = os.path.lexists(checkpoint := folder / CHECKPOINT_FILE)
         with clock("read"):
-            photographs = Photographs(scene.views, track=track)
+            photographs = Photographs(scene.views, track=in_time)
         training, held_out = split(len(photographs), config.holdout)
         training = drop_masked_views(photographs, training, "photographs to fit", least=MIN_PHOTOGRAPHS)
         held_out = drop_masked_views(photographs, held_out, "held-out photographs")
         identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
-        chosen_device, checkpoint = choose_device(device), folder / CHECKPOINT_FILE
+        chosen_device = choose_device(device)
         if config.budget.error is not None and not held_out:
             raise InputError("budget.error: is measured on held-out photographs, and there are none; leave it out")
-        if continued := os.path.lexists(checkpoint):
+        if continued:
             most = max(config.optimize.steps, steps_for_minutes(config.budget.minutes, config.optimize), STEPS[-1])
             shape = {"steps": most, "sh_degree": config.optimize.sh_degree}
             state = load_state(checkpoint, identity, **shape, device=chosen_device)
         else:
             with clock("seeds"):
-                state = initial_state(scene, photographs, training, config, chosen_device, track, report)
+                state = initial_state(scene, photographs, training, config, chosen_device, in_time, report)
         optimizer = Optimizer(
             state.adam,
             photographs,
@@ -147,11 +158,6 @@ def reconstruct(
             exposures=state.exposures,
             step=state.step,
         )
-
-        first = began - spent
-
-        def elapsed() -> float:
-            return now() - first
 
         def validations(steps: int) -> int:
             return sum(config.validates_at(step, steps) for step in range(optimizer.step, steps + 1))

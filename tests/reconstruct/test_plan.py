@@ -171,7 +171,7 @@ def test_seconds_buy_steps_by_what_trial_steps_take(
 
 
 def test_seconds_that_are_over_before_the_first_step_are_refused(optimizer: Optimizer) -> None:
-    problem = "budget.seconds=20: is over before the first step: 20 s went into reading the photographs and seeding; "
+    problem = "budget.seconds=20: is over before the first step: 20 s went into reading photographs and seeding; "
     with pytest.raises(InputError, match=problem + "give more seconds, a smaller data.image_scale"):
         planned(optimizer, BudgetConfig(seconds=20.0), spent=19.7)
     # A promised error comes before seconds.

@@ -186,8 +186,10 @@ class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
         if remap is not None:
             color = remap.bilinear(color)
         if color.shape[:2] != (grid.height, grid.width):
+            # Of two to four pixels for one a box would take some whole and some not at all.
+            method = Image.Resampling.BOX if reduction == 1 else Image.Resampling.HAMMING
             whole = (0, 0, size[0] / reduction, size[1] / reduction)
-            color = np.array(Image.fromarray(color).resize((grid.width, grid.height), Image.Resampling.BOX, box=whole))
+            color = np.array(Image.fromarray(color).resize((grid.width, grid.height), method, box=whole))
         return color
 
 
