@@ -66,7 +66,8 @@ class BudgetConfig(Budget):
     seconds: float | None = field(
         default=None,
         metadata={
-            "help": "largest time from reading the photographs to the splat; what a kill made be repeated is extra"
+            "help": "largest time from the start of the command to its results, which the clock keeps: it changes the "
+            "number of steps while they are done; what a kill made be repeated is extra"
         },
     )
     megabytes: float | None = field(

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -63,7 +64,7 @@ class Costs:
         return ExpectedSeconds(stepping, other)
 
 
-def measured_costs(optimizer: Optimizer, held_out: Sequence[int]) -> Costs:
+def measured_costs(optimizer: Optimizer, held_out: Sequence[int], limit: float = inf) -> Costs:
     """What the remaining work costs; nothing changes.
 
     Gaussians that contribute nothing now will not contribute later either, and the first pruning takes them out. So it
@@ -72,19 +73,20 @@ def measured_costs(optimizer: Optimizer, held_out: Sequence[int]) -> Costs:
     Args:
         optimizer: as it is now.
         held_out: views that are validated on.
+        limit: seconds that go into each kind of work, of which one look is taken at least.
     """
     config, state, prunings, pruned = optimizer.config, optimizer, (0.0, 0.0), False
     steps: dict[tuple[int, bool], float] = {}
     for step in range(optimizer.step, config.steps):
         kind = (config.shrink_at(step), pruned)
         if kind not in steps:
-            steps[kind] = _mean_seconds(trial_views(optimizer.training), partial(_step, state, kind[0]))
+            steps[kind] = _mean_seconds(trial_views(optimizer.training), partial(_step, state, kind[0]), limit)
         if not pruned and optimizer.pruning.due(step + 1, config):
             began, pruned = time.perf_counter(), True
             state = _pruned(optimizer)
             seconds = time.perf_counter() - began
             prunings = (seconds, seconds * len(state.parameters["means"]) / len(optimizer.parameters["means"]))
-    picture = _mean_seconds(trial_views(held_out), lambda view: score(optimizer, [view])) if held_out else 0.0
+    picture = _mean_seconds(trial_views(held_out), lambda view: score(optimizer, [view]), limit) if held_out else 0.0
     return Costs(
         step=optimizer.step,
         steps=steps,
@@ -152,11 +154,14 @@ def _step(optimizer: Optimizer, shrink: int, view: int) -> None:
         seen.step(torch.arange(len(rows), device=rows.device), grads, dict.fromkeys(grads, 0.0))
 
 
-def _mean_seconds(views: Sequence[int], work: Callable[[int], object]) -> float:
-    """Of looks at some views; the first look compiles and warms caches, and is not counted."""
-    seconds = []
+def _mean_seconds(views: Sequence[int], work: Callable[[int], object], limit: float) -> float:
+    """Of looks at some views; the first look compiles and warms caches, and is not counted unless all time goes into
+    it."""
+    seconds: list[float] = []
     for view in (views[0], *views):
         began = time.perf_counter()
         work(view)
         seconds.append(time.perf_counter() - began)
-    return float(np.mean(seconds[1:]))
+        if sum(seconds) > limit:
+            break
+    return float(np.mean(seconds[1:] or seconds))

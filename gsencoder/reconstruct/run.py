@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache
+from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -36,6 +37,9 @@ from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.score import MIN_PHOTOGRAPHS, drop_masked_views, split
 from gsencoder.reconstruct.start import initial_gaussians
 from gsencoder.types import Gaussians, Scene
+
+TRIAL_SHARE = 1 / 30
+"""Of promised seconds that are left, what goes into trials of each kind of work."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -164,7 +168,8 @@ def reconstruct(
 
         @cache
         def costs() -> Costs:
-            return measured_costs(optimizer, held_out)
+            limit = config.budget.clock
+            return measured_costs(optimizer, held_out, inf if limit is None else (limit - elapsed()) * TRIAL_SHARE)
 
         with clock("trial"):
             if continued:

@@ -11,7 +11,7 @@ from reconstructions import cut_at, refusal
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.reconstruct import Reconstruction, reconstruct, sfm
+from gsencoder.reconstruct import Reconstruction, expected_time, reconstruct, sfm
 from gsencoder.reconstruct import run as running
 from gsencoder.reconstruct.budget import BudgetConfig
 from gsencoder.reconstruct.config import ReconstructConfig
@@ -40,7 +40,7 @@ class Wall:
 
         monkeypatch.setattr(Optimizer, "advance", timed)
         costs = Costs(step=0, steps={(2, False): 4.0, (1, True): 4.0}, prunings=(0.0, 0.0), validation=0.0, picture=0.0)
-        monkeypatch.setattr(running, "measured_costs", lambda one, _: replace(costs, step=one.step))
+        monkeypatch.setattr(running, "measured_costs", lambda one, *_: replace(costs, step=one.step))
 
     def __call__(self) -> float:
         return self.now
@@ -91,6 +91,20 @@ def test_a_run_that_was_cut_goes_on_by_the_clock_and_is_reproduced_too(
     assert 94 <= result.elapsed <= 105
     assert result.plan.earlier[0] == 24
     check_equal(reconstruct(scene, with_options_of(result)), result)
+
+
+def test_trials_of_steps_end_where_their_share_of_the_time_has_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, looks = [0.0], []
+
+    def work(view: int) -> None:
+        looks.append(view)
+        now[0] += 8.0 if len(looks) == 1 else 2.0
+
+    monkeypatch.setattr(expected_time.time, "perf_counter", lambda: now[0])
+    for limit, seconds, views in ((100.0, 2.0, 5), (11.0, 2.0, 3), (7.0, 8.0, 1)):
+        looks.clear()
+        assert expected_time._mean_seconds([3, 4, 5, 6], work, limit) == seconds
+        assert len(looks) == views
 
 
 def test_a_schedule_does_not_depend_on_what_is_planned_later_and_is_always_completed() -> None:
