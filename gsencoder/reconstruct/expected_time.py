@@ -87,13 +87,8 @@ def measured_costs(optimizer: Optimizer, held_out: Sequence[int], limit: float =
             seconds = time.perf_counter() - began
             prunings = (seconds, seconds * len(state.parameters["means"]) / len(optimizer.parameters["means"]))
     picture = _mean_seconds(trial_views(held_out), lambda view: score(optimizer, [view]), limit) if held_out else 0.0
-    return Costs(
-        step=optimizer.step,
-        steps=steps,
-        prunings=prunings,
-        validation=len(held_out) * picture,
-        picture=picture,
-    )
+    validation = len(held_out) * picture
+    return Costs(step=optimizer.step, steps=steps, prunings=prunings, validation=validation, picture=picture)
 
 
 class Pace:

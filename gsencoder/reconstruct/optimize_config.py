@@ -67,13 +67,11 @@ class OptimizeConfig:
         if self.steps < 0:
             raise InputError(f"steps: expected 0 or more, got {self.steps}")
         ends = (0, *self.earlier[1::2], self.steps)
-        if len(self.earlier) % 2 or any(
-            not begun < until < planned
-            for begun, until, planned in zip(ends, ends[1:-1], self.earlier[::2], strict=False)
-        ):
-            raise InputError(f"earlier: expected pairs of more steps and a later step than before, got {self.earlier}")
-        if self.earlier and self.earlier[-1] >= self.steps:
-            raise InputError(f"earlier: expected steps before the last, {self.steps}, got {self.earlier}")
+        follow = all(until < planned for planned, until in zip(self.earlier[::2], ends[1:], strict=False))
+        if self.earlier and (len(self.earlier) % 2 or not follow or sorted({*ends}) != [*ends]):
+            raise InputError(
+                f"earlier: expected numbers of steps, each with a later step before it, got {self.earlier}"
+            )
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
         if len(self.shrinks) != len(self.shares) or not self.shrinks:

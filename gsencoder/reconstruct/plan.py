@@ -43,15 +43,8 @@ PLAN = "plan"
 
 
 class PhotographsTooLargeError(Exception):
-    """Promised seconds have no time for steps of photographs of this size, and enough is left to begin anew.
-
-    Attributes:
-        factor: by which they should be made smaller.
-    """
-
-    def __init__(self, factor: float) -> None:
-        super().__init__(factor)
-        self.factor = factor
+    """Promised seconds have no time for steps of photographs of this size, and enough is left to begin anew with
+    photographs that are so many times as large, `args[0]`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,11 +224,9 @@ def _within_seconds(
     if may_shrink and steps < FEW_STEPS and factor < SMALLEST_REDUCTION and before + factor * begun < seconds / 2:
         raise PhotographsTooLargeError(factor)
     total = before + other + steps * each
-    notes: tuple[str, ...] = ()
-    if steps < STEPS[0]:
-        needed = math.ceil((before + other + STEPS[0] * each) / AIMED)
-        notes = (f"{budget.shown('seconds')}: has time for {steps} steps; budget.seconds={needed} has for {STEPS[0]}",)
-    return replace(plan, steps=steps, spent=before, seconds=total, notes=notes)
+    needed = math.ceil((before + other + STEPS[0] * each) / AIMED)
+    few = f"{budget.shown('seconds')}: has time for {steps} steps; budget.seconds={needed} has for {STEPS[0]}"
+    return replace(plan, steps=steps, spent=before, seconds=total, notes=(few,) if steps < STEPS[0] else ())
 
 
 def refuse_late(budget: BudgetConfig, spent: float, subject: str, advice: str = "") -> None:
@@ -249,7 +240,7 @@ def refuse_late(budget: BudgetConfig, spent: float, subject: str, advice: str = 
 
 def late_notes(budget: BudgetConfig, seconds: float) -> tuple[str, ...]:
     """What is said where so many seconds in all are far more than the aim in minutes, which no clock keeps."""
-    if budget.promised or not 0 < 60 * LATE * budget.minutes < seconds:
-        return ()
-    wanted = f"{60 * budget.minutes:g}"
-    return (f"that is more than budget.minutes={budget.minutes:g} aims at; budget.seconds={wanted} keeps to them",)
+    note = (
+        f"budget.minutes={budget.minutes:g} aims at less; budget.seconds={60 * budget.minutes:g} is kept by the clock"
+    )
+    return (note,) if not budget.promised and 0 < 60 * LATE * budget.minutes < seconds else ()

@@ -11,13 +11,7 @@ from scene_files import photograph, save
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers import images
 from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
-from gsencoder.data.readers.image_file import (
-    picture_info,
-    picture_size,
-    read_integers,
-    read_reduced,
-    read_rgba,
-)
+from gsencoder.data.readers.image_file import picture_info, picture_size, read_integers, read_rgba
 from gsencoder.data.readers.images import ImageFiles, InstanceFiles, PixelGrid
 from gsencoder.data.readers.masks import MaskFiles
 from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
@@ -258,9 +252,9 @@ def test_a_photograph_is_decoded_once_until_its_file_changes(tmp_path: Path, mon
 
     def counted(path: Path, reduction: int) -> object:
         decoded.append(path)
-        return read_reduced(path, reduction)
+        return read_rgba(path, reduction=reduction)
 
-    monkeypatch.setattr(images, "read_reduced", counted)
+    monkeypatch.setattr(images, "read_rgba", counted)
     path = save(tmp_path / "a.png", photograph(0))
     first = ImageFiles([path], [grid()], RemapCache())[0]
     again = ImageFiles([path], [grid()], RemapCache())[0]

@@ -41,7 +41,6 @@ from gsencoder.reconstruct.score import Score
 from gsencoder.reconstruct.sfm import SfmConfig
 from gsencoder.types import Scene
 
-UNREGISTERED = "more seconds, fewer photographs, or a smaller sfm.size"
 PLY_FILE, PICTURES_FILE, MODEL_FOLDER = "splat.ply", "held_out.png", "sparse/0"
 
 
@@ -129,9 +128,9 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             )
 
         try:
-            result = fitted(opened.scene, scale, may_shrink=config.data.image_scale == 1)
+            result = fitted(opened.scene, scale, may_shrink=config.data.image_scale == 1 and not config.splat)
         except PhotographsTooLargeError as found:
-            scale = round(scale * found.factor, 3)
+            scale = round(scale * float(found.args[0]), 3)
             opened = _at_scale(opened, scale, path, work.path, config, screen)
             result = fitted(opened.scene, scale, may_shrink=False)
         ended = time.perf_counter()
@@ -179,9 +178,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
 def _open(
     path: Path, work: Path, config: ReconstructCommandConfig, data: SceneConfig, spent: Callable[[], float]
 ) -> OpenedScene:
-    def in_time() -> None:
-        refuse_late(config.budget, spent(), "registering the photographs", UNREGISTERED)
-
+    subject, advice = "registering the photographs", "more seconds, fewer photographs, or a smaller sfm.size"
     return open_scene(
         path,
         work,
@@ -190,7 +187,7 @@ def _open(
         sfm=config.sfm,
         video=config.video,
         track=Progress(quiet=config.quiet),
-        in_time=in_time,
+        in_time=lambda: refuse_late(config.budget, spent(), subject, advice),
     )
 
 

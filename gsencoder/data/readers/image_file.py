@@ -180,56 +180,35 @@ def is_deep_grey(path: Path) -> bool:
         return picture.mode in DEEP_GREY
 
 
-def read_rgba(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
+def read_rgba(path: Path, *, reduction: int = 1) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
     """Color (composited over black) and alpha, None where the file has none.
+
+    Args:
+        path: the file.
+        reduction: 1, 2, 4 or 8: JPEG is decoded so many times smaller, and files of other formats are not.
 
     Raises:
         InputError: unreadable, damaged, too large, or of a kind that is not color.
     """
     with open_picture(path) as file:
-        return _rgba(path, file)
-
-
-def read_reduced(path: Path, reduction: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
-    """Color as `read_rgba` gives it, each pixel the mean of so many by so many of the file's, and (width, height) of
-    the file. JPEG is decoded at that size, which takes a fraction of the time.
-
-    Args:
-        path: the file.
-        reduction: 1, 2, 4 or 8.
-
-    Raises:
-        InputError: as `read_rgba`.
-    """
-    from PIL import Image
-
-    with open_picture(path) as file:
-        size = _stored_size(file)
         if file.format == "JPEG" and reduction > 1:
-            file.draft("RGB", (max(1, size[0] // reduction), max(1, size[1] // reduction)))
-        color = _rgba(path, file)[0]
-    if reduction > 1 and color.shape[:2] == size[::-1]:
-        color = np.array(Image.fromarray(color).reduce(reduction))
-    return color, size
-
-
-def _rgba(path: Path, file: "Image") -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
-    picture = _decode(path, file)
-    try:
-        if picture.mode.startswith("I"):
-            wide = np.asarray(picture).astype(np.int64)
-            if wide.min() < 0 or wide.max() > 65_535:
-                raise InputError(f"{path}: grey values beyond 16 bits; expected an 8- or 16-bit photograph")
-            return np.repeat((wide >> 8).astype(np.uint8)[..., None], 3, axis=2), None
-        if picture.mode == "F":
-            raise InputError(f"{path}: a floating-point picture; expected an 8- or 16-bit photograph")
-        if not picture.has_transparency_data:
-            return np.array(picture.convert("RGB")), None
-        rgba = np.asarray(picture.convert("RGBA"))
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(f"{path}: cannot be turned into RGB ({_brief(error)})") from error
+            file.draft("RGB", (file.width // reduction, file.height // reduction))
+        picture = _decode(path, file)
+        try:
+            if picture.mode.startswith("I"):
+                wide = np.asarray(picture).astype(np.int64)
+                if wide.min() < 0 or wide.max() > 65_535:
+                    raise InputError(f"{path}: grey values beyond 16 bits; expected an 8- or 16-bit photograph")
+                return np.repeat((wide >> 8).astype(np.uint8)[..., None], 3, axis=2), None
+            if picture.mode == "F":
+                raise InputError(f"{path}: a floating-point picture; expected an 8- or 16-bit photograph")
+            if not picture.has_transparency_data:
+                return np.array(picture.convert("RGB")), None
+            rgba = np.asarray(picture.convert("RGBA"))
+        except InputError:
+            raise
+        except Exception as error:
+            raise InputError(f"{path}: cannot be turned into RGB ({_brief(error)})") from error
     alpha = rgba[..., 3]
     color = (rgba[..., :3].astype(np.uint16) * alpha[..., None] + 127) // 255
     return color.astype(np.uint8), alpha.copy()

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Int32, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.image_file import read_integers, read_reduced
+from gsencoder.data.readers.image_file import picture_size, read_integers, read_rgba
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache
 from gsencoder.types.orientation import EXCHANGED, turned
 
@@ -157,11 +157,8 @@ class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
     def _load(self, view: int) -> UInt8[np.ndarray, "H W 3"]:
         path, grid = self._paths[view], self._grids[view]
         assert path is not None
-        try:
-            state = path.stat()
-        except OSError:
-            return self._decoded(view, path)  # which says what is wrong with it
-        key = (path, state.st_mtime_ns, state.st_size, grid)
+        state = path.stat() if path.exists() else None
+        key = (path, grid, state and (state.st_mtime_ns, state.st_size))
         with _kept_lock:
             color = _kept.pop(key, None)
         if color is None:
@@ -178,7 +175,9 @@ class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
 
         grid = self._grids[view]
         reduction = grid.reduction
-        color, size = read_reduced(path, reduction)
+        size, color = picture_size(path), read_rgba(path, reduction=reduction)[0]
+        if color.shape[:2] == size[::-1] and reduction > 1:
+            color = np.array(Image.fromarray(color).reduce(reduction))
         if grid.is_exchanged(*size):
             color, size = turned(color, grid.turn), size[::-1]
         self.check_size(view, size[::-1])
