@@ -1,4 +1,6 @@
+import json
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scene_files import photograph, save
 
+from gsencoder.app import cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers import images
 from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
@@ -15,6 +18,8 @@ from gsencoder.data.readers.image_file import picture_info, picture_size, read_i
 from gsencoder.data.readers.images import ImageFiles, InstanceFiles, PixelGrid
 from gsencoder.data.readers.masks import MaskFiles
 from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
 
 PINHOLE = CameraModel(model="PINHOLE", width=32, height=24, params=(30.0, 31.0, 16.0, 12.0))
 
@@ -272,3 +277,26 @@ def test_a_photograph_is_decoded_once_until_its_file_changes(tmp_path: Path, mon
     for view, added in ((1, 1), (1, 1), (0, 2), (1, 3)):
         assert files[view].shape == (24, 32, 3)
         assert len(decoded) == count + added
+
+
+def test_a_fusion_decodes_each_photograph_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checks, seeds and the teacher look at the same views; before, some were decoded four times."""
+    room, folder = make_room(0, objects=2, views=5, width=160, height=120), tmp_path / "room"
+    write_room(room, folder)
+    transforms = json.loads((folder / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        picture = folder / frame["file_path"]
+        frame["file_path"] = frame["file_path"].replace(".png", ".jpg")
+        Image.open(picture).convert("RGB").save(picture.with_suffix(".jpg"))
+    (folder / "transforms.json").write_text(json.dumps(transforms))
+    decoded: Counter[str] = Counter()
+
+    def counted(path: Path, reduction: int) -> object:
+        decoded[path.name] += 1
+        assert reduction == 2
+        return read_rgba(path, reduction=reduction)
+
+    monkeypatch.setattr(images, "read_rgba", counted)
+    words = ["fuse", str(folder), "seeds.voxel=0.2", "data.image_scale=0.25", "teacher=palette", "quiet=true"]
+    assert cli.main([*words, f"out={tmp_path / 'features'}"]) == 0
+    assert decoded == {f"{view:03d}.jpg": 1 for view in range(5)}
