@@ -11,6 +11,7 @@ import re
 import signal
 import sys
 import textwrap
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -45,7 +46,7 @@ SHORT = {"-h": "--help", "-m": "--multirun"}
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command line, by default that of the process, and returns the exit code."""
-    words = list(sys.argv[1:] if argv is None else argv)
+    began, words = time.perf_counter(), list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in words[: words.index("--") if "--" in words else None]
     if not faulthandler.is_enabled():
         # A mapped file that was cut off, a broken disk or a library may end the process: where is said on the way.
@@ -57,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     try:
         with stopping_signals():
-            code = _dispatch(words)
+            code = _dispatch(words, began)
             sys.stdout.flush()
             return code
     except InputError as error:
@@ -177,7 +178,7 @@ def _split_flags(words: Sequence[str]) -> tuple[set[str], list[str]]:
     return flags, rest
 
 
-def _dispatch(words: Sequence[str]) -> int:
+def _dispatch(words: Sequence[str], began: float) -> int:
     flags, rest = _split_flags(words)
     if "--version" in flags:
         print(f"gsencoder {gsencoder.__version__}")
@@ -211,11 +212,12 @@ def _dispatch(words: Sequence[str]) -> int:
 
         print(printable(OmegaConf.to_yaml(settings(config))), end="")
         return 0
-    _run(command, config, "--debug" in flags)
+    _run(command, config, "--debug" in flags, began)
     return 0
 
 
-def _run(command: Command, config: Any, debug: bool) -> None:
+def _run(command: Command, config: Any, debug: bool, began: float | None = None) -> None:
+    """Runs a command; what it took to load it counts from `began`."""
     from gsencoder.app.runs.output_folder import refuse_to_replace_inputs
     from gsencoder.app.runs.summary import Summary
     from gsencoder.app.settings.config import check_required, settings
@@ -227,7 +229,7 @@ def _run(command: Command, config: Any, debug: bool) -> None:
     check_required(cls, config)
     values = settings(config)
     refuse_to_replace_inputs(config.out, values)
-    summary = Summary(command.name, values)
+    summary = Summary(command.name, values, began)
     with _collected_warnings(summary.add_warning, debug), _impossible_sizes(values):
         run(config, summary)
 

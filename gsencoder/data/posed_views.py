@@ -82,7 +82,7 @@ def make_views(
     depths = [image.depth for image in images]
     masks = [image.mask for image in images]
     instances = [image.instance for image in images]
-    partial = _have_empty_pixels(list({(grid.pinhole, grid.source): grid for grid in grids}), remaps)
+    partial = _have_empty_pixels({(grid.pinhole, grid.source, grid.reduction) for grid in grids}, remaps)
     background = None
     if mask_background and not _any(masks) and not _any(transparent) and not any(map(_is_fisheye, images)):
         background = find_background([image.image for image in images])
@@ -186,7 +186,7 @@ def _check_sizes(image: PosedImage, grid: PixelGrid, depth_grid: PixelGrid, size
             )
 
 
-def _have_empty_pixels(cameras: list[tuple[Pinhole, CameraModel]], remaps: RemapCache) -> bool:
+def _have_empty_pixels(cameras: set[tuple[Pinhole, CameraModel, int]], remaps: RemapCache) -> bool:
     """Whether some pixel of a pinhole camera is outside the distorted picture. With many cameras the check would cost
     more than masks do, and the result is True."""
     distorted = [camera for camera in cameras if not camera[1].is_pinhole]

@@ -66,7 +66,8 @@ class BudgetConfig(Budget):
     seconds: float | None = field(
         default=None,
         metadata={
-            "help": "largest time from reading the photographs to the splat; what a kill made be repeated is extra"
+            "help": "largest time from the start of the command to its results, which the clock keeps: it changes the "
+            "number of steps while they are done; what a kill made be repeated is extra"
         },
     )
     megabytes: float | None = field(
@@ -82,6 +83,11 @@ class BudgetConfig(Budget):
     def option_of_steps(self) -> str:
         """The option that chooses the number of steps."""
         return next((f"budget.{name}" for name in ("error", "seconds") if name in self.promised), "budget.minutes")
+
+    @property
+    def clock(self) -> float | None:
+        """Promised seconds that the clock keeps; a promised error comes before them."""
+        return self.seconds if self.error is None else None
 
     def minutes_left(self, spent: float = 0.0) -> float:
         """The minutes that sizes and steps are chosen for; 0 = all that they want.
@@ -115,6 +121,13 @@ def steps_for_minutes(minutes: float, config: OptimizeConfig) -> int:
     return max(LEAST_STEPS, round(config.steps * (minutes / DEFAULT_MINUTES) ** (1 / 3)))
 
 
+def least_pixels(device: torch.device, config: OptimizeConfig) -> float:
+    """Pixels of a photograph that is made no smaller: where they are a third of a step, even half of them would hardly
+    save time."""
+    none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
+    return none / (one - none) / 2
+
+
 def choose_scale(
     cameras: Cameras, budget: BudgetConfig, device: torch.device, config: OptimizeConfig, *, spent: float = 0.0
 ) -> float:
@@ -134,9 +147,7 @@ def choose_scale(
     none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
     steps = steps_for_minutes(minutes, config) if budget.seconds is None else PROMISED_STEPS
     seconds = (1 - SEED_SHARE) * 60 * minutes / steps
-    # Where pixels are a third of a step, even half of them would hardly save time.
-    least = none / (one - none) / 2
-    affordable = max(least, (seconds - none) / (one - none))
+    affordable = max(least_pixels(device, config), (seconds - none) / (one - none))
     scale = math.sqrt(affordable / pixels)
     return 1.0 if scale > SMALLEST_REDUCTION else round(scale, 3)
 
@@ -145,7 +156,7 @@ def affordable_steps(optimizer: Optimizer, minutes: float) -> int:
     """The number of steps that the formula allows; those of the settings where they are not the default, or for 0
     minutes."""
     config = optimizer.config
-    if not minutes or config.steps != OptimizeConfig().steps:
+    if not minutes or config.steps != OptimizeConfig().steps or config.earlier:
         return config.steps
     views = trial_views(optimizer.training)
     gaussians = float(np.mean([optimizer.rows_seen(view) for view in views]))

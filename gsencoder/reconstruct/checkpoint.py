@@ -125,7 +125,7 @@ def load_state(
             settings = {name: value for name, value in settings.items() if name != IMAGE_SCALE}
         # Runs of earlier versions fitted photographs as they were.
         if "optimize" in earlier:
-            earlier["optimize"] = {"exposure": False, **earlier["optimize"]}
+            earlier["optimize"] = {"exposure": False, "earlier": [], **earlier["optimize"]}
         # What they would have taken for empty shows in the digest of the photographs.
         for section, option in (("optimize", "empty_weight"), ("data", "background")):
             if section in earlier and option in settings.get(section, {}):

@@ -41,7 +41,7 @@ class ReconstructConfig:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
         if self.budget.error is not None or self.budget.seconds is not None:
             of_steps = replace(self.budget, megabytes=None)
-            check_governed(of_steps, self.optimize, OptimizeConfig(), ("steps",), "optimize")
+            check_governed(of_steps, self.optimize, OptimizeConfig(), ("steps", "earlier"), "optimize")
         if self.budget.error is not None and not self.holdout:
             raise InputError(
                 "budget.error: is measured on held-out photographs, and holdout=0 holds out none; leave one of the two "

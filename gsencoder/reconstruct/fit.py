@@ -1,8 +1,8 @@
 """The steps of a reconstruction, with validations, a log and checkpoints."""
 
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,9 @@ from gsencoder.core.files.step_log import LOG_FILE, Log, read_log
 from gsencoder.core.runtime.tracking import Track
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, save_state
 from gsencoder.reconstruct.config import START_AGAIN, ReconstructConfig, Report
+from gsencoder.reconstruct.expected_time import Pace
 from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.plan import Plan, extended, follow
+from gsencoder.reconstruct.plan import STEPS, Plan, extended, follow
 from gsencoder.reconstruct.report import LogRow, describe
 from gsencoder.reconstruct.score import covisible_pixels, score
 
@@ -23,13 +24,11 @@ class Fitted:
 
     Attributes:
         rows: of the log, oldest first.
-        plan: as it was extended.
-        seconds: from the first reading to the last step, of all runs that it took.
+        plan: as it was extended, or changed by the clock.
     """
 
     rows: list[LogRow]
     plan: Plan
-    seconds: float
 
 
 def fit(
@@ -42,14 +41,17 @@ def fit(
     identity: Mapping[str, Any],
     track: Track,
     report: Report,
+    *,
+    pace: Pace | None = None,
+    now: Callable[[], float] = time.monotonic,
 ) -> Fitted:
-    """All remaining steps of a plan, which is extended while a promised error is not reached. Whatever stops the run
-    between two steps leaves a checkpoint."""
+    """All remaining steps of a plan, which is extended while a promised error is not reached, and changed where a clock
+    sets the pace. Whatever stops the run between two steps leaves a checkpoint."""
     with advised(START_AGAIN):
         log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
         rows = read_rows(work / LOG_FILE)
     seen = covisible_pixels(optimizer.photographs, held_out, optimizer.training)
-    start, saved_at, saved_step = time.monotonic() - state.seconds, time.monotonic(), optimizer.step
+    start, saved_at, saved_step = now() - state.seconds, now(), optimizer.step
 
     def validate() -> None:
         due = config.validates_at(optimizer.step, plan.steps)
@@ -59,7 +61,7 @@ def fit(
         scores = {
             name: value for name, value in score(optimizer, held_out, seen)._asdict().items() if value is not None
         }
-        row: LogRow = {"seconds": time.monotonic() - start, "gaussians": len(optimizer.parameters["means"]), **scores}
+        row: LogRow = {"seconds": now() - start, "gaussians": len(optimizer.parameters["means"]), **scores}
         log.add(optimizer.step, row)
         rows.append({"step": optimizer.step, **row})
         report(
@@ -68,15 +70,15 @@ def fit(
         )
 
     def save() -> None:
-        now = State(
+        between = State(
             adam=optimizer.adam,
             anchor=optimizer.anchor,
             exposures=None if optimizer.exposures is None else optimizer.exposures.maps,
             step=optimizer.step,
-            seconds=time.monotonic() - start,
+            seconds=now() - start,
             facts={**state.facts, **plan.facts()},
         )
-        save_state(work / CHECKPOINT_FILE, now, identity)
+        save_state(work / CHECKPOINT_FILE, between, identity)
 
     try:
         validate()
@@ -84,10 +86,16 @@ def fit(
             for _ in track(range(optimizer.step, plan.steps), "optimising"):
                 optimizer.advance()
                 validate()
-                if time.monotonic() - saved_at >= config.checkpoint_every:
+                if pace is not None and optimizer.step < plan.steps:
+                    steps = pace.steps(optimizer, config.validates_at, STEPS[-1])
+                    if steps != plan.steps:
+                        plan = replace(plan, steps=steps, earlier=(*plan.earlier, plan.steps, optimizer.step))
+                        break
+                if now() - saved_at >= config.checkpoint_every:
                     save()
-                    saved_at, saved_step = time.monotonic(), optimizer.step
-            plan = extended(plan, config.budget, rows)
+                    saved_at, saved_step = now(), optimizer.step
+            else:
+                plan = extended(plan, config.budget, rows)
             if plan.steps == optimizer.step:
                 break
             follow(optimizer, plan)
@@ -95,7 +103,7 @@ def fit(
         # Also after the last step: writing the results may be interrupted as well.
         if optimizer.is_consistent and optimizer.step > saved_step:
             save()
-    return Fitted(rows=rows, plan=plan, seconds=plan.spent + time.monotonic() - start)
+    return Fitted(rows=rows, plan=plan)
 
 
 def read_rows(path: Path) -> list[LogRow]:

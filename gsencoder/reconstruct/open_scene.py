@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -89,6 +89,7 @@ def open_scene(
     sfm: SfmConfig = SfmConfig(),
     video: VideoConfig = VideoConfig(),
     track: Track = untracked,
+    in_time: Callable[[], None] = lambda: None,
 ) -> OpenedScene:
     """Reads a scene; photographs alone, or frames of a video, are registered by structure from motion first.
 
@@ -100,6 +101,7 @@ def open_scene(
         sfm: how photographs are placed.
         video: which frames of a video are taken; they are written to `images` in `work`.
         track: progress of decoding a video.
+        in_time: is called while photographs are registered, and may end it.
 
     Raises:
         InputError: no photographs, several scenes, a video that cannot be used, or structure from motion fails.
@@ -141,7 +143,9 @@ def open_scene(
         )
     if placed is None:
         with clock("place"):
-            placed = register_photographs(pictures, work, sfm, single_camera=is_video(path))
+            placed = register_photographs(pictures, work, sfm, single_camera=is_video(path), in_time=in_time)
+        # What was found stays: the same command with more seconds need not look for it again.
+        in_time()
     if placed.missing:
         warnings.warn(
             f"{len(placed.missing)} of {len(placed.placed) + len(placed.missing)} photographs could not be placed "

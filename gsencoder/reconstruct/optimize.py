@@ -156,7 +156,7 @@ class Optimizer:
                 # Where all exposures are equal, color maps would explain what depends on the viewing direction, which
                 # belongs to the splat.
                 self.exposures = None
-            if self.pruning.due(self.step, self.config.steps):
+            if self.pruning.due(self.step, self.config):
                 self.prune()
             self.is_consistent = True
         return terms

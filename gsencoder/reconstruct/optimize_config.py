@@ -16,6 +16,13 @@ class OptimizeConfig:
     """Settings of the optimization of a splat."""
 
     steps: int = field(default=1500, metadata={"help": "photographs looked at, one a step"})
+    earlier: tuple[int, ...] = field(
+        default=(),
+        metadata={
+            "help": "numbers of steps that were planned before, each with that of the step until which it was; written "
+            "by budget.seconds, whose splat they reproduce (results.budget in summary.json)"
+        },
+    )
     sh_degree: int = field(default=2, metadata={"help": "how colors may depend on the direction, 0 to 3"})
     sh_every: float = field(default=0.2, metadata={"help": "share of the steps after which the degree rises by one"})
     shrinks: tuple[int, ...] = field(
@@ -59,6 +66,12 @@ class OptimizeConfig:
     def __post_init__(self) -> None:
         if self.steps < 0:
             raise InputError(f"steps: expected 0 or more, got {self.steps}")
+        ends = (0, *self.earlier[1::2], self.steps)
+        follow = all(until < planned for planned, until in zip(self.earlier[::2], ends[1:], strict=False))
+        if self.earlier and (len(self.earlier) % 2 or not follow or sorted({*ends}) != [*ends]):
+            raise InputError(
+                f"earlier: expected numbers of steps, each with a later step before it, got {self.earlier}"
+            )
         if not 0 <= self.sh_degree <= 3:
             raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
         if len(self.shrinks) != len(self.shares) or not self.shrinks:
@@ -79,19 +92,45 @@ class OptimizeConfig:
             if not 0 <= getattr(self, name) <= limit:
                 raise InputError(f"{name}: expected a number from 0 to {limit:g}, got {getattr(self, name)}")
 
+    def _plan_at(self, step: int) -> tuple[int, int, float]:
+        """The number of steps that was planned at a step, when that plan began, and the share of the schedule that was
+        done then."""
+        begun, done = 0, 0.0
+        for planned, until in zip(self.earlier[::2], self.earlier[1::2], strict=True):
+            if step < until:
+                return planned, begun, done
+            done += (1 - done) * (until - begun) / (planned - begun)
+            begun = until
+        return self.steps, begun, done
+
+    def _place_of(self, step: int) -> tuple[float, int]:
+        """Where in the schedule of how many steps a step is: a plan stretches what the one before has left over all of
+        its own steps. It depends on the plans until then alone."""
+        planned, begun, done = self._plan_at(step)
+        return planned * (done + (1 - done) * (step - begun) / (planned - begun)) if begun else float(step), planned
+
+    def completes(self, share: float, step: int) -> bool:
+        """Whether a share of the schedule is done after so many steps, and was not before."""
+        planned, begun, done = self._plan_at(step - 1)
+        reached = round(begun + (share - done) / (1 - done) * (planned - begun))
+        return share > done and step == max(begun + 1, reached)
+
     def shrink_at(self, step: int) -> int:
         """Factor by which the photographs of a step are made smaller."""
-        ends = np.cumsum(self.shares) * self.steps
-        return self.shrinks[min(int(np.searchsorted(ends, step, side="right")), len(self.shrinks) - 1)]
+        place, steps = self._place_of(step)
+        ends = np.cumsum(self.shares) * steps
+        return self.shrinks[min(int(np.searchsorted(ends, place, side="right")), len(self.shrinks) - 1)]
 
     def degree_at(self, step: int) -> int:
         """Degree of the color coefficients that a step uses."""
-        return min(self.sh_degree, int(step / max(1.0, self.sh_every * self.steps)))
+        place, steps = self._place_of(step)
+        return min(self.sh_degree, int(place / max(1.0, self.sh_every * steps)))
 
     def rates_at(self, step: int, extent: float) -> dict[str, float]:
         """Learning rates of a step; that of the positions falls exponentially."""
+        place, steps = self._place_of(step)
         return {
-            "means": self.means_rate * extent * self.means_final ** (step / max(1, self.steps)),
+            "means": self.means_rate * extent * self.means_final ** (place / max(1, steps)),
             "quats": self.quats_rate,
             "log_scales": self.scales_rate,
             "logit_opacities": self.opacities_rate,

@@ -1,21 +1,25 @@
 """The plan of a reconstruction: how many steps, colors of which degree, and how many Gaussians keep its budget.
 
-Sizes are counted on a trial pruning of the seeds, and seconds are those of trial steps on the scene. How many steps an
-error takes is not predicted: the plan begins with few, and is extended until held-out photographs show that error.
+Sizes are counted on a trial pruning of the seeds, and seconds are those of trial steps on the scene; where seconds are
+promised, the clock changes the number of steps while they are done. How many steps an error takes is not predicted: the
+plan begins with few, and is extended until held-out photographs show that error.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from gsencoder.core.errors import InputError
-from gsencoder.core.promises import MEGABYTE, PLANNED
+from gsencoder.core.promises import MEGABYTE
 from gsencoder.data.splat_formats.ply import inria_row_bytes
-from gsencoder.reconstruct.budget import BudgetConfig, affordable_steps
+from gsencoder.reconstruct.budget import SMALLEST_REDUCTION, BudgetConfig, affordable_steps, least_pixels
 from gsencoder.reconstruct.checkpoint import PLANNED_DEGREE
-from gsencoder.reconstruct.expected_time import expected_seconds
+from gsencoder.reconstruct.expected_time import Costs
 from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.report import LogRow
+from gsencoder.reconstruct.report import MAX_COMPARISONS, LogRow
 from gsencoder.reconstruct.row_adam import RowAdam
 
 STEPS = (50, 100, 150, 200, 300, 400, 600, 800, 1100, 1500, 2100, 3000)
@@ -24,10 +28,23 @@ or fewer than the first."""
 PATIENCE = 2
 """A promised error is given up once it was looked at so many times without becoming smaller than before: more steps
 then fit the photographs that are fitted, and no others."""
+AIMED = 0.98
+"""Share of promised seconds that the clock steers to."""
+FEW_STEPS = STEPS[1]
+"""Where promised seconds have no time for so many steps, photographs are made smaller once more."""
+SMALLEST_SHARE = 0.2
+"""Of the pixels, which smaller photographs keep at least."""
+LATE = 1.5
+"""So many times the aim in minutes is said."""
 HEADER_BYTES = 2048
 """Of a .ply file, at most."""
 PLAN = "plan"
 """The fact of a checkpoint that holds the rest of the plan."""
+
+
+class PhotographsTooLargeError(Exception):
+    """Promised seconds have no time for steps of photographs of this size, and enough is left to begin anew with
+    photographs that are so many times as large, `args[0]`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +54,7 @@ class Plan:
     Attributes:
         steps: of the optimization; of a promised error the next at which it is looked at.
         sh_degree: of colors.
+        earlier: what was planned before, see `OptimizeConfig`.
         most: Gaussians that pruning leaves at most; None = no limit.
         spent: seconds before the first step.
         seconds: expected in all; None without a promise of them.
@@ -46,6 +64,7 @@ class Plan:
 
     steps: int
     sh_degree: int
+    earlier: tuple[int, ...] = ()
     most: int | None = None
     spent: float = 0.0
     seconds: float | None = None
@@ -58,7 +77,7 @@ class Plan:
         return {
             "steps_planned": self.steps,
             PLANNED_DEGREE: self.sh_degree,
-            PLAN: {**rest, "notes": list(self.notes)},
+            PLAN: {**rest, "earlier": list(self.earlier), "notes": list(self.notes)},
         }
 
     @classmethod
@@ -71,47 +90,53 @@ class Plan:
             sh_degree: likewise.
         """
         rest = dict(facts.get(PLAN, {}))
-        notes = tuple(rest.pop("notes", ()))
+        notes, earlier = (tuple(rest.pop(name, ())) for name in ("notes", "earlier"))
         steps = int(facts.get("steps_planned", steps))
-        return cls(steps=steps, sh_degree=int(facts.get(PLANNED_DEGREE, sh_degree)), notes=notes, **rest)
+        return cls(
+            steps=steps, sh_degree=int(facts.get(PLANNED_DEGREE, sh_degree)), notes=notes, earlier=earlier, **rest
+        )
 
 
 def make_plan(
     optimizer: Optimizer,
     budget: BudgetConfig,
-    held_out: Sequence[int],
+    costs: Callable[[], Costs],
     validations: Callable[[int], int],
     *,
     double_means: bool,
     spent: Callable[[], float],
+    may_shrink: bool = False,
 ) -> Plan:
     """Plans a reconstruction that has not begun; `follow` carries the plan out.
 
     Args:
         optimizer: with the seeds.
         budget: what is promised, and the aim in minutes.
-        held_out: views that are validated on.
+        costs: measures the work, with the colors of the plan.
         validations: how many there are in so many steps.
         double_means: whether the splat's positions are written as doubles.
         spent: seconds until now.
+        may_shrink: whether photographs may be made smaller.
 
     Raises:
-        InputError: megabytes into which not one Gaussian fits.
+        InputError: megabytes into which not one Gaussian fits, or seconds that are over.
+        PhotographsTooLargeError: seconds ask for smaller ones.
     """
     config = optimizer.config
-    plan = Plan(steps=config.steps, sh_degree=config.sh_degree)
+    plan = Plan(steps=config.steps, sh_degree=config.sh_degree, earlier=config.earlier)
     if budget.megabytes is not None:
         plan = _within_megabytes(optimizer, budget, budget.megabytes, plan, double_means)
     if budget.error is not None:
         return replace(plan, steps=STEPS[0], spent=spent())
     if budget.seconds is None:
         return replace(plan, steps=affordable_steps(optimizer, budget.minutes), spent=spent())
-    return _within_seconds(optimizer, budget, budget.seconds, plan, held_out, validations, spent)
+    follow(optimizer, plan)
+    return _within_seconds(optimizer, budget, budget.seconds, plan, costs, validations, spent, may_shrink)
 
 
 def follow(optimizer: Optimizer, plan: Plan) -> None:
     """Sets steps, colors and the limit of Gaussians; coefficients of colors above the planned degree are taken out."""
-    optimizer.config = replace(optimizer.config, steps=plan.steps, sh_degree=plan.sh_degree)
+    optimizer.config = replace(optimizer.config, steps=plan.steps, sh_degree=plan.sh_degree, earlier=plan.earlier)
     optimizer.most = plan.most
     coefficients = (plan.sh_degree + 1) ** 2 - 1
     if optimizer.parameters["shN"].shape[1] > coefficients:
@@ -177,21 +202,45 @@ def _within_seconds(
     budget: BudgetConfig,
     seconds: float,
     plan: Plan,
-    held_out: Sequence[int],
+    measure: Callable[[], Costs],
     validations: Callable[[int], int],
     spent: Callable[[], float],
+    may_shrink: bool,
 ) -> Plan:
     """As many steps as there is time for, by trial steps of each kind."""
-    trial = min(affordable_steps(optimizer, budget.minutes_left(spent())), STEPS[-1])
-    follow(optimizer, replace(plan, steps=trial))
-    expected = expected_seconds(optimizer, held_out, validations(trial))
-    before, each = spent(), expected.steps / trial
-    steps = int((PLANNED * seconds - before - expected.other) / each)
-    steps = min(max(steps, STEPS[0]), STEPS[-1])
-    total = before + expected.other + steps * each
-    notes: tuple[str, ...] = ()
-    if total > seconds:
-        notes = (
-            f"{budget.shown('seconds')}: the fewest steps, {steps}, take about {total:.3g} s in all; they are done",
+    begun = spent()
+    refuse_late(budget, begun, "reading photographs and seeding")
+    costs, steps = measure(), plan.steps
+    before = spent()
+    expected = costs.expected(optimizer.config, optimizer.pruning, 0, steps, 0)
+    each = expected.steps / steps
+    for _ in range(2):
+        # How often is validated depends on the steps.
+        other = expected.other + costs.validation * validations(steps) + MAX_COMPARISONS * costs.picture
+        steps = min(max(int((AIMED * seconds - before - other) / each), 1), STEPS[-1])
+    cameras, shares = optimizer.photographs.cameras, (SMALLEST_SHARE, steps / (2 * FEW_STEPS))
+    least = least_pixels(optimizer.device, optimizer.config) / float(np.median(cameras.widths * cameras.heights))
+    factor = math.sqrt(max(*shares, least))
+    if may_shrink and steps < FEW_STEPS and factor < SMALLEST_REDUCTION and before + factor * begun < seconds / 2:
+        raise PhotographsTooLargeError(factor)
+    total = before + other + steps * each
+    needed = math.ceil((before + other + STEPS[0] * each) / AIMED)
+    few = f"{budget.shown('seconds')}: has time for {steps} steps; budget.seconds={needed} has for {STEPS[0]}"
+    return replace(plan, steps=steps, spent=before, seconds=total, notes=(few,) if steps < STEPS[0] else ())
+
+
+def refuse_late(budget: BudgetConfig, spent: float, subject: str, advice: str = "") -> None:
+    """Raises InputError where promised seconds are over before the first step; `subject` says with what."""
+    if budget.clock is not None and spent >= AIMED * budget.clock:
+        raise InputError(
+            f"{budget.shown('seconds')}: is over before the first step: {spent:.0f} s went into {subject}; "
+            f"give {advice or 'more seconds, a smaller data.image_scale, or fewer photographs (data.max_views)'}"
         )
-    return replace(plan, steps=steps, spent=before, seconds=total, notes=notes)
+
+
+def late_notes(budget: BudgetConfig, seconds: float) -> tuple[str, ...]:
+    """What is said where so many seconds in all are far more than the aim in minutes, which no clock keeps."""
+    note = (
+        f"budget.minutes={budget.minutes:g} aims at less; budget.seconds={60 * budget.minutes:g} is kept by the clock"
+    )
+    return (note,) if not budget.promised and 0 < 60 * LATE * budget.minutes < seconds else ()

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import ScaledPhotograph
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import Parameters, camera_of, rows_in_view
 from gsencoder.render.rasterize import RasterConfig, rasterize
 from gsencoder.types import Cameras
@@ -37,9 +38,9 @@ class PruneConfig:
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
-    def due(self, step: int, steps: int) -> bool:
-        """Whether is pruned after `step` of `steps`; small shares are of the first step."""
-        return step in {max(1, round(share * steps)) for share in self.at}
+    def due(self, step: int, schedule: OptimizeConfig) -> bool:
+        """Whether is pruned after `step` steps; small shares are of the first step."""
+        return any(schedule.completes(share, step) for share in self.at)
 
 
 def rows_to_keep(

@@ -3,9 +3,11 @@
 import os
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import cache
+from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,17 +26,20 @@ from gsencoder.reconstruct.anchor import anchor_at
 from gsencoder.reconstruct.budget import steps_for_minutes
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
 from gsencoder.reconstruct.config import ReconstructConfig, Report
-from gsencoder.reconstruct.expected_time import expected_seconds
+from gsencoder.reconstruct.expected_time import Costs, Pace, measured_costs
 from gsencoder.reconstruct.exposure_prediction import predict_exposures
 from gsencoder.reconstruct.fit import fit
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.plan import PLAN, STEPS, Plan, follow, make_plan
-from gsencoder.reconstruct.report import Comparison, LogRow, compare, describe_exposure, describe_plan
+from gsencoder.reconstruct.plan import AIMED, PLAN, STEPS, Plan, follow, late_notes, make_plan, refuse_late
+from gsencoder.reconstruct.report import MAX_COMPARISONS, Comparison, LogRow, compare, describe_exposure, describe_plan
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.score import MIN_PHOTOGRAPHS, drop_masked_views, split
 from gsencoder.reconstruct.start import initial_gaussians
 from gsencoder.types import Gaussians, Scene
+
+TRIAL_SHARE = 1 / 30
+"""Of promised seconds that are left, what goes into trials of each kind of work."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -82,6 +87,8 @@ def reconstruct(
     work: Path | None = None,
     made_from: Mapping[str, Any] = {},
     spent: float = 0.0,
+    may_shrink: bool = False,
+    now: Callable[[], float] = time.monotonic,
     track: Track = untracked,
     report: Report = lambda line: None,  # noqa: ARG005
 ) -> Reconstruction:
@@ -99,37 +106,51 @@ def reconstruct(
         made_from: what else a run must share with the run that it continues, as JSON values, such as the path and the
             reading options of the scene.
         spent: seconds that reading the scene took, which count to a promise of seconds.
+        may_shrink: whether the caller begins anew with smaller photographs where promised seconds ask for it.
+        now: the clock.
         track: progress of long loops.
         report: receives a line after seeding and after each validation.
 
     Raises:
         InputError: no photographs, too few of them, nothing to seed from, no Gaussian in view, a loss or gradient that
             is not finite, a promise that cannot be kept, or a checkpoint of another run.
+        PhotographsTooLargeError: only with `may_shrink`.
 
     Warns:
         SceneWarning: photographs that are masked all over, or plane sweeps that found no surface.
     """
     if scene.views is None:
         raise InputError(f"reconstruct: scene {scene.name} has no photographs to fit a splat to")
-    clock, began = Clock(), time.monotonic()
+    clock, first = Clock(), now() - spent
+
+    def elapsed() -> float:
+        return now() - first
+
+    def in_time(items: Iterable[Any], label: str) -> Iterator[Any]:
+        for item in track(items, label):
+            if not continued:
+                refuse_late(config.budget, elapsed(), "reading photographs and seeding")
+            yield item
+
     with ExitStack() as stack:
         folder = work or Path(stack.enter_context(TemporaryDirectory()))
+        continued = os.path.lexists(checkpoint := folder / CHECKPOINT_FILE)
         with clock("read"):
-            photographs = Photographs(scene.views, track=track)
+            photographs = Photographs(scene.views, track=in_time)
         training, held_out = split(len(photographs), config.holdout)
         training = drop_masked_views(photographs, training, "photographs to fit", least=MIN_PHOTOGRAPHS)
         held_out = drop_masked_views(photographs, held_out, "held-out photographs")
         identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
-        chosen_device, checkpoint = choose_device(device), folder / CHECKPOINT_FILE
+        chosen_device = choose_device(device)
         if config.budget.error is not None and not held_out:
             raise InputError("budget.error: is measured on held-out photographs, and there are none; leave it out")
-        if continued := os.path.lexists(checkpoint):
+        if continued:
             most = max(config.optimize.steps, steps_for_minutes(config.budget.minutes, config.optimize), STEPS[-1])
             shape = {"steps": most, "sh_degree": config.optimize.sh_degree}
             state = load_state(checkpoint, identity, **shape, device=chosen_device)
         else:
             with clock("seeds"):
-                state = initial_state(scene, photographs, training, config, chosen_device, track, report)
+                state = initial_state(scene, photographs, training, config, chosen_device, in_time, report)
         optimizer = Optimizer(
             state.adam,
             photographs,
@@ -142,11 +163,13 @@ def reconstruct(
             step=state.step,
         )
 
-        def since_reading() -> float:
-            return time.monotonic() - began + spent
-
         def validations(steps: int) -> int:
             return sum(config.validates_at(step, steps) for step in range(optimizer.step, steps + 1))
+
+        @cache
+        def costs() -> Costs:
+            limit = config.budget.clock
+            return measured_costs(optimizer, held_out, inf if limit is None else (limit - elapsed()) * TRIAL_SHARE)
 
         with clock("trial"):
             if continued:
@@ -155,25 +178,32 @@ def reconstruct(
                 plan = make_plan(
                     optimizer,
                     config.budget,
-                    held_out,
+                    costs,
                     validations,
                     double_means=bool(scene.origin.any()),
-                    spent=since_reading,
+                    spent=elapsed,
+                    may_shrink=may_shrink,
                 )
             follow(optimizer, plan)
+            saved_from = now()
             if not continued:
                 state = replace(state, adam=optimizer.adam)
                 save_state(checkpoint, replace(state, facts={**state.facts, **plan.facts()}), identity)
-            if continued or plan.seconds is None:
-                seconds = sum(expected_seconds(optimizer, held_out, validations(plan.steps)))
-            else:
-                seconds = plan.seconds - plan.spent
+            saving = now() - saved_from
+            left = optimizer.step, plan.steps, validations(plan.steps)
+            seconds = sum(costs().expected(optimizer.config, config.prune, *left))
             report(describe_plan(optimizer, config.optimize.steps, seconds, config.budget.option_of_steps, STEPS[-1]))
-            for note in plan.notes:
+            for note in (*plan.notes, *late_notes(config.budget, elapsed() + seconds)):
                 report(note)
+        if continued:
+            # What is repeated does not count.
+            first = now() - plan.spent - state.seconds
+        pace = None
+        if (limit := config.budget.clock) is not None:
+            # The last checkpoint and the splat, and pictures beside it.
+            pace = Pace(costs(), AIMED * limit - 2 * saving - MAX_COMPARISONS * costs().picture, elapsed)
         with clock("optimise"):
-            fitted = fit(optimizer, state, plan, held_out, config, folder, identity, track, report)
-        ended = time.monotonic()
+            fitted = fit(optimizer, state, plan, held_out, config, folder, identity, track, report, pace=pace, now=now)
         exposure = differing = source = None
         predicted = predict_exposures(optimizer.exposures, photographs.cameras, held_out)
         if optimizer.exposures is not None:
@@ -182,8 +212,6 @@ def reconstruct(
         if differing is not None:
             report(differing)
         comparisons = compare(optimizer, held_out, matched=differing is not None and source == "mean")
-        # What a run that is continued repeats does not count.
-        elapsed = fitted.seconds + time.monotonic() - ended if continued else since_reading()
         return Reconstruction(
             gaussians=optimizer.gaussians(),
             seeding={name: value for name, value in {**state.facts, **fitted.plan.facts()}.items() if name != PLAN},
@@ -197,7 +225,7 @@ def reconstruct(
             held_out_colors=predicted.maps.numpy(),
             seconds=clock.seconds,
             plan=fitted.plan,
-            elapsed=elapsed,
+            elapsed=elapsed(),
         )
 
 

@@ -6,7 +6,7 @@ import math
 import os
 import shutil
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -83,7 +83,12 @@ def _names_with(folder: Path, suffixes: tuple[str, ...]) -> list[str]:
 
 
 def register_photographs(
-    folder: Path, work: Path, config: SfmConfig = SfmConfig(), *, single_camera: bool = False
+    folder: Path,
+    work: Path,
+    config: SfmConfig = SfmConfig(),
+    *,
+    single_camera: bool = False,
+    in_time: Callable[[], None] = lambda: None,
 ) -> Placed:
     """Finds poses and intrinsics. Every photograph is decoded before. Few photographs that do not fit together are
     looked at a second time, for features that match from farther aside.
@@ -93,6 +98,7 @@ def register_photographs(
         work: an existing folder for COLMAP's database; the model is written to `sparse/0` in it.
         config: settings.
         single_camera: whether one camera took them all with one focal length, as the frames of a video.
+        in_time: is called before each part of the work, and may end it.
 
     Raises:
         InputError: fewer than three photographs, one that cannot be decoded or has a name that is no UTF-8, no two
@@ -122,7 +128,9 @@ def register_photographs(
         attempt = attempts / ("thorough" if thorough else "usual")
         attempt.mkdir(parents=True)
         try:
-            models += _map(pycolmap, attempt, folder, names, config, single_camera, thorough)
+            models += _map(pycolmap, attempt, folder, names, config, single_camera, thorough, in_time)
+        except InputError:
+            raise
         except (RuntimeError, ValueError) as error:
             message = " ".join(str(error).split())[:160]
             raise InputError(f"{folder}: pycolmap cannot place these photographs: {message}") from error
@@ -239,11 +247,14 @@ def _map(
     config: SfmConfig,
     single_camera: bool,
     thorough: bool,
+    in_time: Callable[[], None],
 ) -> list[Any]:
     """The models that COLMAP makes of the photographs, in a folder of their own."""
     database = work / "database.db"
     _find_features(pycolmap, database, folder, names, config, single_camera, thorough)
+    in_time()
     _match(pycolmap, database, len(names), config, thorough)
+    in_time()
     models = pycolmap.incremental_mapping(database, folder, work, options=_mapping(pycolmap, thorough))
     return list(models.values())
 

@@ -1,4 +1,6 @@
+import json
 import zlib
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -8,12 +10,16 @@ from hypothesis import strategies as st
 from PIL import Image
 from scene_files import photograph, save
 
+from gsencoder.app import cli
 from gsencoder.core.errors import InputError
+from gsencoder.data.readers import images
 from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
 from gsencoder.data.readers.image_file import picture_info, picture_size, read_integers, read_rgba
 from gsencoder.data.readers.images import ImageFiles, InstanceFiles, PixelGrid
 from gsencoder.data.readers.masks import MaskFiles
 from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
+from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic.write import write_room
 
 PINHOLE = CameraModel(model="PINHOLE", width=32, height=24, params=(30.0, 31.0, 16.0, 12.0))
 
@@ -212,3 +218,85 @@ def test_mutated_pictures_give_a_picture_or_an_input_error(tmp_path: Path, data:
         assert color.shape[2] == 3
     assert "mutated" in message
     assert "\n" not in message
+
+
+def wide_photograph(folder: Path, suffix: str) -> Path:
+    """400 × 300 pixels with edges, gradients and grain."""
+    draw = np.random.default_rng(0)
+    rows, columns = np.mgrid[:300, :400]
+    values = np.stack((columns / 2, rows / 2, 120 * ((columns // 25 + rows // 25) % 2)), axis=2)
+    pixels = np.clip(values + draw.normal(0, 4, (300, 400, 1)), 0, 255).astype(np.uint8)
+    path = folder / f"wide.{suffix}"
+    Image.fromarray(pixels).save(path, **({"quality": 93} if suffix == "jpg" else {}))
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+@pytest.mark.parametrize("params", [(350.0, 350.0, 200.0, 150.0), (350.0, 350.0, 200.0, 150.0, -0.05, 0.01, 0.0, 0.0)])
+@pytest.mark.parametrize(("width", "reduction"), [(60, 2), (37, 4), (150, 1)])
+def test_a_reduced_photograph_is_as_the_full_one_made_smaller(
+    tmp_path: Path, suffix: str, params: tuple[float, ...], width: int, reduction: int
+) -> None:
+    model = "OPENCV" if len(params) > 4 else "PINHOLE"
+    camera = CameraModel(model=model, width=400, height=300, params=params)
+    small = grid(camera, width, round(width * 0.75))
+    assert small.reduction == reduction
+    path = wide_photograph(tmp_path, suffix)
+    expected, remap = read_rgba(path)[0], RemapCache().get(small.pinhole, camera)
+    if remap is not None:
+        expected = remap.bilinear(expected)
+    expected = np.asarray(Image.fromarray(expected).resize((small.width, small.height), Image.Resampling.BOX))
+    differences = np.abs(ImageFiles([path], [small], RemapCache())[0].astype(int) - expected)
+    # Of 255, where the edges of the checkers have 120.
+    assert differences.mean() < (1.8 if reduction > 1 else 1e-9)
+    assert differences.max() <= 20
+
+
+def test_a_photograph_is_decoded_once_until_its_file_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decoded = []
+
+    def counted(path: Path, reduction: int) -> object:
+        decoded.append(path)
+        return read_rgba(path, reduction=reduction)
+
+    monkeypatch.setattr(images, "read_rgba", counted)
+    path = save(tmp_path / "a.png", photograph(0))
+    first = ImageFiles([path], [grid()], RemapCache())[0]
+    again = ImageFiles([path], [grid()], RemapCache())[0]
+    again[:] = 0  # A copy.
+    np.testing.assert_array_equal(ImageFiles([path], [grid()], RemapCache())[0], first)
+    assert len(decoded) == 1
+    ImageFiles([path], [grid(width=16, height=12)], RemapCache())[0]
+    assert len(decoded) == 2
+    save(path, 255 - photograph(0))
+    assert (ImageFiles([path], [grid()], RemapCache())[0] == 255 - first).all()
+    # The one that was looked at last stays where there is room for one.
+    monkeypatch.setattr(images, "KEPT_BYTES", 24 * 32 * 3)
+    other = save(tmp_path / "b.png", photograph(1))
+    files, count = ImageFiles([path, other], [grid()] * 2, RemapCache()), len(decoded)
+    for view, added in ((1, 1), (1, 1), (0, 2), (1, 3)):
+        assert files[view].shape == (24, 32, 3)
+        assert len(decoded) == count + added
+
+
+def test_a_fusion_decodes_each_photograph_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checks, seeds and the teacher look at the same views; before, some were decoded four times."""
+    room, folder = make_room(0, objects=2, views=5, width=160, height=120), tmp_path / "room"
+    write_room(room, folder)
+    transforms = json.loads((folder / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        picture = folder / frame["file_path"]
+        frame["file_path"] = frame["file_path"].replace(".png", ".jpg")
+        Image.open(picture).convert("RGB").save(picture.with_suffix(".jpg"))
+    (folder / "transforms.json").write_text(json.dumps(transforms))
+    decoded: Counter[str] = Counter()
+
+    def counted(path: Path, reduction: int) -> object:
+        decoded[path.name] += 1
+        assert reduction == 2
+        return read_rgba(path, reduction=reduction)
+
+    monkeypatch.setattr(images, "read_rgba", counted)
+    words = ["fuse", str(folder), "seeds.voxel=0.2", "data.image_scale=0.25", "teacher=palette", "quiet=true"]
+    assert cli.main([*words, f"out={tmp_path / 'features'}"]) == 0
+    assert decoded == {f"{view:03d}.jpg": 1 for view in range(5)}

@@ -1,6 +1,7 @@
 """What a reconstruction starts from: poses are taken where there are some, and photographs are placed where not."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -49,7 +50,10 @@ class Placing:
         monkeypatch.setattr(opening, "load_placement", lambda *_: self.earlier)
         monkeypatch.setattr(opening, "load_scene", self.load)
 
-    def place(self, pictures: Path, work: Path, sfm: SfmConfig, *, single_camera: bool) -> Placed:
+    def place(
+        self, pictures: Path, work: Path, sfm: SfmConfig, *, single_camera: bool, in_time: Callable[[], None]
+    ) -> Placed:
+        in_time()
         self.calls.append((pictures, single_camera))
         return self.placed
 

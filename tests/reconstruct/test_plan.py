@@ -9,11 +9,11 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.reconstruct import plan as planning
 from gsencoder.reconstruct.budget import BudgetConfig
-from gsencoder.reconstruct.expected_time import ExpectedSeconds
+from gsencoder.reconstruct.expected_time import Costs
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.plan import Plan, error_of, follow, make_plan
+from gsencoder.reconstruct.plan import PhotographsTooLargeError, Plan, error_of, follow, make_plan
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.score import split
@@ -32,8 +32,23 @@ def optimizer(scene: Scene) -> Optimizer:
     return Optimizer(adam, Photographs(scene.views), training, OptimizeConfig(), prune=PruneConfig())
 
 
-def planned(optimizer: Optimizer, budget: BudgetConfig, *, spent: float = 0.0, double: bool = False) -> Plan:
-    return make_plan(optimizer, budget, [0, 3], lambda steps: steps, double_means=double, spent=lambda: spent)
+def costs() -> Costs:
+    """Of a step 3 s, of each of three prunings 4 s."""
+    return Costs(step=0, steps={(2, False): 3.0, (1, True): 3.0}, prunings=(4.0, 4.0), validation=0.0, picture=0.0)
+
+
+def planned(
+    optimizer: Optimizer, budget: BudgetConfig, *, spent: float = 0.0, double: bool = False, may_shrink: bool = False
+) -> Plan:
+    return make_plan(
+        optimizer,
+        budget,
+        costs,
+        lambda steps: 2,
+        double_means=double,
+        spent=lambda: spent,
+        may_shrink=may_shrink,
+    )
 
 
 def test_less_room_first_costs_degrees_of_color_and_then_gaussians(optimizer: Optimizer) -> None:
@@ -142,26 +157,38 @@ def test_an_error_that_two_looks_did_not_make_smaller_is_given_up(errors: list[f
 
 
 @pytest.mark.parametrize(
-    ("seconds", "steps", "total", "broken"),
-    [(100.0, 17, 83.0, False), (1000.0, 100, 332.0, False), (50.0, 5, 47.0, False), (20.0, 5, 47.0, True)],
+    ("seconds", "steps", "total"), [(100.0, 22, 98.0), (1000.0, 100, 332.0), (50.0, 5, 47.0), (40.0, 2, 38.0)]
 )
 def test_seconds_buy_steps_by_what_trial_steps_take(
-    optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch, seconds: float, steps: int, total: float, broken: bool
+    optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch, seconds: float, steps: int, total: float
 ) -> None:
-    """A step takes 3 s, all else 12 s, and 20 s are spent; 0.85 of what is promised is planned with, between 5 and
-    100 steps. Those that are tried are as many as there may be time for."""
-    tried = []
-
-    def expected(one: Optimizer, _: object, validations: int) -> ExpectedSeconds:
-        tried.append((one.config.steps, validations))
-        return ExpectedSeconds(3.0 * one.config.steps, 12.0)
-
-    monkeypatch.setattr(planning, "expected_seconds", expected)
-    monkeypatch.setattr(planning, "affordable_steps", lambda _, minutes: round(60 * minutes))
+    """A step takes 3 s, all else 12 s, and 20 s are spent; at most 100 steps."""
     monkeypatch.setattr(planning, "STEPS", (5, 100))
     plan = planned(optimizer, BudgetConfig(seconds=seconds), spent=20.0)
     assert (plan.steps, plan.seconds, plan.spent) == (steps, pytest.approx(total), 20.0)
-    assert tried == [(min(100, max(1, round(0.85 * seconds - 20))),) * 2]
-    assert bool(plan.notes) == broken
-    if broken:
-        assert plan.notes == ("budget.seconds=20: the fewest steps, 5, take about 47 s in all; they are done",)
+    few = ("budget.seconds=40: has time for 2 steps; budget.seconds=48 has for 5",)
+    assert plan.notes == (few if steps < 5 else ())
+
+
+def test_seconds_that_are_over_before_the_first_step_are_refused(optimizer: Optimizer) -> None:
+    problem = "budget.seconds=20: is over before the first step: 20 s went into reading photographs and seeding; "
+    with pytest.raises(InputError, match=problem + "give more seconds, a smaller data.image_scale"):
+        planned(optimizer, BudgetConfig(seconds=20.0), spent=19.7)
+    # A promised error comes before seconds.
+    assert planned(optimizer, BudgetConfig(seconds=20.0, error=0.5), spent=19.7).steps == planning.STEPS[0]
+
+
+def test_photographs_are_to_be_smaller_where_there_is_time_for_few_steps_and_for_another_beginning(
+    optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Photographs as small as these are made no smaller.
+    few, enough = BudgetConfig(seconds=240.0), BudgetConfig(seconds=400.0)
+    assert planned(optimizer, few, spent=20.0, may_shrink=True).steps == 67
+    monkeypatch.setattr(planning, "least_pixels", lambda *_: 100.0)
+    with pytest.raises(PhotographsTooLargeError) as wanted:
+        planned(optimizer, few, spent=20.0, may_shrink=True)
+    # (0.98 · 240 − 20 − 12) / 3 = 67 steps, of 200 that are wished for.
+    assert wanted.value.args[0] == pytest.approx((67 / 200) ** 0.5, abs=1e-3)
+    assert planned(optimizer, few, spent=20.0).steps == 67
+    assert planned(optimizer, few, spent=110.0, may_shrink=True).steps == 37
+    assert planned(optimizer, enough, spent=20.0, may_shrink=True).steps > planning.FEW_STEPS

@@ -9,6 +9,7 @@ from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import ScaledPhotograph
+from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.render import blend
@@ -86,11 +87,12 @@ def test_what_is_wider_than_a_share_of_some_picture_is_taken_out(shrink: int) ->
 
 def test_pruning_is_due_once_for_each_share_of_the_steps() -> None:
     config = PruneConfig(at=(0.25, 0.5, 1.0))
-    assert [step for step in range(41) if config.due(step, 40)] == [10, 20, 40]
+    assert [step for step in range(41) if config.due(step, OptimizeConfig(steps=40))] == [10, 20, 40]
 
 
 def test_a_share_of_less_than_a_step_is_due_after_the_first() -> None:
-    assert [step for step in range(41) if PruneConfig(at=(0.01,)).due(step, 40)] == [1]
+    config = PruneConfig(at=(0.01,))
+    assert [step for step in range(41) if config.due(step, OptimizeConfig(steps=40))] == [1]
 
 
 @pytest.mark.parametrize("at", [0.0, -0.5, 1.01])

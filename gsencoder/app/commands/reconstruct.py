@@ -3,6 +3,7 @@
 import shutil
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
@@ -33,11 +34,12 @@ from gsencoder.reconstruct.budget import choose_scale
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, IMAGE_SCALE, image_scale_of
 from gsencoder.reconstruct.config import ReconstructConfig
 from gsencoder.reconstruct.open_scene import FRAMES_FOLDER, OpenedScene, find_photographed, open_scene
-from gsencoder.reconstruct.plan import error_of
+from gsencoder.reconstruct.plan import PhotographsTooLargeError, error_of, refuse_late
 from gsencoder.reconstruct.report import Comparison, LogRow, describe
 from gsencoder.reconstruct.run import Reconstruction, reconstruct
 from gsencoder.reconstruct.score import Score
 from gsencoder.reconstruct.sfm import SfmConfig
+from gsencoder.types import Scene
 
 PLY_FILE, PICTURES_FILE, MODEL_FOLDER = "splat.ply", "held_out.png", "sparse/0"
 
@@ -87,15 +89,19 @@ def run(config: ReconstructCommandConfig, summary: Summary) -> None:
 
 def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, summary: Summary) -> None:
     """Reads a scene or registers photographs, reconstructs, and writes splat, log and pictures into `out`."""
-    screen, began = console(config.quiet), time.perf_counter()
+    screen = console(config.quiet)
+
+    def spent() -> float:
+        return time.perf_counter() - summary.began
+
     with (
         WorkFolder(folder_beside(out, "reconstruction")) as work,
         output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
     ):
         refuse_to_replace_inputs(work.path, settings(config))
         work.take(anew=not config.resume)
-        opened = _open(path, work.path, config, config.data)
-        scale = _affordable_scale(opened, work.path, config, spent=time.perf_counter() - began)
+        opened = _open(path, work.path, config, config.data, spent)
+        scale = _affordable_scale(opened, work.path, config, spent=spent())
         opened = _at_scale(opened, scale, path, work.path, config, screen)
         summary.add_seconds(opened.seconds)
         with summary.step("check"):
@@ -106,22 +112,31 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             summary.results.update(placed=len(sfm.placed), missing=list(sfm.missing), sfm_error=sfm.error)
         parts = ("data", "sfm", "video") if opened.is_video else ("data", "sfm")
         reading = {name: settings(getattr(config, name)) for name in parts}
-        made_from = {"scene": str(path.resolve()), "splat": config.splat, IMAGE_SCALE: scale, **reading}
-        result = reconstruct(
-            opened.scene,
-            ReconstructConfig(**{item.name: getattr(config, item.name) for item in fields(ReconstructConfig)}),
-            device=config.device,
-            work=work.path,
-            made_from=made_from,
-            spent=time.perf_counter() - began,
-            track=Progress(quiet=config.quiet),
-            report=screen.print,
-        )
-        fitted = time.perf_counter()
+        made_from = {"scene": str(path.resolve()), "splat": config.splat, **reading}
+
+        def fitted(scene: Scene, scale: float, may_shrink: bool) -> Reconstruction:
+            return reconstruct(
+                scene,
+                ReconstructConfig(**{item.name: getattr(config, item.name) for item in fields(ReconstructConfig)}),
+                device=config.device,
+                work=work.path,
+                made_from={**made_from, IMAGE_SCALE: scale},
+                spent=spent(),
+                may_shrink=may_shrink,
+                track=Progress(quiet=config.quiet),
+                report=screen.print,
+            )
+
+        try:
+            result = fitted(opened.scene, scale, may_shrink=config.data.image_scale == 1 and not config.splat)
+        except PhotographsTooLargeError as found:
+            scale = round(scale * float(found.args[0]), 3)
+            opened = _at_scale(opened, scale, path, work.path, config, screen)
+            result = fitted(opened.scene, scale, may_shrink=False)
+        ended = time.perf_counter()
         summary.add_seconds(result.seconds)
         origin = opened.scene.origin
         save_splat(folder / PLY_FILE, result.gaussians, origin=origin if origin.any() else None)
-        seconds = result.elapsed + time.perf_counter() - fitted
         if opened.sfm is not None:
             # Without its poses the splat could not be fused.
             shutil.copytree(opened.sfm.model, folder / MODEL_FOLDER)
@@ -144,6 +159,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             splat=PLY_FILE,
             log=LOG_FILE,
         )
+        seconds = result.elapsed + time.perf_counter() - ended
         # A scene without poses of its own has the name of the folder of its state.
         name = opened.scene.name if opened.sfm is None else path.name
         promises = _report_budget(summary, name, scale, result, folder / PLY_FILE, seconds, config)
@@ -159,9 +175,20 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
         )
 
 
-def _open(path: Path, work: Path, config: ReconstructCommandConfig, data: SceneConfig) -> OpenedScene:
-    track = Progress(quiet=config.quiet)
-    return open_scene(path, work, splat=config.splat, data=data, sfm=config.sfm, video=config.video, track=track)
+def _open(
+    path: Path, work: Path, config: ReconstructCommandConfig, data: SceneConfig, spent: Callable[[], float]
+) -> OpenedScene:
+    subject, advice = "registering the photographs", "more seconds, fewer photographs, or a smaller sfm.size"
+    return open_scene(
+        path,
+        work,
+        splat=config.splat,
+        data=data,
+        sfm=config.sfm,
+        video=config.video,
+        track=Progress(quiet=config.quiet),
+        in_time=lambda: refuse_late(config.budget, spent(), subject, advice),
+    )
 
 
 def _report_budget(
@@ -179,6 +206,8 @@ def _report_budget(
         return []
     image_scale = scale * config.data.image_scale
     chosen = {"image_scale": image_scale, "steps": result.steps, "sh_degree": plan.sh_degree}
+    options = [f"data.image_scale={image_scale!r}", f"optimize.steps={result.steps}"]
+    options += [f"optimize.earlier={[*plan.earlier]}".replace(" ", ""), f"optimize.sh_degree={plan.sh_degree}"]
     if plan.most is not None:
         chosen["most_gaussians"] = plan.most
     report_choice(
@@ -188,6 +217,7 @@ def _report_budget(
         predicted={"seconds": plan.seconds, "megabytes": plan.megabytes},
         notes=plan.notes,
         quiet=config.quiet,
+        options=[*options, "budget.minutes=0"],
     )
     realised = {"seconds": seconds, "megabytes": file.stat().st_size / MEGABYTE}
     if result.log:
@@ -221,14 +251,13 @@ def _at_scale(
     with warnings.catch_warnings():
         # They were shown when the scene was read at its full size.
         warnings.simplefilter("ignore", SceneWarning)
-        smaller = _open(path, work, config, data)
+        smaller = _open(path, work, config, data, lambda: 0.0)
     width, height = (int(np.median(sizes)) for sizes in (views.cameras.widths, views.cameras.heights))
     budget = config.budget
-    time_given = f"about {budget.minutes:g} minutes" if budget.seconds is None else f"{budget.seconds:g} s"
-    option = "budget.minutes=0" if budget.seconds is None else "budget.seconds="
+    option = f"budget.minutes={budget.minutes:g}" if budget.seconds is None else budget.shown("seconds")
     screen.print(
-        f"photographs of {width}×{height} are looked at {scale:g} times as large, for a result in {time_given} "
-        f"({option} or data.image_scale= change that)"
+        f"photographs of {width}×{height} are looked at {scale:g} times as large, because of {option} "
+        "(data.image_scale= states another size)"
     )
     return replace(smaller, sfm=opened.sfm, seconds=opened.seconds)
 

@@ -59,15 +59,16 @@ class Summary:
         results: figures and file names; filled by the command.
         warnings: one line each, in order; see `add_warning`.
         timings: seconds by step, in order of first start.
+        began: when the run began, by `time.perf_counter`.
     """
 
-    def __init__(self, command: str, settings: Mapping[str, Any]) -> None:
+    def __init__(self, command: str, settings: Mapping[str, Any], began: float | None = None) -> None:
         self.command = command
         self.settings = dict(settings)
         self.results: dict[str, Any] = {}
         self.warnings: list[str] = []
         self.timings: dict[str, float] = {}
-        self._start = time.perf_counter()
+        self.began = time.perf_counter() if began is None else began
         self._scene: tuple[str, Path, Summary] | None = None
 
     def add_warning(self, text: str) -> str:
@@ -119,7 +120,7 @@ class Summary:
         """The record as JSON values. `non_finite` lists the results that were not finite and are null."""
         lost: list[str] = []
         results = plain(self.results, "results", lost)
-        total = time.perf_counter() - self._start
+        total = time.perf_counter() - self.began
         record = {
             "command": self.command,
             "version": gsencoder.__version__,

@@ -180,13 +180,19 @@ def is_deep_grey(path: Path) -> bool:
         return picture.mode in DEEP_GREY
 
 
-def read_rgba(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
+def read_rgba(path: Path, *, reduction: int = 1) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
     """Color (composited over black) and alpha, None where the file has none.
+
+    Args:
+        path: the file.
+        reduction: 1, 2, 4 or 8: JPEG is decoded so many times smaller, and files of other formats are not.
 
     Raises:
         InputError: unreadable, damaged, too large, or of a kind that is not color.
     """
     with open_picture(path) as file:
+        if file.format == "JPEG" and reduction > 1:
+            file.draft("RGB", (file.width // reduction, file.height // reduction))
         picture = _decode(path, file)
         try:
             if picture.mode.startswith("I"):

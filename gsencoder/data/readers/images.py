@@ -2,12 +2,16 @@
 scaled. `depth_images.py` has depth of sensors, `masks.py` masks.
 
 - Distorted pictures are resampled once (undistort.py): color bilinearly, everything else by the nearest pixel.
-- A smaller scale averages color over areas; depth and instances take the pixel at the new center.
+- A smaller scale averages color over areas; depth and instances take the pixel at the new center. Photographs are
+  decoded and undistorted at half, a quarter or an eighth of their size where that is at least twice the view's.
+- Photographs that were read last are kept, up to `KEPT_BYTES`: checks, seeds and teachers look at the same ones.
 - A file whose width and height are exchanged is turned by the photograph's EXIF orientation. Masks, depth and instance
   maps of another size than the photograph are enlarged or reduced by the nearest pixel.
 """
 
+import math
 import operator
+import threading
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,11 +22,15 @@ import numpy as np
 from jaxtyping import Int32, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.image_file import read_integers, read_rgba
+from gsencoder.data.readers.image_file import picture_size, read_integers, read_rgba
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache
 from gsencoder.types.orientation import EXCHANGED, turned
 
 Array = TypeVar("Array", bound=np.ndarray)
+KEPT_BYTES = 64 << 20
+"""Of all photographs that are kept; scenes with more decode them each time they are looked at."""
+_kept: dict[Any, UInt8[np.ndarray, "_ _ 3"]] = {}
+_kept_lock = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +51,15 @@ class PixelGrid:
     width: int
     height: int
     turn: int = 1
+
+    @property
+    def reduction(self) -> int:
+        """How many times smaller a photograph is decoded: 1, 2, 4 or 8."""
+        source = self.source
+        most = min(source.width // (2 * self.width), source.height // (2 * self.height))
+        # Pixels that are cut off are the last ones of the file; turned they would be the first.
+        sides = 0 if self.turn == 1 else math.gcd(source.width, source.height)
+        return max(each for each in (1, 2, 4, 8) if each <= max(1, most) and sides % each == 0)
 
     def is_exchanged(self, width: int, height: int) -> bool:
         """Whether a file of this size is to be turned."""
@@ -138,18 +155,40 @@ class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
     """Photographs as uint8 [H, W, 3] RGB, undistorted and scaled."""
 
     def _load(self, view: int) -> UInt8[np.ndarray, "H W 3"]:
-        from PIL import Image
-
         path, grid = self._paths[view], self._grids[view]
         assert path is not None
-        color = self._turned(view, read_rgba(path)[0])
-        self.check_size(view, color.shape[:2])
-        remap = self._remaps.get(grid.pinhole, grid.source)
+        state = path.stat() if path.exists() else None
+        key = (path, grid, state and (state.st_mtime_ns, state.st_size))
+        with _kept_lock:
+            color = _kept.pop(key, None)
+        if color is None:
+            color = self._decoded(view, path)
+        if color.nbytes <= KEPT_BYTES:
+            with _kept_lock:
+                _kept[key] = color
+                while sum(each.nbytes for each in _kept.values()) > KEPT_BYTES:
+                    _kept.pop(next(iter(_kept)))
+        return color.copy()
+
+    def _decoded(self, view: int, path: Path) -> UInt8[np.ndarray, "H W 3"]:
+        from PIL import Image
+
+        grid = self._grids[view]
+        reduction = grid.reduction
+        size, color = picture_size(path), read_rgba(path, reduction=reduction)[0]
+        if color.shape[:2] == size[::-1] and reduction > 1:
+            color = np.array(Image.fromarray(color).reduce(reduction))
+        if grid.is_exchanged(*size):
+            color, size = turned(color, grid.turn), size[::-1]
+        self.check_size(view, size[::-1])
+        remap = self._remaps.get(grid.pinhole, grid.source, reduction)
         if remap is not None:
             color = remap.bilinear(color)
         if color.shape[:2] != (grid.height, grid.width):
-            small = Image.fromarray(color).resize((grid.width, grid.height), Image.Resampling.BOX)
-            color = np.array(small)
+            # Of two to four pixels for one a box would take some whole and some not at all.
+            method = Image.Resampling.BOX if reduction == 1 else Image.Resampling.HAMMING
+            whole = (0, 0, size[0] / reduction, size[1] / reduction)
+            color = np.array(Image.fromarray(color).resize((grid.width, grid.height), method, box=whole))
         return color
 
 

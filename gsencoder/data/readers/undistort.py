@@ -91,6 +91,11 @@ class Pinhole:
         sx, sy = width / self.width, height / self.height
         return intrinsic_matrix(self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
+    def reduced(self, factor: int) -> "Pinhole":
+        """The camera of pixels that stand for factor × factor of this one's; the last ones may be cut off."""
+        values = {name: getattr(self, name) / factor for name in ("fx", "fy", "cx", "cy")}
+        return Pinhole(**values, width=-(-self.width // factor), height=-(-self.height // factor))
+
 
 def check_camera(camera: CameraModel, where: str) -> None:
     """Raises InputError where the camera cannot be used; `where` begins the message."""
@@ -274,10 +279,10 @@ class RemapCache:
 
     def __init__(self, budget: int = 256 << 20) -> None:
         self._budget = budget
-        self._remaps: dict[tuple[Pinhole, CameraModel], Remap] = {}
+        self._remaps: dict[tuple[Pinhole, CameraModel, int], Remap] = {}
 
-    def get(self, target: Pinhole, source: CameraModel) -> Remap | None:
-        """The remap, or None if both cameras have the same pixels."""
+    def get(self, target: Pinhole, source: CameraModel, reduction: int = 1) -> Remap | None:
+        """The remap between pictures that are both so many times smaller, or None if they have the same pixels."""
         if (
             source.is_pinhole
             and (target.width, target.height) == (source.width, source.height)
@@ -286,13 +291,15 @@ class RemapCache:
             return None
         # Views are read on several threads. The lock is no attribute, because scenes are sent to other processes.
         with _remap_lock:
-            remap = self._remaps.pop((target, source), None)
+            key = (target, source, reduction)
+            remap = self._remaps.pop(key, None)
             if remap is None:
-                remap = build_remap(target, source)
+                full = build_remap(target.reduced(reduction), source)
+                remap = Remap(x=full.x / np.float32(reduction), y=full.y / np.float32(reduction))
                 size = remap.x.nbytes + remap.y.nbytes
                 size_of_all = sum(r.x.nbytes + r.y.nbytes for r in self._remaps.values())
                 while self._remaps and size_of_all + size > self._budget:
                     oldest = self._remaps.pop(next(iter(self._remaps)))
                     size_of_all -= oldest.x.nbytes + oldest.y.nbytes
-            self._remaps[(target, source)] = remap
+            self._remaps[key] = remap
             return remap

@@ -50,7 +50,8 @@ def test_seconds_are_counted_from_the_first_reading_to_the_splat_and_all_that_wa
 
     for name, function in {"_open": opened, "choose_scale": scale, "reconstruct": fitted, "save_splat": saved}.items():
         monkeypatch.setattr(command, name, function)
-    monkeypatch.setattr(command, "time", SimpleNamespace(perf_counter=lambda: now[0]))
+    for module in (cli, command):
+        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
     words = ["holdout=3", "seeds.voxel=0.15", "budget.seconds=506", "budget.megabytes=9", "budget.error=0.99"]
     assert cli.main(["reconstruct", str(room), f"out={tmp_path / 'out'}", *words]) == 0
     assert spent_at == {"scale": 30, "fit": 60}
@@ -62,7 +63,8 @@ def test_seconds_are_counted_from_the_first_reading_to_the_splat_and_all_that_wa
     assert budget["realised"]["seconds"] == 507
     assert budget["realised"]["error"] == 1 - results["seen_ssim"]
     printed = capsys.readouterr()
-    assert "photographs of 120×90 are looked at 0.5 times as large, for a result in 506 s (budget.seconds= or" in (
-        " ".join(printed.out.split())
+    assert (
+        "photographs of 120×90 are looked at 0.5 times as large, because of budget.seconds=506 (data.image_scale"
+        in (" ".join(printed.out.split()))
     )
     assert "budget.seconds: promised 506, and it became 507" in printed.err
