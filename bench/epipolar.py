@@ -41,7 +41,7 @@ def made_texture(rng: np.random.Generator, side: int, smooth: float) -> np.ndarr
 def orbit(seed: int) -> Views:
     """Photographs of something colorful on a pedestal in a room whose walls all have one wallpaper."""
     rng = np.random.default_rng(seed)
-    count, radius = int(rng.integers(5, 14)), rng.uniform(0.6, 1.2)
+    count, radius = int(rng.integers(5, 11)), rng.uniform(0.6, 1.2)
     turns = rng.uniform(0, 2 * np.pi) + np.deg2rad(rng.uniform(5, 12)) * np.arange(count)
     centers = np.stack(
         (radius * np.cos(turns), radius * np.sin(turns), rng.uniform(0, 0.4) + rng.uniform(-0.04, 0.04, count)), axis=1
@@ -89,8 +89,8 @@ def made_rooms(count: int) -> Iterator[tuple[str, Views]]:
 
 
 def scenes(folder: Path) -> Iterator[tuple[str, Views]]:
-    """Names and photographs; of the large scenes every second view."""
-    for path in [*sorted((folder / "house").iterdir()), folder / "plush", folder / "kitchen"]:
+    """Names and photographs of every third room of the house and of the large scenes, of these every second view."""
+    for path in [*sorted((folder / "house").iterdir())[::3], folder / "plush", folder / "kitchen"]:
         views = load_scene(path).views
         assert views is not None
         yield path.name, replace(views, depths=None).select(range(0, len(views), 1 if len(views) < 30 else 2))
