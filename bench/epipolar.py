@@ -48,7 +48,7 @@ def orbit(seed: int) -> Views:
     )
     forward = rng.normal(size=(count, 3)) * 0.05 - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    cameras = looking_cameras(centers, forward, np.array([0.0, 0, 1]), width=320, height=240, focal=280.0)
+    cameras = looking_cameras(centers, forward, np.array([0.0, 0, 1]), width=240, height=180, focal=210.0)
     paper, skin = made_texture(rng, 128, rng.uniform(1.5, 4)), made_texture(rng, 512, rng.uniform(4, 12))
     period, contrast = rng.uniform(0.4, 1.6), rng.uniform(0.2, 0.8)
     thing = Solid(shape="ellipsoid", center=np.zeros(3), half=rng.uniform(0.08, 0.25, 3))
