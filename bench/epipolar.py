@@ -133,7 +133,8 @@ class Case:
     rows: np.ndarray
     cameras: Cameras
     matches: list[PairMatches]
-    stray: int | None = None
+    strays: tuple[int, ...] = ()
+    kind: str = ""
 
     def judge(self) -> EpipolarCheck:
         names = [str(row) for row in self.rows]
@@ -164,28 +165,41 @@ def good_cases(scenes: dict[str, tuple[Cameras, list[PairMatches]]], count: int)
 
 
 def stray_cases(scenes: dict[str, tuple[Cameras, list[PairMatches]]], count: int) -> Iterator[Case]:
-    """The same with one view turned by 3° to 15° and moved by 3 to 15 % of the distance to what it looks at, where it
-    has matches with two others that have matches with a third each, and three pairs remain without it."""
+    """Subsets of 8 to 24 views of which one or two are turned by 3° to 20° or moved by 5 to 30 % of the distance to what
+    they look at. Each has matches with two others that have matches with a third, and three pairs remain without it:
+    where there are fewer, nothing can be said."""
     rng = np.random.default_rng(1)
     found = 0
     for case in good_cases(scenes, 100 * count):
-        pairs = np.array([(pair.first, pair.second) for pair in of_rows(case.matches, case.rows)]).reshape(-1, 2)
-        suitable = []
-        for view in range(len(case.rows)):
-            with_view = (pairs == view).any(axis=1)
-            partners = np.setdiff1d(pairs[with_view], view)
-            if np.isin(partners, pairs[~with_view]).sum() >= 2 and (~with_view).sum() >= 3:
-                suitable.append(view)
-        if not suitable:
+        if len(case.rows) < 8:
             continue
-        stray = int(case.rows[rng.choice(suitable)])
-        axis, way = (direction / np.linalg.norm(direction) for direction in rng.normal(size=(2, 3)))
-        pose = np.eye(4)
-        pose[:3, :3] = Rotation.from_rotvec(np.deg2rad(rng.uniform(3, 15)) * axis).as_matrix()
-        pose[:3, 3] = rng.uniform(0.03, 0.15) * typical_distance(case.cameras) * way
+        strays = rng.choice(len(case.rows), int(rng.integers(1, 3)), replace=False)
+        pairs = np.array([(pair.first, pair.second) for pair in case.matches]).reshape(-1, 2)
+        pairs = pairs[np.isin(pairs, case.rows).all(axis=1)]
+        is_stray = np.isin(pairs, case.rows[strays])
+        rest = pairs[~is_stray.any(axis=1)]
+        partners = [
+            np.intersect1d(pairs[(pairs == view).any(axis=1) & (is_stray.sum(axis=1) == 1)], rest)
+            for view in case.rows[strays]
+        ]
+        if len(rest) < 3 or min(map(len, partners)) < 2:
+            continue
         poses = case.cameras.cam_from_world.copy()
-        poses[stray] = pose @ poses[stray]
-        yield replace(case, cameras=replace(case.cameras, cam_from_world=poses), stray=stray)
+        kinds = []
+        for view in case.rows[strays]:
+            axis, way = (direction / np.linalg.norm(direction) for direction in rng.normal(size=(2, 3)))
+            pose = np.eye(4)
+            if rng.uniform() < 0.5:
+                degrees = rng.uniform(3, 20)
+                pose[:3, :3] = Rotation.from_rotvec(np.deg2rad(degrees) * axis).as_matrix()
+                kinds.append(f"turned by {degrees:.0f}°")
+            else:
+                share = rng.uniform(0.05, 0.3)
+                pose[:3, 3] = share * typical_distance(case.cameras) * way
+                kinds.append(f"moved by {share:.0%}")
+            poses[view] = pose @ poses[view]
+        cameras = replace(case.cameras, cam_from_world=poses)
+        yield replace(case, cameras=cameras, strays=tuple(map(int, case.rows[strays])), kind=", ".join(kinds))
         found += 1
         if found == count:
             return
@@ -221,13 +235,16 @@ def main() -> None:
         figures[f"{kind}"] = len(checks)
         figures[f"{kind} accused"] = sum(bool(check.findings) for _, check in checks)
         figures[f"{kind} undecided"] = sum(not check.decided for _, check in checks)
-    strays = [(case, case.judge()) for case in stray_cases(real, arguments.cases)]
-    named = [{finding.view for finding in check.findings} for _, check in strays]
-    figures["strays"] = len(strays)
-    figures["strays named"] = sum(str(case.stray) in views for (case, _), views in zip(strays, named, strict=True))
-    figures["others named with them"] = sum(
-        bool(views - {str(case.stray)}) for (case, _), views in zip(strays, named, strict=True)
-    )
+    strays, named, others = 0, 0, 0
+    for case in stray_cases(real, arguments.cases):
+        found = {finding.view for finding in case.judge().findings}
+        missed = {str(stray) for stray in case.strays} - found
+        strays += len(case.strays)
+        named += len(case.strays) - len(missed)
+        others += len(found - {str(stray) for stray in case.strays})
+        if missed or found - {str(stray) for stray in case.strays}:
+            print(f"{case.scene}, {len(case.rows)} views: {case.strays} {case.kind}; found {sorted(map(str, found))}")
+    figures |= {"strays": strays, "strays named": named, "others named with them": others}
     for name, value in figures.items():
         print(f"{name}: {value}")
     write_figures(arguments.json, figures)

@@ -308,7 +308,7 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
             error, usual = mean_error(cameras, own), mean_error(cameras, near_pairs(cameras, [p for p, _ in others]))
             if error > max(STRAY_ERROR, STRAY_FACTOR * usual):
                 suspects.append((error, usual, view, own))
-        for error, _, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
+        for error, usual, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
             moved = fit_pose_to_matches(cameras, view, own)
             fitting = sum(_fits(moved, pair, limit) for pair in own)
             if (

@@ -34,8 +34,8 @@ CLEAR = 0.7
 """Where the files' own reading compares nothing, another one is named if this share agrees under it."""
 COMPARABLE = 0.02
 """Samples that land in another view, as a share of all pairs, below which depth says nothing about poses."""
-STRAY = 0.9
-"""A view is astray if moving it brings its spread below this share."""
+STRAY, STRAY_SPREAD = 0.9, 0.002
+"""A view is astray if moving it brings its spread below this share, and it is above what pixels alone make."""
 SUSPECTS = 8
 """So many views, those that fit worst, are tried to be moved."""
 OTHER_PICTURE = 0.8
@@ -310,7 +310,7 @@ def _stray_views(views: DepthViews, names: tuple[str, ...]) -> list[Finding]:
     findings = []
     for view in sorted(int(suspect) for suspect in suspects):
         fit = fit_pose(views, view, normals)
-        if fit.after < STRAY * fit.before:
+        if fit.before > STRAY_SPREAD and fit.after < STRAY * fit.before:
             message = (
                 f"its pose does not fit the other views: {fit.moved:.3g} units and {np.rad2deg(fit.turned):.2f}° off"
             )
