@@ -165,9 +165,9 @@ def good_cases(scenes: dict[str, tuple[Cameras, list[PairMatches]]], count: int)
 
 
 def stray_cases(scenes: dict[str, tuple[Cameras, list[PairMatches]]], count: int) -> Iterator[Case]:
-    """Subsets of 8 to 24 views of which one or two are turned by 3° to 20° or moved by 5 to 30 % of the distance to what
-    they look at. Each has matches with two others that have matches with a third, and three pairs remain without it:
-    where there are fewer, nothing can be said."""
+    """Subsets of 8 to 24 views of which one or two are turned by 3° to 20° or moved by 5 to 30 % of the distance to
+    what they look at. Each has matches with two others that have matches with a third, and three pairs remain without
+    it: where there are fewer, nothing can be said."""
     rng = np.random.default_rng(1)
     found = 0
     for case in good_cases(scenes, 100 * count):

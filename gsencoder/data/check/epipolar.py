@@ -92,14 +92,14 @@ class EpipolarCheck:
     """
 
     views: Int64[np.ndarray, " V"]
-    pairs: int
-    matches: int
-    error: float
-    share: float
-    best_error: float
-    findings: tuple[Finding, ...]
-    decided: bool
-    worst: PairMatches | None
+    pairs: int = 0
+    matches: int = 0
+    error: float = float("nan")
+    share: float = float("nan")
+    best_error: float = float("nan")
+    findings: tuple[Finding, ...] = ()
+    decided: bool = False
+    worst: PairMatches | None = None
     cameras: Cameras
 
 
@@ -139,19 +139,7 @@ def judge_matches(
         names: of the views.
     """
     if not matches:
-        nan = float("nan")
-        return EpipolarCheck(
-            views=rows,
-            pairs=0,
-            matches=0,
-            error=nan,
-            share=nan,
-            best_error=nan,
-            findings=(),
-            decided=False,
-            worst=None,
-            cameras=cameras,
-        )
+        return EpipolarCheck(views=rows, cameras=cameras)
     near = near_pairs(cameras, matches)
     best, best_error = cameras, mean_error(cameras, near)
     findings: list[Finding] = []
@@ -310,22 +298,18 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
                 suspects.append((error, usual, view, own))
         for error, usual, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
             moved = fit_pose_to_matches(cameras, view, own)
-            fitting = sum(_fits(moved, pair, limit) for pair in own)
-            if (
-                fitting >= 2
-                and share_that_fits(moved, own, limit) >= MOVED_SHARE
-                and mean_error(moved, own) < error / 2
-            ):
+            fitting, after = sum(_fits(moved, pair, limit) for pair in own), mean_error(moved, own)
+            if fitting >= 2 and share_that_fits(moved, own, limit) >= MOVED_SHARE and after < error / 2:
+                message = (
+                    f"its photograph does not fit its pose: its matches lie {error:.1f} pixels from their epipolar "
+                    f"lines, {after:.1f} if it is moved, and those of the other views {usual:.1f}"
+                )
+                findings.append(Finding(cause="stray view", message=message, view=names[view]))
+                remaining = [(pair, fits) for pair, fits in remaining if view not in (pair.first, pair.second)]
+                views -= {view}
                 break
         else:
             return findings
-        message = (
-            f"its photograph does not fit its pose: its matches lie {error:.1f} pixels from their epipolar lines, "
-            f"{mean_error(moved, own):.1f} if it is moved, and those of the other views {usual:.1f}"
-        )
-        findings.append(Finding(cause="stray view", message=message, view=names[view]))
-        remaining = [(pair, fits) for pair, fits in remaining if view not in (pair.first, pair.second)]
-        views -= {view}
 
 
 def fit_pose_to_matches(cameras: Cameras, view: int, matches: Sequence[PairMatches]) -> Cameras:
