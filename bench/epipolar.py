@@ -8,8 +8,9 @@ are judged in full and in part: far views see the same motif at other places, an
 """
 
 import argparse
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -38,9 +39,8 @@ def made_texture(rng: np.random.Generator, side: int, smooth: float) -> np.ndarr
     return 0.5 + 0.5 * np.tanh(noise / noise.std())
 
 
-def orbit(seed: int) -> Views:
-    """Photographs of something colorful on a pedestal in a room whose walls all have one wallpaper."""
-    rng = np.random.default_rng(seed)
+def orbit_cameras(rng: np.random.Generator) -> Cameras:
+    """Five to ten cameras around the origin, 5° to 12° apart."""
     count, radius = int(rng.integers(5, 11)), rng.uniform(0.6, 1.2)
     turns = rng.uniform(0, 2 * np.pi) + np.deg2rad(rng.uniform(5, 12)) * np.arange(count)
     centers = np.stack(
@@ -48,7 +48,14 @@ def orbit(seed: int) -> Views:
     )
     forward = rng.normal(size=(count, 3)) * 0.05 - centers
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
-    cameras = looking_cameras(centers, forward, np.array([0.0, 0, 1]), width=240, height=180, focal=210.0)
+    return looking_cameras(centers, forward, np.array([0.0, 0, 1]), width=240, height=180, focal=210.0)
+
+
+def orbit(seed: int) -> Views:
+    """Photographs of something colorful on a pedestal in a room whose walls all have one wallpaper."""
+    rng = np.random.default_rng(seed)
+    cameras = orbit_cameras(rng)
+    count = len(cameras)
     paper, skin = made_texture(rng, 128, rng.uniform(1.5, 4)), made_texture(rng, 512, rng.uniform(4, 12))
     period, contrast = rng.uniform(0.4, 1.6), rng.uniform(0.2, 0.8)
     thing = Solid(shape="ellipsoid", center=np.zeros(3), half=rng.uniform(0.08, 0.25, 3))
@@ -80,32 +87,39 @@ def sample(texture: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.stack([map_coordinates(channel, where, order=1, mode="grid-wrap") for channel in texture.T], axis=-1)
 
 
-def made_rooms(count: int) -> Iterator[tuple[str, Views]]:
-    """Rooms as the demo's, in which little can be matched."""
-    for seed in range(count):
-        views = make_room(seed, width=320, height=240).views
-        assert views is not None
-        yield f"room_{seed}", replace(views, depths=None)
+def made_room(seed: int) -> Views:
+    """A room as the demo's, in which little can be matched."""
+    views = make_room(seed, width=320, height=240).views
+    assert views is not None
+    return replace(views, depths=None)
 
 
-def scenes(folder: Path) -> Iterator[tuple[str, Views]]:
-    """Names and photographs of every third room of the house and of the large scenes, of these every second view."""
+def photographs(path: Path) -> Views:
+    """Those of a scene; of a large one every second."""
+    views = load_scene(path).views
+    assert views is not None
+    return replace(views, depths=None).select(range(0, len(views), 1 if len(views) < 30 else 2))
+
+
+def scenes(folder: Path) -> Iterator[tuple[str, Callable[[], Views]]]:
+    """Names and photographs of every third room of the house, of the large scenes and of made rooms."""
     for path in [*sorted((folder / "house").iterdir())[::3], folder / "plush", folder / "kitchen"]:
-        views = load_scene(path).views
-        assert views is not None
-        yield path.name, replace(views, depths=None).select(range(0, len(views), 1 if len(views) < 30 else 2))
-    yield from made_rooms(8)
+        yield path.name, partial(photographs, path)
+    for seed in range(8):
+        yield f"room_{seed}", partial(made_room, seed)
 
 
-def matched(name: str, views: Views, cache: Path) -> tuple[Cameras, list[PairMatches]]:
+def matched(name: str, make: Callable[[], Views], cache: Path) -> tuple[Cameras, list[PairMatches]]:
     """Cameras at the size of the matched pictures and the consistent matches of all pairs."""
-    cameras = views.cameras.resized(PICTURE_SIZE, enlarge=False)
     file = cache / f"{name}.npz"
     if not file.is_file():
+        views = make()
+        cameras = views.cameras.resized(PICTURE_SIZE, enlarge=False)
         pairs = [(first, second) for first in range(len(views)) for second in range(first + 1, len(views))]
         found = consistent_matches(match_photographs(views, cameras, pairs, features=FEATURES))
         np.savez_compressed(
             file,
+            **{field.name: getattr(cameras, field.name) for field in fields(cameras)},
             pairs=np.array([(pair.first, pair.second, len(pair.first_pixels)) for pair in found]).reshape(-1, 3),
             pixels=np.concatenate(
                 [np.zeros((0, 4)), *(np.hstack((pair.first_pixels, pair.second_pixels)) for pair in found)]
@@ -113,6 +127,7 @@ def matched(name: str, views: Views, cache: Path) -> tuple[Cameras, list[PairMat
         )
     with np.load(file) as arrays:
         table, pixels = arrays["pairs"], arrays["pixels"]
+        cameras = Cameras(**{field.name: arrays[field.name] for field in fields(Cameras)})
     ends = np.cumsum(table[:, 2])
     return cameras, [
         PairMatches(
@@ -214,9 +229,9 @@ def main() -> None:
     add_json_option(parser)
     arguments = parser.parse_args()
     arguments.cache.mkdir(parents=True, exist_ok=True)
-    real = {name: matched(name, views, arguments.cache) for name, views in scenes(arguments.folder)}
+    real = {name: matched(name, make, arguments.cache) for name, make in scenes(arguments.folder)}
     rings = {
-        f"orbit_{seed:03d}": matched(f"orbit_{seed:03d}", orbit(seed), arguments.cache)
+        f"orbit_{seed:03d}": matched(f"orbit_{seed:03d}", partial(orbit, seed), arguments.cache)
         for seed in range(arguments.orbits)
     }
     whole = [
