@@ -1,7 +1,7 @@
 """What a scene holds, and what it lacks."""
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -83,34 +83,10 @@ class SceneFacts:
 
     def to_dict(self) -> dict[str, Any]:
         """The facts as JSON values."""
-        up, depth = self.up, self.depth
-        return {
-            "layout": self.layout,
-            "views": self.views,
-            "sizes": [[*size, count] for size, count in self.sizes.items()],
-            "models": self.models,
-            "focal": list(self.focal),
-            "field_of_view": list(self.field),
-            "camera_extent": list(self.spread),
-            "depth": None
-            if depth is None
-            else {
-                "views": depth.views,
-                "coverage": depth.coverage,
-                "near": depth.near,
-                "far": depth.far,
-                "sensor": depth.sensor,
-            },
-            "masks": self.masks,
-            "empty": self.empty,
-            "points": self.points,
-            "objects": self.objects,
-            "instances": self.instances,
-            "metres_per_unit": self.metres_per_unit,
-            "up": None if up is None else up.to_dict(),
-            "missing": list(self.missing),
-            "unused": list(self.unused),
-        }
+        values = asdict(self)
+        values["field_of_view"], values["camera_extent"] = values.pop("field"), values.pop("spread")
+        sizes = [[*size, count] for size, count in self.sizes.items()]
+        return values | {"sizes": sizes, "up": None if self.up is None else self.up.to_dict()}
 
 
 def scene_facts(scene: Scene, posed: PosedImages, layout: str) -> SceneFacts:

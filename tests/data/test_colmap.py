@@ -3,6 +3,7 @@ import struct
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -293,3 +294,36 @@ def test_a_name_longer_than_any_file_has_is_refused_at_once(tmp_path: Path, text
         load_scene(tmp_path)
     assert time.monotonic() - begun < 10
     assert len(str(caught.value)) < 1000
+
+
+def drop(lines: list[str], row: int) -> list[str]:
+    return lines[:row] + lines[row + 1 :]
+
+
+@pytest.mark.parametrize("old", [False, True])
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("cameras", lambda lines: drop(lines, 0), r"images\.txt: line 5 says that '001.png' has camera 1, which cam"),
+        ("cameras", lambda lines: [lines[0][:9]], r"cameras\.txt: line 4 is not CAMERA_ID MODEL"),
+        ("cameras", lambda lines: [lines[0].rsplit(" ", 1)[0]], r"cameras\.txt: line 4 is not CAMERA_ID MODEL"),
+        ("cameras", lambda lines: [lines[0].replace("PIN", "pin")], r"cameras\.txt: line 4 is not CAMERA_ID MODEL"),
+        ("images", lambda lines: drop(lines, 0), r"images\.txt: line 5 is not IMAGE_ID QW"),
+        ("images", lambda lines: drop(lines, 1), r"images\.txt: line 6 holds no points of the image above it"),
+        ("images", lambda lines: drop(lines, 2), r"images\.txt: line 7 is not IMAGE_ID QW"),
+        ("images", lambda lines: drop(lines, 5), r"points3D\.txt: line 4 names point 0 of image 3, which images\.txt"),
+        ("images", lambda lines: lines[:4], r"points3D\.txt: line 4 names point 0 of image 3, which images\.txt"),
+        ("points3D", lambda lines: drop(lines, 2), r"points3D\.txt: promises 5 entries and holds 4"),
+        ("points3D", lambda lines: [*lines[:4], lines[4][:20]], r"points3D\.txt: line 8 is not POINT3D_ID X Y Z"),
+        ("points3D", lambda lines: ["a" + lines[0], *lines[1:]], r"points3D\.txt: line 4 is not POINT3D_ID X Y Z"),
+    ],
+)
+def test_a_line_that_is_lost_or_damaged_is_named_with_its_file(
+    tmp_path: Path, old: bool, name: str, damage: Callable[[list[str]], list[str]], message: str
+) -> None:
+    path = write_colmap(tmp_path, text=True, old=old) / f"{name}.txt"
+    lines = path.read_text().splitlines()
+    start = next(row for row, line in enumerate(lines) if not line.startswith("#"))
+    path.write_text("\n".join([*lines[:start], *damage(lines[start:])]) + "\n")
+    with pytest.raises(InputError, match=message):
+        load_scene(tmp_path)

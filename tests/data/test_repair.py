@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import splat_samples as samples
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splat_formats.repair import FIXES, inspect_splat, repair_splat
 from gsencoder.data.splats import RawSplat, gaussians_from_raw, read_raw
 
@@ -201,3 +201,65 @@ def test_the_real_files_have_no_defect(shared: Path, name: str) -> None:
     report = inspect_splat(read_raw(shared / "fixtures" / name))
     assert report.defects == ()
     assert report.loadable
+
+
+def surface(count: int = 40, *, step: float = 0.02, scale: float = 0.012) -> RawSplat:
+    """A sheet of Gaussians that nearly touch, of opacities about 0.9."""
+    rng = np.random.default_rng(0)
+    rows, columns = np.divmod(np.arange(count * count), count)
+    means = np.stack((step * rows, step * columns, np.zeros(count * count)), axis=1)
+    return replace(
+        samples.make_raw(count * count),
+        means=(means + rng.normal(size=means.shape) * step / 10).astype(np.float32).astype(np.float64),
+        log_scales=rng.normal(np.log(scale), 0.3, means.shape).astype(np.float32),
+        logit_opacities=rng.normal(2.2, 1.0, len(means)).astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize("columns", [("scales",), ("opacities",), ("scales", "opacities")])
+def test_values_that_were_stored_activated_are_said_and_converted(columns: tuple[str, ...]) -> None:
+    right = surface()
+    wrong = right
+    if "scales" in columns:
+        wrong = replace(wrong, log_scales=np.exp(right.log_scales))
+    if "opacities" in columns:
+        wrong = replace(wrong, logit_opacities=1 / (1 + np.exp(-right.logit_opacities)))
+    findings = inspect_splat(wrong).findings
+    assert [finding.split()[0] for finding in findings] == list(columns)
+    assert all("gsencoder repair with fix=[activated] converts them" in finding for finding in findings)
+    with pytest.warns(SceneWarning) as caught:
+        gaussians_from_raw(wrong)
+    assert [str(warning.message) for warning in caught] == [f"splat: {finding}" for finding in findings]
+    fixed, report = repair_splat(wrong, ["activated"])
+    assert [change.count for change in report.changes] == [len(wrong)]
+    np.testing.assert_allclose(fixed.log_scales, right.log_scales, atol=1e-5)
+    np.testing.assert_allclose(fixed.logit_opacities, right.logit_opacities, atol=1e-4)
+    assert inspect_splat(fixed).findings == ()
+
+
+def test_a_splat_as_it_should_be_has_no_odd_values() -> None:
+    right = surface()
+    for good in (
+        right,
+        replace(right, means=right.means + np.array([4651.0, 5428.0, 100.0])),
+        surface(12, step=2.0, scale=1.3),
+    ):
+        assert inspect_splat(good).findings == ()
+    # Of large Gaussians logarithms are positive, too.
+    large = replace(right, means=300 * right.means, log_scales=right.log_scales + np.float32(np.log(300)))
+    assert large.log_scales.min() > 0
+    assert inspect_splat(large).findings == ()
+
+
+def test_coordinates_that_float32_rounded_are_said_with_what_to_subtract() -> None:
+    right = surface()
+    far = right.means + np.array([465123.4, 5428765.6, 300.0])
+    assert inspect_splat(replace(right, means=far)).findings == ()
+    (finding,) = inspect_splat(replace(right, means=far.astype(np.float32).astype(np.float64))).findings
+    assert "rounded to steps of 0.5 along y" in finding
+    assert "subtracted in double precision" in finding
+    assert "[465000.0, 5429000.0, 0.0]" in finding
+    coarse = replace(right, means=np.round(right.means / 0.1) * 0.1)
+    (finding,) = inspect_splat(coarse).findings
+    assert "steps of 0.1 along" in finding
+    assert "export again without rounding" in finding

@@ -101,7 +101,7 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
         save_check_picture,
         scene_table,
     )
-    from gsencoder.data.check.scene_check import check_scene, findings_of
+    from gsencoder.data.check.scene_check import check_scene, findings_of, is_decided
     from gsencoder.data.scene_facts import scene_facts
 
     with summary.step("read"):
@@ -116,11 +116,11 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
     if config.check:
         with summary.step("check"):
             depth, matches = check_scene(scene.views, limit=config.views, track=Progress(quiet=config.quiet))
-        findings = findings_of(depth, matches)
+        findings = findings_of(scene.views, depth, matches)
         lines += check_lines(facts, depth, matches)
         lines += [f"wrong: {finding_line(finding)}" for finding in findings]
         if not findings and (depth is not None or matches is not None):
-            lines.append("nothing wrong was seen")
+            lines.append("nothing wrong was seen" if is_decided(depth, matches) else "too little to tell")
         results["check"] = check_results(depth, matches)
         results["findings"] = [
             {"cause": each.cause, "view": each.view, "factor": each.factor, "message": each.message}

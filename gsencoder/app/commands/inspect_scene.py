@@ -145,6 +145,7 @@ def check_results(depth: DepthCheck | None, matches: EpipolarCheck | None) -> di
             "share": matches.share,
             "error_pixels": matches.error,
             "best_error_pixels": matches.best_error,
+            "decided": matches.decided,
         }
     return results
 

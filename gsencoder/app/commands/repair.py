@@ -109,7 +109,7 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
     """Writes a transforms.json whose poses, depth and cameras fit, and checks that they do."""
     # Only scenes need Pillow and, for some depth sensors, torch.
     from gsencoder.data.check.repair_scene import repair_posed
-    from gsencoder.data.check.scene_check import check_scene, findings_of, fit_of
+    from gsencoder.data.check.scene_check import check_scene, findings_of, fit_of, is_decided
     from gsencoder.data.readers.write_transforms import transforms_of
 
     assert config.out is not None
@@ -121,13 +121,16 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
         assert posed is not None
     with summary.step("check"):
         depth, matches = check_scene(scene.views, limit=config.views, track=track)
-    repair = repair_posed(posed, findings_of(depth, matches), depth.registration if depth is not None else None)
+    findings = findings_of(scene.views, depth, matches)
+    if not findings and not is_decided(depth, matches):
+        raise InputError(f"{path}: too little to tell whether something is wrong, so there is nothing to repair")
+    repair = repair_posed(posed, findings, depth.registration if depth is not None else None)
     content = transforms_of(repair.posed, config.out.parent)
     with summary.step("check"):
         again = _load_back(content, config.out)
         assert again.views is not None
         checked = check_scene(again.views, limit=config.views, track=track)
-        remaining = [finding for finding in findings_of(*checked) if finding.view is None]
+        remaining = [finding for finding in findings_of(again.views, *checked) if finding.view is None]
         if remaining:
             raise InputError(f"{path}: still wrong once repaired: {remaining[0].message}; nothing was written")
     before, after = fit_of(depth, matches), fit_of(*checked)

@@ -92,14 +92,14 @@ class EpipolarCheck:
     """
 
     views: Int64[np.ndarray, " V"]
-    pairs: int
-    matches: int
-    error: float
-    share: float
-    best_error: float
-    findings: tuple[Finding, ...]
-    decided: bool
-    worst: PairMatches | None
+    pairs: int = 0
+    matches: int = 0
+    error: float = float("nan")
+    share: float = float("nan")
+    best_error: float = float("nan")
+    findings: tuple[Finding, ...] = ()
+    decided: bool = False
+    worst: PairMatches | None = None
     cameras: Cameras
 
 
@@ -139,19 +139,7 @@ def judge_matches(
         names: of the views.
     """
     if not matches:
-        nan = float("nan")
-        return EpipolarCheck(
-            views=rows,
-            pairs=0,
-            matches=0,
-            error=nan,
-            share=nan,
-            best_error=nan,
-            findings=(),
-            decided=False,
-            worst=None,
-            cameras=cameras,
-        )
+        return EpipolarCheck(views=rows, cameras=cameras)
     near = near_pairs(cameras, matches)
     best, best_error = cameras, mean_error(cameras, near)
     findings: list[Finding] = []
@@ -308,24 +296,20 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
             error, usual = mean_error(cameras, own), mean_error(cameras, near_pairs(cameras, [p for p, _ in others]))
             if error > max(STRAY_ERROR, STRAY_FACTOR * usual):
                 suspects.append((error, usual, view, own))
-        for error, _, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
+        for error, usual, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
             moved = fit_pose_to_matches(cameras, view, own)
-            fitting = sum(_fits(moved, pair, limit) for pair in own)
-            if (
-                fitting >= 2
-                and share_that_fits(moved, own, limit) >= MOVED_SHARE
-                and mean_error(moved, own) < error / 2
-            ):
+            fitting, after = sum(_fits(moved, pair, limit) for pair in own), mean_error(moved, own)
+            if fitting >= 2 and share_that_fits(moved, own, limit) >= MOVED_SHARE and after < error / 2:
+                message = (
+                    f"its photograph does not fit its pose: its matches lie {error:.1f} pixels from their epipolar "
+                    f"lines, {after:.1f} if it is moved, and those of the other views {usual:.1f}"
+                )
+                findings.append(Finding(cause="stray view", message=message, view=names[view]))
+                remaining = [(pair, fits) for pair, fits in remaining if view not in (pair.first, pair.second)]
+                views -= {view}
                 break
         else:
             return findings
-        message = (
-            f"its photograph does not fit its pose: its matches lie {error:.1f} pixels from their epipolar lines, "
-            f"{mean_error(moved, own):.1f} if it is moved, and those of the other views {usual:.1f}"
-        )
-        findings.append(Finding(cause="stray view", message=message, view=names[view]))
-        remaining = [(pair, fits) for pair, fits in remaining if view not in (pair.first, pair.second)]
-        views -= {view}
 
 
 def fit_pose_to_matches(cameras: Cameras, view: int, matches: Sequence[PairMatches]) -> Cameras:
@@ -341,50 +325,69 @@ def fit_pose_to_matches(cameras: Cameras, view: int, matches: Sequence[PairMatch
     """
     from scipy.spatial.transform import Rotation
 
-    def with_pose(rotation: np.ndarray, center: np.ndarray) -> Cameras:
-        poses = cameras.cam_from_world.copy()
-        poses[view, :3, :3], poses[view, :3, 3] = rotation, -rotation @ center
-        return replace(cameras, cam_from_world=poses)
+    centers, turns = cameras.centers, cameras.cam_from_world[:, :3, :3].astype(np.float64)
+    unproject = np.linalg.inv(cameras.Ks.astype(np.float64))
+    ends = [_ends(view, pair) for pair in matches]
+    others = [other for other, _, _ in ends]
+    pair = np.repeat(np.arange(len(ends)), [len(here) for _, _, here in ends])
+    there, here = (np.concatenate([_homogeneous(end[side]) for end in ends]) for side in (1, 2))
+    rays_there = unproject[others].mT @ turns[others]
 
-    centers = cameras.centers.astype(np.float64)
+    def lines(rotation: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """x₂ᵀ F x₁ of all matches and the lengths of the normals of their lines here and there."""
+        across = np.cross((centers[others] - center)[:, None], rays_there)
+        fundamental = (unproject[view].T @ rotation @ across.mT)[pair]
+        own_lines = np.einsum("mij,mj->mi", fundamental, there)
+        other_lines = np.einsum("mji,mj->mi", fundamental, here)
+        lengths = (np.maximum(np.linalg.norm(each[:, :2], axis=1), 1e-12) for each in (own_lines, other_lines))
+        return np.einsum("mi,mi->m", own_lines, here), *lengths
+
+    def error(rotation: np.ndarray, center: np.ndarray) -> float:
+        product, own, other = lines(rotation, center)
+        return _clipped(np.abs(product) / np.minimum(own, other))
+
+    def sampson(rotation: np.ndarray, center: np.ndarray, step: np.ndarray) -> np.ndarray:
+        """Signed distances to first order (Hartley and Zisserman, eq. 11.9)."""
+        product, own, other = lines(Rotation.from_rotvec(step[:3]).as_matrix() @ rotation, center + reach * step[3:])
+        return product / np.hypot(own, other)
+
     relative = [_relative_pose(cameras, view, pair) for pair in matches]
-    rays = [(centers[other], rotation, direction) for other, rotation, direction in filter(None, relative)]
-    candidates = [(rotation, center) for start, rotation, _ in rays for center in (centers[view], start)] + [
+    known = [(centers[other], rotation, direction) for other, rotation, direction in filter(None, relative)]
+    candidates = [(rotation, center) for start, rotation, _ in known for center in (centers[view], start)] + [
         (rotation, _nearest_point(first, direction, second, other))
-        for (first, rotation, direction), (second, turned, other) in permutations(rays, 2)
+        for (first, rotation, direction), (second, turned, other) in permutations(known, 2)
         for rotation in (rotation, turned)
     ]
-    own = cameras.cam_from_world[view, :3, :3].astype(np.float64)
-    candidates.append((own, centers[view]))
-    candidates.sort(key=lambda candidate: mean_error(with_pose(*candidate), matches))
+    candidates.append((turns[view], centers[view]))
+    candidates.sort(key=lambda candidate: error(*candidate))
     reach = typical_distance(cameras)
-    fitted = [with_pose(*candidates[0])]
+    fitted = [candidates[0]]
     for rotation, center in candidates[:STARTS]:
         for _ in range(STEPS):
-
-            def distances(step: np.ndarray, rotation: np.ndarray = rotation, center: np.ndarray = center) -> np.ndarray:
-                turned = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
-                moved = with_pose(turned, center + reach * step[3:])
-                return np.concatenate([_sampson(moved, pair) for pair in matches])
-
-            # float32 of the poses leaves four digits of differences over this step.
-            here = distances(np.zeros(6))
-            jacobian = np.stack([(distances(1e-3 * unit) - here) / 1e-3 for unit in np.eye(6)], axis=1)
-            weighted = jacobian / (1 + np.square(here))[:, None]
+            now = sampson(rotation, center, np.zeros(6))
+            jacobian = np.stack([(sampson(rotation, center, 1e-6 * unit) - now) / 1e-6 for unit in np.eye(6)], axis=1)
+            weighted = jacobian / (1 + np.square(now))[:, None]
             system = jacobian.T @ weighted
-            step = np.linalg.solve(system + 1e-6 * np.trace(system) * np.eye(6), -weighted.T @ here)
+            step = np.linalg.solve(system + 1e-6 * np.trace(system) * np.eye(6), -weighted.T @ now)
             rotation, center = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation, center + reach * step[3:]
-        fitted.append(with_pose(rotation, center))
-    return min(fitted, key=lambda moved: mean_error(moved, matches))
+            if np.abs(step).max() < 1e-5:
+                break
+        fitted.append((rotation, center))
+    rotation, center = min(fitted, key=lambda candidate: error(*candidate))
+    poses = cameras.cam_from_world.copy()
+    poses[view, :3, :3], poses[view, :3, 3] = rotation, -rotation @ center
+    return replace(cameras, cam_from_world=poses)
 
 
-def _sampson(cameras: Cameras, pair: PairMatches) -> Float64[np.ndarray, " M"]:
-    """Signed distances of matches from their epipolar geometry to first order (Hartley and Zisserman, eq. 11.9)."""
-    matrix = fundamental_matrix(cameras, pair.first, pair.second)
-    first, second = (np.column_stack((each, np.ones(len(each)))) for each in (pair.first_pixels, pair.second_pixels))
-    lines, other = first @ matrix.T, second @ matrix
-    length = np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (other[:, :2] ** 2).sum(axis=1))
-    return np.einsum("mi,mi->m", second, lines) / np.maximum(length, 1e-12)
+def _homogeneous(pixels: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 3"]:
+    return np.column_stack((pixels, np.ones(len(pixels))))
+
+
+def _ends(view: int, pair: PairMatches) -> tuple[int, Float64[np.ndarray, "M 2"], Float64[np.ndarray, "M 2"]]:
+    """The other view of a pair, the pixels there and those in this view."""
+    if pair.second == view:
+        return pair.first, pair.first_pixels, pair.second_pixels
+    return pair.second, pair.second_pixels, pair.first_pixels
 
 
 def _relative_pose(
@@ -394,9 +397,10 @@ def _relative_pose(
     stands from there."""
     pycolmap = load_pycolmap()
     options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed, options.max_num_trials = INLIER_ERROR, 0, 2000
-    ends = [(pair.first, pair.first_pixels), (pair.second, pair.second_pixels)]
-    (other, there), (_, here) = ends if pair.second == view else ends[::-1]
+    options.max_error, options.random_seed = INLIER_ERROR, 0
+    # All matches fit one fundamental matrix, so that few are wrong here.
+    options.min_num_trials, options.max_num_trials = 50, 2000
+    other, there, here = _ends(view, pair)
     models = [
         pycolmap.Camera(
             model="PINHOLE",

@@ -11,6 +11,7 @@ ADVICE = {
     "depth scale": "the depth scale is wrong: depths should be {factor:.4g} times as large",
     "depth focal length": "depth has the focal length of another sensor: {factor:.4g} times the stated one",
     "focal length": "the focal length of the photographs is {factor:.4g} times the stated one",
+    "picture size": "the intrinsics are those of pictures of another size: times {factor:.4g} they would fit these",
 }
 """Causes that concern all views."""
 

@@ -76,6 +76,11 @@ def _mend(
     if cause == "depth focal length":
         assert factor is not None
         return [_with_depth_focal(image, factor) for image in images], f"focal length of the depth times {factor:.4g}"
+    if cause == "picture size":
+        assert factor is not None
+        return [
+            replace(image, camera=focal_times(image.camera, factor, principal_point=True)) for image in images
+        ], f"intrinsics times {factor:.4g}"
     if cause == "focal length":
         assert factor is not None
         mended = [
@@ -104,9 +109,9 @@ def _with_poses(images: list[PosedImage], poses: Float64[np.ndarray, "V 4 4"]) -
     return [replace(image, cam_from_world=pose) for image, pose in zip(images, poses, strict=True)]
 
 
-def focal_times(camera: CameraModel, factor: float) -> CameraModel:
+def focal_times(camera: CameraModel, factor: float, *, principal_point: bool = False) -> CameraModel:
     """A camera with its focal lengths multiplied; its distortion is that of directions, and stays."""
-    count = focal_count(camera)
+    count = focal_count(camera) + 2 * principal_point
     params = tuple(value * factor if index < count else value for index, value in enumerate(camera.params))
     return replace(camera, params=params)
 

@@ -22,7 +22,7 @@ from gsencoder.data.check.findings import ADVICE, Finding
 from gsencoder.data.check.readings import Reading, other_readings, stated_reading
 from gsencoder.data.check.registration_fit import RegistrationFit, fit_registration
 from gsencoder.data.check.stray_views import fit_pose, surface_normals, view_spreads
-from gsencoder.types import Scene, Views
+from gsencoder.types import Cameras, Scene, Views
 
 BETTER = 0.95
 """Another reading of the files is named if its spread is below this share of the files' own."""
@@ -34,8 +34,8 @@ CLEAR = 0.7
 """Where the files' own reading compares nothing, another one is named if this share agrees under it."""
 COMPARABLE = 0.02
 """Samples that land in another view, as a share of all pairs, below which depth says nothing about poses."""
-STRAY = 0.9
-"""A view is astray if moving it brings its spread below this share."""
+STRAY, STRAY_SPREAD = 0.9, 0.002
+"""A view is astray if moving it brings its spread below this share, and it is above what pixels alone make."""
 SUSPECTS = 8
 """So many views, those that fit worst, are tried to be moved."""
 OTHER_PICTURE = 0.8
@@ -44,6 +44,11 @@ UNRELATED = 0.3
 """Photographs whose colors correlate by less than this across views show something else than the depth."""
 SAME_FACTOR = 0.03
 """Depth and photographs whose focal lengths are off by factors this near to each other share one wrong camera."""
+OFF_CENTER = 1.3
+"""A principal point this many times as far right and down as the middle, or more, is that of a larger picture; one that
+is so many times as near to the corner, that of a smaller one …"""
+EQUALLY = 0.05
+"""… if it is equally far right and down, to this share."""
 PHOTOGRAPHS = 4
 """So many are looked at for pictures of one color."""
 SUSPICIOUS = 0.9
@@ -106,9 +111,32 @@ def check_scene(
     return depth, check_matches(views, limit=limit or 24, track=track)
 
 
-def findings_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> list[Finding]:
-    """All findings of both checks."""
-    return [finding for check in (depth, matches) if check is not None for finding in check.findings]
+def findings_of(views: Views, depth: DepthCheck | None, matches: EpipolarCheck | None) -> list[Finding]:
+    """All findings of both checks; intrinsics of another size are the cause of any other, unless the views fit."""
+    found = [finding for check in (depth, matches) if check is not None for finding in check.findings]
+    size = None if is_decided(depth, matches) and not found else wrong_size(views.cameras)
+    return found if size is None else [size]
+
+
+def is_decided(depth: DepthCheck | None, matches: EpipolarCheck | None) -> bool:
+    """Whether enough could be compared to say that nothing is wrong."""
+    return (depth is not None and depth.comparable) or (matches is not None and matches.decided)
+
+
+def wrong_size(cameras: Cameras) -> Finding | None:
+    """A principal point near the corner, or beyond it, is that of intrinsics for pictures of another size."""
+    if not len(cameras):
+        return None
+    right, down = 2 * np.median(cameras.Ks[:, :2, 2] / np.stack((cameras.widths, cameras.heights), axis=1), axis=0)
+    if not min(right, down) > 0 or abs(np.log(right / down)) > EQUALLY or abs(np.log(right)) < np.log(OFF_CENTER):
+        return None
+    (cx, cy), width, height = cameras.Ks[0, :2, 2], cameras.widths[0], cameras.heights[0]
+    message = (
+        f"{ADVICE['picture size'].format(factor=1 / right)} (the principal point {cx:g}, {cy:g} lies off the middle of "
+        f"{width}×{height} pixels); state the w and h that they are of, scale them, or, if these are corners cut out "
+        "of larger pictures, leave them"
+    )
+    return Finding(cause="picture size", message=message, factor=float(1 / right))
 
 
 def fit_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> float:
@@ -131,9 +159,9 @@ def warn_of_faults(scene: Scene) -> None:
             SceneWarning,
             stacklevel=2,
         )
-    if views.depths is None or len(views) < 2:
-        return
-    _, finding = suspicious_depth(views)
+    finding = wrong_size(views.cameras)
+    if finding is None and views.depths is not None and len(views) > 1:
+        finding = suspicious_depth(views)[1]
     if finding is not None:
         mends = "" if finding.cause == "unknown" else ", and gsencoder repair can mend it"
         warnings.warn(
@@ -282,7 +310,7 @@ def _stray_views(views: DepthViews, names: tuple[str, ...]) -> list[Finding]:
     findings = []
     for view in sorted(int(suspect) for suspect in suspects):
         fit = fit_pose(views, view, normals)
-        if fit.after < STRAY * fit.before:
+        if fit.before > STRAY_SPREAD and fit.after < STRAY * fit.before:
             message = (
                 f"its pose does not fit the other views: {fit.moved:.3g} units and {np.rad2deg(fit.turned):.2f}° off"
             )

@@ -6,6 +6,8 @@ import math
 import re
 import shutil
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,7 +16,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning, readable
 from gsencoder.core.files.foreign_file import MODEL_BYTES, check_foreign, open_foreign
-from gsencoder.data.readers.colmap_binary import check_binary_model
+from gsencoder.data.readers.colmap_binary import CAMERA_PARAMS, check_binary_model
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.undistort import CameraModel, check_camera, load_pycolmap
 
@@ -180,13 +182,9 @@ def _are_points(words: list[str]) -> bool:
 
 
 def _check_image_line(words: list[str], where: str) -> None:
-    try:
+    with _expected(where, words, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
         [int(words[0]), int(words[8])]
         name, pose = words[9], [float(word) for word in words[1:8]]
-    except (ValueError, IndexError):
-        raise InputError(
-            f"{where} is not IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME: {' '.join(words)[:80]!r}"
-        ) from None
     if not np.isfinite(pose).all():
         raise InputError(f"{where}: image {name[:120]!r}: the pose has values that are not finite")
 
@@ -214,6 +212,8 @@ def _load(model: Path) -> Any:
     except InputError:
         raise
     except Exception as error:
+        if not binary:
+            _check_lines(model)
         message = " ".join(str(error).split())[:200]
         raise InputError(f"{model}: pycolmap cannot read this model ({type(error).__name__}: {message})") from error
     if not binary:
@@ -232,6 +232,49 @@ def _read_text(reconstruction: Any, model: Path) -> None:
             shutil.copy(file, folder)
         Path(folder, "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
         reconstruction.read_text(folder)
+
+
+def _check_lines(model: Path) -> None:
+    """Raises InputError with the line of a text model that pycolmap cannot read, or that names what is not there."""
+    pycolmap = load_pycolmap()
+    counts = {pycolmap.CameraModelId(number).name: count for number, count in enumerate(CAMERA_PARAMS)}
+    cameras, points = set[int](), dict[int, int]()
+    for where, words in _rows(model / "cameras.txt"):
+        with _expected(where, words, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"):
+            cameras.add(int(words[0]))
+            if len([int(words[2]), int(words[3]), *map(float, words[4:])]) != 2 + counts[words[1]]:
+                raise ValueError
+    lines = _image_lines(model / "images.txt")[0]
+    for image, seen in zip(lines[::2], lines[1::2], strict=True):
+        words = image.split()
+        points[int(words[0])] = len(seen.split()) // 3
+        if int(words[8]) not in cameras:
+            where = next(where for where, row in _rows(model / "images.txt") if row == words)
+            raise InputError(f"{where} says that {words[9]!r} has camera {words[8]}, which cameras.txt lacks")
+    for where, words in _rows(model / "points3D.txt"):
+        with _expected(where, words, "POINT3D_ID X Y Z R G B ERROR TRACK[]"):
+            [int(words[0]), words[7], *map(float, words[1:8])]
+            track = list(map(int, words[8:]))
+            seen_by = list(zip(track[::2], track[1::2], strict=True))
+        for number, point in seen_by:
+            if point >= points.get(number, 0):
+                raise InputError(f"{where} names point {point} of image {number}, which images.txt lacks")
+
+
+def _rows(file: Path) -> Iterator[tuple[str, list[str]]]:
+    """Where each line with values stands, and its words."""
+    with io.TextIOWrapper(open_foreign(file), encoding="utf-8", errors="replace") as stream:
+        for number, line in enumerate(stream, 1):
+            if (words := line.split()) and not words[0].startswith("#"):
+                yield f"{file}: line {number}", words
+
+
+@contextmanager
+def _expected(where: str, words: list[str], form: str) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, IndexError, KeyError):
+        raise InputError(f"{where} is not {form}: {' '.join(words)[:80]!r}") from None
 
 
 def _check_text_counts(model: Path, reconstruction: Any) -> None:

@@ -15,9 +15,12 @@ from gsencoder.data.check.epipolar import check_matches
 from gsencoder.data.check.scene_check import (
     check_depth,
     check_scene,
+    findings_of,
+    is_decided,
     plain_photographs,
     suspicious_depth,
     warn_of_faults,
+    wrong_size,
 )
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.types import Scene, Views
@@ -284,3 +287,51 @@ def test_photographs_of_one_color_are_counted_and_named() -> None:
     assert plain_photographs(views) == (["a", "c"], 3)
     with pytest.warns(SceneWarning, match="2 of 3 photographs that were looked at are of one color all over: a, c"):
         warn_of_faults(Scene(name="s", views=views))
+
+
+def with_size(views: Views, factor: float) -> Views:
+    Ks = views.cameras.Ks.copy()
+    Ks[:, :2] *= np.float32(factor)
+    return replace(views, cameras=replace(views.cameras, Ks=Ks))
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 4.0])
+def test_a_principal_point_of_pictures_of_another_size_is_named(box: Views, factor: float) -> None:
+    assert wrong_size(box.cameras) is None
+    wrong = with_size(box, factor)
+    (finding,) = findings_of(wrong, None, None)
+    assert (finding.cause, finding.factor) == ("picture size", pytest.approx(1 / factor))
+    assert f"times {1 / factor:g} they would fit" in finding.message
+    assert "state the w and h" in finding.message
+    with pytest.warns(SceneWarning, match="intrinsics are those of pictures of another size"):
+        warn_of_faults(Scene(name="box", views=replace(wrong, depths=None)))
+    # With depth that does not fit it is the cause, and the only finding.
+    assert findings_of(wrong, check_depth(wrong), None) == [finding]
+
+
+def test_a_corner_cut_out_of_a_larger_picture_is_right_where_the_views_fit(box: Views) -> None:
+    """Without a quarter of its rows and columns the principal point lies as that of a smaller picture does."""
+    assert box.images is not None
+    assert box.depths is not None
+    Ks = box.cameras.Ks.copy()
+    Ks[:, :2, 2] -= (80, 60)
+    cameras = replace(box.cameras, Ks=Ks, widths=box.cameras.widths - 80, heights=box.cameras.heights - 60)
+    corner = replace(
+        box,
+        cameras=cameras,
+        images=[image[60:, 80:] for image in box.images],
+        depths=[depth[60:, 80:] for depth in box.depths],
+    )
+    assert wrong_size(corner.cameras) is not None
+    depth = check_depth(corner)
+    assert depth.comparable
+    assert findings_of(corner, depth, None) == []
+
+
+def test_too_little_is_no_judgement(box: Views) -> None:
+    """Views that share nothing, or photographs without features, say neither that all is well nor that it is not."""
+    assert box.images is not None
+    grey = replace(box, images=[np.full_like(image, 128) for image in box.images], depths=None)
+    assert not is_decided(None, check_matches(grey))
+    assert is_decided(check_depth(box), None)
+    assert not is_decided(None, None)
