@@ -1,9 +1,9 @@
-"""Is a bare splat a room or an object? Its free space says: what encloses it, and what stands in it.
+"""Is a bare splat a room or an object? Its free space says: what surrounds it, and what stands in it.
 
 A cupboard, a bust or a box is as closed as a room, so that being enclosed is not enough. Rays in 26 directions through
-a coarse grid tell rooms apart in two ways. A scan without a ceiling is flat and open: most of its surface is free on
-one side, and no part of its space is enclosed. A room with walls has one large space, and something stands in it: rays
-that leave this space at a surface enter the same space again behind it. They do not where an empty shell ends.
+a coarse grid tell rooms apart: one free space lies beside most of the surfaces, and something stands in it, so that
+rays that leave this space at a surface enter it again behind. They do not where an empty shell ends. A scan without a
+ceiling is flat and open: a ray from its surfaces gets out in half of all directions, as from a floor.
 """
 
 from collections.abc import Iterator
@@ -20,80 +20,112 @@ from gsencoder.data.surfaces import surfaces_of_gaussians
 from gsencoder.types import Gaussians
 
 CELLS = 32
-"""Cells along the longest side: a wall of 5 m is 16 cm a cell, less than a chair."""
+"""Cells along the longest side: a wall of 5 m is 16 cm a cell, less than a chair. Cells are no smaller than most
+Gaussians (`RESOLVED`), else surfaces of few Gaussians have holes, through which rays would enter spaces again."""
+RESOLVED = 0.75
+"""Share of the Gaussians whose standard deviation is at most the side of a cell."""
 EXTENT = (0.03, 0.97)
 """Quantiles of the coordinates between which the grid lies."""
 OPAQUE = 0.3
 """Gaussians of less opacity enclose nothing."""
-MAX_GAUSSIANS = 200_000
-"""Of more Gaussians, a random choice of so many fills cells."""
+MIN_GAUSSIANS, MAX_GAUSSIANS = 4000, 100_000
+"""Fewer opaque Gaussians show an object: objects cut from seeds of rooms have up to 1,900, rooms 16,000 and more. Of
+more Gaussians, a random choice of so many fills cells."""
+TURNS = np.arange(8) * np.pi / 4
+DISC = np.concatenate([np.stack((r * np.cos(TURNS + r / 3), r * np.sin(TURNS + r / 3)), axis=1) for r in (0, 1, 2)])[7:]
+"""Points of a disc, in standard deviations, whose cells it fills: surfaces of overlapping discs have no holes."""
 MAX_FRAME_MEANS, STARTS = 5000, 4
 """Means and normals of which the grid's axes are fitted, and random axes from which on."""
-FILLED = 0.05
-"""Area of the discs in a cell, in areas of its side, from which on the cell is a surface."""
-ENCLOSED = 0.65
-"""Share of the directions in which a free cell's rays end at a surface, from which on the cell is enclosed."""
-OPEN_FLATNESS, OPEN_SURFACES, OPEN_SPACE = 0.35, 0.5, 0.3
-"""An open scan's smallest side is at most this share of its largest one; rays from its surfaces get out in at least
-this share of the directions; and at most this share of it is one enclosed space. House rooms have 0.06 to 0.3, 0.53 to
-0.68 and 0.0 to 0.12; a window has 0.13, 0.58 and 0.47, a bowl 0.41, 0.48 and 0.0."""
-ROOM_FLATNESS = 0.55
-"""A room with walls is at most this high, as a share of its length."""
-ROOM_SPACE, ROOM_SURFACES, ROOM_CONTENT = 0.3, 0.36, 0.01
-"""The same of the enclosed space of a room with walls, at least, and of its surfaces (a piece of furniture has boards
-in it and behind it, 0.2 to 0.35); and the share of the rays from its space that enter it again. A corridor with a few
-cupboards has 0.013, rooms with tables and shelves 0.08 to 0.14; a scanned packet 0.008, boxes and bathtubs none."""
-FULL_SPACE, FULL_CONTENT = 0.05, 0.04
-"""Where less space is enclosed, since things stand everywhere, more rays must enter it again: a kitchen has 0.07 and
-0.05."""
+FILLED = 0.15
+"""Area of the discs in a cell, in areas of its side, from which on the cell is a surface; more than one counts as one,
+since Gaussians of fitted surfaces overlap."""
+ENCLOSED = 0.45
+"""Share of the directions in which a free cell's rays end at a surface, from which on the cell is enclosed: half of
+them, as between floor and walls, and a little less where a wall was not photographed."""
+THIN, FLAT, HIGH = 0.07, 0.35, 0.55
+"""Smallest over largest side: below the first a thing is a sheet (two cells); scans without a ceiling are at most FLAT
+(house rooms 0.09 to 0.28), and rooms with walls at most HIGH (0.19 to 0.50)."""
+OPEN, OPEN_WITH_CONTENT, OPEN_BESIDE, CONTENT = 0.56, 0.48, 0.6, 0.01
+"""Of a scan without a ceiling: its surfaces' openness, less where something stands in its space; the share of them that
+lie beside this space; and the content that counts. Rooms: 0.53 and more, 0.69 and more; a deck chair and a window frame
+have 0.52 and 0.50, and no content."""
+CLOSED, CLOSED_BESIDE, CLOSED_CONTENT, CLOSED_SPACE = 0.31, 0.83, 0.1, 0.28
+"""The same of a room with walls, and its free space: things whose boards lie behind each other are less open (a car with
+seats 0.28, a kitchen 0.34); a teddy's head and body have a content of 0.05, rooms 0.14 and more; a figure on a plate of
+ground has a free space of 0.17, rooms 0.41 and more."""
+BARE_SPACE = 0.4
+"""In a low room of which this share is free, as a corridor, `CONTENT` is enough."""
 DIRECTIONS = tuple(each for each in product((-1, 0, 1), repeat=3) if any(each))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Enclosure:
-    """What encloses the free space of a splat; shares from 0 to 1.
+    """What surrounds the free space of a splat; shares from 0 to 1.
 
     Attributes:
         flatness: smallest side over largest side.
         openness: mean share of the directions in which rays from surfaces meet nothing.
         space: the largest connected enclosed space, as a share of the box around the splat.
+        beside: share of the surfaces that lie beside this space.
         content: share of the rays from this space that enter it again behind the first surface they meet.
+        enough: whether there are Gaussians enough to tell.
     """
 
     flatness: float
     openness: float
     space: float
+    beside: float
     content: float
+    enough: bool = True
 
     @property
     def is_room(self) -> bool:
         """Whether photographs of it would be taken from inside."""
-        if self.flatness <= OPEN_FLATNESS and self.openness >= OPEN_SURFACES and self.space <= OPEN_SPACE:
-            return True
-        if self.flatness > ROOM_FLATNESS:
+        if not self.enough or not THIN <= self.flatness <= HIGH or self.beside < OPEN_BESIDE:
             return False
-        if self.space >= ROOM_SPACE:
-            return self.openness >= ROOM_SURFACES and self.content >= ROOM_CONTENT
-        return self.space >= FULL_SPACE and self.content >= FULL_CONTENT
+        low, filled = self.flatness <= FLAT, self.content >= CONTENT
+        if low and (self.openness >= OPEN or (self.openness >= OPEN_WITH_CONTENT and filled)):
+            return True
+        if self.beside < CLOSED_BESIDE or self.space < CLOSED_SPACE or self.openness < CLOSED:
+            return False
+        return self.content >= CLOSED_CONTENT or (low and filled and self.space >= BARE_SPACE)
+
+    @property
+    def reason(self) -> str:
+        """Why it is a room or none, for people."""
+        if not self.enough:
+            return f"fewer than {MIN_GAUSSIANS:,} opaque Gaussians show no room"
+        if self.is_room:
+            return f"{self.beside:.0%} of its surfaces lie around one free space"
+        if self.beside < OPEN_BESIDE:
+            return f"no free space lies beside most of its surfaces ({self.beside:.0%})"
+        return f"of the rays from the free space within it {self.content:.1%} meet things that stand there"
 
 
 def enclosure_of(gaussians: Gaussians) -> Enclosure:
-    """Measures what encloses the free space of a splat; which way is up does not matter."""
+    """Measures what surrounds the free space of a splat; which way is up does not matter."""
     from scipy import ndimage
 
-    areas = _surface_areas(gaussians)
+    areas = np.minimum(_surface_areas(gaussians), 1)
     surface = areas >= FILLED
+    enough = int((gaussians.opacities >= OPAQUE).sum()) >= MIN_GAUSSIANS
     if not surface.any():
-        return Enclosure(flatness=1.0, openness=1.0, space=0.0, content=0.0)
+        return Enclosure(flatness=1.0, openness=1.0, space=0.0, beside=0.0, content=0.0, enough=enough)
+    areas = areas * surface / areas[surface].sum()
     closed = _blocked(surface) / len(DIRECTIONS)
-    openness = float(np.average(1 - closed, weights=areas * surface))
     numbers, count = ndimage.label(~surface & (closed >= ENCLOSED))
     space = np.zeros_like(surface)
     if count:
         space = numbers == 1 + int(np.bincount(numbers.ravel())[1:].argmax())
     content = float(_entering_again(surface, space)[space].sum()) / max(1, len(DIRECTIONS) * int(space.sum()))
-    sides = surface.shape
-    return Enclosure(flatness=min(sides) / max(sides), openness=openness, space=float(space.mean()), content=content)
+    return Enclosure(
+        flatness=min(surface.shape) / max(surface.shape),
+        openness=float((areas * (1 - closed)).sum()),
+        space=float(space.mean()),
+        beside=float(areas[ndimage.binary_dilation(space, np.ones((3, 3, 3)))].sum()),
+        content=content,
+        enough=enough,
+    )
 
 
 def _surface_areas(gaussians: Gaussians) -> Float64[np.ndarray, "x y z"]:
@@ -107,18 +139,18 @@ def _surface_areas(gaussians: Gaussians) -> Float64[np.ndarray, "x y z"]:
     frame = _frame(gaussians, gaussians.means[rows].astype(np.float64))
     means, scales = gaussians.means[rows] @ frame.T, gaussians.scales[rows].astype(np.float64)
     low, high = np.quantile(means, EXTENT, axis=0)
-    edge = float((high - low).max()) / CELLS or 1.0
+    order = np.argsort(-scales, axis=1)[:, :2]
+    widths = np.take_along_axis(scales, order, axis=1)
+    edge = max(float((high - low).max()) / CELLS, float(np.quantile(widths[:, 0], RESOLVED))) or 1.0
     shape = np.maximum(np.ceil((high - low) / edge), 1).astype(np.int64)
     axes = frame @ Rotation.from_quat(gaussians.quats[rows].astype(np.float64), scalar_first=True).as_matrix()
-    # A disc fills the cells of its center and of the ends of its axes.
-    reach = np.minimum(scales, 2 * edge)[:, None] * axes
-    points = np.concatenate([means, *(means + sign * reach[..., axis] for axis in range(3) for sign in (-1, 1))])
-    widths = np.sort(scales, axis=1)[:, 1:]
-    shares = np.pi * widths.prod(axis=1) / edge**2 * total / len(rows) / 7
-    cells = np.floor((points - low) / edge)
+    reach = np.take_along_axis(axes, order[:, None], axis=2) * np.minimum(widths, 1.5 * edge)[:, None]
+    points = means[:, None] + np.einsum("nij,pj->npi", reach, DISC)
+    shares = np.pi * widths.prod(axis=1) / edge**2 * total / len(rows) / len(DISC)
+    cells = np.floor((points - low) / edge).reshape(-1, 3)
     within = ((cells >= 0) & (cells < shape)).all(axis=1)
     index = np.ravel_multi_index(tuple(cells[within].astype(np.int64).T), tuple(shape))
-    return np.bincount(index, np.tile(shares, 7)[within], int(shape.prod())).reshape(shape)
+    return np.bincount(index, np.repeat(shares, len(DISC))[within], int(shape.prod())).reshape(shape)
 
 
 def _frame(gaussians: Gaussians, means: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3 3"]:

@@ -42,18 +42,33 @@ def with_views(
     Raises:
         InputError: cameras inside are wanted, and nowhere in the splat is there room for one.
     """
+    return with_explained_views(scene, count, config, cameras=cameras)[0]
+
+
+def with_explained_views(
+    scene: Scene, count: int, config: BlendConfig = BlendConfig(), *, cameras: CamerasOfSplat = "auto"
+) -> tuple[Scene, str]:
+    """`with_views`, and why the cameras stand where they do."""
     if scene.views is not None:
-        return scene
+        return scene, "the scene has views"
     assert scene.gaussians is not None
-    inside = None
-    if cameras == "inside" or (cameras == "auto" and enclosure_of(scene.gaussians).is_room):
+    inside, reason = None, "cameras= says so"
+    if cameras == "auto":
+        enclosure = enclosure_of(scene.gaussians)
+        cameras, reason = ("inside" if enclosure.is_room else "around"), enclosure.reason
+        if enclosure.is_room:
+            inside = interior_views(scene.gaussians, count, up=scene.up)
+            if inside is None or inside.covered < ROOM:
+                cameras, reason = "around", f"it looks like a room, but cameras inside cover less than {ROOM:.0%} of it"
+    elif cameras == "inside":
         inside = interior_views(scene.gaussians, count, up=scene.up)
-    if inside is None and cameras == "inside":
-        raise InputError(f"cameras=inside: no camera in {scene.name} would see surfaces all over its picture")
-    if inside is not None and (cameras == "inside" or inside.covered >= ROOM):
+        if inside is None:
+            raise InputError(f"cameras=inside: no camera in {scene.name} would see surfaces all over its picture")
+    if cameras == "inside":
+        assert inside is not None
         placed, kind = inside.cameras, INSIDE
     else:
         placed, kind = orbit_cameras(scene.gaussians, count=count, up=scene.up), AROUND
     names = tuple(f"{kind}_{view:03d}" for view in range(len(placed)))
     images = RenderedImages(scene.gaussians, placed, config)
-    return replace(scene, views=Views(cameras=placed, names=names, images=images))
+    return replace(scene, views=Views(cameras=placed, names=names, images=images)), reason

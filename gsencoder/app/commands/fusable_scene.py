@@ -10,7 +10,7 @@ from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.fit import with_fitting_splat
-from gsencoder.fusion.orbit_views import INSIDE, CamerasOfSplat, with_views
+from gsencoder.fusion.orbit_views import INSIDE, CamerasOfSplat, with_explained_views
 from gsencoder.render import BlendConfig
 from gsencoder.types import Scene
 
@@ -62,9 +62,11 @@ def load_fusable(
     if scene.views is not None:
         return scene
     with summary.step("cameras"):
-        scene = with_views(scene, orbits, blend, cameras=cameras)
+        scene, reason = with_explained_views(scene, orbits, blend, cameras=cameras)
     assert scene.views is not None
     where = "inside" if scene.views.names[0].startswith(INSIDE) else "around"
     summary.results["cameras"] = where
-    console(quiet).print(f"{scene.name}: a bare splat; rendered from {len(scene.views)} cameras {where} it")
+    console(quiet).print(
+        f"{scene.name}: a bare splat; rendered from {len(scene.views)} cameras {where} it, because {reason}"
+    )
     return scene
