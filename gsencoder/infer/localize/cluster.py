@@ -17,9 +17,8 @@ NEIGHBOR_CELLS = 4.2
 SPARSE, GROWTH, SPARSE_RADII = 0.25, 2**0.5, 6
 """Where more than this share of the points is in no cluster with four neighbors within a spacing, they are sparser than the
 scene: the radius grows by this factor, at most this often (8 times)."""
-GAP, GAP_OF_PART, PART = 0.2, 0.3, 0.25
-"""Clusters are one thing up to a gap of this share of the larger one's size, or of that share where the smaller one has
-less than a quarter of its points: things of one name are about equally large, parts need not be."""
+GAP = 0.25
+"""Clusters are one thing up to a gap of this share of the larger one's size."""
 WIDEST = 8
 """No gap within a thing is wider than this many radii. In house rooms those of tables and sofas were up to 7.5, and those
 between two things of a name 11 and more."""
@@ -31,7 +30,7 @@ def cluster_by_gaps(points: Float32[np.ndarray, "n 3"], smallest: float, min_sam
     """DBSCAN labels after joining clusters whose gap is small beside their size, −1 = noise.
 
     One thing is seen or fitted in patches, and the gaps between these are small beside the thing: the legs of a table
-    and its top, the halves of a treadmill. The next thing of the name is farther away than a fifth of its size. The
+    and its top, the halves of a treadmill. The next thing of the name is farther away than a quarter of its size. The
     size is that of what was joined so far, twice the root mean square distance from the center (0.6 of a rod's length,
     0.8 of a square's side), which does not depend on the axes of the world.
 
@@ -74,8 +73,7 @@ class _Part:
 
 
 def _belong_together(larger: _Part, smaller: _Part, widest: float) -> bool:
-    share = GAP_OF_PART if len(smaller.rows) < PART * len(larger.rows) else GAP
-    limit = min(share * max(larger.size, smaller.size), widest)
+    limit = min(GAP * max(larger.size, smaller.size), widest)
     near = ((smaller.points >= larger.low - limit) & (smaller.points <= larger.high + limit)).all(axis=1)
     return bool(np.isfinite(larger.tree.query(smaller.points[near], distance_upper_bound=limit)[0]).any())
 
