@@ -15,13 +15,13 @@ computed on a grid of eps / 4."""
 NEIGHBOR_CELLS = 4.2
 """Volume of a ball of radius eps, in cubes of edge eps."""
 SPARSE, GROWTH, SPARSE_RADII = 0.25, 2**0.5, 6
-"""Where more than this share of the points is in no cluster with four neighbors within a spacing, they are sparser than the
-scene: the radius grows by this factor, at most this often (8 times)."""
+"""Where more than this share of the points is in no cluster of four neighbors within a spacing, they are sparser than
+the scene: the radius grows by this factor, at most this often (8 times)."""
 GAP = 0.25
 """Clusters are one thing up to a gap of this share of the larger one's size."""
 WIDEST = 8
-"""No gap within a thing is wider than this many radii. In house rooms those of tables and sofas were up to 7.5, and those
-between two things of a name 11 and more."""
+"""No gap within a thing is wider than this many radii. In house rooms those of tables and sofas are up to 7.5 wide, and
+those between two things of a name 11 and more."""
 MAX_PARTS = 32
 """So many of the largest clusters are joined; others stay as they are."""
 
