@@ -5,11 +5,14 @@ import type { LocalizeSettings } from "./types";
 /** So many pairs of neighbors are looked at; above, points are clustered by occupied cells of eps / 4. */
 const MAX_PAIRS = 3e7;
 
-/** Radii that are compared where the radius follows gaps: gsencoder/infer/localize/cluster.py. */
-const RADII = 6;
+/** How clusters are joined: gsencoder/infer/localize/cluster.py says why. */
+const EPS_SPACINGS = 1.5;
+const SPARSE = 0.25;
 const GROWTH = Math.SQRT2;
-const SPARSE_RADII = 8;
-const LARGE = 0.05;
+const SPARSE_RADII = 6;
+const GAP = 0.25;
+const WIDEST = 8;
+const MAX_PARTS = 32;
 
 export interface Cluster {
   rows: Int32Array;
@@ -140,6 +143,9 @@ function tooMany(points: Float32Array, eps: number): boolean {
 }
 
 function labelsOf(points: Float32Array, eps: number, minSamples: number): Int32Array {
+  // Points at this distance are neighbors, also where their coordinates round: two units in the last place of float32.
+  const largest = points.reduce((most, value) => Math.max(most, Math.abs(value)), 0);
+  eps += 2 ** (Math.floor(Math.log2(largest || 1)) - 22);
   if (!tooMany(points, eps)) return dbscan(points, eps, minSamples);
   const grid = makeGrid(points, eps / 4);
   const cells = grid.keys.length;
@@ -166,35 +172,94 @@ function labelsOf(points: Float32Array, eps: number, minSamples: number): Int32A
   return labels;
 }
 
-function countLarge(labels: Int32Array): number {
-  const sizes: number[] = [];
-  for (const label of labels) if (label >= 0) sizes[label] = (sizes[label] ?? 0) + 1;
-  const least = LARGE * sizes.reduce((a, b) => Math.max(a, b), 0);
-  return sizes.filter((size) => size >= least).length;
+interface Part {
+  rows: number[];
+  points: Float32Array;
+  /** Twice the root mean square distance from the center. */
+  size: number;
 }
 
-/** DBSCAN at the radius that separates gaps within things from gaps between them (`cluster_by_gaps`). */
+function makePart(points: Float32Array, rows: number[]): Part {
+  const own = new Float32Array(3 * rows.length);
+  rows.forEach((row, place) => own.set(points.subarray(3 * row, 3 * row + 3), 3 * place));
+  let variance = 0;
+  for (let axis = 0; axis < 3; axis++) {
+    let mean = 0;
+    for (let place = axis; place < own.length; place += 3) mean += (own[place] ?? 0) / rows.length;
+    for (let place = axis; place < own.length; place += 3) variance += ((own[place] ?? 0) - mean) ** 2 / rows.length;
+  }
+  return { rows, points: own, size: 2 * Math.sqrt(variance) };
+}
+
+/** Whether a point of the one lies within `limit` of one of the other. */
+function areNear(larger: Float32Array, smaller: Float32Array, limit: number): boolean {
+  const { low, sides, cellOf, starts, order } = makeGrid(larger, limit);
+  for (let point = 0; point < smaller.length; point += 3) {
+    const at = [0, 1, 2].map((axis) => Math.floor(((smaller[point + axis] ?? 0) - (low[axis] ?? 0)) / limit));
+    const [x = 0, y = 0, z = 0] = at;
+    for (let i = Math.max(0, x - 1); i <= Math.min(sides[0] - 1, x + 1); i++) {
+      for (let j = Math.max(0, y - 1); j <= Math.min(sides[1] - 1, y + 1); j++) {
+        for (let k = Math.max(0, z - 1); k <= Math.min(sides[2] - 1, z + 1); k++) {
+          const cell = cellOf.get((i * sides[1] + j) * sides[2] + k);
+          if (cell === undefined) continue;
+          for (let place = starts[cell] ?? 0; place < (starts[cell + 1] ?? 0); place++) {
+            const other = 3 * (order[place] ?? 0);
+            let squared = 0;
+            for (let axis = 0; axis < 3; axis++) {
+              squared += ((larger[other + axis] ?? 0) - (smaller[point + axis] ?? 0)) ** 2;
+            }
+            if (squared <= limit * limit) return true;
+          }
+        }
+      }
+    }
+  }
+  return false;
+}
+
+/** DBSCAN labels after joining clusters whose gap is small beside their size (`cluster_by_gaps`). */
 function labelsByGaps(points: Float32Array, smallest: number, minSamples: number): Int32Array {
-  let labels = labelsOf(points, smallest, minSamples);
+  let radius = smallest;
   for (let step = 0; step < SPARSE_RADII; step++) {
-    const clustered = labels.reduce((sum, label) => sum + (label >= 0 ? 1 : 0), 0);
-    if (4 * clustered >= labels.length) break;
-    smallest *= GROWTH;
-    labels = labelsOf(points, smallest, minSamples);
+    const noise = labelsOf(points, radius / EPS_SPACINGS, 5).reduce((sum, label) => sum + (label < 0 ? 1 : 0), 0);
+    if (noise <= (SPARSE * points.length) / 3) break;
+    radius *= GROWTH;
   }
-  const runs = [{ count: countLarge(labels), length: 1, labels }];
-  for (let step = 1; step < RADII; step++) {
-    const run = runs[runs.length - 1];
-    if (!run) break;
-    // One thing remains one at larger radii.
-    if (run.count !== 1) labels = labelsOf(points, smallest * GROWTH ** step, minSamples);
-    const count = countLarge(labels);
-    if (count === run.count) run.length += 1;
-    else runs.push({ count, length: 1, labels });
+  const labels = labelsOf(points, radius, minSamples);
+  const groups: number[][] = [];
+  labels.forEach((label, row) => {
+    if (label >= 0) (groups[label] ??= []).push(row);
+  });
+  const bySize = (a: { length: number }, b: { length: number }): number => b.length - a.length;
+  let parts = groups.sort(bySize).slice(0, MAX_PARTS).map((rows) => makePart(points, rows));
+  const apart = new Map<Part, Set<Part>>();
+  const belongTogether = (larger: Part, smaller: Part): boolean => {
+    const limit = Math.min(GAP * Math.max(larger.size, smaller.size), WIDEST * radius);
+    return areNear(larger.points, smaller.points, limit);
+  };
+  const findPair = (): [Part, Part] | undefined => {
+    for (const [place, larger] of parts.entries()) {
+      const known = apart.get(larger) ?? new Set();
+      apart.set(larger, known);
+      for (const smaller of parts.slice(place + 1)) {
+        if (known.has(smaller)) continue;
+        if (belongTogether(larger, smaller)) return [larger, smaller];
+        known.add(smaller);
+      }
+    }
+    return undefined;
+  };
+  for (let pair = findPair(); pair; pair = findPair()) {
+    const [larger, smaller] = pair;
+    const joined = makePart(points, [...larger.rows, ...smaller.rows]);
+    parts = [...parts.filter((part) => part !== larger && part !== smaller), joined];
+    parts.sort((a, b) => bySize(a.rows, b.rows));
   }
-  let best = runs[0];
-  for (const run of runs) if (run.count && (!best?.count || run.length > best.length)) best = run;
-  return best?.labels ?? labels;
+  for (const { rows } of parts) {
+    const label = rows.reduce((least, row) => Math.min(least, labels[row] ?? least), Infinity);
+    for (const row of rows) labels[row] = label;
+  }
+  return labels;
 }
 
 /** The clusters of the Gaussians at or above a threshold, best first. */

