@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from viewed_rooms import room_scene, save_viewed_room, search_of
+from viewer_containers import read_container
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats import load_splat
@@ -18,7 +19,7 @@ from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.localize.relevancy import feature_axes
 from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.infer.viewer import search as module
-from gsencoder.infer.viewer.container import Container, read_container
+from gsencoder.infer.viewer.container import Container
 from gsencoder.infer.viewer.page_scene import FileOptions, file_container, jpeg_of, scene_container
 from gsencoder.infer.viewer.search import NO_LABEL, SceneSearch
 from gsencoder.infer.viewer.shown import (

@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from viewed_rooms import STUB, room_scene, save_viewed_room, search_of
+from viewer_containers import read_container
 
 from gsencoder.core.errors import InputError
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.viewer.bundle import SCRIPT, STYLE, Bundle, load_bundle
-from gsencoder.infer.viewer.container import Container, read_container
+from gsencoder.infer.viewer.container import Container
 from gsencoder.infer.viewer.file_size import MadePage, fitting_page
 from gsencoder.infer.viewer.page import file_page, served_page
 from gsencoder.infer.viewer.page_scene import FileOptions

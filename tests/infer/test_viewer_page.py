@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from viewed_rooms import HOSTILE, STUB, name_features, room_scene, save_viewed_room, search_of
+from viewer_containers import read_container
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats import load_splat
@@ -20,7 +21,7 @@ from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
 from gsencoder.infer.viewer.bundle import load_bundle
-from gsencoder.infer.viewer.container import Container, read_container
+from gsencoder.infer.viewer.container import Container
 from gsencoder.infer.viewer.file_size import MadePage, fitting_page
 from gsencoder.infer.viewer.page import file_page, json_in_script, served_page
 from gsencoder.infer.viewer.page_scene import WORD_STEP, FileOptions, file_container, scene_container

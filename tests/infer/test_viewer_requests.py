@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 from viewed_rooms import STUB, room_scene, save_viewed_room, search_of
+from viewer_containers import read_container
 from viewer_requests import at, call, head, sent
 
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.infer.viewer import server as viewer_server
-from gsencoder.infer.viewer.container import read_container
 from gsencoder.infer.viewer.page import served_page
 from gsencoder.infer.viewer.page_scene import scene_container
 from gsencoder.infer.viewer.search import RELEVANCY_STEP, UNSEEN, SceneSearch

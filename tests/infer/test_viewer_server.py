@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 from viewed_rooms import STUB, room_scene, save_viewed_room, search_of
+from viewer_containers import read_container
 from viewer_requests import at, call, connected, head
 
 from gsencoder.core.errors import InputError
 from gsencoder.infer.viewer import server as viewer_server
-from gsencoder.infer.viewer.container import read_container
 from gsencoder.infer.viewer.page import served_page
 from gsencoder.infer.viewer.page_scene import scene_container
 from gsencoder.infer.viewer.search import SceneSearch

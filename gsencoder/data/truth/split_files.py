@@ -1,6 +1,5 @@
 """Split files of benchmarks: one name of a scene a line, such as scannetv2_val.txt."""
 
-from collections.abc import Iterable
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
@@ -29,22 +28,3 @@ def read_split(path: Path) -> tuple[str, ...]:
     if not first:
         raise InputError(f"{path}: lists no scene; expected one name a line")
     return tuple(first)
-
-
-def folders_of_split(names: Iterable[str], root: Path) -> tuple[Path, ...]:
-    """The folders of a split's scenes, in order.
-
-    Args:
-        names: of the scenes.
-        root: folder of the data set.
-
-    Raises:
-        InputError: some are missing; the first is named, and their number.
-    """
-    folders = [root / name for name in names]
-    missing = [folder for folder in folders if not folder.is_dir()]
-    if missing:
-        raise InputError(
-            f"{missing[0]}: no such folder ({len(missing)} of {len(folders)} scenes of the split are missing)"
-        )
-    return tuple(folders)

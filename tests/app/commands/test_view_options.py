@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 from command_runs import refusal
 from viewed_rooms import STUB, name_features, room_scene, save_viewed_room
+from viewer_containers import read_container
 
 from gsencoder.app import cli
 from gsencoder.app.commands import view
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.store.folder import WORDS_FILE, save_features
-from gsencoder.infer.viewer.container import Container, read_container
+from gsencoder.infer.viewer.container import Container
 from gsencoder.infer.viewer.page_scene import jpeg_of
 from gsencoder.types import Scene
 

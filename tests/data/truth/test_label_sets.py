@@ -16,7 +16,7 @@ from gsencoder.data.truth.label_sets import (
     scannet_classes,
     vertex_classes,
 )
-from gsencoder.data.truth.split_files import folders_of_split, read_split
+from gsencoder.data.truth.split_files import read_split
 from gsencoder.data.truth.write_truth import instance_truth, write_instance_truth, write_semantic_truth
 from gsencoder.types import MeshLabels
 
@@ -121,12 +121,7 @@ def test_a_list_of_classes_counts_from_zero(tmp_path: Path) -> None:
 def test_a_split_is_one_name_a_line(tmp_path: Path) -> None:
     path = tmp_path / "val.txt"
     path.write_text("scene0011_00\r\n\nscene0011_01  \n", encoding="utf-8-sig")
-    names = read_split(path)
-    assert names == ("scene0011_00", "scene0011_01")
-    (tmp_path / names[0]).mkdir()
-    assert folders_of_split(names[:1], tmp_path) == (tmp_path / names[0],)
-    with pytest.raises(InputError, match=r"scene0011_01: no such folder \(1 of 2 scenes of the split are missing\)"):
-        folders_of_split(names, tmp_path)
+    assert read_split(path) == ("scene0011_00", "scene0011_01")
 
 
 @pytest.mark.parametrize(
