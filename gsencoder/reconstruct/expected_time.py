@@ -150,13 +150,13 @@ def _step(optimizer: Optimizer, shrink: int, view: int) -> None:
 
 
 def _mean_seconds(views: Sequence[int], work: Callable[[int], object], limit: float) -> float:
-    """Of looks at some views, as many as the limit allows, one at least; the first look compiles and warms caches, and is
-    not counted."""
+    """Of looks at some views, as many as the limit allows and one at least; a first one compiles and warms caches, and
+    is not counted."""
     seconds: list[float] = []
     for view in (views[0], *views):
         began = time.perf_counter()
         work(view)
         seconds.append(time.perf_counter() - began)
-        if sum(seconds[1:]) > limit:
+        if sum(seconds[1:]) > max(limit, 0.0):
             break
     return float(np.mean(seconds[1:]))
