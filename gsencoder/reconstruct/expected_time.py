@@ -73,7 +73,7 @@ def measured_costs(optimizer: Optimizer, held_out: Sequence[int], limit: float =
     Args:
         optimizer: as it is now.
         held_out: views that are validated on.
-        limit: seconds that go into each kind of work, of which one look is taken at least.
+        limit: seconds that go into each kind of work, which is done twice at least.
     """
     config, state, prunings, pruned = optimizer.config, optimizer, (0.0, 0.0), False
     steps: dict[tuple[int, bool], float] = {}
@@ -150,13 +150,13 @@ def _step(optimizer: Optimizer, shrink: int, view: int) -> None:
 
 
 def _mean_seconds(views: Sequence[int], work: Callable[[int], object], limit: float) -> float:
-    """Of looks at some views; the first look compiles and warms caches, and is not counted unless all time goes into
-    it."""
+    """Of looks at some views, as many as the limit allows and one at least; a first one compiles and warms caches, and
+    is not counted."""
     seconds: list[float] = []
     for view in (views[0], *views):
         began = time.perf_counter()
         work(view)
         seconds.append(time.perf_counter() - began)
-        if sum(seconds) > limit:
+        if sum(seconds[1:]) > max(limit, 0.0):
             break
-    return float(np.mean(seconds[1:] or seconds))
+    return float(np.mean(seconds[1:]))

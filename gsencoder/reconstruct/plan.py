@@ -216,16 +216,18 @@ def _within_seconds(
     each = expected.steps / steps
     for _ in range(2):
         # How often is validated depends on the steps.
-        other = expected.other + costs.validation * validations(steps) + MAX_COMPARISONS * costs.picture
-        steps = min(max(int((AIMED * seconds - before - other) / each), 1), STEPS[-1])
+        other = expected.other + costs.validation * validations(max(steps, 1)) + MAX_COMPARISONS * costs.picture
+        steps = min(math.floor((AIMED * seconds - before - other) / each), STEPS[-1])
     cameras, shares = optimizer.photographs.cameras, (SMALLEST_SHARE, steps / (2 * FEW_STEPS))
     least = least_pixels(optimizer.device, optimizer.config) / float(np.median(cameras.widths * cameras.heights))
     factor = math.sqrt(max(*shares, least))
     if may_shrink and steps < FEW_STEPS and factor < SMALLEST_REDUCTION and before + factor * begun < seconds / 2:
         raise PhotographsTooLargeError(factor)
-    total = before + other + steps * each
     needed = math.ceil((before + other + STEPS[0] * each) / AIMED)
-    few = f"{budget.shown('seconds')}: has time for {steps} steps; budget.seconds={needed} has for {STEPS[0]}"
+    few = f"{budget.shown('seconds')}: has time for {max(steps, 0)} steps; budget.seconds={needed} has for {STEPS[0]}"
+    if steps < 1:
+        raise InputError(few)
+    total = before + other + steps * each
     return replace(plan, steps=steps, spent=before, seconds=total, notes=(few,) if steps < STEPS[0] else ())
 
 

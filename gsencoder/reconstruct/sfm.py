@@ -128,7 +128,7 @@ def register_photographs(
         attempt = attempts / ("thorough" if thorough else "usual")
         attempt.mkdir(parents=True)
         try:
-            models += _map(pycolmap, attempt, folder, names, config, single_camera, thorough, in_time)
+            models += _map(pycolmap, attempt, folder, names, config, single_camera, in_time, thorough)
         except InputError:
             raise
         except (RuntimeError, ValueError) as error:
@@ -246,8 +246,8 @@ def _map(
     names: list[str],
     config: SfmConfig,
     single_camera: bool,
-    thorough: bool,
     in_time: Callable[[], None],
+    thorough: bool,
 ) -> list[Any]:
     """The models that COLMAP makes of the photographs, in a folder of their own."""
     database = work / "database.db"

@@ -10,16 +10,18 @@ from hypothesis import strategies as st
 from PIL import Image
 from scene_files import photograph, save
 
-from gsencoder.app import cli
 from gsencoder.core.errors import InputError
+from gsencoder.data.check.scene_check import plain_photographs
 from gsencoder.data.readers import images
 from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
 from gsencoder.data.readers.image_file import picture_info, picture_size, read_integers, read_rgba
 from gsencoder.data.readers.images import ImageFiles, InstanceFiles, PixelGrid
 from gsencoder.data.readers.masks import MaskFiles
 from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
+from gsencoder.fusion.fit import SmallViews
 
 PINHOLE = CameraModel(model="PINHOLE", width=32, height=24, params=(30.0, 31.0, 16.0, 12.0))
 
@@ -279,8 +281,10 @@ def test_a_photograph_is_decoded_once_until_its_file_changes(tmp_path: Path, mon
         assert len(decoded) == count + added
 
 
-def test_a_fusion_decodes_each_photograph_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Checks, seeds and the teacher look at the same views; before, some were decoded four times."""
+def test_checks_the_fit_of_a_splat_and_a_teacher_decode_each_photograph_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They look at the same views; before, some were decoded four times."""
     room, folder = make_room(0, objects=2, views=5, width=160, height=120), tmp_path / "room"
     write_room(room, folder)
     transforms = json.loads((folder / "transforms.json").read_text())
@@ -297,6 +301,11 @@ def test_a_fusion_decodes_each_photograph_once(tmp_path: Path, monkeypatch: pyte
         return read_rgba(path, reduction=reduction)
 
     monkeypatch.setattr(images, "read_rgba", counted)
-    words = ["fuse", str(folder), "seeds.voxel=0.2", "data.image_scale=0.25", "teacher=palette", "quiet=true"]
-    assert cli.main([*words, f"out={tmp_path / 'features'}"]) == 0
+    views = load_scene(folder, options=SceneConfig(image_scale=0.25)).views
+    assert views is not None
+    assert views.images is not None
+    assert plain_photographs(views) == ([], 4)
+    for view in range(5):
+        assert np.isfinite(SmallViews(views).picture(view)).all()
+        np.testing.assert_array_equal(views.select([view]).images[0], views.images[view])
     assert decoded == {f"{view:03d}.jpg": 1 for view in range(5)}

@@ -101,7 +101,7 @@ def test_trials_of_steps_end_where_their_share_of_the_time_has_gone(monkeypatch:
         now[0] += 8.0 if len(looks) == 1 else 2.0
 
     monkeypatch.setattr(expected_time.time, "perf_counter", lambda: now[0])
-    for limit, seconds, views in ((100.0, 2.0, 5), (11.0, 2.0, 3), (7.0, 8.0, 1)):
+    for limit, seconds, views in ((100.0, 2.0, 5), (3.0, 2.0, 3), (-1.0, 2.0, 2)):
         looks.clear()
         assert expected_time._mean_seconds([3, 4, 5, 6], work, limit) == seconds
         assert len(looks) == views

@@ -174,6 +174,8 @@ def test_seconds_that_are_over_before_the_first_step_are_refused(optimizer: Opti
     problem = "budget.seconds=20: is over before the first step: 20 s went into reading photographs and seeding; "
     with pytest.raises(InputError, match=problem + "give more seconds, a smaller data.image_scale"):
         planned(optimizer, BudgetConfig(seconds=20.0), spent=19.7)
+    with pytest.raises(InputError, match="budget.seconds=35: has time for 0 steps; budget.seconds=186 has for 50"):
+        planned(optimizer, BudgetConfig(seconds=35.0), spent=20.0)
     # A promised error comes before seconds.
     assert planned(optimizer, BudgetConfig(seconds=20.0, error=0.5), spent=19.7).steps == planning.STEPS[0]
 
