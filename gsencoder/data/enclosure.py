@@ -50,11 +50,11 @@ OPEN, OPEN_WITH_CONTENT, OPEN_BESIDE, CONTENT = 0.56, 0.48, 0.6, 0.01
 lie beside this space; and the content that counts. Rooms: 0.53 and more, 0.69 and more; a deck chair and a window frame
 have 0.52 and 0.50, and no content."""
 CLOSED, CLOSED_BESIDE, CLOSED_CONTENT, CLOSED_SPACE = 0.31, 0.83, 0.1, 0.28
-"""The same of a room with walls, and its free space: things whose boards lie behind each other are less open (a car with
-seats 0.28, a kitchen 0.34); a teddy's head and body have a content of 0.05, rooms 0.14 and more; a figure on a plate of
-ground has a free space of 0.17, rooms 0.41 and more."""
-BARE_SPACE = 0.4
-"""In a low room of which this share is free, as a corridor, `CONTENT` is enough."""
+"""The same of a room with walls, and its free space: things whose boards lie behind each other are less open (a car
+with seats 0.28, a kitchen 0.34); a teddy's head and body have a content of 0.05, rooms 0.14 and more; a figure on a
+plate of ground has a free space of 0.17, rooms 0.41 and more."""
+BARE_SPACE = 0.43
+"""In a room of which this share is free, as a corridor, `CONTENT` is enough; a hat has 0.41."""
 DIRECTIONS = tuple(each for each in product((-1, 0, 1), repeat=3) if any(each))
 
 
@@ -88,7 +88,7 @@ class Enclosure:
             return True
         if self.beside < CLOSED_BESIDE or self.space < CLOSED_SPACE or self.openness < CLOSED:
             return False
-        return self.content >= CLOSED_CONTENT or (low and filled and self.space >= BARE_SPACE)
+        return self.content >= CLOSED_CONTENT or (filled and self.space >= BARE_SPACE)
 
     @property
     def reason(self) -> str:

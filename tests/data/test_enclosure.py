@@ -1,0 +1,129 @@
+"""Rooms and objects are told apart by their free space, however they are turned, sized and sampled."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gsencoder.data.enclosure import MIN_GAUSSIANS, Enclosure, enclosure_of
+from gsencoder.data.seeding.flat import flat_gaussians
+from gsencoder.data.up import with_up
+from gsencoder.fusion.orbit_views import with_explained_views
+from gsencoder.types import Gaussians, Scene
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+BOARDS = {
+    "chair": [
+        ((0, 0, 0.45), (0.45, 0.45, 0.49)),
+        ((0, 0.41, 0.45), (0.45, 0.45, 0.95)),
+        *(((x, y, 0), (x + 0.04, y + 0.04, 0.45)) for x in (0, 0.41) for y in (0, 0.41)),
+    ],
+    "box": [((0, 0, 0), (0.3, 0.2, 0.12))],
+    "sheet": [((0, 0, 0), (2.0, 1.4, 0.02))],
+}
+"""Objects: low and high corners of boards."""
+FURNITURE = [((0.1, 0.1, 0), (0.7, 2.0, 0.5)), ((1.6, 1.4, 0), (2.6, 2.2, 0.75)), ((3.4, 0.1, 0), (4.0, 0.6, 1.8))]
+
+
+def sides(low: np.ndarray, high: np.ndarray, spacing: float, left_out: tuple[int, ...] = ()) -> list[np.ndarray]:
+    """Points and normals, as rows of six, on the sides of a box but some of (x low, x high, y low, …)."""
+    generator, size, rows = np.random.default_rng(0), high - low, []
+    for number in range(6):
+        if number not in left_out:
+            axis, end = divmod(number, 2)
+            points = generator.uniform(0, 1, (int(np.delete(size, axis).prod() / spacing**2) + 1, 3))
+            points[:, axis] = end
+            normals = np.broadcast_to((2 * end - 1) * np.eye(3)[axis], points.shape)
+            rows.append(np.concatenate((low + points * size, normals), axis=1))
+    return rows
+
+
+def splat(rows: list[np.ndarray]) -> Gaussians:
+    both = np.concatenate(rows).astype(np.float32)
+    return flat_gaussians(both[:, :3], both[:, 3:], np.full((len(both), 3), 0.5, np.float32), largest=0.1)
+
+
+def room() -> Gaussians:
+    """Floor and two walls, as a scan has them that nobody completed, with three pieces of furniture."""
+    rows = sides(np.zeros(3), np.array([6.0, 5.0, 1.6]), 0.06, left_out=(1, 3, 5))
+    for low, high in FURNITURE:
+        rows += sides(np.array(low), np.array(high), 0.045)
+    return splat(rows)
+
+
+def made_object(name: str) -> Gaussians:
+    corners = [(np.array(low, float), np.array(high, float)) for low, high in BOARDS[name]]
+    area = sum(2 * (np.prod(d) * (1 / d).sum()) for d in (high - low for low, high in corners))
+    return splat([each for low, high in corners for each in sides(low, high, np.sqrt(area / 8000))])
+
+
+def moved(gaussians: Gaussians, number: int) -> Gaussians:
+    rotation, size = Rotation.random(random_state=number), 10.0 ** (number - 1)
+    quats = (rotation * Rotation.from_quat(gaussians.quats, scalar_first=True)).as_quat(scalar_first=True)
+    means = size * rotation.apply(gaussians.means) + [3, -7, 20 * number]
+    scales = size * gaussians.scales
+    return replace(
+        gaussians, means=means.astype(np.float32), quats=quats.astype(np.float32), scales=scales.astype(np.float32)
+    )
+
+
+def denser(gaussians: Gaussians) -> Gaussians:
+    """Four overlapping Gaussians for each one in half of the scene, beside each other within its disc."""
+    half = gaussians.means[:, 0] < np.median(gaussians.means[:, 0])
+    rows = np.concatenate((np.repeat(np.flatnonzero(half), 4), np.flatnonzero(~half)))
+    made = gaussians.select(rows)
+    shift = np.random.default_rng(1).normal(size=made.means.shape) * made.scales
+    turned = Rotation.from_quat(made.quats, scalar_first=True).apply(shift)
+    return replace(made, means=(made.means + turned).astype(np.float32))
+
+
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_room_stays_a_room_wherever_it_lies_and_however_large_it_is(number: int) -> None:
+    first, second = enclosure_of(room()), enclosure_of(moved(room(), number))
+    assert first.is_room
+    assert second.is_room
+    for field in fields(Enclosure):
+        assert getattr(second, field.name) == pytest.approx(getattr(first, field.name), abs=0.12), field.name
+
+
+@pytest.mark.parametrize("name", list(BOARDS))
+def test_an_object_stays_an_object_turned_enlarged_and_denser_in_one_half(name: str) -> None:
+    gaussians = made_object(name)
+    assert not any(enclosure_of(each).is_room for each in (gaussians, moved(gaussians, 2), denser(gaussians)))
+
+
+def test_a_room_stays_a_room_where_one_half_has_four_times_the_gaussians() -> None:
+    first, second = enclosure_of(room()), enclosure_of(denser(room()))
+    assert second.is_room
+    assert second.openness == pytest.approx(first.openness, abs=0.03)
+
+
+@pytest.mark.parametrize(("axis", "sign"), [(0, 1), (0, -1), (1, 1)])
+def test_two_thirds_of_a_room_are_a_room_and_half_of_a_box_is_none(axis: int, sign: int) -> None:
+    def part(gaussians: Gaussians, share: float) -> Gaussians:
+        values = sign * gaussians.means[:, axis]
+        return gaussians.select(np.flatnonzero(values < np.quantile(values, share)))
+
+    assert enclosure_of(part(room(), 0.67)).is_room
+    assert not enclosure_of(part(made_object("box"), 0.6)).is_room
+
+
+def test_few_gaussians_show_no_room() -> None:
+    gaussians = room()
+    few = gaussians.select(np.linspace(0, len(gaussians) - 1, MIN_GAUSSIANS - 1).astype(int))
+    assert not enclosure_of(few).is_room
+    assert "fewer than 4,000" in enclosure_of(few).reason
+
+
+def test_what_was_decided_is_said_and_an_object_has_no_up_of_its_own() -> None:
+    scene, up = with_up(Scene(name="chair", gaussians=made_object("chair")))
+    assert up is None
+    seen, reason = with_explained_views(scene, 12)
+    assert seen.views is not None
+    assert seen.views.names[0] == "orbit_000"
+    assert "no free space lies beside most of its surfaces" in reason
+    # No direction is up, so that cameras surround it on all sides.
+    directions = seen.views.cameras.centers - scene.gaussians.means.mean(axis=0)  # type: ignore[union-attr]
+    assert (directions.max(axis=0) > 0.3).all()
+    assert (directions.min(axis=0) < -0.3).all()
