@@ -142,7 +142,8 @@ def test_the_origin_is_added_back_in_double_precision() -> None:
 
 
 def test_gaussians_never_seen_are_never_taken_and_have_no_relevancy() -> None:
-    localization = localize(SCENE, ["mug", "chair"], TABLE, LocalizeConfig(threshold=ThresholdConfig(fixed=-1.0)))
+    config = LocalizeConfig(threshold=ThresholdConfig(fixed=-1.0), min_probability=0.0)
+    localization = localize(SCENE, ["mug", "chair"], TABLE, config)
     assert np.isnan(localization.relevancy[:, :50]).all()
     assert np.isfinite(localization.relevancy[:, 50:]).all()
     assert min(int(box.rows.min()) for box in localization.boxes) >= 50

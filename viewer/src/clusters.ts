@@ -11,6 +11,7 @@ const SPARSE = 0.25;
 const GROWTH = Math.SQRT2;
 const SPARSE_RADII = 6;
 const GAP = 0.25;
+const STRAY = 0.02;
 const WIDEST = 8;
 const MAX_PARTS = 32;
 
@@ -234,6 +235,7 @@ function labelsByGaps(points: Float32Array, smallest: number, minSamples: number
   let parts = groups.sort(bySize).slice(0, MAX_PARTS).map((rows) => makePart(points, rows));
   const apart = new Map<Part, Set<Part>>();
   const belongTogether = (larger: Part, smaller: Part): boolean => {
+    if (smaller.rows.length < STRAY * larger.rows.length) return false;
     const limit = Math.min(GAP * Math.max(larger.size, smaller.size), WIDEST * radius);
     return areNear(larger.points, smaller.points, limit);
   };

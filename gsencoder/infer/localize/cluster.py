@@ -19,6 +19,8 @@ SPARSE, GROWTH, SPARSE_RADII = 0.25, 2**0.5, 6
 the scene: the radius grows by this factor, at most this often (8 times)."""
 GAP = 0.25
 """Clusters are one thing up to a gap of this share of the larger one's size."""
+STRAY = 0.02
+"""Clusters with less than this share of the larger one's points are not joined to it: strays would thicken a door."""
 WIDEST = 8
 """No gap within a thing is wider than this many radii. In house rooms those of tables and sofas are up to 7.5 wide, and
 those between two things of a name 11 and more."""
@@ -73,6 +75,8 @@ class _Part:
 
 
 def _belong_together(larger: _Part, smaller: _Part, widest: float) -> bool:
+    if len(smaller.rows) < STRAY * len(larger.rows):
+        return False
     limit = min(GAP * max(larger.size, smaller.size), widest)
     near = ((smaller.points >= larger.low - limit) & (smaller.points <= larger.high + limit)).all(axis=1)
     return bool(np.isfinite(larger.tree.query(smaller.points[near], distance_upper_bound=limit)[0]).any())

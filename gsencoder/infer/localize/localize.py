@@ -55,8 +55,8 @@ class LocalizeConfig:
     eps_spacings: float | None = field(
         default=None,
         metadata={
-            "help": "DBSCAN radius in spacings, where eps is not given; empty = from 1.5 spacings on it follows the "
-            "gaps between the Gaussians that were selected"
+            "help": "DBSCAN radius in spacings, where eps is not given; empty = 1.5, or more for words whose Gaussians "
+            "are sparse, and clusters whose gap is small beside their size are one"
         },
     )
     min_samples: int = field(
@@ -103,11 +103,11 @@ class LocalizeConfig:
 
     @property
     def follows_gaps(self) -> bool:
-        """Whether each word has a radius of its own (`gsencoder.infer.localize.cluster.cluster_by_gaps`)."""
+        """Whether clusters are joined (`gsencoder.infer.localize.cluster.cluster_by_gaps`): no radius was given."""
         return self.eps is None and self.eps_spacings is None
 
     def radius(self, spacing: float) -> float:
-        """The radius of DBSCAN, or the smallest one where it follows gaps, in the unit of the scene's spacing."""
+        """The radius of DBSCAN, or the smallest one where clusters are joined, in the unit of the scene's spacing."""
         return self.eps or (self.eps_spacings or EPS_SPACINGS) * spacing
 
 
@@ -126,12 +126,13 @@ def localize(
 ) -> Localization:
     """Finds words in a scene.
 
-    Each word's Gaussians at or above the threshold are clustered (DBSCAN); every cluster becomes a box with the
-    score that `gsencoder.infer.localize.boxes.score_clusters` and the probability that
-    `gsencoder.infer.localize.presence` defines. Boxes that are less probable than `config.min_probability` are left
-    out, and a word that has no box is absent. Axis-aligned and oriented boxes are drawn around Gaussian means, unless
-    `config.extent` says "sigma", and have the scene's origin added back in float64. A word's boxes do not depend on the
-    other queries, unless `config.contrast` is on.
+    Each word's Gaussians at or above the threshold are clustered (DBSCAN), and clusters that are parts of one thing
+    joined (`gsencoder.infer.localize.cluster.cluster_by_gaps`); every one becomes a box with the score that
+    `gsencoder.infer.localize.boxes.score_clusters` and the probability that `gsencoder.infer.localize.presence`
+    defines. Boxes that are less probable than `config.min_probability` are left out, and a word that has no box is
+    absent. Axis-aligned and oriented boxes are drawn around Gaussian means, unless `config.extent` says "sigma", and
+    have the scene's origin added back in float64. A word's boxes do not depend on the other queries, unless
+    `config.contrast` is on.
 
     Args:
         scene: Gaussians with features.
