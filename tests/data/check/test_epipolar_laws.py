@@ -70,7 +70,7 @@ def turned_to_error(cameras: Cameras, matches: list[PairMatches], view: int, err
 
 
 def shifted(pair: PairMatches, cameras: Cameras, pixels: float) -> PairMatches:
-    """The matches with half of those of the second view moved to the right and half to the left, to this median error."""
+    """The matches with half of those of the second view moved to the right, the others to the left: a median error."""
     size, moved = pixels, pair
     for _ in range(20):
         moved = replace(pair, second_pixels=pair.second_pixels + size * np.resize([1, -1], 60)[:, None] * (1, 0))
