@@ -27,8 +27,8 @@ from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.shapes import Solid
 from gsencoder.types import Cameras, Views
 
-ORBITS = 100
-"""Orbits before a wallpaper."""
+OFF = {"kitchen": (4, 32, 33, 37)}
+"""Rows of views that are no good ones: by their depth, too, frames 96, 768, 792 and 888 are 1.7 to 2.3 cm off."""
 HALF = np.array([1.6, 1.6, 1.2])
 """Half of the sides of the room with the wallpaper, meters."""
 
@@ -172,10 +172,11 @@ def good_cases(scenes: dict[str, tuple[Cameras, list[PairMatches]]], count: int)
     for index in range(count):
         name = str(rng.choice(names[index % 2]))
         cameras, matches = scenes[name]
-        size = int(rng.integers(3, min(24, len(cameras)) + 1))
-        rows = rng.permutation(len(cameras))[:size]
+        good = np.setdiff1d(np.arange(len(cameras)), OFF.get(name, ()))
+        size = int(rng.integers(3, min(24, len(good)) + 1))
+        rows = rng.permutation(good)[:size]
         if rng.uniform() < 0.5:
-            rows = rng.integers(len(cameras) - size + 1) + np.arange(size)
+            rows = good[rng.integers(len(good) - size + 1) + np.arange(size)]
         yield Case(scene=name, rows=np.sort(rows), cameras=cameras, matches=matches)
 
 

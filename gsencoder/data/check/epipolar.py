@@ -61,11 +61,11 @@ UNKNOWN_SHARE = 0.1
 STRAY_ERROR = 3.0
 """A view may be astray if the error of its pairs is above so many pixels, and above …"""
 STRAY_FACTOR = 3.0
-"""… this many times that of the other pairs, and less than …"""
+"""… this many times that of the middle one of the other pairs, and less than …"""
 STRAY_SHARE = 0.25
 """… this share of their matches is in pairs that fit. It is astray if it has another pose under which two pairs fit
 and …"""
-MOVED_SHARE = 0.6
+MOVED_SHARE = 0.5
 """… this share of the matches is in pairs that do."""
 STEPS = 12
 STARTS = 4
@@ -261,10 +261,14 @@ def _clipped(distances: Float64[np.ndarray, " n"]) -> float:
     return float(np.minimum(distances, CLIP).mean())
 
 
+def _usual_error(cameras: Cameras, matches: Sequence[PairMatches]) -> float:
+    """The median error in pixels of the middle pair."""
+    return float(np.median([np.median(_distances(cameras, pair)) for pair in matches]))
+
+
 def _fit_limit(cameras: Cameras, matches: Sequence[PairMatches]) -> float:
     """The largest median error in pixels of a pair that fits."""
-    usual = float(np.median([np.median(_distances(cameras, pair)) for pair in matches]))
-    return float(np.clip(FIT_FACTOR * usual, *FIT_RANGE))
+    return float(np.clip(FIT_FACTOR * _usual_error(cameras, matches), *FIT_RANGE))
 
 
 def share_that_fits(cameras: Cameras, matches: Sequence[PairMatches], limit: float) -> float:
@@ -289,12 +293,17 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
             others = [(pair, fits) for pair, fits in remaining if view not in (pair.first, pair.second)]
             # A neighbor that fits nobody else may itself be the one that is astray.
             trusted = {end for pair, fits in others if fits for end in (pair.first, pair.second)}
-            own = [pair for pair, _ in remaining if view in (pair.first, pair.second)]
-            own = near_pairs(cameras, [pair for pair in own if trusted & {pair.first, pair.second}], view)
+            own = [
+                pair
+                for pair, fits in remaining
+                if view in (pair.first, pair.second) and (fits or trusted & {pair.first, pair.second})
+            ]
+            own = near_pairs(cameras, own, view)
             if len(own) < 2 or len(others) < 3 or share_that_fits(cameras, own, limit) >= STRAY_SHARE:
                 continue
-            error, usual = mean_error(cameras, own), mean_error(cameras, near_pairs(cameras, [p for p, _ in others]))
-            if error > max(STRAY_ERROR, STRAY_FACTOR * usual):
+            # A second view that is astray is in few of the others' pairs.
+            usual = _usual_error(cameras, near_pairs(cameras, [pair for pair, _ in others]))
+            if (error := mean_error(cameras, own)) > max(STRAY_ERROR, STRAY_FACTOR * usual):
                 suspects.append((error, usual, view, own))
         for error, usual, view, own in sorted(suspects, key=lambda suspect: -suspect[0]):
             moved = fit_pose_to_matches(cameras, view, own)

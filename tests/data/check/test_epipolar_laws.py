@@ -14,6 +14,7 @@ from gsencoder.data.check.epipolar import (
     _best_reading,
     _spread_triples,
     _stray_views,
+    _usual_error,
     consistent_matches,
     fit_pose_to_matches,
     judge_matches,
@@ -69,11 +70,11 @@ def turned_to_error(cameras: Cameras, matches: list[PairMatches], view: int, err
 
 
 def shifted(pair: PairMatches, cameras: Cameras, pixels: float) -> PairMatches:
-    """The matches with half of those of the second view moved to the right and half to the left, to this mean error."""
+    """The matches with half of those of the second view moved to the right, the others to the left: a median error."""
     size, moved = pixels, pair
     for _ in range(20):
         moved = replace(pair, second_pixels=pair.second_pixels + size * np.resize([1, -1], 60)[:, None] * (1, 0))
-        size *= pixels / mean_error(cameras, [moved])
+        size *= pixels / _usual_error(cameras, [moved])
     return moved
 
 
