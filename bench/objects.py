@@ -1,7 +1,7 @@
 """Objects and rooms that come as bare splats: is an object seen from around, and a room from inside?
 
     python bench/objects.py $S [--furniture FOLDER] [--more 60] [--fit FOLDER --pieces 8] [--objects FILE …]
-        [--rooms FILE …]
+        [--rooms FILE …] [--geometry]
 
 Objects are pieces of furniture of Debian's `sweethome3d-furniture` (their surfaces sampled evenly, whatever covers
 them), the splats of the fixtures, and instances cut from the seeds of house rooms. Rooms are seeds of house rooms, of
@@ -11,7 +11,7 @@ inside, and a camera within an object.
 
 --more takes so many other pieces by chance. --fit photographs pieces from around (40 pictures), reconstructs them in
 FOLDER with `gsencoder reconstruct`, where they are not there yet, and judges these too. --objects and --rooms are other
-splats, such as reconstructions.
+splats, such as reconstructions. --geometry judges free space alone (`gsencoder.data.enclosure`) and places no cameras.
 """
 
 import argparse
@@ -33,6 +33,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import SceneWarning
+from gsencoder.data.enclosure import enclosure_of
 from gsencoder.data.orbits import orbit_cameras
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.flat import flat_gaussians
@@ -214,6 +215,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=300)
     parser.add_argument("--objects", type=Path, nargs="*", default=())
     parser.add_argument("--rooms", type=Path, nargs="*", default=())
+    parser.add_argument("--geometry", action="store_true")
     add_json_option(parser)
     options = parser.parse_args()
     warnings.simplefilter("ignore", SceneWarning)
@@ -244,6 +246,12 @@ def main() -> None:
     for number, (kind, form, name, gaussians) in enumerate(judged()):
         other, true = turned(gaussians, number)
         start = time.perf_counter()
+        if options.geometry:
+            enclosure = enclosure_of(other)
+            seconds = time.perf_counter() - start
+            right.setdefault(f"{kind}s, {form}", []).append(enclosure.is_room == (kind == "room"))
+            print(f"| {kind} | {form} | {name} | {'inside' if enclosure.is_room else 'orbit'} | | | | {seconds:.1f} |")
+            continue
         scene, up = with_up(Scene(name=name, gaussians=other))
         views = with_views(scene, 24).views
         seconds = time.perf_counter() - start

@@ -42,9 +42,9 @@ since Gaussians of fitted surfaces overlap."""
 ENCLOSED = 0.45
 """Share of the directions in which a free cell's rays end at a surface, from which on the cell is enclosed: half of
 them, as between floor and walls, and a little less where a wall was not photographed."""
-THIN, FLAT, HIGH = 0.07, 0.35, 0.55
-"""Smallest over largest side: below the first a thing is a sheet (two cells); scans without a ceiling are at most FLAT
-(house rooms 0.09 to 0.28), and rooms with walls at most HIGH (0.19 to 0.50)."""
+FLAT, HIGH = 0.35, 0.55
+"""Smallest over largest side: scans without a ceiling are at most FLAT (house rooms 0.06 to 0.28), and rooms with walls
+at most HIGH (0.19 to 0.50)."""
 OPEN, OPEN_WITH_CONTENT, OPEN_BESIDE, CONTENT = 0.56, 0.48, 0.6, 0.01
 """Of a scan without a ceiling: its surfaces' openness, less where something stands in its space; the share of them that
 lie beside this space; and the content that counts. Rooms: 0.53 and more, 0.69 and more; a deck chair and a window frame
@@ -81,7 +81,7 @@ class Enclosure:
     @property
     def is_room(self) -> bool:
         """Whether photographs of it would be taken from inside."""
-        if not self.enough or not THIN <= self.flatness <= HIGH or self.beside < OPEN_BESIDE:
+        if not self.enough or self.flatness > HIGH or self.beside < OPEN_BESIDE:
             return False
         low, filled = self.flatness <= FLAT, self.content >= CONTENT
         if low and (self.openness >= OPEN or (self.openness >= OPEN_WITH_CONTENT and filled)):

@@ -6,7 +6,7 @@ from typing import Literal
 from gsencoder.core.errors import InputError
 from gsencoder.data.enclosure import enclosure_of
 from gsencoder.data.orbits import orbit_cameras
-from gsencoder.fusion.interior_views import ROOM, interior_views
+from gsencoder.fusion.interior_views import ROOM, InteriorViews, interior_views
 from gsencoder.render import BlendConfig
 from gsencoder.render.images import RenderedImages
 from gsencoder.types import Scene, Views
@@ -52,10 +52,12 @@ def with_explained_views(
     if scene.views is not None:
         return scene, "the scene has views"
     assert scene.gaussians is not None
-    inside, reason = None, "cameras= says so"
+    inside: InteriorViews | None = None
+    reason = "cameras= says so"
     if cameras == "auto":
         enclosure = enclosure_of(scene.gaussians)
-        cameras, reason = ("inside" if enclosure.is_room else "around"), enclosure.reason
+        cameras = "inside" if enclosure.is_room else "around"
+        reason = enclosure.reason
         if enclosure.is_room:
             inside = interior_views(scene.gaussians, count, up=scene.up)
             if inside is None or inside.covered < ROOM:
