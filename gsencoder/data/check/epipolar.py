@@ -339,10 +339,8 @@ def fit_pose_to_matches(cameras: Cameras, view: int, matches: Sequence[PairMatch
     ends = [_ends(view, pair) for pair in matches]
     others = [other for other, _, _ in ends]
     pair = np.repeat(np.arange(len(ends)), [len(here) for _, _, here in ends])
-    there, here = (
-        np.concatenate([_homogeneous(pixels) for pixels in each])
-        for each in ([there for _, there, _ in ends], [here for _, _, here in ends])
-    )
+    there = np.concatenate([_homogeneous(pixels) for _, pixels, _ in ends])
+    here = np.concatenate([_homogeneous(pixels) for _, _, pixels in ends])
     rays_there = unproject[others].mT @ turns[others]
 
     def lines(rotation: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
