@@ -210,7 +210,7 @@ def test_a_fitted_splat_whose_gaussians_are_turned_anyhow_has_the_up_of_its_surf
     assert bare.gaussians is not None
     count = len(bare.gaussians)
     anyhow = Rotation.random(count, random_state=0).as_quat(scalar_first=True).astype(np.float32)
-    scales = np.tile(np.array([0.01, 0.01, 0.001], np.float32), (count, 1))
+    scales = np.tile(np.array([0.02, 0.02, 0.002], np.float32), (count, 1))
     fitted = replace(bare, gaussians=replace(bare.gaussians, quats=anyhow, scales=scales))
     for number in range(2):
         rotation = Rotation.random(random_state=number).as_matrix()

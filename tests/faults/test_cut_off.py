@@ -123,7 +123,7 @@ def load():
         return mapped[-1]
     return None, run
 
-cli._dispatch = lambda words: load()[1](None, None)
+cli._dispatch = lambda words, began: load()[1](None, None)
 cli.main(["inspect"])
 """
 

@@ -60,15 +60,15 @@ def with_photographs(scene: Scene) -> Scene:
     return replace(scene, views=replace(scene.views, images=photographs))
 
 
-def one_component(memory: QueryMemory) -> QueryMemory:
+def first_components(memory: QueryMemory, count: int) -> QueryMemory:
     bank = memory.bank
     return replace(
         memory,
         bank=replace(
             bank,
-            components=bank.components[:1],
-            sources=bank.sources[:1],
-            grid_from_image=bank.grid_from_image[:1],
+            components=bank.components[:count],
+            sources=bank.sources[:count],
+            grid_from_image=bank.grid_from_image[:count],
         ),
     )
 
@@ -105,7 +105,7 @@ def test_weights_of_all_components_sum_to_one_and_a_bank_may_have_fewer(memory: 
     assert sorted(components.components.tolist()) == list(range(len(memory.bank)))
     assert components.weights.sum() == pytest.approx(1, abs=1e-5)
     assert (np.diff(components.weights) <= 0).all()
-    single = strongest_components(one_component(memory), scene.gaussians, scene.views.cameras, 0, (24, 20), 6)
+    single = strongest_components(first_components(memory, 1), scene.gaussians, scene.views.cameras, 0, (24, 20), 6)
     assert single.components.tolist() == [0]
     assert single.weights.tolist() == [1.0]
 
@@ -113,9 +113,9 @@ def test_weights_of_all_components_sum_to_one_and_a_bank_may_have_fewer(memory: 
 def test_of_equal_components_the_first_come_first(memory: QueryMemory, scene: Scene) -> None:
     assert scene.gaussians is not None
     assert scene.views is not None
-    bank = memory.bank
-    same = replace(bank, components=np.repeat(bank.components[:1], len(bank), axis=0))
-    tied = replace(memory, bank=same)
+    """Of eight, which a matrix product computes alike: columns of a remainder are rounded otherwise."""
+    memory = first_components(memory, 8)
+    tied = replace(memory, bank=replace(memory.bank, components=np.repeat(memory.bank.components[:1], 8, axis=0)))
     components = strongest_components(tied, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
     assert components.components.tolist() == [0, 1, 2]
 
@@ -260,7 +260,7 @@ def test_the_bar_under_a_tile_is_as_long_as_its_weight(memory: QueryMemory, scen
 def test_scenes_without_photographs_and_banks_of_one_component_are_drawn(memory: QueryMemory, scene: Scene) -> None:
     rendered = attention_picture(memory, scene, 0, (24, 20))
     assert in_color(rendered, MARK).any()
-    single = attention_picture(one_component(memory), scene, 0, (24, 20))
+    single = attention_picture(first_components(memory, 1), scene, 0, (24, 20))
     assert single.shape[1] < rendered.shape[1]
     assert in_color(single, MARK).any()
 

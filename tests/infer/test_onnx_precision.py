@@ -23,6 +23,7 @@ from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.onnx.export import Cloud, check_cosines, export_onnx, lower, random_cloud
 from gsencoder.infer.onnx.header import from_metadata, to_metadata
 from gsencoder.infer.onnx.operators import OPSET, OURS, in_standard_operators
+from gsencoder.infer.onnx.precision import PRODUCT_LIMIT
 from gsencoder.infer.onnx.runtime import OnnxEncoder
 from gsencoder.models.grid.neighbors import convolve_reference, neighbor_table
 
@@ -125,7 +126,7 @@ def test_a_convolution_of_integers_is_that_of_what_they_stand_for(rows: int) -> 
     cells = np.unique(rng.integers(0, 14, (2 * rows, 3)), axis=0)[:rows]
     neighbors = neighbor_table(torch.from_numpy(cells)).numpy()
     x = rng.integers(0, 256, (len(cells), 5)).astype(np.uint8)
-    weight = rng.integers(-127, 128, (27 * 5, 7)).astype(np.int8)
+    weight = rng.integers(-PRODUCT_LIMIT, PRODUCT_LIMIT + 1, (27 * 5, 7)).astype(np.int8)
     step, zero, scale = np.float32(0.02), np.uint8(113), rng.uniform(0.001, 0.1, 7).astype(np.float32)
     output = operator(
         "convolve_int8",
@@ -141,7 +142,8 @@ def test_a_convolution_of_integers_is_that_of_what_they_stand_for(rows: int) -> 
 
 def test_a_linear_layer_of_integers_is_that_of_what_they_stand_for() -> None:
     rng = np.random.default_rng(0)
-    x, weight = rng.integers(0, 256, (40, 64)).astype(np.uint8), rng.integers(-127, 128, (64, 9)).astype(np.int8)
+    x = rng.integers(0, 256, (40, 64)).astype(np.uint8)
+    weight = rng.integers(-PRODUCT_LIMIT, PRODUCT_LIMIT + 1, (64, 9)).astype(np.int8)
     scale, bias = rng.uniform(0.001, 0.1, 9).astype(np.float32), rng.normal(size=9).astype(np.float32)
     values = {
         "x": x,

@@ -180,6 +180,10 @@ def test_a_checkpoint_from_before_exposures_is_of_another_setting(tmp_path: Path
     state = State(adam=adam, anchor=None, step=1, seconds=0.0, facts={})
     save_state(tmp_path / "state", state, {"optimize": {"steps": 4}})
     with pytest.raises(InputError, match=r"optimize.exposure=False, and this run asks optimize.exposure=True; give"):
-        load_state(tmp_path / "state", {"optimize": {"steps": 4, "exposure": True}}, steps=4, sh_degree=0)
-    same = load_state(tmp_path / "state", {"optimize": {"steps": 4, "exposure": False}}, steps=4, sh_degree=0)
+        load_state(
+            tmp_path / "state", {"optimize": {"steps": 4, "exposure": True, "earlier": []}}, steps=4, sh_degree=0
+        )
+    same = load_state(
+        tmp_path / "state", {"optimize": {"steps": 4, "exposure": False, "earlier": []}}, steps=4, sh_degree=0
+    )
     assert same.exposures is None

@@ -3,6 +3,9 @@
 A weight matrix is rounded to int8 with a scale for each output channel. In a product of integers the other factor is
 rounded to uint8 with one scale and one zero point, which are computed when the graph runs (dynamic quantization). Sums
 are int32, and everything between products stays float32.
+
+Processors without VNNI add two products of bytes in 16 bits, which 255 · 127 twice overflows without an error. Weights
+of integer products are therefore at most `PRODUCT_LIMIT`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,6 +18,9 @@ from onnx import helper, numpy_helper
 
 from gsencoder.core.int8 import round_columns
 from gsencoder.infer.onnx.operators import OURS, convolve, convolve_int8, linear_int8
+
+PRODUCT_LIMIT = 63
+"""2 · 255 · 63 < 2¹⁵."""
 
 
 class Product(NamedTuple):
@@ -75,7 +81,7 @@ def products_in_int8(model: onnx.ModelProto) -> onnx.ModelProto:
             # Queries, keys and values are products of the same tokens.
             as_bytes[product.x] = tuple(f"{product.x}.{chunk}" for chunk in ("uint8", "step", "zero"))  # type: ignore[assignment]
             nodes.append(helper.make_node("DynamicQuantizeLinear", [product.x], list(as_bytes[product.x])))
-        rounded, scale = round_columns(product.matrix)
+        rounded, scale = round_columns(product.matrix, PRODUCT_LIMIT)
         weights = _store(done.graph, product.weight, rounded=rounded, scale=scale)
         name, rest = (convolve_int8, []) if product.convolves else (linear_int8, [node.input[2]])
         between = [node.input[1]] if product.convolves else []
