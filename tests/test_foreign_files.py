@@ -1,12 +1,11 @@
 """What a scene or an option names is a regular file: pipes and devices end with an error, within a second."""
 
-import os
-import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from no_files import ends_within, make_no_file
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files.foreign_file import open_foreign, read_foreign, read_foreign_text
@@ -49,28 +48,14 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 @pytest.fixture(autouse=True)
 def _ends() -> Iterator[None]:
-    def late(*_: object) -> None:
-        raise TimeoutError("reading did not end")
-
-    before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, 1.0)
-    yield
-    signal.setitimer(signal.ITIMER_REAL, 0)
-    signal.signal(signal.SIGALRM, before)
-
-
-def endless(path: Path, kind: str) -> Path:
-    if kind == "pipe":
-        os.mkfifo(path)
-    else:
-        path.symlink_to("/dev/zero")
-    return path
+    with ends_within(1.0):
+        yield
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 @pytest.mark.parametrize("name", READERS)
 def test_a_pipe_and_a_device_are_refused_by_every_reader(tmp_path: Path, name: str, kind: str) -> None:
-    path = endless(tmp_path / name, kind)
+    path = make_no_file(tmp_path / name, kind)
     with pytest.raises(InputError, match="not a regular file") as caught:
         READERS[name](path)
     assert str(path) in str(caught.value)
@@ -79,20 +64,20 @@ def test_a_pipe_and_a_device_are_refused_by_every_reader(tmp_path: Path, name: s
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 def test_a_summary_that_is_no_file_is_no_summary(tmp_path: Path, kind: str) -> None:
     (tmp_path / "views.json").write_text("{}")
-    endless(tmp_path / "summary.json", kind)
+    make_no_file(tmp_path / "summary.json", kind)
     check_written(tmp_path / "views.json")
     assert kind_of_path(tmp_path) == "a folder of other files"
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 def test_questions_that_are_no_file_are_no_set(tmp_path: Path, kind: str) -> None:
-    assert not is_question_set(endless(tmp_path / "questions.json", kind))
+    assert not is_question_set(make_no_file(tmp_path / "questions.json", kind))
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 def test_a_binary_model_that_is_no_file_is_refused(tmp_path: Path, kind: str) -> None:
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
-        endless(tmp_path / name, kind)
+        make_no_file(tmp_path / name, kind)
     with pytest.raises(InputError):
         check_binary_model(tmp_path)
 
@@ -118,7 +103,7 @@ def test_truth_of_a_scene_that_cannot_be_read_is_named_and_not_left_out(tmp_path
     if kind == "dangling":
         path.symlink_to(tmp_path / "gone")
     else:
-        endless(path, kind)
+        make_no_file(path, kind)
     with pytest.raises(InputError, match=r"b\.txt"):
         scene_files(tmp_path / "predictions", tmp_path / "truth")
 

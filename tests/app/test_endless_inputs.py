@@ -1,13 +1,11 @@
 """What a command is given, or a scene names, and is no file: exit code 2 within seconds, and a line that names it."""
 
 import json
-import os
 import shutil
-import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from no_files import ends_within, make_no_file
 from viewed_rooms import save_viewed_room
 
 from gsencoder.app.cli import main
@@ -80,26 +78,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(autouse=True)
-def _ends() -> Iterator[None]:
-    def late(*_: object) -> None:
-        raise TimeoutError("the command did not end")
-
-    before = signal.signal(signal.SIGALRM, late)
-    yield
-    signal.setitimer(signal.ITIMER_REAL, 0)
-    signal.signal(signal.SIGALRM, before)
-
-
-def make_no_file(path: Path, kind: str) -> None:
-    if kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "folder":
-        path.mkdir()
-    else:
-        path.symlink_to("/dev/zero" if kind == "device" else path.parent / "gone")
-
-
 def refusal(words: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> str:
     """What a command says that ends with exit code 2, in one line."""
     for name in ("room", "features", "tables", "truth"):
@@ -107,9 +85,8 @@ def refusal(words: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> str
     command, *rest = words.replace("BAD", str(folder / "bad")).split()
     out = () if command in ("inspect", "view") else (f"out={folder / OUT.get(command, 'out')}",)
     COMMANDS[command].load()  # Which takes longer than a refusal may.
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
-    code = main([command, *rest, *out])
-    signal.setitimer(signal.ITIMER_REAL, 0)
+    with ends_within(SECONDS):
+        code = main([command, *rest, *out])
     error = capsys.readouterr().err
     lines = [line for line in error.splitlines() if line.startswith("error: ")]
     assert (code, len(lines)) == (2, 1), (code, error)
