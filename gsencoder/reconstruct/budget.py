@@ -124,8 +124,14 @@ def steps_for_minutes(minutes: float, config: OptimizeConfig) -> int:
 def least_pixels(device: torch.device, config: OptimizeConfig) -> float:
     """Pixels of a photograph that is made no smaller: where they are a third of a step, even half of them would hardly
     save time."""
+    none, pixel = _step_costs(device, config)
+    return none / pixel / 2
+
+
+def _step_costs(device: torch.device, config: OptimizeConfig) -> tuple[float, float]:
+    """Seconds of a step without pixels, and of each pixel more."""
     none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
-    return none / (one - none) / 2
+    return none, one - none
 
 
 def choose_scale(
@@ -144,10 +150,10 @@ def choose_scale(
     minutes = budget.minutes_left(spent)
     if not minutes:
         return 1.0
-    none, one = (step_seconds(size, USUAL_GAUSSIANS, device, config) for size in (0.0, 1.0))
+    none, pixel = _step_costs(device, config)
     steps = steps_for_minutes(minutes, config) if budget.seconds is None else PROMISED_STEPS
     seconds = (1 - SEED_SHARE) * 60 * minutes / steps
-    affordable = max(least_pixels(device, config), (seconds - none) / (one - none))
+    affordable = max(least_pixels(device, config), (seconds - none) / pixel)
     scale = math.sqrt(affordable / pixels)
     return 1.0 if scale > SMALLEST_REDUCTION else round(scale, 3)
 
