@@ -2,10 +2,10 @@
 
     python bench/clock.py [SCENE …] [--seconds 120] [--busy 2] [--out FOLDER] [--json FILE]
 
-Each scene is reconstructed twice by the command line, in processes of their own: with --minutes, where the time that is
-announced before the first step is held against what steps, prunings and validations took, and with --seconds, which
-are held against the wall clock of the whole process, imports included. --busy starts so many processes beside it that
-compute all the time. Without scenes: the plush at half its size and three rooms of the house.
+Each scene is reconstructed by the command line, in processes of their own: with --minutes, where the time that is
+announced before the first step is held against the time from then to the end of the process, and with --seconds, which
+are held against the wall clock of the whole process, imports included; a refused budget has no steps. --busy starts
+processes that compute all the time. Without scenes: the plush at half its size and three rooms of the house.
 """
 
 import argparse
@@ -39,33 +39,32 @@ def busy_cores(count: int) -> Iterator[None]:
             process.wait()
 
 
-def announced_seconds(printed: str) -> float:
-    """The time that a run announced before its first step.
-
-    Raises:
-        ValueError: it announced none, or several.
-    """
-    times = ANNOUNCED.findall(printed)
-    if len(times) != 1:
-        raise ValueError(f"expected one time that is announced, found {len(times)} in {printed!r}")
-    number, unit = times[0]
-    return float(number) * (60 if unit == "minutes" else 1)
-
-
 def measured(scene: Path, out: Path, options: Sequence[str]) -> dict[str, Any]:
-    """Figures of one run.
+    """Figures of one run; its steps are 0 where the budget was refused (exit code 2).
 
     Raises:
         CalledProcessError: it failed.
+        ValueError: no time was announced.
     """
-    command = [sys.executable, "-m", "gsencoder", "reconstruct", str(scene), f"out={out}", "overwrite=true", *options]
-    began = time.perf_counter()
-    printed = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-    wall = time.perf_counter() - began
-    summary = json.loads((out / "summary.json").read_text())
-    announced, taken = announced_seconds(printed), summary["timings"]["optimise"]
-    results = {"announced": announced, "taken": taken, "announced_by_taken": announced / taken, "wall": wall}
-    return results | {"steps": summary["results"]["steps"], "budget": summary["results"].get("budget", {})}
+    command = [sys.executable, "-u", "-m", "gsencoder", "reconstruct", str(scene), f"out={out}", "overwrite=true"]
+    began, announced = time.perf_counter(), {}
+    with subprocess.Popen([*command, *options], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if match := ANNOUNCED.search(line):
+                announced[time.perf_counter()] = float(match[1]) * (60 if match[2] == "minutes" else 1)
+    ended = time.perf_counter()
+    nothing = {"announced": None, "taken": None, "announced_by_taken": None}
+    if process.returncode == 2 and any(option.startswith("budget.seconds=") for option in options):
+        return {"steps": 0, "wall": ended - began, **nothing}
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, process.args)
+    if len(announced) != 1:
+        raise ValueError(f"expected one time that is announced, found {list(announced.values())}")
+    ((at, seconds),) = announced.items()
+    results = json.loads((out / "summary.json").read_text())["results"]
+    times = {"announced": seconds, "taken": ended - at, "announced_by_taken": seconds / (ended - at)}
+    return {"steps": results["steps"], "wall": ended - began, **times, "budget": results.get("budget", {})}
 
 
 def scenes_of(shared: Path) -> dict[Path, list[str]]:
@@ -86,7 +85,8 @@ def main() -> None:
     shared = Path(os.environ.get("GSENCODER_SHARED", "../shared"))
     chosen = {path: [] for path in arguments.scenes} if arguments.scenes else scenes_of(shared)
     figures: dict[str, Any] = {}
-    print(f"{'scene':<12}{'run':<16}{'steps':>6}{'announced':>10}{'taken':>8}{'ratio':>7}{'wall':>8}{'of budget':>10}")
+    headings = ("announced", "taken", "ratio", "wall", "of budget")
+    print(f"{'scene':<12}{'run':<20}{'steps':>6}" + "".join(f"{heading:>10}" for heading in headings))
     with tempfile.TemporaryDirectory() as temporary, busy_cores(arguments.busy):
         for scene, options in chosen.items():
             aims = [f"budget.minutes={arguments.minutes:g}"] if arguments.minutes else []
@@ -94,11 +94,12 @@ def main() -> None:
                 out = (arguments.out or Path(temporary)) / scene.name / budget
                 out.parent.mkdir(parents=True, exist_ok=True)
                 found = measured(scene, out, [budget, *options])
-                share = found["wall"] / float(budget.split("=")[1]) if "seconds" in budget else float("nan")
+                promised = budget.startswith("budget.seconds") and found["steps"]
+                share = found["wall"] / float(budget.split("=")[1]) if promised else None
                 figures.setdefault(scene.name, {})[budget] = found | {"wall_by_budget": share}
-                numbers = f"{found['steps']:>6}{found['announced']:>10.1f}{found['taken']:>8.1f}"
-                ratios = f"{found['announced_by_taken']:>7.2f}{found['wall']:>8.1f}{share:>10.3f}"
-                print(f"{scene.name:<12}{budget:<16}{numbers}{ratios}", flush=True)
+                columns = (found["announced"], found["taken"], found["announced_by_taken"], found["wall"], share)
+                numbers = "".join(f"{'-' if each is None else format(each, '.2f'):>10}" for each in columns)
+                print(f"{scene.name:<12}{budget:<20}{found['steps']:>6}{numbers}", flush=True)
                 write_figures(arguments.json, figures)
 
 

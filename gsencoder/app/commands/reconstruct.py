@@ -102,7 +102,8 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
         work.take(anew=not config.resume)
         opened = _open(path, work.path, config, config.data, spent)
         scale = _affordable_scale(opened, work.path, config, spent=spent())
-        opened = _at_scale(opened, scale, path, work.path, config, screen)
+        full = opened
+        opened = _at_scale(full, scale, path, work.path, config, screen)
         summary.add_seconds(opened.seconds)
         with summary.step("check"):
             warn_of_faults(opened.scene)
@@ -131,7 +132,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
             result = fitted(opened.scene, scale, may_shrink=config.data.image_scale == 1 and not config.splat)
         except PhotographsTooLargeError as found:
             scale = round(scale * float(found.args[0]), 3)
-            opened = _at_scale(opened, scale, path, work.path, config, screen)
+            opened = _at_scale(full, scale, path, work.path, config, screen)
             result = fitted(opened.scene, scale, may_shrink=False)
         ended = time.perf_counter()
         summary.add_seconds(result.seconds)

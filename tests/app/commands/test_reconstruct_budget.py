@@ -14,7 +14,7 @@ from gsencoder.reconstruct import Reconstruction, reconstruct
 from gsencoder.reconstruct.budget import BudgetConfig
 from gsencoder.reconstruct.config import ReconstructConfig
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.plan import Plan
+from gsencoder.reconstruct.plan import PhotographsTooLargeError, Plan
 from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow
@@ -68,3 +68,26 @@ def test_seconds_are_counted_from_the_first_reading_to_the_splat_and_all_that_wa
         in (" ".join(printed.out.split()))
     )
     assert "budget.seconds: promised 506, and it became 507" in printed.err
+
+
+def test_photographs_that_turn_out_too_large_are_read_once_more_and_the_size_that_was_taken_is_recorded(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    widths = []
+
+    def fitted(scene: Scene, config: ReconstructConfig, *, may_shrink: bool, **options: Any) -> Reconstruction:
+        assert scene.views is not None
+        widths.append(int(scene.views.cameras.widths[0]))
+        if may_shrink:
+            raise PhotographsTooLargeError(0.5)
+        short = OptimizeConfig(steps=2, shrinks=(1,), shares=(1.0,), sh_degree=0)
+        return reconstruct(scene, replace(config, budget=BudgetConfig(), optimize=short), **options)
+
+    monkeypatch.setattr(command, "reconstruct", fitted)
+    monkeypatch.setattr(command, "choose_scale", lambda *_, **__: 0.8)
+    assert cli.main(["reconstruct", str(room), f"out={tmp_path}", "seeds.voxel=0.15", "budget.seconds=600"]) == 0
+    assert widths == [96, 48]
+    assert summary_of(tmp_path)["results"]["budget"]["chosen"]["image_scale"] == 0.4
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "photographs of 120×90 are looked at 0.8 times as large" in printed
+    assert "photographs of 120×90 are looked at 0.4 times as large" in printed
