@@ -162,6 +162,16 @@ def test_a_text_file_that_lost_its_last_lines_is_an_error(tmp_path: Path, name: 
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("promised", [4, 6])
+def test_a_text_file_holds_as_many_entries_as_it_promises(tmp_path: Path, promised: int) -> None:
+    path = write_colmap(tmp_path, text=True) / "points3D.txt"
+    text = path.read_text()
+    assert "# Number of points: 5" in text
+    path.write_text(text.replace("# Number of points: 5", f"# Number of points: {promised}"))
+    with pytest.raises(InputError, match=rf"points3D\.txt: promises {promised} entries and holds 5"):
+        load_scene(tmp_path)
+
+
 def test_the_parameter_counts_are_those_of_pycolmap() -> None:
     pycolmap = load_pycolmap()
     for number, count in enumerate(CAMERA_PARAMS):
