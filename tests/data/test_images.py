@@ -16,7 +16,14 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.check.scene_check import plain_photographs
 from gsencoder.data.readers import images
 from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
-from gsencoder.data.readers.image_file import picture_info, picture_size, read_integers, read_rgba
+from gsencoder.data.readers.image_file import (
+    picture_info,
+    picture_size,
+    read_integers,
+    read_mask,
+    read_rgba,
+    read_small,
+)
 from gsencoder.data.readers.images import ImageFiles, InstanceFiles, PixelGrid
 from gsencoder.data.readers.masks import MaskFiles
 from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
@@ -176,6 +183,18 @@ def test_instances_keep_their_numbers(tmp_path: Path) -> None:
     assert files[0].dtype == np.int32
     with pytest.raises(InputError, match="one channel"):
         InstanceFiles([save(tmp_path / "rgb.png", photograph(0))], [grid()], RemapCache())[0]
+
+
+def test_alpha_is_no_mask_and_a_palette_has_numbers_and_a_quick_look_is_large_enough(tmp_path: Path) -> None:
+    values = np.zeros((24, 32, 4), np.uint8)
+    values[..., 3], values[:5, :, 1] = 255, 9
+    assert (read_mask(save(tmp_path / "mask.png", values)) == (np.arange(24) < 5)[:, None]).all()
+    numbers = np.arange(24 * 32, dtype=np.uint8).reshape(24, 32) % 7
+    palette = Image.fromarray(numbers)
+    palette.putpalette([*range(100, 121)])
+    palette.save(tmp_path / "palette.png")
+    assert (read_integers(tmp_path / "palette.png", "a map", wide=False) == numbers).all()
+    assert read_small(save(tmp_path / "wide.png", photograph(0, 200, 40)), 20).shape == (20, 100, 3)
 
 
 def test_sequences_index_like_lists(tmp_path: Path) -> None:
