@@ -1,5 +1,6 @@
 """What a scene or an option names is a regular file: pipes and devices end with an error, within a second."""
 
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -8,7 +9,13 @@ import pytest
 from no_files import ends_within, make_no_file
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import open_foreign, read_foreign, read_foreign_text
+from gsencoder.core.files.foreign_file import (
+    TEXT_BYTES,
+    check_foreign,
+    open_foreign,
+    read_foreign,
+    read_foreign_text,
+)
 from gsencoder.core.files.npz import read_npz
 from gsencoder.core.files.written_files import check_written
 from gsencoder.core.onnx_session import open_session
@@ -86,12 +93,37 @@ def test_links_to_files_are_read_and_large_files_are_not(tmp_path: Path) -> None
     (tmp_path / "file").write_bytes(b"\xef\xbb\xbfa\r\nb")
     (tmp_path / "link").symlink_to(tmp_path / "file")
     assert read_foreign_text(tmp_path / "link") == "a\nb"
-    with pytest.raises(InputError, match="8 bytes?|at most 3"):
-        read_foreign(tmp_path / "link", 3)
+    assert len(read_foreign(tmp_path / "link", 7)) == 7
+    for refuse in (read_foreign, read_foreign_text, open_foreign, check_foreign):
+        with pytest.raises(InputError, match="7 bytes; at most 6"):
+            refuse(tmp_path / "link", 6)
     with pytest.raises(InputError, match="is a folder"):
         open_foreign(tmp_path)
     with pytest.raises(FileNotFoundError):
         open_foreign(tmp_path / "missing")
+
+
+@pytest.mark.parametrize("read", [read_foreign, read_foreign_text])
+def test_a_text_of_gigabytes_is_refused_where_no_limit_is_named(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    with (tmp_path / "file").open("wb") as stream:
+        stream.truncate(TEXT_BYTES + 1)
+    with pytest.raises(InputError, match="at most 268,435,456 are read"):
+        read(tmp_path / "file")
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_lines_may_end_as_on_any_system(tmp_path: Path, end: str) -> None:
+    (tmp_path / "file").write_bytes(f"a{end}{end}b{end}".encode())
+    assert read_foreign_text(tmp_path / "file") == "a\n\nb\n"
+
+
+def test_a_file_that_is_refused_is_closed(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"1234")
+    opened = len(os.listdir("/dev/fd"))
+    for path in (tmp_path, tmp_path / "file", make_no_file(tmp_path / "pipe", "pipe")):
+        with pytest.raises(InputError):
+            open_foreign(path, 3)
+    assert len(os.listdir("/dev/fd")) == opened
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "dangling"])

@@ -162,6 +162,16 @@ def test_a_text_file_that_lost_its_last_lines_is_an_error(tmp_path: Path, name: 
         load_scene(tmp_path)
 
 
+@pytest.mark.parametrize("promised", [4, 6])
+def test_a_text_file_holds_as_many_entries_as_it_promises(tmp_path: Path, promised: int) -> None:
+    path = write_colmap(tmp_path, text=True) / "points3D.txt"
+    text = path.read_text()
+    assert "# Number of points: 5" in text
+    path.write_text(text.replace("# Number of points: 5", f"# Number of points: {promised}"))
+    with pytest.raises(InputError, match=rf"points3D\.txt: promises {promised} entries and holds 5"):
+        load_scene(tmp_path)
+
+
 def test_the_parameter_counts_are_those_of_pycolmap() -> None:
     pycolmap = load_pycolmap()
     for number, count in enumerate(CAMERA_PARAMS):
@@ -300,6 +310,12 @@ def drop(lines: list[str], row: int) -> list[str]:
     return lines[:row] + lines[row + 1 :]
 
 
+def unturned(line: str) -> str:
+    """An image of no rotation and a name with blanks, twelve words that begin like points: x, y and number 0."""
+    words = line.split()
+    return f"{words[0]} 1 0 0 0 0 0 0 {words[8]} my {words[9]} copy"
+
+
 @pytest.mark.parametrize("old", [False, True])
 @pytest.mark.parametrize(
     ("name", "damage", "message"),
@@ -310,6 +326,16 @@ def drop(lines: list[str], row: int) -> list[str]:
         ("cameras", lambda lines: [lines[0].replace("PIN", "pin")], r"cameras\.txt: line 4 is not CAMERA_ID MODEL"),
         ("images", lambda lines: drop(lines, 0), r"images\.txt: line 5 is not IMAGE_ID QW"),
         ("images", lambda lines: drop(lines, 1), r"images\.txt: line 6 holds no points of the image above it"),
+        (
+            "images",
+            lambda lines: [lines[0], unturned(lines[2]), *lines[3:]],
+            r"images\.txt: line 6 holds no points of ",
+        ),
+        (
+            "images",
+            lambda lines: [lines[0], "nan 1 -1 " + lines[1], *lines[2:]],
+            r"images\.txt: line 6 is not IMAGE_ID",
+        ),
         ("images", lambda lines: drop(lines, 2), r"images\.txt: line 7 is not IMAGE_ID QW"),
         ("images", lambda lines: drop(lines, 5), r"points3D\.txt: line 4 names point 0 of image 3, which images\.txt"),
         ("images", lambda lines: lines[:4], r"points3D\.txt: line 4 names point 0 of image 3, which images\.txt"),

@@ -109,6 +109,25 @@ def test_two_thirds_of_a_room_are_a_room_and_half_of_a_box_is_none(axis: int, si
     assert not enclosure_of(part(made_object("box"), 0.6)).is_room
 
 
+@pytest.mark.parametrize(
+    ("change", "is_room"),
+    [
+        ({}, True),
+        ({"beside": 0.82}, False),
+        ({"space": 0.27}, False),
+        ({"openness": 0.3}, False),
+        ({"flatness": 0.56}, False),
+        ({"content": 0.09}, False),
+        ({"content": 0.09, "space": 0.44}, True),
+        ({"content": 0.005, "space": 0.44}, False),
+        ({"enough": False}, False),
+    ],
+)
+def test_every_sign_of_a_room_with_walls_is_needed(change: dict[str, float], is_room: bool) -> None:
+    walls = Enclosure(flatness=0.4, openness=0.35, space=0.4, beside=0.9, content=0.15)
+    assert replace(walls, **change).is_room == is_room
+
+
 def test_few_gaussians_show_no_room() -> None:
     gaussians = room()
     few = gaussians.select(np.linspace(0, len(gaussians) - 1, MIN_GAUSSIANS - 1).astype(int))

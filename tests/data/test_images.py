@@ -1,6 +1,8 @@
 import json
+import os
 import zlib
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,14 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.check.scene_check import plain_photographs
 from gsencoder.data.readers import images
 from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
-from gsencoder.data.readers.image_file import picture_info, picture_size, read_integers, read_rgba
+from gsencoder.data.readers.image_file import (
+    picture_info,
+    picture_size,
+    read_integers,
+    read_mask,
+    read_rgba,
+    read_small,
+)
 from gsencoder.data.readers.images import ImageFiles, InstanceFiles, PixelGrid
 from gsencoder.data.readers.masks import MaskFiles
 from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
@@ -22,6 +31,7 @@ from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
 from gsencoder.fusion.fit import SmallViews
+from gsencoder.types.orientation import EXCHANGED, INVERSE, turned
 
 PINHOLE = CameraModel(model="PINHOLE", width=32, height=24, params=(30.0, 31.0, 16.0, 12.0))
 
@@ -175,6 +185,18 @@ def test_instances_keep_their_numbers(tmp_path: Path) -> None:
         InstanceFiles([save(tmp_path / "rgb.png", photograph(0))], [grid()], RemapCache())[0]
 
 
+def test_alpha_is_no_mask_and_a_palette_has_numbers_and_a_quick_look_is_large_enough(tmp_path: Path) -> None:
+    values = np.zeros((24, 32, 4), np.uint8)
+    values[..., 3], values[:5, :, 1] = 255, 9
+    assert (read_mask(save(tmp_path / "mask.png", values)) == (np.arange(24) < 5)[:, None]).all()
+    numbers = np.arange(24 * 32, dtype=np.uint8).reshape(24, 32) % 7
+    palette = Image.fromarray(numbers)
+    palette.putpalette([*range(100, 121)])
+    palette.save(tmp_path / "palette.png")
+    assert (read_integers(tmp_path / "palette.png", "a map", wide=False) == numbers).all()
+    assert read_small(save(tmp_path / "wide.png", photograph(0, 200, 40)), 20).shape == (20, 100, 3)
+
+
 def test_sequences_index_like_lists(tmp_path: Path) -> None:
     paths = [save(tmp_path / f"{i}.png", photograph(i)) for i in range(4)]
     files = ImageFiles(paths, [grid()] * 4, RemapCache())
@@ -254,6 +276,28 @@ def test_a_reduced_photograph_is_as_the_full_one_made_smaller(
     assert differences.max() <= 20
 
 
+@pytest.mark.parametrize("turn", [1, *EXCHANGED])
+def test_a_photograph_is_made_smaller_without_a_shift_turned_or_not(tmp_path: Path, turn: int) -> None:
+    """Its sides are no multiples of what it could be decoded smaller by: 3 of 104 columns are missing."""
+    ramp = np.broadcast_to(np.round(2.5 * np.arange(101)).astype(np.uint8)[:, None], (74, 101, 3))
+    path = save(tmp_path / "turned.png", turned(ramp, INVERSE[turn]))
+    camera = CameraModel(model="PINHOLE", width=101, height=74, params=(90.0, 90.0, 50.5, 37.0))
+    small = replace(grid(camera, 12, 9), turn=turn)
+    expected = Image.fromarray(ramp).resize((12, 9), Image.Resampling.BOX)
+    color = ImageFiles([path], [small], RemapCache())[0]
+    assert np.abs(color.astype(int) - np.asarray(expected)).max() <= 2
+
+
+def test_a_file_has_the_shape_of_its_photograph_up_to_less_than_a_pixel_and_a_square_one_is_not_turned() -> None:
+    turning = replace(grid(), turn=6)
+    for width, height, fits in ((16, 12, True), (64, 48, True), (17, 12, False), (15, 12, False), (12, 16, False)):
+        assert grid().fits(width, height) == fits
+        assert turning.fits(height, width) == (fits or (width, height) == (12, 16))
+    assert turning.is_exchanged(12, 16)
+    assert not turning.is_exchanged(16, 16)
+    assert not grid().is_exchanged(12, 16)
+
+
 def test_a_photograph_is_decoded_once_until_its_file_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     decoded = []
 
@@ -272,12 +316,21 @@ def test_a_photograph_is_decoded_once_until_its_file_changes(tmp_path: Path, mon
     assert len(decoded) == 2
     save(path, 255 - photograph(0))
     assert (ImageFiles([path], [grid()], RemapCache())[0] == 255 - first).all()
-    # The one that was looked at last stays where there is room for one.
-    monkeypatch.setattr(images, "KEPT_BYTES", 24 * 32 * 3)
-    other = save(tmp_path / "b.png", photograph(1))
-    files, count = ImageFiles([path, other], [grid()] * 2, RemapCache()), len(decoded)
-    for view, added in ((1, 1), (1, 1), (0, 2), (1, 3)):
-        assert files[view].shape == (24, 32, 3)
+    # One with its time, as a copy that keeps it has.
+    before = path.stat()
+    save(path, photograph(0) // 2)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert path.stat().st_size != before.st_size
+    assert (ImageFiles([path], [grid()], RemapCache())[0] == photograph(0) // 2).all()
+    # Those that were looked at last stay where there is room for two, and a larger one than that puts none of them out.
+    monkeypatch.setattr(images, "KEPT_BYTES", 2 * 24 * 32 * 3)
+    paths = [save(tmp_path / f"{name}.png", photograph(number)) for number, name in enumerate("bcd")]
+    camera = replace(PINHOLE, width=64, height=48)
+    paths.append(save(tmp_path / "large.png", photograph(0, 64, 48)))
+    files = ImageFiles(paths, [*[grid()] * 3, grid(camera, 64, 48)], RemapCache())
+    count = len(decoded)
+    for view, added in ((0, 1), (0, 1), (1, 2), (0, 2), (2, 3), (0, 3), (3, 4), (3, 5), (0, 5), (2, 5), (1, 6)):
+        assert files[view].shape == ((48, 64, 3) if view == 3 else (24, 32, 3))
         assert len(decoded) == count + added
 
 

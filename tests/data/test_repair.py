@@ -251,6 +251,47 @@ def test_a_splat_as_it_should_be_has_no_odd_values() -> None:
     assert inspect_splat(large).findings == ()
 
 
+def test_scales_of_which_some_are_zero_are_stored_activated_as_well() -> None:
+    lengths = np.exp(surface().log_scales)
+    lengths[::7] = 0
+    (finding,) = inspect_splat(replace(surface(), log_scales=lengths)).findings
+    assert finding.startswith("scales seem to be stored as they are")
+
+
+def test_values_that_are_no_better_as_they_are_stored_are_not_called_activated() -> None:
+    """Logarithms of 1, which is 50 times the distance between Gaussians and as a length 20 times; opacities of 0.5."""
+    right = surface()
+    for odd in (
+        replace(right, log_scales=np.ones_like(right.log_scales)),
+        replace(right, logit_opacities=np.zeros_like(right.logit_opacities)),
+    ):
+        assert inspect_splat(odd).findings == ()
+
+
+def test_layers_and_rows_that_were_made_are_not_called_rounded() -> None:
+    """Layers at uneven heights; a lattice of Gaussians that touch; and a row of them, each at a place of its own."""
+    right = surface()
+    places = np.arange(len(right.means))
+    layers, lattice, row = (right.means.copy() for _ in range(3))
+    layers[:, 2] = np.float32([0, 0.3, 0.74, 1.5, 1.63])[places % 5]
+    lattice[:, 2] = 0.5 / 16 * (places % 8)  # 2.6 times the scale of 0.012.
+    row[:, 2] = 0.25 * places
+    for means in (layers, lattice, row):
+        assert inspect_splat(replace(right, means=means)).findings == ()
+    coarse = lattice * np.array([1, 1, 2])
+    (finding,) = inspect_splat(replace(right, means=coarse)).findings
+    assert "steps of 0.0625 along z" in finding
+
+
+def test_a_row_with_several_defects_is_counted_once() -> None:
+    raw = samples.make_raw()
+    for field, value in (("quats", 0), ("log_scales", -np.inf), ("logit_opacities", np.inf)):
+        raw = put(field, [4], value)(raw)
+    raw = put("logit_opacities", [5], np.inf)(put("log_scales", [5], -np.inf)(raw))
+    found = {defect.name: defect.first_rows for defect in inspect_splat(raw).defects}
+    assert found == {"quats": (4,), "scales": (5,)}
+
+
 def test_coordinates_that_float32_rounded_are_said_with_what_to_subtract() -> None:
     right = surface()
     far = right.means + np.array([465123.4, 5428765.6, 300.0])

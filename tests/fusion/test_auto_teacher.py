@@ -1,5 +1,6 @@
 """The teacher where none is named: labels of a scene that has some, else what is installed."""
 
+from copy import copy
 from dataclasses import replace
 
 import pytest
@@ -70,6 +71,24 @@ def test_labels_of_which_the_table_lacks_some_are_those_of_the_sentence_encoder(
     taken = chosen(renamed(room, "table", "a thing with legs"))
     assert (taken.teacher, taken.text) == (LabelsConfig(), SENTENCES)
     assert taken.reason == "labels of 2 names, 1 of them not in clip_vitb32_names.npz"
+
+
+def test_names_that_no_table_needs_to_know_are_those_of_the_tower_that_is_given(room: Scene) -> None:
+    taken = chosen(renamed(room, "table", "a thing with legs"), text=OTHER)
+    assert (taken.teacher, taken.text, taken.reason) == (LabelsConfig(), OTHER, "labels of 2 names")
+
+
+def test_the_words_are_those_of_the_teacher_and_the_tower_that_were_chosen(room: Scene) -> None:
+    words = dict[tuple[TeacherConfig, TextConfig], Words]()
+
+    def words_of(teacher: TeacherConfig, text: TextConfig) -> Words | None:
+        return words.setdefault((teacher, text), copy(TABLE))
+
+    for scene in (room, renamed(room, "table", "a thing with legs"), replace(room, objects=())):
+        for config in (AutoConfig(), AutoConfig(words="own.npz"), SEGMENTER):
+            for text in (NO_TOWER, OTHER):
+                taken = choose_teacher(config, text, scene, words_of)
+                assert taken.words is words[taken.teacher, taken.text]
 
 
 def test_a_table_that_is_given_means_labels_and_a_teacher_that_is_given_is_taken(room: Scene) -> None:

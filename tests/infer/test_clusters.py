@@ -60,6 +60,27 @@ def test_small_things_side_by_side_and_a_thing_far_from_a_large_one_stay_apart()
     assert things(np.concatenate([person, counter])) == 2
 
 
+def test_strays_in_front_of_a_door_stay_apart_and_its_handle_does_not() -> None:
+    """One in fifty of the points of the door is the limit, also of one that was seen in two parts."""
+    door = plate((0, 0, 0), (0.9, 0, 2.0))
+    parts = door[np.abs(door[:, 2] - 0.5) > 0.035]
+    assert (len(door), len(parts)) == (46 * 101, 46 * 98)
+    for points in (door, parts):
+        for size, count in ((0.14, 2), (0.18, 1)):
+            near = plate((0.4, 0.1, 1), (0.4 + size, 0.1, 1 + size))
+            labels = cluster_by_gaps(np.concatenate([points, near]).astype(np.float32), RADIUS, 3)
+            assert labels.max() + 1 == count
+
+
+def test_a_gap_is_small_beside_the_wider_one_of_two_parts_whichever_has_more_points() -> None:
+    """A dense knob 16 cm in front of a thin pole."""
+    pole, knob = plate((0, 0, 0), (0, 0, 2.4)), plate((0, 0.16, 1), (0.06, 0.22, 1.06), SPACING / 2)
+    assert len(pole) < len(knob)
+    for points in (np.concatenate([pole, knob]), np.concatenate([knob, pole])):
+        assert cluster(points.astype(np.float32), RADIUS, 3).max() == 1
+        assert things(points) == 1
+
+
 def test_a_thing_that_is_sparser_than_its_scene_is_one(rng: np.random.Generator) -> None:
     """Points by chance, one in six of those that the spacing stands for."""
     seat, back = rng.random((200, 3)) * (0.44, 0.44, 0), rng.random((200, 3)) * (0.44, 0, 0.44)

@@ -91,6 +91,23 @@ def test_the_halo_is_what_lies_around_a_box() -> None:
         assert (rows <= high + 1.5).all()
 
 
+def test_nothing_nearer_to_a_box_than_its_halo_is_left_out_of_its_chunk() -> None:
+    """Where there is room for a part of the halo alone, it is as wide as the next row that is left out is far."""
+    means = np.random.default_rng(0).uniform(0, 3, (2000, 3)).astype(np.float32)
+    chunks = cut(means, 200, 0.5)
+    narrow = [one for one in chunks if one.halo < 0.5]
+    assert 0 < len(narrow) < len(chunks)
+    for one in chunks:
+        left_out = np.setdiff1d(np.arange(2000), one.rows)
+        far = np.linalg.norm(means[left_out] - means[left_out].clip(one.low, one.high), axis=1).min()
+        assert far == pytest.approx(one.halo) if one in narrow else far > 0.5
+        around = one.seen_around(means)
+        assert (around >= one.halo).all()
+        gaps = np.linalg.norm(means[one.core_rows][:, None] - means[left_out], axis=2).min(axis=1)
+        assert (gaps >= around - 1e-5).all()
+    assert np.isinf(cut(means, 0, 0.5)[0].seen_around(means)).all()
+
+
 def test_chunks_whose_halo_covers_what_a_token_sees_give_what_the_whole_gives() -> None:
     """A network of one level that attends to nothing but itself sees two cells far: stem and block, one each."""
     shape = TransformerConfig(

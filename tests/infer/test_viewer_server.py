@@ -1,13 +1,15 @@
 """The server of `view` answers its own page, and nothing and nobody else."""
 
+import http.client
 import json
 import socket
 import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -259,6 +261,61 @@ def test_strangers_take_no_place_from_the_page(server: ViewServer, monkeypatch: 
         assert threading.active_count() <= threads + 9
     for each in strangers:
         each.close()
+
+
+def test_a_request_that_has_come_is_not_ended_while_it_is_answered(
+    server: ViewServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, now = ViewServer.search_of, time.monotonic
+
+    def slow(made: ViewServer, value: Any) -> SceneSearch:
+        with monkeypatch.context() as later:
+            later.setattr(viewer_server, "time", SimpleNamespace(monotonic=lambda: now() + 1000))
+            made.service_actions()
+        return real(made, value)
+
+    monkeypatch.setattr(ViewServer, "search_of", slow)
+    body = json.dumps({"scene": 0, "rows": [0]})
+    lines = ("Content-Type: application/json", f"Content-Length: {len(body)}")
+    with connected(server) as stream:
+        for text in (head(server, "GET", "labels/0"), head(server, "POST", "words", *lines) + body) * 2:
+            stream.sendall(text.encode())
+            response = http.client.HTTPResponse(stream)
+            response.begin()
+            assert (response.status, bool(response.read())) == (200, True)
+            time.sleep(0.03)
+
+
+def test_where_too_many_wait_those_are_ended_that_came_first_of_those_without_the_token(
+    search: SceneSearch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(viewer_server, "MAX_CONNECTIONS", 3)
+    with ExitStack() as stack:
+        idle = stack.enter_context(ViewServer((b"", ""), [search], []))
+        ends = [stack.enter_context(end) for _ in range(5) for end in socket.socketpair()][::2]
+        for end in ends:
+            end.setblocking(False)
+
+        def is_ended(end: socket.socket) -> bool:
+            try:
+                return end.recv(1) == b""
+            except BlockingIOError:
+                return False
+
+        def ended() -> list[int]:
+            return [number for number, end in enumerate(ends) if is_ended(end)]
+
+        for number in range(5):
+            idle.wait_for(ends[number], number in (0, 3))
+            idle.service_actions()
+            assert ended() == ([], [], [], [1], [1, 2])[number]
+        idle.has_come(ends[3])
+        idle.service_actions()
+        assert ended() == [1, 2]
+        now = time.monotonic
+        monkeypatch.setattr(viewer_server, "time", SimpleNamespace(monotonic=lambda: now() + viewer_server.TIMEOUT))
+        idle.service_actions()
+        assert ended() == [0, 1, 2, 4]
 
 
 def test_a_client_that_resets_its_connection_prints_nothing(

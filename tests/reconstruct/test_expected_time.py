@@ -12,7 +12,7 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct import expected_time
 from gsencoder.reconstruct.config import ReconstructConfig
-from gsencoder.reconstruct.expected_time import ExpectedSeconds, measured_costs
+from gsencoder.reconstruct.expected_time import Costs, ExpectedSeconds, Pace, measured_costs
 from gsencoder.reconstruct.optimize import Optimizer, PhotographGradients
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
@@ -114,6 +114,38 @@ def test_each_kind_of_work_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     one.step = 20
     assert expected_seconds(one, HELD_OUT, 0) == (0, 0)
     assert work.now > 0
+
+
+def seconds_of_steps() -> Costs:
+    """A second each, and of two prunings 5 and 3."""
+    kinds = {(shrink, pruned): 1.0 for shrink in (1, 2) for pruned in (False, True)}
+    return Costs(step=0, steps=kinds, prunings=(5.0, 3.0), validation=0.0, picture=0.0)
+
+
+def test_prunings_before_the_steps_that_are_asked_for_do_not_count() -> None:
+    config, prune = replace(CONFIG, steps=20), PruneConfig(at=(0.25, 0.75))
+    assert seconds_of_steps().expected(config, prune, 0, 20, 0) == (20, 8)
+    assert seconds_of_steps().expected(config, prune, 10, 20, 0) == (10, 3)
+
+
+def test_the_clock_is_looked_at_after_a_quarter_of_what_is_left_and_changes_the_steps_by_the_pace_since_then() -> None:
+    one, now = optimizer(splat(), at=()), 0.0
+    pace = Pace(seconds_of_steps(), 100.0, lambda: now)
+    # Step and second, the steps that were planned, and those that there is time for, 70 at most.
+    for now, one.step, planned, steps in (
+        (24.0, 10, 100, 100),
+        (40.0, 20, 100, 50),
+        (54.0, 22, 50, 50),
+        (56.0, 36, 50, 70),
+        (75.0, 54, 68, 70),
+        (90.0, 60, 70, 64),
+        (120.0, 62, 70, 63),
+    ):
+        one.config = replace(CONFIG, steps=planned)
+        assert pace.steps(one, lambda step, of: False, 70) == steps
+    now, pace = 0.0, Pace(seconds_of_steps(), 100.0, lambda: now)
+    one.config, one.step, now = replace(CONFIG, steps=100), 50, 52.0
+    assert pace.steps(one, lambda step, of: False, 1000) == 96
 
 
 def test_a_pruning_that_would_leave_nothing_now_is_no_error_before_its_time() -> None:

@@ -1,5 +1,7 @@
 """Plans of a reconstruction that keep sizes, seconds and errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -13,8 +15,9 @@ from gsencoder.reconstruct.expected_time import Costs
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.plan import PhotographsTooLargeError, Plan, error_of, follow, make_plan
+from gsencoder.reconstruct.plan import PhotographsTooLargeError, Plan, error_of, follow, late_notes, make_plan
 from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.reconstruct.report import MAX_COMPARISONS
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.reconstruct.score import split
 from gsencoder.types import Scene
@@ -168,6 +171,30 @@ def test_seconds_buy_steps_by_what_trial_steps_take(
     assert (plan.steps, plan.seconds, plan.spent) == (steps, pytest.approx(total), 20.0)
     few = ("budget.seconds=40: has time for 2 steps; budget.seconds=48 has for 5",)
     assert plan.notes == (few if steps < 5 else ())
+
+
+def test_seconds_are_kept_for_as_many_validations_as_the_steps_have_and_for_the_pictures(optimizer: Optimizer) -> None:
+    """Of the 1,500 steps that were planned there would be five times as many validations."""
+    measured = replace(costs(), validation=6.0, picture=4.0)
+    plan = make_plan(
+        optimizer,
+        BudgetConfig(seconds=500.0),
+        lambda: measured,
+        lambda steps: 2 + steps // 50,
+        double_means=False,
+        spent=lambda: 20.0,
+    )
+    needed = 20 + 12 + 6.0 * (2 + plan.steps // 50) + 4.0 * MAX_COMPARISONS + 3.0 * plan.steps
+    assert 485 < needed <= 500
+    assert plan.seconds == pytest.approx(needed, abs=6)
+
+
+def test_minutes_that_are_exceeded_by_more_than_half_are_said_where_nothing_is_promised() -> None:
+    assert late_notes(BudgetConfig(minutes=10.0), 900.0) == ()
+    (note,) = late_notes(BudgetConfig(minutes=10.0), 901.0)
+    assert "budget.minutes=10 aims at less; budget.seconds=600" in note
+    for budget in (BudgetConfig(minutes=0.0), BudgetConfig(minutes=10.0, error=0.5)):
+        assert late_notes(budget, 901.0) == ()
 
 
 def test_seconds_that_are_over_before_the_first_step_are_refused(optimizer: Optimizer) -> None:

@@ -156,7 +156,7 @@ def scene_regions(means: Float32[np.ndarray, "N 3"], voxel: float) -> Int64[np.n
     keys = np.zeros(len(means), np.int64)
     for column in means.T:
         # Borders lie at multiples of the edge in the world, so that a region is the same whatever else there is.
-        cells = np.floor(column.astype(np.float64) / (REGION_CELL * voxel)).clip(-(2.0**50), 2.0**50)
+        cells = np.floor(column.astype(np.float64) / (REGION_CELL * voxel))
         keys = keys * (LAST_CELL + 1) + np.minimum(cells - cells.min(), LAST_CELL).astype(np.int64)
     occupied = np.unique(keys)
     tree = cKDTree(np.stack(np.unravel_index(occupied, (LAST_CELL + 1,) * 3), axis=1))
@@ -217,7 +217,8 @@ def _cut(means: Float32[np.ndarray, "N 3"], chunk: int, halo: float) -> Iterator
             if len(surroundings) > chunk:
                 inside = means[halo_rows].clip(low, high)
                 nearest, far = _smallest(np.square(means[halo_rows] - inside).sum(axis=1), chunk - len(core_rows))
-                halo_rows, width = halo_rows[nearest], math.sqrt(far)
+                # Rows in the corners of the halo are farther than it is wide.
+                halo_rows, width = halo_rows[nearest], min(halo, math.sqrt(far))
             rows = np.concatenate((core_rows, halo_rows))
             yield Chunk(core_rows=core_rows, rows=rows, low=low, high=high, halo=width)
             continue

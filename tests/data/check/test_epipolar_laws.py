@@ -143,6 +143,45 @@ def test_another_focal_length_is_read_back(cameras: Cameras, matches: list[PairM
     np.testing.assert_allclose(best.Ks, cameras.Ks, rtol=1e-5)
 
 
+def test_the_next_photographs_are_those_of_the_scene_and_not_of_the_views_that_were_looked_at() -> None:
+    right, rows = box_cameras(9, width=320, height=240, focal=200.0), np.array([1, 3, 4, 7])
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (60, 3)) + right.centers.mean(axis=0)
+    pixels = right.project(points)[0].astype(np.float64)[rows]
+    pairs = [
+        PairMatches(first=first, second=second, first_pixels=pixels[first], second_pixels=pixels[second])
+        for first, second in ((0, 1), (0, 2), (1, 2), (2, 3))
+    ]
+    wrong = with_poses(right, np.roll(right.cam_from_world, 1, axis=0))
+    cause, places, best, error = _best_reading(wrong.select(rows), wrong, rows, pairs)
+    assert (cause, places) == ("order", -1)
+    assert error < 0.01
+    np.testing.assert_array_equal(best.cam_from_world, right.cam_from_world[rows])
+
+
+def test_the_figures_of_a_check_are_means_of_pairs_a_share_of_matches_and_the_worst_pair(
+    cameras: Cameras, matches: list[PairMatches]
+) -> None:
+    rough = shifted(matches[1], cameras, 9.0)
+    rough = replace(rough, first_pixels=rough.first_pixels[:20], second_pixels=rough.second_pixels[:20])
+    errors = [mean_error(cameras, [pair]) for pair in (matches[0], rough, matches[2])]
+    assert errors[1] > 5
+    check = judge_matches([matches[0], rough, matches[2]], cameras, cameras, np.arange(6), NAMES)
+    assert (check.pairs, check.matches, check.worst) == (3, 140, rough)
+    assert check.error == pytest.approx(np.mean(errors))
+    fundamental = fundamental_matrix(cameras, rough.first, rough.second)
+    near = epipolar_distances(fundamental, rough.first_pixels, rough.second_pixels) <= 2
+    assert 0 < near.sum() < 10
+    assert check.share == pytest.approx((120 + near.sum()) / 140)
+
+
+def test_once_all_poses_are_read_rightly_a_view_is_astray_by_what_is_usual_then(
+    cameras: Cameras, matches: list[PairMatches]
+) -> None:
+    wrong = turned_to_error(cameras, matches, 2, 4.5)
+    axes = with_poses(wrong, other_poses(wrong.cam_from_world.astype(np.float64))["axes"])
+    assert judged(axes, matches) == ([("axes", None), ("stray view", "2.png")], True)
+
+
 def test_two_views_astray_are_both_named_the_worse_one_first(cameras: Cameras, matches: list[PairMatches]) -> None:
     assert astray(turned(cameras, {1: 3.0, 4: 6.0}), matches) == ["4.png", "1.png"]
     assert astray(cameras, matches) == []
@@ -195,6 +234,33 @@ def test_a_view_without_a_pose_that_fits_is_not_astray(cameras: Cameras, matches
     assert mean_error(cameras, [pair for pair in motif if 2 in (pair.first, pair.second)]) > 5
     assert len(consistent_matches(motif)) == len(motif)
     assert astray(cameras, motif) == []
+
+
+def seen_from(cameras: Cameras, pair: PairMatches, view: int, degrees: float) -> PairMatches:
+    """A pair as it would be if one of its views were turned."""
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (60, 3)) + cameras.centers.mean(axis=0)
+    pixels = turned(cameras, {view: degrees}).project(points)[0].astype(np.float64)
+    return replace(pair, first_pixels=pixels[pair.first], second_pixels=pixels[pair.second])
+
+
+def test_a_pose_that_fits_one_pair_alone_is_none_of_a_view_astray(cameras: Cameras, matches: list[PairMatches]) -> None:
+    pairs = {(pair.first, pair.second): pair for pair in matches if pair.second < 4}
+    del pairs[0, 3]
+    assert astray(turned(cameras, {0: 8.0}), [*pairs.values()]) == ["0.png"]
+    pairs |= {(0, 1): seen_from(cameras, pairs[0, 1], 0, 8), (0, 2): seen_from(cameras, pairs[0, 2], 0, -8)}
+    assert astray(cameras, [*pairs.values()]) == []
+
+
+def test_a_pose_that_does_not_halve_the_error_is_none_of_a_view_astray(
+    cameras: Cameras, matches: list[PairMatches]
+) -> None:
+    """Two of three pairs fit it; the third, 20 pixels off and more, fits neither."""
+    pairs = {(pair.first, pair.second): pair for pair in matches if pair.second < 4}
+    far = np.random.default_rng(0).normal(size=(60, 2)) * 1e4
+    pairs[0, 3] = replace(pairs[0, 3], second_pixels=pairs[0, 3].second_pixels + far)
+    for error, named in ((8.5, []), (17.0, ["0.png"])):
+        wrong = turned_to_error(cameras, [pairs[0, 1], pairs[0, 2]], 0, error)
+        assert astray(wrong, [*pairs.values()]) == named
 
 
 def test_far_pairs_that_do_not_fit_accuse_nobody(cameras: Cameras, matches: list[PairMatches]) -> None:

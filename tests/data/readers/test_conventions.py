@@ -87,6 +87,16 @@ def test_a_mask_may_have_png_in_place_of_the_ending_and_missing_ones_are_counted
     assert [mask.all() for mask in masks] == [False] * 3 + [True] * 5
 
 
+def test_where_masks_have_both_names_those_of_colmap_are_taken(field_room: FieldRoom, tmp_path: Path) -> None:
+    folder = write_colmap_text(tmp_path, field_room.copy_photographs(tmp_path))
+    for image in (folder / "images").iterdir():
+        save_mask(folder / "masks" / f"{image.name}.png", MASK)
+        save_mask(folder / "masks" / f"{image.stem}.png", 255 - MASK)
+    masks = masks_of(folder)
+    assert masks is not None
+    assert all(np.array_equal(mask, MASK > 0) for mask in masks)
+
+
 def test_masks_that_belong_to_no_image_are_called(field_room: FieldRoom, tmp_path: Path) -> None:
     folder = write_colmap_text(tmp_path, field_room.copy_photographs(tmp_path))
     save_mask(folder / "masks" / "left.png")
