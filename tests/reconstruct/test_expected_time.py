@@ -131,8 +131,8 @@ def test_prunings_before_the_steps_that_are_asked_for_do_not_count() -> None:
 def test_the_clock_is_looked_at_after_a_quarter_of_what_is_left_and_changes_the_steps_by_the_pace_since_then() -> None:
     one, now = optimizer(splat(), at=()), 0.0
     pace = Pace(seconds_of_steps(), 100.0, lambda: now)
-    # Step and second, the steps that were planned, and those that there is time for, 70 at most.
-    for now, one.step, planned, steps in (
+    # Second and step, the steps that were planned, and those that there is time for, 70 at most.
+    for second, step, planned, steps in (
         (24.0, 10, 100, 100),
         (40.0, 20, 100, 50),
         (54.0, 22, 50, 50),
@@ -141,9 +141,11 @@ def test_the_clock_is_looked_at_after_a_quarter_of_what_is_left_and_changes_the_
         (90.0, 60, 70, 64),
         (120.0, 62, 70, 63),
     ):
-        one.config = replace(CONFIG, steps=planned)
+        now, one.step, one.config = second, step, replace(CONFIG, steps=planned)
         assert pace.steps(one, lambda step, of: False, 70) == steps
-    now, pace = 0.0, Pace(seconds_of_steps(), 100.0, lambda: now)
+    # A fiftieth is changed as well.
+    now = 0.0
+    pace = Pace(seconds_of_steps(), 100.0, lambda: now)
     one.config, one.step, now = replace(CONFIG, steps=100), 50, 52.0
     assert pace.steps(one, lambda step, of: False, 1000) == 96
 
