@@ -228,7 +228,7 @@ def main() -> None:
             yield "room", "seeded", name, made
         for kind, files in (("object", options.objects), ("room", options.rooms)):
             for file in files:
-                yield kind, "fitted", str(file), load_splat(file)
+                yield kind, "fitted", file.parent.name, load_splat(file)
         if options.fit is not None:
             for name in PIECES[: options.pieces]:
                 made = furniture(*pieces[name])

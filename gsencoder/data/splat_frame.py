@@ -98,14 +98,16 @@ def _pose(value: object, where: str) -> Float64[np.ndarray, "4 4"]:
 
 
 def usual_frames() -> Iterator[SplatFrame]:
-    """The frames that programs write without saying so: other orders and signs of the axes, twice or half the size; and
-    intrinsics of photographs of twice or half the size."""
+    """The frames that programs write without saying so: other orders and signs of the axes, twice or half the size,
+    millimeters or centimeters in place of meters and the reverse; and intrinsics of photographs of twice or half the
+    size."""
     for rotation in Rotation.create_group("O").as_matrix().round():
         if not np.array_equal(rotation, np.eye(3)):
             axes = ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(np.abs(row).argmax())] for row in rotation)
             yield SplatFrame(name=f"axes ({axes})", rotation=rotation, shift=np.zeros(3))
+    for factor in (2.0, 0.5, 1e-3, 1e-2, 1e2, 1e3):
+        yield replace(identity_frame(), name=f"{factor:g} times its size", scale=factor)
     for factor, size in ((2.0, "twice"), (0.5, "half")):
-        yield replace(identity_frame(), name=f"{size} its size", scale=factor)
         yield replace(identity_frame(), name=f"{size} the intrinsics", intrinsics_factor=factor)
 
 

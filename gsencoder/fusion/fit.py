@@ -156,7 +156,8 @@ def agreement(
         frame: the world of the splat.
         origin: that Gaussians and cameras are relative to.
     """
-    cameras = _cameras_in(views.cameras, frame, origin)
+    cameras, scale = _cameras_in(views.cameras, frame, origin), np.float32(frame.scale)
+    gaussians = replace(gaussians, means=gaussians.means * scale, scales=gaussians.scales * scale)
     colors = colors_from_sh(torch.as_tensor(gaussians.sh), torch.zeros(1, 3).expand(len(gaussians), 3), torch.ones(3))
     correlations = []
     for view in _best_views(gaussians, cameras):
@@ -179,14 +180,13 @@ def agreement(
 
 
 def _cameras_in(cameras: Cameras, frame: SplatFrame, origin: Float64[np.ndarray, "3"]) -> Cameras:
-    """Cameras that see a splat, as it is in its file, as the given ones see it moved: pictures do not depend on the
-    scale of a world, and so it is the cameras that are moved."""
+    """Cameras that see a splat, only scaled, as the given ones see it moved: the cameras are turned, not the splat."""
     given = cameras.cam_from_world.astype(np.float64)
     rotation, shift, poses = given[:, :3, :3], given[:, :3, 3], given.copy()
-    # x_cam = R (s Q (x + o) + t − o) + c = s [R Q x + (R (s Q o + t − o) + c) / s]
+    # x_cam = R (s Q (x + o) + t − o) + c = R Q (s x) + R (s Q o + t − o) + c
     offset = frame.scale * frame.rotation @ origin + frame.shift - origin
     poses[:, :3, :3] = rotation @ frame.rotation
-    poses[:, :3, 3] = (rotation @ offset + shift) / frame.scale
+    poses[:, :3, 3] = rotation @ offset + shift
     Ks = cameras.Ks.copy()
     Ks[:, :2] *= frame.intrinsics_factor
     return replace(cameras, cam_from_world=poses.astype(cameras.cam_from_world.dtype), Ks=Ks)

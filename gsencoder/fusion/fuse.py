@@ -209,7 +209,8 @@ def fuse(
     mean = subspace.mean if moments is None else moments.mean.astype(np.float32)
     assert mean is not None
     if not (weights > 0).any():
-        raise InputError(f"fuse: none of {len(rows)} views of {scene.name} sees any Gaussian; check poses and units")
+        none = f"none of {len(rows)} views of {scene.name} sees any Gaussian"
+        raise InputError(f"fuse: {none}; check poses, units, masks and opacities")
 
     return Fusion(
         features=GaussianFeatures(

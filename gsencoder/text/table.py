@@ -154,7 +154,9 @@ class TextTable:
             parts = [f"{word[:MAX_SHOWN]!r}{_did_you_mean(self.near(word[:MAX_NAME]))}" for word in unknown[:3]]
             more = f" and {len(unknown) - 3} more" if len(unknown) > 3 else ""
             space = self.space.name[:MAX_SHOWN]
-            raise InputError(f"not among the {len(self)} words of {space}: {'; '.join(parts)}{more}")
+            advice = "; phrases need a sentence encoder, as in fuse teacher=mosaic text=minilm"
+            phrases = advice if any(" " in word.strip() for word in unknown) else ""
+            raise InputError(f"not among the {len(self)} words of {space}: {'; '.join(parts)}{more}{phrases}")
         return self.embeddings[np.array(rows, np.int64)]
 
 

@@ -57,6 +57,7 @@ HOSTILE = {
     "points.ply": (GOOD_PLY.replace(b"f_dc_", b"color_"), "point cloud or mesh"),
     "surfels.ply": (GOOD_PLY.replace(b"scale_2", b"thick"), "2D splat"),
     "rest.ply": (GOOD_PLY.replace(b"f_rest_8", b"other_8"), "8 f_rest"),
+    "more.ply": (GOOD_PLY.replace(b"f_rest_8", b"f_rest_x"), "8 f_rest"),
     "twice.ply": (GOOD_PLY.replace(b"f_rest_8", b"f_rest_7"), "repeats a property"),
     "type.ply": (GOOD_PLY.replace(b"property float y", b"property quad y"), "line 6"),
     "format.ply": (GOOD_PLY.replace(b"binary_little_endian", b"binary_middle_endian"), "line 2"),

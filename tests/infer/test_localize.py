@@ -94,6 +94,13 @@ def test_every_object_of_a_name_has_a_box_and_ranks_count_up() -> None:
     assert len(localize(SCENE, ["chair"], TABLE, LocalizeConfig(max_boxes=2)).boxes) == 2
 
 
+@pytest.mark.parametrize("value", [0, 2**31])
+@pytest.mark.parametrize("name", ["min_samples", "max_boxes"])
+def test_counts_that_no_library_takes_are_refused(name: str, value: int) -> None:
+    with pytest.raises(InputError, match=f"{name}: expected 1 to"):
+        LocalizeConfig(**{name: value})
+
+
 def test_words_asked_together_are_found_as_they_are_one_by_one() -> None:
     together = localize(SCENE, ["mug", "chair", "lamp"], TABLE)
     alone = [box for word in together.queries for box in localize(SCENE, [word], TABLE).boxes]

@@ -83,6 +83,8 @@ def test_an_unknown_word_is_an_error_that_names_near_ones(table: TextTable, word
 def test_an_unknown_word_with_nothing_near_says_so(table: TextTable) -> None:
     with pytest.raises(InputError, match="no name is near"):
         table.encode(["qqqq"])
+    with pytest.raises(InputError, match=r"no name is near.*phrases need a sentence encoder, as in fuse"):
+        table.encode(["qq qq qq"])
 
 
 @given(st.text(max_size=40))

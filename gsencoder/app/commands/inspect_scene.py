@@ -8,6 +8,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 from rich.table import Table
 
+from gsencoder.core.errors import listed
 from gsencoder.core.even_indices import even_indices
 from gsencoder.core.files.picture_file import write_picture
 from gsencoder.data.check.depth_agreement import agreement_map
@@ -98,6 +99,8 @@ def check_lines(facts: SceneFacts, depth: DepthCheck | None, matches: EpipolarCh
                 f"views: {matches.share:.0%} within 2 pixels of their epipolar lines, {matches.error:.2f} pixels on "
                 "average (pictures of at most 640 pixels)"
             )
+            if matches.decided and matches.unmatched:
+                lines.append(f"too few matches to tell whether these fit: {listed(matches.unmatched)}")
         else:
             lines.append("photographs: no two of the views that were looked at have features in common")
     if depth is None and matches is None:
@@ -146,6 +149,7 @@ def check_results(depth: DepthCheck | None, matches: EpipolarCheck | None) -> di
             "error_pixels": matches.error,
             "best_error_pixels": matches.best_error,
             "decided": matches.decided,
+            "unmatched": list(matches.unmatched),
         }
     return results
 

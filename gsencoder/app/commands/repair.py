@@ -124,24 +124,28 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
     findings = findings_of(scene.views, depth, matches)
     if not findings and not is_decided(depth, matches):
         raise InputError(f"{path}: too little to tell whether something is wrong, so there is nothing to repair")
-    repair = repair_posed(posed, findings, depth.registration if depth is not None else None)
-    content = transforms_of(repair.posed, config.out.parent)
-    with summary.step("check"):
-        again = _load_back(content, config.out)
-        assert again.views is not None
-        checked = check_scene(again.views, limit=config.views, track=track)
-        remaining = [finding for finding in findings_of(again.views, *checked) if finding.view is None]
-        if remaining:
-            raise InputError(f"{path}: still wrong once repaired: {remaining[0].message}; nothing was written")
-    before, after = fit_of(depth, matches), fit_of(*checked)
-    summary.results.update(
-        path=str(config.out), changes=list(repair.changes), agreement_before=before, agreement_after=after
-    )
+    before, changes, repaired = fit_of(depth, matches), list[str](), posed
+    while True:
+        # A view that is far astray may hide another one.
+        repair = repair_posed(repaired, findings, depth.registration if depth is not None else None)
+        repaired, changes = repair.posed, [*changes, *repair.changes]
+        content = transforms_of(repaired, config.out.parent)
+        with summary.step("check"):
+            again = _load_back(content, config.out)
+            assert again.views is not None
+            depth, matches = check_scene(again.views, limit=config.views, track=track)
+        findings = findings_of(again.views, depth, matches)
+        if wrong := [finding for finding in findings if finding.view is None]:
+            raise InputError(f"{path}: still wrong once repaired: {wrong[0].message}; nothing was written")
+        if not findings:
+            break
+    after = fit_of(depth, matches)
+    summary.results.update(path=str(config.out), changes=changes, agreement_before=before, agreement_after=after)
     with sole_writer(config.out, overwrite=config.overwrite):
         with summary.step("write"):
             write_json(config.out, content)
         write_beside(config.out, summary)
-    for change in repair.changes:
+    for change in changes:
         screen.print(change, highlight=False)
     outside = (
         "" if config.out.resolve().parent == path.resolve() else "; its files lie elsewhere: data.allow_outside=true"

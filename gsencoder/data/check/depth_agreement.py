@@ -5,7 +5,7 @@ view's own depth image says d there, r = z / d − 1 is zero up to noise and the
 the point there. Wrong axes, poses, scales and intrinsics spread r.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,6 +52,11 @@ class DepthViews:
 
     def __len__(self) -> int:
         return len(self.depths)
+
+    def select(self, rows: Sequence[int]) -> "DepthViews":
+        """Some of the views."""
+        arrays = ("depths", "pixels", "values", "cam_from_world", "Ks")
+        return replace(self, **{name: getattr(self, name)[list(rows)] for name in arrays})
 
     def with_focal_times(self, factor: float) -> "DepthViews":
         """The same images by a sensor of another focal length."""

@@ -87,6 +87,7 @@ class EpipolarCheck:
         findings: what is wrong.
         decided: False if there are too few pairs to say anything, or most of the matches do not fit and it cannot be
             said why.
+        unmatched: names of the views of which nothing can be said: they have no pair that fits, and are not astray.
         worst: the pair with the largest error, for a picture; None without pairs.
         cameras: of the views that were looked at, at the size of the matched pictures, as the files give them.
     """
@@ -99,6 +100,7 @@ class EpipolarCheck:
     best_error: float = float("nan")
     findings: tuple[Finding, ...] = ()
     decided: bool = False
+    unmatched: tuple[str, ...] = ()
     worst: PairMatches | None = None
     cameras: Cameras
 
@@ -168,6 +170,8 @@ def judge_matches(
                 "epipolar lines, and no other reading of the poses fits",
             )
         )
+    matched = {view for pair in matches if _fits(best, pair, limit) for view in (pair.first, pair.second)}
+    astray = {finding.view for finding in findings}
     distances = [_distances(cameras, pair) for pair in matches]
     all_distances = np.concatenate(distances)
     return EpipolarCheck(
@@ -179,6 +183,7 @@ def judge_matches(
         best_error=best_error,
         findings=tuple(findings),
         decided=bool(findings) or (enough and fitting >= 0.5),
+        unmatched=tuple(name for view, name in enumerate(names) if view not in matched and name not in astray),
         worst=max(zip(distances, matches, strict=True), key=lambda pair: _clipped(pair[0]))[1],
         cameras=cameras,
     )

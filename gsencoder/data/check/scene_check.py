@@ -303,19 +303,21 @@ def _with_registration(findings: list[Finding], fit: RegistrationFit) -> list[Fi
 
 
 def _stray_views(views: DepthViews, names: tuple[str, ...]) -> list[Finding]:
-    """Views that fit clearly better once they are moved."""
+    """Views that fit clearly better once they are moved; those that fit worst are judged first, and others without
+    those that are astray."""
     spreads = view_spreads(residuals(views))
     suspects = np.argsort(-np.nan_to_num(spreads))[:SUSPECTS]
     normals = [surface_normals(views, view) for view in range(len(views))]
-    findings = []
-    for view in sorted(int(suspect) for suspect in suspects):
-        fit = fit_pose(views, view, normals)
+    findings, rows = [], list(range(len(views)))
+    for view in map(int, suspects):
+        fit = fit_pose(views.select(rows), rows.index(view), [normals[row] for row in rows])
         if fit.before > STRAY_SPREAD and fit.after < STRAY * fit.before:
+            rows.remove(view)
             message = (
                 f"its pose does not fit the other views: {fit.moved:.3g} units and {np.rad2deg(fit.turned):.2f}° off"
             )
             findings.append(Finding(cause="stray view", message=message, view=names[view]))
-    return findings
+    return sorted(findings, key=lambda finding: names.index(str(finding.view)))
 
 
 def _other_pictures(

@@ -9,10 +9,9 @@ from gsencoder.data.check.depth_agreement import CLIP, DepthViews, residuals, wo
 from gsencoder.types.cameras import project_points
 from gsencoder.types.poses import invert_rigid, transform
 
-REACHES = (0.15, 0.1, 0.07, 0.05, 0.04, 0.03, 0.03, 0.03)
+REACHES = (0.15,) * 4 + (0.1,) * 4 + (0.07,) * 3 + (0.05, 0.04, 0.03, 0.03, 0.03)
 """Samples are matched to the surface on their pixel's ray in another view if its depth differs by at most this share,
-one
-for each step: at first far, then near, so that what is hidden there is left out."""
+one for each step: at first far, then near, so that what is hidden there is left out."""
 HUBER = 0.01
 """Distances beyond this share of the depth count linearly."""
 

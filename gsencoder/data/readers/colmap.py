@@ -136,8 +136,8 @@ def _pose_file(model: Path) -> str:
     return f"frames.{suffix}" if (model / f"frames.{suffix}").is_file() else f"images.{suffix}"
 
 
-def _image_lines(file: Path) -> tuple[list[str], bool]:
-    """The lines of an images.txt, two for each image, and whether the file itself has them.
+def _image_lines(file: Path) -> tuple[list[str], bool, bool]:
+    """The lines of an images.txt, two for each image, whether the file itself has them, and whether any has points.
 
     pycolmap takes the line after an image for its points, whatever it holds. Where no image has points, every line is
     an image, and empty ones may be missing.
@@ -168,7 +168,7 @@ def _image_lines(file: Path) -> tuple[list[str], bool]:
             f"{file}: line {lost} holds no points of the image above it; expected two lines an image, of which the "
             "second may be empty (X Y POINT3D_ID …)"
         )
-    return ([*lines, ""], False) if len(lines) % 2 else (lines, complete)
+    return ([*lines, ""], False, with_points > 0) if len(lines) % 2 else (lines, complete, with_points > 0)
 
 
 def _are_points(words: list[str]) -> bool:
@@ -222,15 +222,19 @@ def _load(model: Path) -> Any:
 
 
 def _read_text(reconstruction: Any, model: Path) -> None:
-    """Reads a text model, also one whose images.txt has one line an image."""
-    lines, complete = _image_lines(model / "images.txt")
-    if complete:
+    """Reads a text model, also one whose images.txt has one line an image, or no points for the tracks of points3D.txt
+    to name (tracks are not used)."""
+    lines, complete, with_points = _image_lines(model / "images.txt")
+    points = [] if with_points else [words[:8] for _, words in _rows(model / "points3D.txt")]
+    if complete and not points:
         reconstruction.read_text(str(model))
         return
     with TemporaryDirectory(prefix="gsencoder_model_") as folder:
         for file in model.glob("[cprf]*.txt"):
             shutil.copy(file, folder)
         Path(folder, "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        if points:
+            Path(folder, "points3D.txt").write_text("\n".join(map(" ".join, points)) + "\n", encoding="utf-8")
         reconstruction.read_text(folder)
 
 

@@ -148,7 +148,8 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
         raise InputError(
             f"{path}: the .ply lacks {', '.join(missing)}; expected a Gaussian splat, not a point cloud or mesh"
         )
-    rest = sum(name.startswith("f_rest_") for name in names)
+    colors = {name for name in names if re.fullmatch(r"f_rest_\d+", name)}
+    rest = len(colors)
     if rest not in (0, 9, 24, 45, 72) or any(f"f_rest_{i}" not in names for i in range(rest)):
         raise InputError(
             f"{path}: has {rest} f_rest properties; expected f_rest_0 … with 0, 9, 24 or 45 of them (SH 0 to 3)"
@@ -169,7 +170,7 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
     opacities, sh = np.empty(count, np.float32), np.empty((count, coefficients, 3), np.float32)
     widths = np.zeros(count, np.float64)
     normals = [name for name in _NORMALS if name in names]
-    used = {*_REQUIRED, *(name for name in names if name.startswith("f_rest_")), *normals, FILTER}
+    used = {*_REQUIRED, *colors, *normals, FILTER}
     with np.errstate(over="ignore", invalid="ignore"):
         for start in range(0, count, _BLOCK):
             stop = min(start + _BLOCK, count)
@@ -191,6 +192,8 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
             # Trainers write normals of zeros.
             used -= {name for name in normals if block[name].any()}
     if FILTER in names:
+        if wrong := int((~((widths >= 0) & (widths < np.inf))).sum()):
+            raise InputError(f"{path}: {FILTER} of {wrong:,} rows is no width; expected 0 or more in each row")
         scales, opacities = _filtered(scales, opacities, widths)
         warnings.warn(
             f"{path}: {FILTER} of mip-splatting is applied, which widens Gaussians and makes them fainter",
@@ -216,7 +219,7 @@ def _filtered(
     (Yu et al., Mip-Splatting, 2024)."""
     logs = log_scales.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
-        wider = np.logaddexp(2 * logs, 2 * np.log(np.abs(widths))[:, None]) / 2
+        wider = np.logaddexp(2 * logs, 2 * np.log(widths)[:, None]) / 2
         opacities = opacities_from_logits(logits) * np.exp((logs - wider).sum(axis=1))
     return wider.astype(np.float32), logits_from_opacities(opacities)
 

@@ -94,8 +94,8 @@ class LocalizeConfig:
             if not 0 <= getattr(self, name) < math.inf:
                 raise InputError(f"{name}: expected zero or a positive number, got {getattr(self, name)}")
         for name in ("min_samples", "max_boxes"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
+            if not 1 <= getattr(self, name) < 2**31:
+                raise InputError(f"{name}: expected 1 to 2³¹ − 1, got {getattr(self, name)}")
         if not 0 <= self.min_share <= 1:
             raise InputError(f"min_share: expected a share in [0, 1], got {self.min_share}")
         if not 0 <= self.min_probability <= 1:

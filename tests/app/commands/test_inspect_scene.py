@@ -63,12 +63,18 @@ def stray(content: dict[str, Any]) -> None:
     content["frames"][4]["transform_matrix"][0][3] += 0.05
 
 
+def two_exchanged(content: dict[str, Any]) -> None:
+    second, last = (content["frames"][row] for row in (1, 6))
+    second["transform_matrix"], last["transform_matrix"] = last["transform_matrix"], second["transform_matrix"]
+
+
 FAULTS: dict[str, tuple[Change, str, int]] = {
     "axes": (opencv_axes, "OpenGL's camera axes", 8),
     "order": (next_poses, r"photograph \+1 places away", 8),
     "depth scale": (wrong_scale, r"depths should be 0\.2 times", 8),
     "focal length": (wrong_focal, r"focal length of the photographs is 0\.9", 8),
     "stray view": (stray, "view images/004.png: its pose does not fit", 7),
+    "two exchanged": (two_exchanged, "view images/00[16].png: its pose does not fit", 6),
 }
 
 

@@ -45,6 +45,18 @@ def matches(cameras: Cameras) -> list[PairMatches]:
     ]
 
 
+def test_views_without_a_pair_that_fits_are_named_as_unmatched(cameras: Cameras, matches: list[PairMatches]) -> None:
+    alone = [pair for pair in matches if 5 not in (pair.first, pair.second)]
+    check = judge_matches(alone, cameras, cameras, np.arange(6), NAMES)
+    assert check.decided
+    assert check.unmatched == (NAMES[5],)
+    # A pair that does not fit says as little.
+    moved = turned(cameras, {5: 10})
+    with_one = [*alone, next(pair for pair in matches if pair.second == 5)]
+    assert judge_matches(with_one, moved, moved, np.arange(6), NAMES).unmatched == (NAMES[5],)
+    assert judge_matches(matches, cameras, cameras, np.arange(6), NAMES).unmatched == ()
+
+
 def with_poses(cameras: Cameras, poses: np.ndarray) -> Cameras:
     return replace(cameras, cam_from_world=poses.astype(np.float32))
 

@@ -118,6 +118,16 @@ def test_a_view_that_is_wrong_alone_is_named(box: Views, fault: str) -> None:
     assert [(finding.cause, finding.view) for finding in check.findings] == [(fault, box.names[ROW])]
 
 
+def test_a_view_that_stands_far_off_is_named_alone(box: Views) -> None:
+    """A fifth of the distance to the walls, against hundredths."""
+    aside = np.eye(4)
+    aside[:3, 3] = 0.15, -0.1, 0.05
+    moved = with_poses(box, lambda poses: np.stack([*poses[:ROW], aside @ poses[ROW], *poses[ROW + 1 :]]))
+    assert [(finding.cause, finding.view) for finding in check_depth(moved).findings] == [
+        ("stray view", box.names[ROW])
+    ]
+
+
 def test_two_faults_at_once_are_both_named(box: Views) -> None:
     check = check_depth(with_other_picture(POSE_FAULTS["inverse"](box)))
     assert {(finding.cause, finding.view) for finding in check.findings} == {

@@ -202,6 +202,29 @@ def test_the_filter_of_mip_splatting_is_applied_row_by_row(field_room: FieldRoom
     assert np.array_equal(filtered.means, plain.means)
 
 
+def test_tracks_may_name_points_of_images_that_were_not_written(field_room: FieldRoom, tmp_path: Path) -> None:
+    content = field_room.copy_photographs(tmp_path)
+    write_colmap_text(tmp_path, content)
+    points = tmp_path / "sparse/0/points3D.txt"
+    points.write_text("# Number of points: 2\n1 1 2 3 9 8 7 0.5 1 0 2 4\n2 4 5 6 9 8 7 0.5\n")
+    scene = load_scene(tmp_path)
+    assert scene.sfm_points is not None
+    assert sorted((scene.sfm_points + scene.origin).tolist()) == [[1, 2, 3], [4, 5, 6]]
+    points.write_text(points.read_text().replace(" 9 8 7 0.5 1 0 2 4", ""))
+    with pytest.raises(InputError, match="line 2 is not POINT3D_ID"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("width", [-0.01, np.nan, np.inf])
+def test_a_filter_that_is_no_width_is_named(field_room: FieldRoom, tmp_path: Path, width: float) -> None:
+    rows = field_room.rows()
+    widths = np.zeros(len(rows), np.float32)
+    widths[3:5] = width
+    path = write_ply(tmp_path / "filtered.ply", with_fields(rows, filter_3D=widths))
+    with pytest.raises(InputError, match="filter_3D of 2 rows is no width"):
+        load_splat(path)
+
+
 def test_inspect_says_that_the_filter_is_applied_and_lists_other_properties_once(
     field_room: FieldRoom, tmp_path: Path
 ) -> None:
