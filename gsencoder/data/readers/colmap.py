@@ -168,7 +168,9 @@ def _image_lines(file: Path) -> tuple[list[str], bool, bool]:
             f"{file}: line {lost} holds no points of the image above it; expected two lines an image, of which the "
             "second may be empty (X Y POINT3D_ID …)"
         )
-    return ([*lines, ""], False, with_points > 0) if len(lines) % 2 else (lines, complete, with_points > 0)
+    if len(lines) % 2:
+        lines, complete = [*lines, ""], False
+    return lines, complete, with_points > 0
 
 
 def _are_points(words: list[str]) -> bool:
