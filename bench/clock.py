@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -82,6 +83,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder for the results")
     add_json_option(parser)
     arguments = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the busy processes end, too
     shared = Path(os.environ.get("GSENCODER_SHARED", "../shared"))
     chosen = {path: [] for path in arguments.scenes} if arguments.scenes else scenes_of(shared)
     figures: dict[str, Any] = {}

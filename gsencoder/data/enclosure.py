@@ -195,7 +195,8 @@ def _blocked(surface: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "x y z"]:
 
 
 def _entering_again(surface: Bool[np.ndarray, "x y z"], space: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "x y z"]:
-    """The number of directions in which a ray from each free cell meets a surface, and `space` right behind it."""
+    """The number of directions in which a ray from each free cell meets a surface, and `space` right behind it; of cells
+    in a surface it means nothing."""
     count = np.zeros(surface.shape, np.int64)
     for direction in DIRECTIONS:
         ahead = None
@@ -204,6 +205,6 @@ def _entering_again(surface: Bool[np.ndarray, "x y z"], space: Bool[np.ndarray, 
             found = np.zeros_like(here) if ahead is None else _shifted(ahead[0], step)
             # Of a free cell: whether its ray finds the space behind the next surface.
             behind = np.zeros_like(here) if ahead is None else _shifted(ahead[1], step)
-            counted += behind & ~here
+            counted += behind
             ahead = np.where(here, found, inside), np.where(here, found, behind)
     return count
