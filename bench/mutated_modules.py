@@ -34,6 +34,8 @@ SCENE_FILES = {
     },
     **{f"data/seeding/{name}": ("tests/data/seeding", "tests/data/test_triangulate.py") for name in PHOTOGRAPHS},
     "data/up": ("tests/data/test_up.py",),
+    **dict.fromkeys(("data/splat_frame", "fusion/fit"), ("tests/fusion/test_fit.py",)),
+    "train/presence": ("tests/train/test_presence.py",),
     "app/runs/scene_queue": ("tests/app/test_scene_queue.py",),
     "types/scene": ("tests/test_types.py",),
 }
