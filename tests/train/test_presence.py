@@ -84,6 +84,7 @@ def test_a_process_that_never_comes_is_named_and_not_waited_for(runs: Runs) -> N
     last = runs["last never comes"]
     assert [code for code, _, _ in last] == [2, 2, 2]
     assert "SceneWarning: training: process 0 of 3 waits for process 2, and ends in 0.0" in last[0][2]
+    assert last[0][2].count("waits for process") == 1
     assert "waits" not in last[1][2]
     for rank in (0, 1):
         assert "process 2 did not come within" in last[rank][1] or "process 0 ended" in last[rank][1]

@@ -58,7 +58,7 @@ UNKNOWN_PAIRS = 6
 """Without another reading that fits, poses are only called wrong by so many pairs, of whose matches …"""
 UNKNOWN_SHARE = 0.1
 """… less than this share is in pairs that fit."""
-STRAY_ERROR = 3.0
+STRAY_ERROR = 2.0
 """A view may be astray if the error of its pairs is above so many pixels, and above …"""
 STRAY_FACTOR = 3.0
 """… this many times that of the middle one of the other pairs, and less than …"""
