@@ -47,8 +47,8 @@ SHORT = {"-h": "--help", "-m": "--multirun"}
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs a command line, by default that of the process, and returns the exit code."""
     began, words = time.perf_counter(), list(sys.argv[1:] if argv is None else argv)
-    # Threads of torch wait for one another in a loop of so many turns before they sleep: the default takes the cores from
-    # the thread that is waited for where other programs compute, and steps take five times as long.
+    # How often threads of torch look for one another before they sleep. With the default they take the cores from the
+    # thread that they wait for where other programs compute, and steps take five times as long.
     os.environ.setdefault("GOMP_SPINCOUNT", "3000")
     debug = "--debug" in words[: words.index("--") if "--" in words else None]
     if not faulthandler.is_enabled():

@@ -195,8 +195,8 @@ def _blocked(surface: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "x y z"]:
 
 
 def _entering_again(surface: Bool[np.ndarray, "x y z"], space: Bool[np.ndarray, "x y z"]) -> Int64[np.ndarray, "x y z"]:
-    """The number of directions in which a ray from each free cell meets a surface, and `space` right behind it; of cells
-    in a surface it means nothing."""
+    """The number of directions in which a ray from each free cell meets a surface, and `space` right behind it;
+    of cells in a surface it means nothing."""
     count = np.zeros(surface.shape, np.int64)
     for direction in DIRECTIONS:
         ahead = None

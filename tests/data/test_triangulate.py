@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial import cKDTree
 from walls import DEPTH, TILT, wall_points, wall_views
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig, load_scene
@@ -103,6 +103,15 @@ def test_points_of_a_wall_lie_on_it() -> None:
     assert made.error < 1.0
     assert made.points.dtype == np.float32
     assert np.median(off_wall(made.points)) < 0.05
+
+
+def test_photographs_that_do_not_fit_their_poses_are_warned_of() -> None:
+    views = wall_views(8)
+    poses = views.cameras.cam_from_world.copy()
+    poses[:, [0, 1], 3] = poses[:, [1, 0], 3]  # The cameras went along x, and the poses say along y.
+    wrong = replace(views, cameras=replace(views.cameras, cam_from_world=poses))
+    with pytest.warns(SceneWarning, match=r"do not seem to fit their poses: of [0-9,]+ matched features [0-9]+ lie on"):
+        triangulate(wrong)
 
 
 def test_a_rerun_gives_the_same_points() -> None:
