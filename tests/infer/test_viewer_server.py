@@ -247,8 +247,7 @@ def test_strangers_take_no_place_from_the_page(server: ViewServer, monkeypatch: 
     monkeypatch.setattr(viewer_server, "MAX_CONNECTIONS", 8)
     threads = threading.active_count()
     request = head(server, "GET", "").encode()
-    with connected(server) as page:
-        strangers = []
+    with ExitStack() as strangers, connected(server) as page:
         for _ in range(2):
             page.sendall(request)
             answer = b""
@@ -256,11 +255,14 @@ def test_strangers_take_no_place_from_the_page(server: ViewServer, monkeypatch: 
                 part = page.recv(1 << 16)
                 assert part
                 answer += part
-            strangers += [connected(server) for _ in range(30)]
+            for _ in range(30):
+                strangers.enter_context(connected(server))
         assert call(server, "GET", at(server, ""))[0] == 200
+        # A thread ends a moment after its connection was shut down.
+        until = time.monotonic() + 10
+        while threading.active_count() > threads + 9 and time.monotonic() < until:
+            time.sleep(0.01)
         assert threading.active_count() <= threads + 9
-    for each in strangers:
-        each.close()
 
 
 def test_a_request_that_has_come_is_not_ended_while_it_is_answered(
