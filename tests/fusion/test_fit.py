@@ -15,6 +15,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.splat_frame import DATAPARSER, SplatFrame, identity_frame, moved, stated_frames, usual_frames
 from gsencoder.data.splats import load_splat, save_splat
+from gsencoder.fusion import fit
 from gsencoder.fusion.fit import FITS, SmallViews, agreement, with_fitting_splat
 from gsencoder.geometry import colors_from_sh
 from gsencoder.types import Gaussians, Scene
@@ -32,6 +33,12 @@ def inverse(frame: SplatFrame) -> SplatFrame:
     """From the cameras' world to that of the splat."""
     rotation, scale = frame.rotation.T, 1 / frame.scale
     return replace(frame, rotation=rotation, scale=scale, shift=-scale * rotation @ frame.shift)
+
+
+@pytest.fixture(autouse=True)
+def fewer_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fifth of the room's Gaussians are rendered: a search looks at a hundred pictures."""
+    monkeypatch.setattr(fit, "MAX_GAUSSIANS", 8000)
 
 
 @pytest.fixture(scope="module")
