@@ -32,7 +32,7 @@ MIN_MATCHES = 15
 """Pairs of views with fewer verified matches are not used."""
 FITTING_SHARE, ENOUGH_MATCHES = 0.1, 100
 """Of this many matches or more, a smaller share lies on the epipolar lines only where poses are wrong: 0.18 to 0.9 of
-those of eight scenes, and 0.00 to 0.11 with other axes, inverse poses or those of other photographs."""
+those of eight choices of views, and 0.00 to 0.11 (once 0.20) with other axes, inverse or exchanged poses."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -113,9 +113,10 @@ def _verify(
             good = on_epipolar_lines(
                 cameras, first, second, keypoints[first][matches[:, 0]], keypoints[second][matches[:, 1]]
             )
+            count = int(good.sum())
             if len(good) >= MIN_MATCHES:
-                total, fitting = total + len(good), fitting + int(good.sum())
-            if good.sum() < MIN_MATCHES:
+                total, fitting = total + len(good), fitting + count
+            if count < MIN_MATCHES:
                 continue
             geometry = pycolmap.TwoViewGeometry()
             geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
