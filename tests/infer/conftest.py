@@ -20,7 +20,7 @@ from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 SHAPE = TransformerConfig(
-    encoder_depths=(2, 1),
+    encoder_depths=(1, 1),
     encoder_channels=(16, 32),
     decoder_depths=(1,),
     decoder_channels=(16,),

@@ -39,30 +39,32 @@ def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights
     first = TorchEncoder(str(weights)).outputs.select()
     mean = np.arange(3, dtype=np.float32) / 10
     second = OutputSpace(space=FeatureSpace(name="three", channels=3), mean=mean, scale=5.0)
-    outputs = OutputSpaces(by_teacher={"labels": first, "colors": second})
+    # A teacher whose vectors are learned as they are.
+    third = replace(second, space=FeatureSpace(name="raw", channels=3), centered=False, scaled=False)
+    outputs = OutputSpaces(by_teacher={"labels": first, "colors": second, "raw": third})
     torch.manual_seed(1)
-    network = GaussianEncoder(EncoderConfig(voxel=0.05, transformer=SHAPE), outputs.widths)
+    network = GaussianEncoder(EncoderConfig(voxel=0.05, stem=5, transformer=SHAPE), outputs.widths)
     save_weights(tmp_path / "encoder.safetensors", network, outputs, {"steps": 1})
     save_text_table(tmp_path / "words.labels.safetensors", load_text_table(weights / "words.safetensors"))
     encoder = TorchEncoder(str(tmp_path))
-    clouds = [Cloud(f"{count}", random_cloud(count, encoder.voxel, seed=count)) for count in (1, 300)]
+    clouds = [Cloud(f"{count}", random_cloud(count, encoder.voxel, seed=count)) for count in (1, 300, 2000)]
     with symbolic_sizes():
         lowered = lower(encoder)
     model = export_onnx(encoder, lowered)
     assert max(check_parity(model, encoder, clouds).values()) < 1e-4
-    assert check_cosines(export_onnx(encoder, lowered, "int8_weights"), model, clouds[1:], cosine=0.98)
+    for precision in ("int8_weights", "int8_dynamic"):
+        check_cosines(export_onnx(encoder, lowered, precision), model, clouds[1:], cosine=0.98)
     runtime = OnnxEncoder(model, device="cpu")
-    assert set(runtime.spaces) == {"labels", "colors"}
+    assert set(runtime.spaces) == {"labels", "colors", "raw"}
     assert set(runtime.tables) == {"labels"}
     cloud = clouds[1].gaussians
     together = runtime.encode_spaces(cloud, ALONE)
     for name, features in together.items():
         np.testing.assert_array_equal(runtime.encode(cloud, ALONE, space=name).features, features.features)
-    with pytest.raises(InputError, match="gives features of labels, colors; name one of them"):
+    with pytest.raises(InputError, match="gives features of labels, colors, raw; name one of them"):
         runtime.encode(cloud, ALONE)
     # A wrong block of columns in the graph is not hidden by the larger numbers of another space.
-    swapped = OutputSpaces(by_teacher={"labels": first, "colors": replace(second, scale=5.001)})
-    encoder.outputs = swapped
+    encoder.outputs = OutputSpaces(by_teacher=outputs.by_teacher | {"colors": replace(second, scale=5.001)})
     with pytest.raises(InputError, match="onnxruntime and torch differ"):
         check_parity(model, encoder, clouds[1:])
 
