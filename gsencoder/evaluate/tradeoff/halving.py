@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from gsencoder.core.errors import InputError
+from gsencoder.evaluate.tradeoff.measure import Knobs
 from gsencoder.evaluate.tradeoff.pareto import best_first
 
-Knobs = Mapping[str, Any]
 Evaluate = Callable[[Sequence[Knobs], int], Sequence[Sequence[float]]]
 """Costs of settings on the first so many scenes, one row each; less is better in every column."""
 LEAST = 4
