@@ -21,7 +21,6 @@ from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.scenes import load_scene
 from gsencoder.fusion.basis import Moments, fit_basis
 from gsencoder.fusion.basis_fit import ProjectionSums
-from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import build_teacher
 
@@ -34,7 +33,7 @@ def vectors_of(scenes: list[Path], teacher: Teacher, count: int) -> Iterator[np.
         views = load_scene(path).views
         assert views is not None
         for view in even_indices(len(views), count):
-            rows = map_rows(teacher.feature_map(views, int(view)))
+            rows = teacher.feature_map(views, int(view)).rows()
             yield rows[np.isfinite(rows[:, 0])]
 
 

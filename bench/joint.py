@@ -38,7 +38,6 @@ from gsencoder.app.settings.compose import compose
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.fusion.basis import to_coordinates
-from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.memory.attention import MemoryAttention
@@ -99,7 +98,7 @@ class QueryLoop:
         self._training = replace(memory_training(), steps=setting.optimize.steps)
 
     def _standard(self, feature_map: FeatureMap) -> Tensor:
-        outputs, rows = self._scene.outputs, map_rows(feature_map)
+        outputs, rows = self._scene.outputs, feature_map.rows()
         return torch.from_numpy(
             outputs.standardize(rows if outputs.basis is None else to_coordinates(outputs.basis, rows))
         )

@@ -30,7 +30,6 @@ from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.data.splats import save_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.render import blend
@@ -85,7 +84,7 @@ def rendered_cosines(
         rows = np.flatnonzero(alpha >= MIN_ALPHA)
         rendered = (b.render(values).numpy() / np.maximum(alpha, 1e-6)[:, None])[rows]
         about_mean = rendered @ features.basis.components if features.basis is not None else rendered
-        target = map_rows(teacher_map)[rows]
+        target = teacher_map.rows()[rows]
         raw += cosines(about_mean + features.mean, target).sum()
         centered += cosines(about_mean, target - features.mean).sum()
         covered += len(rows)

@@ -23,7 +23,6 @@ from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.evaluate.rendered import RenderedTally
-from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import Blend, blend
@@ -71,7 +70,7 @@ def score(case: Case, queries: np.ndarray, predict: Predict, own: np.ndarray | N
     seen = torch.from_numpy((weights > 0).astype(np.float32))
     tally, values = RenderedTally(outputs.mean), torch.from_numpy(queries)
     for b, feature_map in case.left_out:
-        target, alpha = map_rows(feature_map), b.render(seen)
+        target, alpha = feature_map.rows(), b.render(seen)
         rows = np.flatnonzero((alpha.numpy() >= MIN_ALPHA) & np.isfinite(target[:, 0]))
         rendered = (b.render(values * seen[:, None]) / alpha.clamp(min=1e-12)[:, None])[rows]
         tally.add(predict(rendered), target[rows])

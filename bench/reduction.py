@@ -23,7 +23,6 @@ from gsencoder.app.settings.compose import compose
 from gsencoder.core.even_indices import even_indices
 from gsencoder.core.files.row_file import RowFile
 from gsencoder.data.scenes import load_scene
-from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.memory.reduction import (
@@ -48,7 +47,7 @@ def raw_features(scene_path: Path, teacher_words: list[str], maps: Path | None) 
     source = teacher if maps is None else CachedTeacher(teacher, maps)
     if maps is not None:
         maps.mkdir(parents=True, exist_ok=True)
-    rows = [map_rows(source.feature_map(views, view)) for view in range(len(views))]
+    rows = [source.feature_map(views, view).rows() for view in range(len(views))]
     return np.concatenate([each[np.isfinite(each[:, 0])] for each in rows])
 
 

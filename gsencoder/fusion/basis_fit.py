@@ -13,7 +13,6 @@ from jaxtyping import Float, Float32, Float64
 from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.basis import to_coordinates
-from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teacher_maps import upright
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.types import FeatureBasis, FeatureMap, Views
@@ -80,7 +79,7 @@ class ProjectionSums:
             codes = feature_map.codes[feature_map.codes >= 0]
             self.add(basis, feature_map.table, np.bincount(codes, minlength=len(feature_map.table)).astype(np.float64))
             return
-        rows = map_rows(feature_map)
+        rows = feature_map.rows()
         self.add(basis, rows[np.isfinite(rows[:, 0])])
 
     def fit(self) -> BasisFit:

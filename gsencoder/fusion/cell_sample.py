@@ -4,7 +4,6 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.lift import map_rows
 from gsencoder.types import FeatureMap
 
 MAX_CELLS = 32_768
@@ -24,7 +23,7 @@ class CellSample:
 
     def add(self, feature_map: FeatureMap) -> None:
         """Adds cells of a map that have a vector."""
-        rows = map_rows(feature_map)
+        rows = feature_map.rows()
         rows = rows[np.isfinite(rows).all(axis=1)]
         self._parts.append(rows[:: -(-len(rows) // self._per_map)] if len(rows) else rows)
 

@@ -21,22 +21,6 @@ BLOCK_VALUES = 1 << 27
 """Values of a map that are made at once from its codes, 0.5 GiB."""
 
 
-def map_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "P D"]:
-    """A map as rows; cells without a feature are NaN."""
-    if feature_map.features is not None:
-        return feature_map.features.reshape(-1, feature_map.space.channels)
-    assert feature_map.table is not None
-    if feature_map.shares is not None:
-        shares = feature_map.shares.reshape(-1, len(feature_map.table))
-        weights = shares.sum(axis=1, keepdims=True)
-        rows = (shares @ feature_map.table) / np.where(weights > 0, weights, np.float32(np.nan))
-        return rows.astype(np.float32)
-    assert feature_map.codes is not None
-    # The row behind the last one is what code −1 takes.
-    padded = np.concatenate([feature_map.table, np.full((1, feature_map.space.channels), np.nan, np.float32)])
-    return padded[feature_map.codes.ravel()]
-
-
 def distinct_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "n D"]:
     """The vectors of a map that its basis and mean are computed from: of a coded map each row of its table that occurs,
     once, so that a region counts however few pixels it has; of others each cell that has a vector."""
@@ -44,7 +28,7 @@ def distinct_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "n D"]:
         assert feature_map.table is not None
         counts = np.bincount(feature_map.codes.ravel() + 1, minlength=len(feature_map.table) + 1)
         return feature_map.table[counts[1:] > 0]
-    rows = map_rows(feature_map)
+    rows = feature_map.rows()
     return rows[np.isfinite(rows[:, 0])]
 
 
@@ -128,7 +112,7 @@ class FeatureSums:
         if feature_map.shares is not None and self._shared is not None:
             self._add_mixed(b, feature_map, share)
             return
-        vectors = map_rows(feature_map)
+        vectors = feature_map.rows()
         scale = np.isfinite(vectors[:, 0]).astype(np.float32)
         if not scale.all():
             vectors = np.where(scale[:, None] > 0, vectors, np.float32(0))

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.lift import map_rows
 from gsencoder.types import FeatureMap, FeatureSpace
 
 MapStream = Callable[[], Iterator[tuple[int, FeatureMap]]]
@@ -22,7 +21,7 @@ def raw_features(view: int, feature_map: FeatureMap) -> tuple[Float32[np.ndarray
         codes, cells = np.unique(feature_map.codes.ravel(), return_index=True)
         rows, cells = feature_map.table[codes[codes >= 0]], cells[codes >= 0]
     else:
-        rows = map_rows(feature_map)
+        rows = feature_map.rows()
         cells = np.flatnonzero(~np.isnan(rows[:, 0]))
         rows = rows[cells]
     line, column = np.divmod(cells, feature_map.width)

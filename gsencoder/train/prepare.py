@@ -11,7 +11,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.lift import capped, map_rows
+from gsencoder.fusion.lift import capped
 from gsencoder.fusion.teacher_maps import upright
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
@@ -169,7 +169,7 @@ def _pool_map(
         valid = shares[:, 0] == 0
         vectors = (shares[:, 1:] @ _standardize(feature_map.table, outputs)).astype(np.float32)
     else:
-        dense = map_rows(feature_map).reshape(feature_map.height, feature_map.width, -1)
+        dense = feature_map.rows().reshape(feature_map.height, feature_map.width, -1)
         grid = _standardize(dense, outputs)[: height * factor, : width * factor]
         vectors = grid.reshape(height, factor, width, factor, -1).mean(axis=(1, 3)).reshape(height * width, -1)
         valid = np.isfinite(vectors).all(axis=1)

@@ -99,6 +99,21 @@ class FeatureMap:
         grid = next(form for form in (self.features, self.codes, self.shares) if form is not None)
         return np.asarray(grid)
 
+    def rows(self) -> Float32[np.ndarray, "P D"]:
+        """The vectors of all cells, row by row of the grid; NaN in cells without a feature."""
+        if self.features is not None:
+            return self.features.reshape(-1, self.space.channels)
+        assert self.table is not None
+        if self.shares is not None:
+            shares = self.shares.reshape(-1, len(self.table))
+            weights = shares.sum(axis=1, keepdims=True)
+            rows = (shares @ self.table) / np.where(weights > 0, weights, np.float32(np.nan))
+            return rows.astype(np.float32)
+        assert self.codes is not None
+        # The row behind the last one is what code −1 takes.
+        padded = np.concatenate([self.table, np.full((1, self.space.channels), np.nan, np.float32)])
+        return padded[self.codes.ravel()]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FeatureBasis:

@@ -6,7 +6,7 @@ import torch
 from splats import front_camera, random_gaussians
 
 from gsencoder.fusion import lift
-from gsencoder.fusion.lift import FeatureSums, capped, center_matrix, map_rows, view_matrix
+from gsencoder.fusion.lift import FeatureSums, capped, center_matrix, view_matrix
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import depth_image
@@ -162,7 +162,7 @@ def test_a_coded_map_has_the_rows_of_its_table_and_none_where_there_is_no_code(r
     table, codes = rng.normal(size=(3, 2)).astype(np.float32), np.array([[0, 2], [-1, 1]], np.int32)
     space = FeatureSpace(name="s", channels=2)
     feature_map = FeatureMap(codes=codes, table=table, grid_from_image=np.eye(2, 3), space=space)
-    np.testing.assert_array_equal(map_rows(feature_map), [table[0], table[2], [np.nan, np.nan], table[1]])
+    np.testing.assert_array_equal(feature_map.rows(), [table[0], table[2], [np.nan, np.nan], table[1]])
 
 
 @pytest.mark.parametrize("coded", [False, True])

@@ -12,7 +12,7 @@ from training_scenes import SPACE as SIDES
 from training_scenes import scene as side_scene
 
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.lift import distinct_rows, map_rows
+from gsencoder.fusion.lift import distinct_rows
 from gsencoder.fusion.teacher_maps import CachedTeacher, read_map, write_map
 from gsencoder.fusion.visibility import VisibilityConfig
 from gsencoder.models.output_space import OutputSpace
@@ -50,7 +50,7 @@ class OwnTables:
         made = self.maps[view]
         if not self.dense:
             return made
-        return FeatureMap(features=map_rows(made).reshape(*SIZE, 6), grid_from_image=IDENTITY, space=SPACE)
+        return FeatureMap(features=made.rows().reshape(*SIZE, 6), grid_from_image=IDENTITY, space=SPACE)
 
     def settings(self) -> dict[str, Any]:
         return {"name": "own"}

@@ -25,7 +25,6 @@ from text_towers import save_graph, save_tokenizer
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.fusion.teachers.build import build_teacher, text_table_of, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -41,7 +40,7 @@ from gsencoder.types import Scene
 
 def rows_of(teacher: Teacher, scene: Scene, view: int) -> np.ndarray:
     assert scene.views is not None
-    return map_rows(teacher.feature_map(scene.views, view)).reshape(HEIGHT, WIDTH, -1)
+    return teacher.feature_map(scene.views, view).rows().reshape(HEIGHT, WIDTH, -1)
 
 
 def expected(view: int, captions: dict[str, str], rest: np.ndarray) -> np.ndarray:

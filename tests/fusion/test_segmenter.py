@@ -13,7 +13,6 @@ from segmenters import PLAIN, save_graph, teacher_of, views_of, words
 from splats import random_gaussians
 
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teacher_maps import read_map, write_map
 from gsencoder.fusion.teachers.build import build_teacher, words_beside
 from gsencoder.fusion.teachers.labels import LabelsConfig
@@ -99,7 +98,7 @@ def test_fusing_shares_equals_fusing_the_vectors_that_they_stand_for(
 
         def feature_map(self, views: Views, view: int) -> FeatureMap:
             made = teacher.feature_map(views, view)
-            vectors = map_rows(made).reshape(made.height, made.width, -1)
+            vectors = made.rows().reshape(made.height, made.width, -1)
             return FeatureMap(features=vectors, grid_from_image=made.grid_from_image, space=made.space)
 
         def settings(self) -> dict[str, Any]:

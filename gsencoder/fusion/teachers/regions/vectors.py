@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float32, Int32
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.fusion.lift import map_rows
 from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.fusion.teachers.regions.captioned import IDENTITY, codes_of
 from gsencoder.fusion.teachers.regions.masks import RegionMasks
@@ -180,7 +179,7 @@ def region_means(
     cells = dense.height * dense.width
     counts = np.bincount(codes[inside].astype(np.int64) * cells + cell[inside], minlength=len(regions) * cells)
     counts = counts.reshape(len(regions), cells).astype(np.float64)
-    rows = map_rows(dense)
+    rows = dense.rows()
     finite = np.isfinite(rows).all(axis=1)
     counts = counts[:, finite]
     sizes = counts.sum(axis=1, keepdims=True)
