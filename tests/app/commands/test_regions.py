@@ -25,7 +25,7 @@ from gsencoder.text.table import load_text_table
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A room, the words of what is in it, a folder of its instance maps as label images, and their captions."""
     folder = tmp_path_factory.mktemp("rooms") / "room"
-    made = make_room(0, objects=4, views=4, width=120, height=90)
+    made = make_room(0, objects=4, views=4, width=64, height=48)
     write_room(made, folder)
     write_words(folder / "words.safetensors", made)
     views = load_scene(folder).views
