@@ -16,9 +16,6 @@ from PIL import Image
 
 import gsencoder
 from gsencoder.app import cli
-from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeding.seed import seed
-from gsencoder.data.splats import save_splat
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
 
@@ -29,7 +26,7 @@ EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo") / "room"
-    write_room(make_room(0, objects=6, views=4, width=64, height=48), folder)
+    write_room(make_room(0, objects=6, views=6, width=120, height=90), folder)
     return folder
 
 
@@ -63,7 +60,7 @@ def test_an_example_fuses_and_localizes(room: Path, tmp_path: Path) -> None:
     seen, total = (int(number.replace(",", "")) for number in re.findall(r"[\d,]+\d", out.splitlines()[0]))
     assert 0.9 * total < seen <= total
     assert re.search(r"^red at \[.*\], \d\.\d\d × \d\.\d\d × \d\.\d\d m, score 0\.\d\d, \d+ Gaussians$", out, re.M)
-    assert size_of(tmp_path / "relevancy.png") == (128, 48)
+    assert size_of(tmp_path / "relevancy.png") == (240, 90)
 
 
 def test_an_example_shows_that_lifting_is_the_transpose_of_rendering(
@@ -73,7 +70,7 @@ def test_an_example_shows_that_lifting_is_the_transpose_of_rendering(
     left, right = (float(number) for number in re.findall(r"= (-?[\d.]+)", out)[:2])
     assert left == pytest.approx(right, rel=1e-3, abs=0.5)
     assert float(re.findall(r"gradient and lift: (\S+)", out)[0]) < 1e-4
-    assert size_of(tmp_path / "patches.png") == (128, 48)
+    assert size_of(tmp_path / "patches.png") == (240, 90)
 
 
 def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(
@@ -84,7 +81,7 @@ def test_an_example_encodes_a_splat_and_saves_a_folder_that_localize_takes(
     assert re.findall(r"^(table|chair): \d+ boxes", out, re.MULTILINE) == ["table", "chair"]
     features = gsencoder.load_features(tmp_path / "encoded").features
     assert len(gsencoder.load_splat(tmp_path / "room.ply")) == len(features["labels-clip_vitb32"])
-    assert size_of(tmp_path / "encoded.png") == (128, 48)
+    assert size_of(tmp_path / "encoded.png") == (240, 90)
 
 
 def test_an_example_renders_views_of_a_target(run: Callable[..., str], room: Path, tmp_path: Path) -> None:
@@ -97,20 +94,19 @@ def test_an_example_renders_views_of_a_target(run: Callable[..., str], room: Pat
 
 
 def test_the_first_commands_of_the_readme_need_nothing_but_gsencoder(
-    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    field_room: FieldRoom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Each `fuse` and `localize` of a labeled room, of a bare splat, and of photographs with a splat."""
     monkeypatch.delenv("GSENCODER_MODELS", raising=False)
     # Embedding all of them takes seconds.
     monkeypatch.setattr("gsencoder.text.open_vocabulary.REFERENCE_NOUNS", ("chair", "table", "tree"))
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(room, "outputs/demo/room")
-    scene = load_scene(room)
-    save_splat("outputs/demo/splat.ply", seed(scene), origin=scene.origin)
-    content = FieldRoom(room=room, splat=Path("outputs/demo/splat.ply")).copy_photographs(Path("splat"))
+    shutil.copytree(field_room.room, "outputs/demo/room")
+    content = field_room.copy_photographs(Path("splat"))
     shutil.copytree("splat/images", "PHOTOS")
     write_transforms(Path("splat"), content)
-    shutil.copy("outputs/demo/splat.ply", "splat")
+    for folder in ("outputs/demo", "splat"):
+        shutil.copy(field_room.splat, Path(folder, "splat.ply"))
     readme = (EXAMPLES.parent / "README.md").read_text().partition("## I have a splat")[0]
     lines = [shlex.split(line, comments=True) for line in re.findall(r"^gsencoder (.*)", readme, re.MULTILINE)]
     quick = {"fuse": ["orbits=2", "cameras=around", "data.up=[0,0,1]"], "localize": ["pictures=1"]}
