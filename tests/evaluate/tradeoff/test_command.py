@@ -1,7 +1,6 @@
 """`gsencoder tradeoff` on a small room: every stage is measured, written, drawn and continued."""
 
 import csv
-import gc
 import json
 import re
 from pathlib import Path
@@ -12,7 +11,6 @@ import pytest
 from PIL import Image
 
 from gsencoder.app import cli
-from gsencoder.app.commands import COMMANDS
 from gsencoder.data.synthetic.room import make_room, write_room
 from gsencoder.text.table import make_text_table, save_text_table
 
@@ -27,9 +25,6 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     names = sorted({one.name for one in room.objects if one.name})
     vectors = np.linalg.qr(np.random.default_rng(0).normal(size=(80, len(names))))[0].T.astype(np.float32)
     save_text_table(folder / "words.safetensors", make_text_table(names, vectors, "t"))
-    # Measuring memory collects garbage, which takes long beside what the command imports.
-    COMMANDS["tradeoff"].load()
-    gc.freeze()
     return folder
 
 
@@ -88,17 +83,17 @@ def test_fusion_is_measured_against_the_exact_features_and_the_budget_advises(
 
 def test_words_packages_and_views_have_scores_of_their_own(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    sweep = ["sweep.knobs=relative,form,candidates", "sweep.values=[relative:0.9,form:index/npz,candidates:2]"]
-    sweep += ["choose.candidates=4", "choose.count=2", "choose.width=64", "choose.height=48", "quiet=true"]
+    sweep = ["sweep.knobs=relative,form,candidates", "sweep.values=[relative:0.9,form:index/npz,candidates:4]"]
+    sweep += ["choose.candidates=8", "choose.count=2", "choose.width=64", "choose.height=48", "quiet=true"]
     stages = "stages=[localization,packages,views]"
     assert cli.main(words_of(scene, stages, "preset=exact", *sweep, f"out={out}")) == 0
     settings = json.loads((out / "summary.json").read_text())["settings"]
     assert settings["preset"] == "exact"
-    assert (settings["fusion"]["max_rank"], settings["choose"]["candidates"]) == (0, 4)
+    assert (settings["fusion"]["max_rank"], settings["choose"]["candidates"]) == (0, 8)
     rows = table_of(out)
     assert set(rows) == {
         ("localization", "defaults"), ("localization", "relative=0.9"), ("packages", "defaults"),
-        ("packages", "form=index"), ("packages", "form=npz"), ("views", "defaults"), ("views", "candidates=2"),
+        ("packages", "form=index"), ("packages", "form=npz"), ("views", "defaults"), ("views", "candidates=4"),
     }  # fmt: skip
     package, index, arrays = (rows["packages", each] for each in ("defaults", "form=index", "form=npz"))
     assert float(index["bytes"]) < float(package["bytes"]) < float(arrays["bytes"])
