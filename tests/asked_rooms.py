@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rooms import cube, room
+from rooms import STEP, cube, room
 
 from gsencoder.app import cli
 from gsencoder.fusion.store.folder import WORDS_FILE, save_features
@@ -23,11 +23,11 @@ def save_room(
     *,
     shift: tuple[float, float, float] = (0, 0, 0),
     scene_name: str = "room",
+    step: float = STEP,
 ) -> None:
     """A cube and two crates in a room, each with features of its name; `names` are those of its frames."""
-    scene, rows = room(
-        cube((-0.8, -0.6, 0.8)), cube((-0.9, 0.9, 0.8)), center=(0.3 + shift[0], 0.2 + shift[1], 0.8 + shift[2])
-    )
+    center = (0.3 + shift[0], 0.2 + shift[1], 0.8 + shift[2])
+    scene, rows = room(cube((-0.8, -0.6, 0.8)), cube((-0.9, 0.9, 0.8)), center=center, step=step)
     assert scene.gaussians is not None
     if names:
         assert scene.views is not None

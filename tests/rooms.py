@@ -45,12 +45,12 @@ def cube(center: tuple[float, float, float], half: float = CUBE, step: float = 0
     return np.concatenate(faces)
 
 
-def walls() -> np.ndarray:
+def walls(step: float = STEP) -> np.ndarray:
     """Four walls, a floor at z = 0 and a ceiling."""
     middle = HEIGHT / 2
-    parts = [sheet((0, 0, z), (0, 1), (HALF, HALF)) for z in (0.0, HEIGHT)]
-    parts += [sheet((x, 0, middle), (1, 2), (HALF, middle)) for x in (-HALF, HALF)]
-    parts += [sheet((0, y, middle), (0, 2), (HALF, middle)) for y in (-HALF, HALF)]
+    parts = [sheet((0, 0, z), (0, 1), (HALF, HALF), step) for z in (0.0, HEIGHT)]
+    parts += [sheet((x, 0, middle), (1, 2), (HALF, middle), step) for x in (-HALF, HALF)]
+    parts += [sheet((0, y, middle), (0, 2), (HALF, middle), step) for y in (-HALF, HALF)]
     return np.concatenate(parts)
 
 
@@ -64,13 +64,17 @@ def corner_cameras(count: int = 12, width: int = 64, height: int = 48) -> Camera
     )
 
 
-def room(*others: np.ndarray, center: tuple[float, float, float] = (0.3, 0.2, 0.8)) -> tuple[Scene, np.ndarray]:
-    """The scene, and the rows of its cube; `others` are more points in the room."""
-    target = cube(center)
-    means = np.concatenate([target, walls(), *others])
+def room(
+    *others: np.ndarray, center: tuple[float, float, float] = (0.3, 0.2, 0.8), step: float = STEP
+) -> tuple[Scene, np.ndarray]:
+    """The scene, and the rows of its cube; `others` are more points in the room, and `step` is between those of the
+    walls."""
+    target, around = cube(center), walls(step)
+    means = np.concatenate([target, around, *others])
     cameras = corner_cameras()
     scales = np.full(len(means), 0.6 * STEP)
     scales[: len(target)] = 0.018
+    scales[len(target) : len(target) + len(around)] = 0.6 * step
     scene = Scene(
         name="room",
         gaussians=splat(means, scales),

@@ -25,8 +25,8 @@ QUICK = (
     "train.steps=4",
     "train.warmup=2",
     "train.log_every=2",
-    "sampling.gaussians=2000",
-    "sampling.smallest=500",
+    "sampling.gaussians=500",
+    "sampling.smallest=200",
     "model.transformer.encoder_channels=[32,32,32,32,32]",
     "model.transformer.decoder_channels=[32,32,32,32]",
 )
@@ -36,7 +36,7 @@ QUICK = (
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three rooms, of which the second has no labels, and the words of all that is in them."""
     folder = tmp_path_factory.mktemp("rooms")
-    made = [make_room(number, objects=3, views=3, width=100, height=75) for number in range(3)]
+    made = [make_room(number, objects=3, views=3, width=64, height=48) for number in range(3)]
     for number, room in enumerate(made):
         write_room(room, folder / f"room_{number}")
     (folder / "room_1" / "objects.json").unlink()

@@ -1,6 +1,7 @@
 """Fusion where B is made and multiplied by torch, as on a GPU, against the numba kernels of a CPU."""
 
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,9 @@ from gsencoder.render import BlendConfig
 from gsencoder.types import FeatureMap, Scene, Views
 
 TORCH = BlendConfig(backend="torch")
-DEPTHS = tuple(np.full((24, 32), 2.0 + 0.3 * view, np.float32) for view in range(5))
-MASKS = tuple(np.random.default_rng(view).random((24, 32)) < 0.7 for view in range(5))
+VIEWS = 3
+DEPTHS = tuple(np.full((24, 32), 2.0 + 0.3 * view, np.float32) for view in range(VIEWS))
+MASKS = tuple(np.random.default_rng(view).random((24, 32)) < 0.7 for view in range(VIEWS))
 TABLE = np.random.default_rng(0).normal(size=(7, 6)).astype(np.float32)
 
 
@@ -38,15 +40,15 @@ class OwnTables(CodedTeacher):
 def teacher_of(kind: str) -> Any:
     rng = np.random.default_rng(1)
     if kind == "dense":
-        maps = [rng.normal(size=(6, 8, 6)).astype(np.float32) for _ in range(5)]
+        maps = [rng.normal(size=(6, 8, 6)).astype(np.float32) for _ in range(VIEWS)]
         maps[2][1, 3] = np.nan
         return FixedTeacher(maps)
-    codes = [rng.integers(-1, 7, (24, 32)).astype(np.int32) for _ in range(5)]
+    codes = [rng.integers(-1, 7, (24, 32)).astype(np.int32) for _ in range(VIEWS)]
     return CodedTeacher(codes, TABLE) if kind == "coded" else OwnTables(codes, TABLE)
 
 
 def hidden_scene(**views: Any) -> Scene:
-    return make_scene(150, **views)
+    return make_scene(150, VIEWS, **views)
 
 
 CASES = {
@@ -63,6 +65,13 @@ CASES = {
 }
 
 
+@cache
+def by_torch(case: str, kind: str) -> Fusion:
+    """What both tests hold against another fusion."""
+    config, views = CASES[case]
+    return fuse(hidden_scene(**views), teacher_of(kind), replace(config, blend=TORCH), device="cpu")
+
+
 def assert_same(one: Fusion, other: Fusion, *, atol: float) -> None:
     np.testing.assert_allclose(one.features.weights, other.features.weights, rtol=1e-4, atol=atol)
     # Of a Gaussian that hardly anything sees, the weights are rounding.
@@ -77,8 +86,7 @@ def test_a_fusion_by_torch_equals_that_by_numba(case: str, kind: str) -> None:
     config, views = CASES[case]
     scene = hidden_scene(**views)
     expected = fuse(scene, teacher_of(kind), config, device="cpu")
-    torch_config = replace(config, blend=TORCH)
-    assert_same(fuse(scene, teacher_of(kind), torch_config, device="cpu"), expected, atol=1e-4)
+    assert_same(by_torch(case, kind), expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["dense", "coded", "own tables"])
@@ -86,7 +94,7 @@ def test_a_fusion_by_torch_equals_that_by_numba(case: str, kind: str) -> None:
 def test_a_fusion_on_another_device_leaves_no_tensor_behind_and_gives_the_same(case: str, kind: str) -> None:
     config, views = CASES[case]
     scene = hidden_scene(**views)
-    expected = fuse(scene, teacher_of(kind), replace(config, blend=TORCH), device="cpu")
+    expected = by_torch(case, kind)
     with pretended_device() as device:
         assert_same(fuse(scene, teacher_of(kind), config, device=device), expected, atol=1e-5)
 

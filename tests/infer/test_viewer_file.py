@@ -5,6 +5,7 @@ import gzip
 import hashlib
 import re
 from dataclasses import replace
+from functools import cache
 from html import unescape
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from gsencoder.infer.viewer.search import SceneSearch
 from gsencoder.types import Scene
 
 OPTIONS = FileOptions(error=0.01, sh_degree=3, photographs=2, photograph_side=64)
+room = cache(room_scene)
 SETTINGS = {"kind": "file", "scenes": 1, "notes": []}
 AWKWARD = Bundle(script="f('</script><!-- </SCRIPT'); // é", style="body::after { content: 'é'; }")
 
@@ -99,7 +101,7 @@ def colored(scene: Scene, degree: int) -> Scene:
 def fitted(search: SceneSearch, limit: int, *degrees: int, options: FileOptions = OPTIONS, **further: int) -> MadePage:
     scenes = [(colored(search.shown.scene, degree), f"t{degree}", search.words) for degree in degrees]
     limits = {"max_gaussians": 10**6, "max_bytes": limit} | further
-    return fitting_page(STUB, scenes, LocalizeConfig(), room_scene().objects, options, **limits)
+    return fitting_page(STUB, scenes, LocalizeConfig(), room().objects, options, **limits)
 
 
 def scenes_of(made: MadePage) -> list[Container]:
@@ -118,7 +120,7 @@ def test_a_page_holds_all_up_to_its_last_byte_and_says_what_it_knows(search: Sce
     assert less.sh_degree == (0,)
     assert f"larger than {(len(whole.page) - 1) / 1e6:g} MB (megabytes=) keeps them" in less.notes[0]
     (scene,) = scenes_of(whole)
-    assert scene.meta["objects"] == [each.name or "" for each in room_scene().objects]
+    assert scene.meta["objects"] == [each.name or "" for each in room().objects]
     assert scene.meta["title"] == "t1"
 
 
@@ -146,7 +148,7 @@ def test_a_thinned_page_uses_most_of_its_size_whatever_was_asked_for(search: Sce
 
 
 def test_photographs_are_counted_as_they_are_in_the_file(search: SceneSearch) -> None:
-    scene = replace(search.shown.scene, views=room_scene().views)
+    scene = replace(search.shown.scene, views=room().views)
     for photographs, count in ((0, 0), (2, 2), (9, 6)):
         made = fitting_page(
             STUB, [(scene, "t", search.words)], LocalizeConfig(), (), replace(OPTIONS, photographs=photographs),

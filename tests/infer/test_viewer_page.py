@@ -6,6 +6,7 @@ import io
 import json
 import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -36,6 +37,7 @@ from gsencoder.infer.viewer.shown import (
 from gsencoder.types import Scene
 
 OPTIONS = FileOptions(error=0.01, sh_degree=3, photographs=2, photograph_side=64)
+room = cache(room_scene)
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +185,7 @@ def test_the_splat_of_a_page_keeps_the_order_and_places_of_its_rows(search: Scen
 
 
 def test_harmonics_above_a_degree_are_left_out(tmp_path: Path, rng: np.random.Generator) -> None:
-    scene = room_scene()
+    scene = room()
     assert scene.gaussians is not None
     few = scene.gaussians.select(np.arange(20))
     full = replace(few, sh=(0.1 * rng.normal(size=(20, 16, 3))).astype(np.float32))
@@ -211,7 +213,7 @@ def test_a_scene_that_is_not_thinned_is_left_as_it_is(search: SceneSearch) -> No
 
 
 def test_features_that_share_a_table_keep_it() -> None:
-    features, _ = name_features(room_scene())
+    features, _ = name_features(room())
     index = np.where(features.seen, np.arange(len(features)) % 7, -1).astype(np.int32)
     shared = replace(features, features=features.features[:7], index=index)
     rows = np.array([5, 900, 17])
@@ -227,7 +229,7 @@ def test_weights_are_coded_by_their_logarithm_and_zero_means_never(weights: list
 
 
 def test_a_gaussian_belongs_to_the_smallest_object_around_it() -> None:
-    scene = room_scene()
+    scene = room()
     inner = replace(scene.objects[-1], aabb_min=np.full(3, -0.1), aabb_max=np.full(3, 0.1))
     outer = replace(inner, aabb_min=np.full(3, -1.0), aabb_max=np.full(3, 1.0))
     means = np.array([[0, 0, 0], [0.5, 0, 0], [2, 0, 0]], np.float32)
@@ -263,7 +265,7 @@ def test_a_page_of_a_file_holds_its_scenes_and_loads_nothing(written: Container,
 
 
 def test_photographs_of_a_file_are_small_and_say_whose_they_are(search: SceneSearch) -> None:
-    scene = room_scene()
+    scene = room()
     shown = replace(search.shown, scene=replace(search.shown.scene, views=scene.views))
     container = file_container(replace_shown(search, shown.scene), (), OPTIONS)
     assert container.meta["photographViews"] == [0, 5]
@@ -278,7 +280,7 @@ def replace_shown(search: SceneSearch, scene: Scene) -> SceneSearch:
 
 
 def test_objects_come_with_numbers_and_names(search: SceneSearch) -> None:
-    scene = room_scene()
+    scene = room()
     container = scene_container(search, scene.objects)
     assert container.meta["objects"] == [each.name or "" for each in scene.objects]
     assert container.arrays["objects"].max() <= len(scene.objects)

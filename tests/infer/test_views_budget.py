@@ -24,7 +24,7 @@ SHELLS = ViewsConfig(source="shells", count=4, width=160, height=120)
 
 
 def test_seconds_are_kept_and_more_of_them_never_judge_fewer_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, rows = room()
+    scene, rows = room(step=0.12)
     assert scene.gaussians is not None
     target, now, judge = target_of("cube", scene.gaussians, rows), [0.0], module.judge_candidates
 
@@ -70,7 +70,7 @@ def test_what_a_budget_chooses_and_what_it_cannot_are_refused() -> None:
 
 
 def test_as_many_candidates_are_judged_as_views_are_asked_for_with_a_budget_and_without() -> None:
-    scene, rows = room()
+    scene, rows = room(step=0.12)
     assert scene.gaussians is not None
     target = target_of("cube", scene.gaussians, rows)
     config = ViewsConfig(source="shells", count=12, candidates=8, judged_side=40, width=160, height=120)
@@ -81,7 +81,7 @@ def test_as_many_candidates_are_judged_as_views_are_asked_for_with_a_budget_and_
 
 
 def test_frames_that_are_all_judged_are_the_candidates_that_are_reported() -> None:
-    scene, rows = room()
+    scene, rows = room(step=0.12)
     assert scene.gaussians is not None
     assert scene.views is not None
     target = target_of("cube", scene.gaussians, rows)
@@ -94,7 +94,7 @@ def test_the_command_records_the_promise_and_warns_where_it_is_broken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "CANDIDATES", (4, 6))
-    save_room(tmp_path / "features")
+    save_room(tmp_path / "features", step=0.12)
     size = ("choose.count=2", "choose.width=120", "choose.height=90", "quiet=true")
     for seconds, broken in ((1e-3, True), (1e4, False)):
         out = tmp_path / f"views {broken}"
@@ -111,7 +111,7 @@ def test_the_command_records_the_promise_and_warns_where_it_is_broken(
 def test_the_command_measures_error_and_megabytes_and_says_both_numbers_where_they_are_broken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    save_room(tmp_path / "features")
+    save_room(tmp_path / "features", step=0.12)
 
     def views(name: str, *words: str) -> tuple[int, dict[str, Any]]:
         out = tmp_path / name

@@ -13,6 +13,7 @@ from walls import cameras, wall_views
 from gsencoder.core.errors import InputError
 from gsencoder.core.promises import PLANNED
 from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.budget import (
     LEAST_STEPS,
     PROMISED_STEPS,
@@ -157,7 +158,7 @@ def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
 ) -> None:
     """Also on a machine that would have planned other ones."""
     scene = Scene(name="wall", views=wall_views(6, depth=True), metres_per_unit=1.0)
-    config = ReconstructConfig(holdout=0, budget=BudgetConfig(minutes=0.01))
+    config = ReconstructConfig(holdout=0, seeds=SeedConfig(voxel=0.15), budget=BudgetConfig(minutes=0.01))
     monkeypatch.setattr("gsencoder.reconstruct.budget.LEAST_STEPS", 20)
     with cut_at(7):
         reconstruct(scene, config, work=tmp_path)

@@ -71,9 +71,9 @@ def test_rows_in_view_are_all_that_a_picture_shows(log_scale: float) -> None:
 
 @pytest.mark.slow
 def test_a_splat_gets_nearer_to_photographs_that_it_was_not_fitted_to() -> None:
-    one = optimizer(replace(QUICK, steps=120))
+    one = optimizer(replace(QUICK, steps=60))
     before = score(one, [2])
-    terms = [one.advance() for _ in range(120)]
+    terms = [one.advance() for _ in range(60)]
     after = score(one, [2])
     assert after.psnr > before.psnr + 1.5
     assert after.ssim > before.ssim
@@ -183,9 +183,9 @@ def test_nothing_becomes_infinite_from_the_worst_of_starts() -> None:
     images = [np.array(image) for image in views.images or ()]
     images[0][:], images[1][:] = 0, 255
     photographs = Photographs(replace(views, images=images))
-    config = OptimizeConfig(steps=600, sh_degree=3, shrinks=(3,), shares=(1.0,))
+    config = OptimizeConfig(steps=240, sh_degree=3, shrinks=(3,), shares=(1.0,))
     one = Optimizer(adam_of(start, config), photographs, range(4), config, prune=PruneConfig(at=(0.5,)))
-    for _ in range(600):
+    for _ in range(240):
         one.advance()
     assert all(bool(torch.isfinite(value).all()) for value in one.parameters.values())
     assert len(one.gaussians()) > 0

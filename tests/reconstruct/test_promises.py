@@ -13,8 +13,8 @@ from gsencoder.app import cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats import save_splat
+from gsencoder.reconstruct import Reconstruction, reconstruct
 from gsencoder.reconstruct import plan as planning
-from gsencoder.reconstruct import reconstruct
 from gsencoder.reconstruct.budget import BudgetConfig
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, PLANNED_DEGREE
 from gsencoder.reconstruct.config import ReconstructConfig
@@ -73,13 +73,20 @@ def test_a_promised_error_takes_the_fewest_steps_that_reach_it(
     assert result.seeding["steps_planned"] == STEPS[first]
 
 
+@pytest.fixture(scope="module")
+def whole(scene: Scene, errors: list[float]) -> Reconstruction:
+    """A run for the last of the errors that nothing cut."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(planning, "STEPS", STEPS)
+        return reconstruct(scene, promising(error=errors[-1]))
+
+
 @pytest.mark.parametrize("cut", [4, 5])
 def test_a_run_for_an_error_that_was_cut_ends_with_the_same_splat(
-    scene: Scene, errors: list[float], cut: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    scene: Scene, errors: list[float], whole: Reconstruction, cut: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(planning, "STEPS", STEPS)
     config = promising(error=errors[-1])
-    whole = reconstruct(scene, config)
     with cut_at(cut):
         reconstruct(scene, config, work=tmp_path)
     assert header_of(tmp_path / CHECKPOINT_FILE)["facts"]["steps_planned"] == STEPS[-1]

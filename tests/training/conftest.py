@@ -15,7 +15,7 @@ from gsencoder.data.synthetic.write import write_room
 def rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three rooms and the words of all that is in them."""
     folder = tmp_path_factory.mktemp("rooms")
-    made = [make_room(number, objects=4, views=4, width=120, height=90) for number in range(3)]
+    made = [make_room(number, objects=4, views=4, width=64, height=48) for number in range(3)]
     for number, room in enumerate(made):
         write_room(room, folder / f"room_{number}")
     write_words(folder / "words.safetensors", *made)

@@ -42,7 +42,7 @@ def ten(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("room") / "features"
-    save_room(folder)
+    save_room(folder, step=0.12)
     return folder
 
 

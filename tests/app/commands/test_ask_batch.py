@@ -146,13 +146,13 @@ def test_an_answer_that_was_begun_with_other_settings_leaves_nothing_behind(feat
 def test_features_that_were_replaced_are_asked_anew(features: Path, tmp_path: Path) -> None:
     file = batch(tmp_path / "q.jsonl", {"question": "Where is the cube?"}, {"question": "Where is the crate?"})
     folder = tmp_path / "features"
-    save_room(folder)
+    save_room(folder, step=0.12)
     with serving(crate_refused) as server:
         words = (f"questions={file}", f"vlm.base_url={server.url}")
         assert ask(folder, tmp_path / "out", *words) == 2
         server.behave = answer("x")
         shutil.rmtree(folder)
-        save_room(folder, shift=(0.4, 0, 0))
+        save_room(folder, shift=(0.4, 0, 0), step=0.12)
         assert ask(folder, tmp_path / "out", *words) == 0
         assert len(server.requests) == 4
         # The same room in another place is the same scene.

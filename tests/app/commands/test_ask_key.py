@@ -32,7 +32,7 @@ ESCAPE = "\x1b[31m"
 @pytest.fixture(scope="module")
 def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("room") / "features"
-    save_room(folder)
+    save_room(folder, step=0.12)
     return folder
 
 

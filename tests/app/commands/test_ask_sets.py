@@ -29,19 +29,19 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("openai")
 
 ROOMS = ("room_000", "room_001")
-QUICK = ("choose.candidates=4", "choose.count=2", "choose.judged_side=60", "choose.width=160", "choose.height=120")
+QUICK = ("choose.candidates=4", "choose.count=2", "choose.judged_side=60", "choose.width=96", "choose.height=72")
 
 
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two rooms, features of their names, and what can be asked about them."""
     folder = tmp_path_factory.mktemp("home")
-    rooms = [make_room(seed, views=8, width=120, height=90) for seed in (0, 1)]
+    rooms = [make_room(seed, objects=5, views=4, width=96, height=72) for seed in (0, 1)]
     words = write_words(folder / "words.safetensors", *rooms)
     for room in rooms:
         write_room(room, folder / "rooms" / room.name)
-        fused = ("teacher=labels", f"teacher.words={words}", f"out={folder / 'features' / room.name}", "quiet=true")
-        assert cli.main(["fuse", str(folder / "rooms" / room.name), *fused]) == 0
+        fused = (f"teacher.words={words}", "seeds.voxel=0.04", f"out={folder / 'features' / room.name}", "quiet=true")
+        assert cli.main(["fuse", str(folder / "rooms" / room.name), "teacher=labels", *fused]) == 0
     made = ("min_pixels=60", "per_kind=2", "objects=3", "per_object=1", f"out={folder / 'set'}", "quiet=true")
     assert cli.main(["questions", str(folder / "rooms"), *made]) == 0
     return folder

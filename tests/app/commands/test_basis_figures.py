@@ -43,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two rooms, and an encoder trained on the first."""
     folder = tmp_path_factory.mktemp("basis")
     for number in range(2):
-        write_room(make_room(number, objects=2, views=3, width=80, height=60), folder / f"room_{number}")
+        write_room(make_room(number, objects=2, views=3, width=48, height=36), folder / f"room_{number}")
     words = [str(folder / f"room_{number}") for number in range(2)]
     assert cli.main(["train", *words, *TRAIN, f"out={folder / 'encoder'}", "quiet=true"]) == 0
     return folder

@@ -24,7 +24,7 @@ CUBE = ORIGIN + np.array([0.3, 0.2, 0.8])
 @pytest.fixture(scope="module")
 def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("room") / "features"
-    save_room(folder)
+    save_room(folder, step=0.12)
     return folder
 
 

@@ -24,7 +24,7 @@ QUICK = ("quiet=true", "train.steps=30", "train.warmup=5", "memory.channels=8", 
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A room with labels, and the words of all that is in it."""
     folder = tmp_path_factory.mktemp("rooms")
-    made = make_room(0, objects=3, views=3, width=100, height=75)
+    made = make_room(0, objects=3, views=3, width=64, height=48)
     write_room(made, folder / "room")
     write_words(folder / "words.safetensors", made)
     return folder / "room"

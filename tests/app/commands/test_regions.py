@@ -25,7 +25,7 @@ from gsencoder.text.table import load_text_table
 def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A room, the words of what is in it, a folder of its instance maps as label images, and their captions."""
     folder = tmp_path_factory.mktemp("rooms") / "room"
-    made = make_room(0, objects=4, views=4, width=120, height=90)
+    made = make_room(0, objects=4, views=4, width=64, height=48)
     write_room(made, folder)
     write_words(folder / "words.safetensors", made)
     views = load_scene(folder).views
@@ -127,6 +127,9 @@ def test_the_preset_of_dinov2_means_over_regions() -> None:
 def test_names_of_objects_through_minilm_are_those_of_labels(
     shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # Embedding all of them takes seconds.
+    nouns = ("chair", "dining table", "tree")
+    monkeypatch.setattr("gsencoder.text.open_vocabulary.REFERENCE_NOUNS", nouns)
     # Both fusions read the same names with the same tower.
     monkeypatch.setenv("GSENCODER_CACHE", str(tmp_path / "cache"))
     scene, fields = shared / "scenes/house/train_040", []

@@ -112,16 +112,16 @@ def test_features_that_were_fused_from_the_labels_name_nearly_all_that_is_there(
     assert instances["spread"]["ap"]["scenes"] == 2
 
 
-@pytest.mark.parametrize("protocol", ["instances", "referring"])
+@pytest.mark.parametrize(("protocol", "count"), [("instances", 3), ("referring", 2)])
 def test_processes_that_share_the_scenes_score_each_of_them_once(
-    protocol: str, rooms: Path, evaluated: dict[str, Path], tmp_path: Path, ranks: RankServer
+    protocol: str, count: int, rooms: Path, evaluated: dict[str, Path], tmp_path: Path, ranks: RankServer
 ) -> None:
     scenes = [str(rooms / f"room_{number}") for number in range(2)]
     options = [f"protocol={protocol}", f"teacher.words={rooms / 'words.safetensors'}", *PROTOCOLS[protocol]]
     words = ["evaluate", *scenes, *options, f"out={tmp_path / 'out'}", "quiet=true"]
     script = tmp_path / "run.py"
     script.write_text(COMMAND)
-    ranks.started(script, *words, count=3).end_well()
+    ranks.started(script, *words, count=count).end_well()
     assert results_of(tmp_path / "out") == results_of(evaluated[protocol])
 
 

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A scan, its words, and lists: the first class, with the id 0, is a thing that the room has."""
     folder = tmp_path_factory.mktemp("scannetpp")
-    made = make_room(0, objects=4, views=4, width=120, height=90)
+    made = make_room(0, objects=4, views=4, width=64, height=48)
     write_scannetpp_scan(made, folder / "scans" / "room")
     names = list(dict.fromkeys(each.name for each in made.objects if each.name))
     words = [*names, *ROOM_NAMES.values()]

@@ -59,7 +59,7 @@ def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("given")
     (folder / "features").mkdir()
     for name in ("room_a", "room_b"):
-        save_room(folder / "features" / name)
+        save_room(folder / "features" / name, step=0.12)
     make_model(folder / "model")
     scanqa(folder / "ScanQA_v1.0_train.json", *QUESTIONS)
     return folder

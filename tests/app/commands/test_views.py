@@ -19,7 +19,7 @@ QUICK = ("choose.candidates=8", "choose.count=4", "choose.width=120", "choose.he
 @pytest.fixture(scope="module")
 def features(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("room") / "features"
-    save_room(folder)
+    save_room(folder, step=0.12)
     return folder
 
 

@@ -19,21 +19,21 @@ from gsencoder.reconstruct.optimize_config import OptimizeConfig
 
 pytestmark = pytest.mark.slow
 
-INPUTS = Inputs(data=SceneConfig(image_scale=0.8), seeds=SeedConfig(voxel=0.08))
+INPUTS = Inputs(data=SceneConfig(image_scale=0.8), seeds=SeedConfig(voxel=0.12))
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("photographs") / "room"
-    write_room(make_room(0, objects=3, views=6, width=80, height=60), path)
+    write_room(make_room(0, objects=3, views=4, width=80, height=60), path)
     return path
 
 
 @pytest.fixture(scope="module")
 def base() -> ReconstructionSettings:
     settings = reconstruction_stage(INPUTS).base
-    quick = OptimizeConfig(steps=12, sh_degree=1, exposure=False)
-    return replace(settings, reconstruct=replace(settings.reconstruct, optimize=quick, holdout=3))
+    quick = OptimizeConfig(steps=8, sh_degree=1, exposure=False)
+    return replace(settings, reconstruct=replace(settings.reconstruct, optimize=quick, holdout=2))
 
 
 def test_the_scores_of_the_size_that_is_judged_are_those_of_the_reconstruction_itself(
