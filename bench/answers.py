@@ -31,8 +31,8 @@ import torch
 from gsencoder.app.commands.evaluated_features import stored_words, with_stored_features
 from gsencoder.app.commands.query_words import load_words
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.json_values import write_json
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.files import write_json
+from gsencoder.core.pretrained import find_file
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.data.truth.expressions import Expression

@@ -16,7 +16,7 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.scenes import load_scene
 from gsencoder.fusion.basis import Moments, fit_basis

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.app import cli
-from gsencoder.core.files import mapped_arrays
+from gsencoder.core import archive as mapped_arrays
 
 CHECKED = {"seconds": 0.0, "bytes": 0.0, "calls": 0.0}
 

@@ -23,8 +23,8 @@ from encoder import surface
 from json_option import add_json_option, write_figures
 from per_scene import labeled, quality
 
-from gsencoder.core.files.model_files import find_file
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.pretrained import find_file
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.evaluate.boxes import accuracy
 from gsencoder.evaluate.protocols.naming import naming_scores
 from gsencoder.fusion.feature_error import field_error

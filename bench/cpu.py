@@ -22,7 +22,7 @@ from torch.nn import functional
 
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.grid.cells import grid_coords
 from gsencoder.models.grid.neighbors import NeighborConv, neighbor_table

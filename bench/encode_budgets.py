@@ -16,7 +16,7 @@ import numpy as np
 from budget_figures import summary_of
 from json_option import add_json_option, write_figures
 
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.seeding.spacing import unit_of

@@ -27,8 +27,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
-from gsencoder.core.runtime.device import autocast_dtype
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.device import autocast_dtype
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs

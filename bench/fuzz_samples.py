@@ -17,8 +17,8 @@ import scene_files
 import splat_samples
 import test_flipped_bits
 
+from gsencoder.core import archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import archive
 from gsencoder.data.readers.camera_file import read_cameras
 from gsencoder.data.readers.objects_json import read_objects
 from gsencoder.data.scenes import SceneConfig, load_scene

@@ -26,7 +26,7 @@ import torch  # noqa: E402
 from gpu_measure import Row, Setting, Skipped, broken_limits  # noqa: E402
 from machine import machine_of_now, version_of  # noqa: E402
 
-from gsencoder.core.runtime.device import choose_device  # noqa: E402
+from gsencoder.core.device import choose_device  # noqa: E402
 
 Part = Callable[[Setting], Iterator[Row]]
 GPU_PACKAGES = ("triton", "gsplat", "onnxruntime-gpu")

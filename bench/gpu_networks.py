@@ -15,7 +15,7 @@ from gpu_measure import Row, Setting, Skipped, compared, measured
 from radios import small_radio
 from splats import front_camera
 
-from gsencoder.core.runtime.device import autocast_dtype
+from gsencoder.core.device import autocast_dtype
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.memory.attention import MemoryAttention, random_projection
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, encoder_inputs

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import write_json
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:

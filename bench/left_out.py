@@ -24,7 +24,7 @@ from PIL import Image
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.data.seeding.spacing import unit_of

@@ -31,7 +31,7 @@ import torch
 from json_option import add_json_option, write_figures
 from synthetic_teacher import SyntheticTeacher
 
-from gsencoder.core.runtime.peak_memory import memory_growth
+from gsencoder.core.process import memory_growth
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.fusion.basis import Moments, fit_basis, to_coordinates

@@ -25,7 +25,7 @@ ROUNDS, PASSES = 3, 5
 def measure(model: str, splat: str) -> dict[str, float]:
     """One process's figures; runs in the child."""
     from gsencoder.app.runs.summary import peak_memory_mb
-    from gsencoder.core.runtime.heap import retain_freed_memory
+    from gsencoder.core.process import retain_freed_memory
     from gsencoder.data.splats import load_splat
     from gsencoder.infer.encode.chunks import EncodeConfig
     from gsencoder.infer.load_encoder import load_encoder

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from json_option import add_json_option, write_figures
 
-from gsencoder.core.files.model_files import find_file
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.pretrained import find_file
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import seed
 from gsencoder.evaluate.boxes import Hit, accuracy

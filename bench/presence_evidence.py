@@ -19,7 +19,7 @@ import numpy as np
 from errors import comma_separated, one_line_errors, output_folder, positive
 
 from gsencoder.core.errors import listed
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig

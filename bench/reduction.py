@@ -20,8 +20,8 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.files.row_file import RowFile
+from gsencoder.core.archive import RowFile
+from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import load_scene
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers.build import build_teacher, words_of

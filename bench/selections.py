@@ -38,7 +38,7 @@ from json_option import add_json_option, write_figures
 from scipy.ndimage import binary_dilation
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.data.seeding.spacing import unit_of

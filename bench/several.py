@@ -16,8 +16,8 @@ import torch
 
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
-from gsencoder.core.runtime.device import autocast_dtype
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.device import autocast_dtype
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.batch import Batch, join_samples
 from gsencoder.train.distill import Distillation

@@ -12,7 +12,7 @@ import time
 import numpy as np
 from json_option import add_json_option, write_figures
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.infer.views.tokens import feature_tokens, token_blends

@@ -37,7 +37,7 @@ from PIL import Image
 from scipy.ndimage import binary_dilation
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.boxes import aabb_iou, queryable_objects

@@ -18,7 +18,7 @@ import numpy as np
 from json_option import add_json_option, write_figures
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.pretrained import find_file
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import queryable_objects

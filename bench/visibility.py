@@ -15,7 +15,7 @@ from pathlib import Path
 from json_option import add_json_option, write_figures
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.files.csv_text import csv_text
+from gsencoder.core.files import csv_text
 from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed

@@ -10,7 +10,7 @@ import numpy as np
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
-from gsencoder.core.files.archive import RESERVED_KEYS, write_archive
+from gsencoder.core.archive import RESERVED_KEYS, write_archive
 
 
 def header_of(path: Path) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from gsencoder.app.settings.choices import Choices, choices_of
 from gsencoder.app.settings.compose import overrides, read_words
 from gsencoder.app.settings.several import named_members
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.pretrained import find_file
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "gsencoder"

@@ -19,8 +19,8 @@ from memory_samples import make_memory
 from splats import front_camera, random_gaussians
 from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 
+from gsencoder.core.archive import open_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import open_archive
 from gsencoder.fusion.checkpoint import SUMS_FILE, FusionCheckpoint
 from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.radio import Head

@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 from no_files import ends_within, make_no_file
 
+from gsencoder.core.archive import read_npz
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import (
+from gsencoder.core.files import (
     TEXT_BYTES,
     check_foreign,
+    check_written,
     open_foreign,
     read_foreign,
     read_foreign_text,
 )
-from gsencoder.core.files.npz import read_npz
-from gsencoder.core.files.written_files import check_written
-from gsencoder.core.onnx_session import open_session
-from gsencoder.core.pretrained import load_companion, read_config
+from gsencoder.core.pretrained import load_companion, open_session, read_config
 from gsencoder.data.readers.colmap_binary import check_binary_model
 from gsencoder.data.readers.image_file import load_npy, open_picture
 from gsencoder.data.readers.tables import table_lines
@@ -144,6 +143,6 @@ def test_masks_are_refused_by_their_declared_size(tmp_path: Path, monkeypatch: p
     np.savez_compressed(tmp_path / "a.npz", pred_masks=np.zeros((2048, 1024), bool))
     kinds = {"pred_masks": ("b", 2)}
     assert read_npz(tmp_path / "a.npz", kinds)["pred_masks"].shape == (2048, 1024)
-    monkeypatch.setattr("gsencoder.core.files.npz.LARGEST_ARRAY", 1 << 20)
+    monkeypatch.setattr("gsencoder.core.archive.LARGEST_ARRAY", 1 << 20)
     with pytest.raises(InputError, match="claims"):
         read_npz(tmp_path / "a.npz", kinds)

@@ -36,7 +36,7 @@ TORCH_FREE = [
     "gsencoder.data.splats",
     "gsencoder.data.splat_formats.repair",
     "gsencoder.text.table",
-    "gsencoder.core.files.archive",
+    "gsencoder.core.archive",
     "gsencoder.fusion.basis",
     "gsencoder.fusion.checkpoint",
     "gsencoder.fusion.store.folder",

@@ -11,7 +11,7 @@ from beartype import beartype
 from jaxtyping import Float32, Float64, Int32, TypeCheckError
 from shape_checks import checked
 
-from gsencoder.core.files.json_values import plain
+from gsencoder.core.files import plain
 from gsencoder.types import FeatureMap, FeatureSpace, Gaussians
 from gsencoder.types.cameras import pixel_centers
 

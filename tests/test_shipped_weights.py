@@ -7,9 +7,9 @@ import pytest
 
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
-from gsencoder.core.added_options import with_added_options
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import plain
+from gsencoder.core.files import plain
+from gsencoder.core.settings import with_added_options
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import aabb_iou

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.knobs import Knob
+from gsencoder.core.settings import Knob
 from gsencoder.evaluate.tradeoff.records import Record, Timing
 from gsencoder.evaluate.tradeoff.stage import Judged, Score, Stage
 

@@ -6,8 +6,8 @@ import numpy as np
 from safetensors.numpy import load_file
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 
-from gsencoder.core.files.archive import open_archive
-from gsencoder.core.files.step_log import LOG_FILE, read_log
+from gsencoder.core.archive import open_archive
+from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.prepared_dataset import PreparedDataset

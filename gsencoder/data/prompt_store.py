@@ -17,11 +17,9 @@ import numpy as np
 from jaxtyping import Float16, UInt8
 from PIL import Image
 
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, readable
-from gsencoder.core.files.archive import open_archive, write_archive
-from gsencoder.core.files.foreign_file import MODEL_BYTES, read_foreign
-from gsencoder.core.files.json_values import write_bytes
-from gsencoder.core.files.sealed_rows import sealed, unsealed
+from gsencoder.core.files import MODEL_BYTES, read_foreign, sealed, unsealed, write_bytes
 
 PROMPTS_FILE, PICTURES_FOLDER, TOKENS_FOLDER = "prompts.jsonl", "pictures", "tokens"
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.data.readers.label_archives import ArchivedLabels
 from gsencoder.data.readers.posed import PosedImage, PosedImages
 from gsencoder.data.truth.mesh_instances import MeshInstances

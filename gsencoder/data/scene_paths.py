@@ -10,8 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import read_foreign_text
-from gsencoder.core.files.written_files import SUMMARY_NAME
+from gsencoder.core.files import SUMMARY_NAME, read_foreign_text
 from gsencoder.data.readers.layouts import describe_layouts, layout_of
 from gsencoder.data.readers.scene_splat import SPLAT_SUFFIXES
 

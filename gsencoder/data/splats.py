@@ -20,9 +20,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.files.foreign_file import open_foreign
-from gsencoder.core.files.written_files import check_written
+from gsencoder.core.files import atomic_file, check_written, open_foreign
 from gsencoder.data.splat_formats.compressed_ply import is_compressed, morton_order, packed_bytes, read_compressed
 from gsencoder.data.splat_formats.dotsplat import read_dotsplat
 from gsencoder.data.splat_formats.ply import read_header, read_inria, read_property, write_inria

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.data.check.depth_agreement import SAMPLES, depth_views
 from gsencoder.types import Gaussians, Views
 from gsencoder.types.cameras import unproject_points

@@ -8,7 +8,7 @@ import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from gsencoder.core.files.foreign_file import read_foreign
+from gsencoder.core.files import read_foreign
 from gsencoder.data.truth.expressions import Expression
 from gsencoder.data.truth.made_questions import kind_of
 from gsencoder.data.truth.questions import Question

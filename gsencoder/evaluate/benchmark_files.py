@@ -10,8 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsencoder.core.files.foreign_file import read_foreign_text
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import read_foreign_text, write_json
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.expression_boxes import boxes_from_labels

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.core.first_repeated import first_repeated
 
 Pooling = Literal["max", "mean"]
 DISTRACTORS = 1999

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.core.errors import about
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.infer.draw.pictures import contact_sheet, fit_pca_colors, pca_picture
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import encode_spaces

@@ -7,8 +7,8 @@ channels. Because rows of B sum to alpha and not to 1, a rendered map decodes as
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from gsencoder.core.archive import Archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.teacher_maps import upright
 from gsencoder.fusion.teachers import Teacher

@@ -10,11 +10,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import open_archive, write_archive
-from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.files.foreign_file import read_foreign_text
-from gsencoder.core.first_difference import first_difference
+from gsencoder.core.files import atomic_file, read_foreign_text
+from gsencoder.core.settings import first_difference
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher

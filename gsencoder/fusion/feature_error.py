@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
 from gsencoder.types import GaussianFeatures
 
 DEFAULT_SAMPLE = 20_000

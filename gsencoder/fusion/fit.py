@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.even_indices import even_indices
 from gsencoder.data.readers.scene_splat import file_of_scene
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splat_frame import DATAPARSER, SplatFrame, identity_frame, moved, stated_frames, usual_frames

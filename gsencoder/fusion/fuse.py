@@ -18,13 +18,10 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.runtime.clock import Clock, timed
-from gsencoder.core.runtime.device import choose_device
-from gsencoder.core.runtime.device_names import Device
-from gsencoder.core.runtime.threads import ahead, thread_count
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Clock, Device, Track, ahead, thread_count, timed, untracked
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
 from gsencoder.fusion.basis_fit import ProjectionSums
 from gsencoder.fusion.cell_sample import CellSample

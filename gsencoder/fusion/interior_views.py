@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.data.orbits import looking_cameras, spiral_directions
 from gsencoder.render.zbuffer import OPAQUE, visible_shares
 from gsencoder.types import Cameras, Gaussians

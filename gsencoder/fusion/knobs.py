@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.knobs import Knob
+from gsencoder.core.settings import Knob
 from gsencoder.fusion.store.package import Form
 
 FUSION_KNOBS = (

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int32
 
-from gsencoder.core.runtime.clock import timed
+from gsencoder.core.process import timed
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask, visible_depths, visible_points
 from gsencoder.render import Blend, BlendConfig, blend

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float32, Int32, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.threads import kernel
+from gsencoder.core.process import kernel
 from gsencoder.render import Blend
 from gsencoder.render.rays import Lattice
 from gsencoder.types import Views

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.knobs import Knob
+from gsencoder.core.settings import Knob
 from gsencoder.infer.encode.chunks import EncodeConfig
 
 Graph = Literal["none", "float32", "float16", "int8_weights", "int8_dynamic"]

@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from gsencoder.core.files.model_files import find_file
-from gsencoder.core.runtime.device_names import Device, Precision
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.pretrained import find_file
+from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.onnx.runtime import SUFFIX, OnnxEncoder
 from gsencoder.text.table import TextTable

@@ -7,10 +7,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
+from gsencoder.core.archive import RowFile
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, about
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.files.row_file import RowFile
-from gsencoder.core.runtime.free_memory import free_memory
+from gsencoder.core.process import free_memory
 from gsencoder.memory.raw_features import MapStream, raw_features
 from gsencoder.memory.reduction import (
     ROUNDING,

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.promises import MEGABYTE
+from gsencoder.core.settings import MEGABYTE
 from gsencoder.fusion.feature_error import row_cosines
 from gsencoder.fusion.store.budget import PackBudget
 from gsencoder.fusion.store.quantize import FIT_SAMPLE, rarity_of

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.core.archive import Archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive
 from gsencoder.data.archive_records import read_space, space_parts
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.promises import PLANNED, Budget
+from gsencoder.core.settings import PLANNED, Budget
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.types import Cameras

@@ -12,11 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import open_archive, write_archive
-from gsencoder.core.first_difference import first_difference
-from gsencoder.core.promises import PROMISES
-from gsencoder.core.removed_options import without_removed_options
+from gsencoder.core.settings import PROMISES, first_difference, without_removed_options
 from gsencoder.reconstruct.anchor import Anchor
 from gsencoder.reconstruct.parameters import shapes_of
 from gsencoder.reconstruct.row_adam import RowAdam

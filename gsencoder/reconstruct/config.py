@@ -5,8 +5,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import plain
-from gsencoder.core.promises import check_governed
+from gsencoder.core.files import plain
+from gsencoder.core.settings import check_governed
 from gsencoder.data.seeding.dense import DenseConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.budget import BudgetConfig

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.step_log import LOG_FILE, Log, read_log
-from gsencoder.core.runtime.tracking import Track
+from gsencoder.core.logs import LOG_FILE, Log, read_log
+from gsencoder.core.process import Track
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, save_state
 from gsencoder.reconstruct.config import START_AGAIN, ReconstructConfig, Report
 from gsencoder.reconstruct.expected_time import Pace

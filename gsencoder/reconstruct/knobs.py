@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from gsencoder.core.knobs import Knob
+from gsencoder.core.settings import Knob
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.reconstruct.budget import BudgetConfig
 from gsencoder.reconstruct.config import ReconstructConfig

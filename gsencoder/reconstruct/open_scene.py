@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, SceneWarning, advised, listed
-from gsencoder.core.runtime.clock import Clock
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Clock, Track, untracked
 from gsencoder.data.readers.posed import inside
 from gsencoder.data.scene_paths import DistinctPaths, find_scenes, is_scene, listed_paths
 from gsencoder.data.scenes import SceneConfig, load_scene

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.signals import defer_signals
+from gsencoder.core.process import defer_signals
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.reconstruct.anchor import Anchor
 from gsencoder.reconstruct.exposure import ROUNDS, Exposures, apply_colors, compared_pixels, fitted_colors

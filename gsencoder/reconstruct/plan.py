@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.promises import MEGABYTE
+from gsencoder.core.settings import MEGABYTE
 from gsencoder.data.splat_formats.ply import inria_row_bytes
 from gsencoder.reconstruct.budget import SMALLEST_REDUCTION, BudgetConfig, affordable_steps, least_pixels
 from gsencoder.reconstruct.checkpoint import PLANNED_DEGREE

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Int64
 from torch import Tensor
 
-from gsencoder.core.runtime.threads import PIECES, kernel, parallel
+from gsencoder.core.process import PIECES, kernel, parallel
 
 BETAS = (0.9, 0.999)
 EPS = 1e-15

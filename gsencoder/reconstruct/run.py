@@ -16,11 +16,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.runtime.clock import Clock
-from gsencoder.core.runtime.device import choose_device
-from gsencoder.core.runtime.device_names import Device
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Clock, Device, Track, untracked
 from gsencoder.data.photographs import Photographs
 from gsencoder.reconstruct.anchor import anchor_at
 from gsencoder.reconstruct.budget import steps_for_minutes

@@ -12,9 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
-from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.files.foreign_file import read_foreign_text
-from gsencoder.core.files.written_files import sha256_of
+from gsencoder.core.files import atomic_file, read_foreign_text, sha256_of
 from gsencoder.data.readers.image_file import check_picture
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.data.video.decode import SUFFIXES as VIDEO_SUFFIXES

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.dense import DenseConfig, DenseSeeds, densify
 from gsencoder.data.seeding.from_photographs import MAX_DENSE_SPACING, seeds_of_photographs

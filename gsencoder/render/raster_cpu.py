@@ -15,7 +15,7 @@ from typing import NamedTuple, no_type_check
 import numpy as np
 from jaxtyping import Float, Float64, Int32, Int64
 
-from gsencoder.core.runtime.threads import PIECES, even_cuts, kernel, parallel
+from gsencoder.core.process import PIECES, even_cuts, kernel, parallel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 
 TILE = 16

@@ -4,7 +4,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from gsencoder.core.runtime.threads import PIECES, even_cuts, kernel, parallel
+from gsencoder.core.process import PIECES, even_cuts, kernel, parallel
 
 
 @kernel

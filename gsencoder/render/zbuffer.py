@@ -11,7 +11,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float64, Integer
 
-from gsencoder.core.runtime.threads import kernel, parallel
+from gsencoder.core.process import kernel, parallel
 from gsencoder.types import Cameras, Gaussians
 
 OPAQUE = 0.3

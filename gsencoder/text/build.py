@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import MODELS_VARIABLE, SENTENCE_ENCODER
+from gsencoder.core.pretrained import MODELS_VARIABLE, SENTENCE_ENCODER
 from gsencoder.text.onnx_tower import OnnxTextConfig, OnnxTower
 from gsencoder.text.open_vocabulary import OpenVocabulary, TowerMissing, make_vocabulary
 from gsencoder.text.table import TextTable

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.archive import open_archive, write_archive
 
 CACHE_VARIABLE = "GSENCODER_CACHE"
 """A folder; "off" = no cache; not set = gsencoder in the user's folder of caches."""

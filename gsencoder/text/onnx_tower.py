@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError, readable
-from gsencoder.core.files.foreign_file import check_foreign, read_foreign_text
-from gsencoder.core.files.model_files import SENTENCE_ENCODER, digest_files, find_file, sentence_encoder_graph
-from gsencoder.core.onnx_session import open_session
+from gsencoder.core.files import check_foreign, read_foreign_text
+from gsencoder.core.pretrained import SENTENCE_ENCODER, digest_files, find_file, open_session, sentence_encoder_graph
 from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
 
 Pooling = Literal["mean", "cls", "eos", "output"]

@@ -12,10 +12,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.core.archive import open_archive, read_npz, warn_without_checksums, write_archive
 from gsencoder.core.errors import InputError, about, readable
-from gsencoder.core.files.archive import open_archive, warn_without_checksums, write_archive
-from gsencoder.core.files.foreign_file import open_foreign
-from gsencoder.core.files.npz import read_npz
+from gsencoder.core.files import open_foreign
 from gsencoder.text.towers import TowerRecord
 from gsencoder.types import FeatureSpace
 

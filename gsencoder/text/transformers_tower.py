@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import digest_files, find_file
-from gsencoder.core.pretrained import load_pretrained, load_tokenizer, read_config
+from gsencoder.core.pretrained import digest_files, find_file, load_pretrained, load_tokenizer, read_config
 from gsencoder.text.onnx_tower import Pooling, stated_pooling
 from gsencoder.text.towers import NO_TEMPLATES, check_known, check_templates, unit
 
@@ -110,7 +109,7 @@ class TransformersTower:
         import torch
         import transformers
 
-        from gsencoder.core.runtime.device import choose_device
+        from gsencoder.core.device import choose_device
 
         self.name = folder.resolve().name
         self.model_type = str(stated.model_type)

@@ -12,10 +12,9 @@ from typing import Any
 
 import torch
 
-from gsencoder.core.added_options import with_added_options
+from gsencoder.core.archive import Archive, open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import Archive, open_archive, write_archive
-from gsencoder.core.first_difference import first_difference
+from gsencoder.core.settings import first_difference, with_added_options
 
 TRAINING_CHECKPOINT_FILE = "checkpoint.safetensors"
 

@@ -11,8 +11,7 @@ from types import TracebackType
 import torch
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.process_rank import ProcessRank
-from gsencoder.core.runtime.threads import available_cores
+from gsencoder.core.process import ProcessRank, available_cores
 
 MOST_WORKERS = 8
 """Four of them made a sample of 32,000 Gaussians each 21 ms beside steps of 36 ms; larger samples take more."""

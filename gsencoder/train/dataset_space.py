@@ -8,10 +8,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import write_archive
-from gsencoder.core.runtime.process_rank import ProcessRank
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis, to_coordinates
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.teachers import MissingInput

@@ -14,11 +14,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor, distributed
 
+from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.device import choose_device
-from gsencoder.core.runtime.device_names import Device
-from gsencoder.core.runtime.process_rank import ProcessRank, rank_from_environment
-from gsencoder.core.runtime.threads import available_cores
+from gsencoder.core.process import Device, ProcessRank, available_cores, rank_from_environment
 from gsencoder.train.presence import Presence, named
 
 T = TypeVar("T")

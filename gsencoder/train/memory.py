@@ -12,9 +12,8 @@ from jaxtyping import Float32
 from torch import nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import plain
-from gsencoder.core.runtime.process_rank import ProcessRank
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.files import plain
+from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.memory.attention import MemoryAttention, random_projection
 from gsencoder.memory.decoders import Decoder, make_decoder
 from gsencoder.memory.queries import principal_queries

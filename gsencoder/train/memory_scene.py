@@ -16,13 +16,11 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gsencoder.core.added_options import with_added_options
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import open_archive, write_archive
-from gsencoder.core.files.foreign_file import read_foreign
-from gsencoder.core.files.json_values import plain, write_json
-from gsencoder.core.first_difference import first_difference
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.files import plain, read_foreign, write_json
+from gsencoder.core.process import Track, untracked
+from gsencoder.core.settings import first_difference, with_added_options
 from gsencoder.data.archive_records import bank_parts, read_bank
 from gsencoder.data.splats import fingerprint
 from gsencoder.fusion.basis import to_coordinates

@@ -10,11 +10,10 @@ from typing import Any
 
 import torch
 
-from gsencoder.core.added_options import TRAINED
 from gsencoder.core.errors import InputError, SceneWarning, about, listed
-from gsencoder.core.files.json_values import plain
-from gsencoder.core.runtime.process_rank import ProcessRank
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.files import plain
+from gsencoder.core.process import ProcessRank, Track, untracked
+from gsencoder.core.settings import TRAINED
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig

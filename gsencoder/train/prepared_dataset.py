@@ -13,14 +13,11 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
-from gsencoder.core.added_options import with_added_options
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised, listed, readable
-from gsencoder.core.files.archive import open_archive, write_archive
-from gsencoder.core.files.atomic import atomic_file, locked
-from gsencoder.core.files.foreign_file import read_foreign, read_foreign_text
-from gsencoder.core.first_difference import first_difference
-from gsencoder.core.runtime.process_rank import ProcessRank
-from gsencoder.core.runtime.tracking import Track
+from gsencoder.core.files import atomic_file, locked, read_foreign, read_foreign_text
+from gsencoder.core.process import ProcessRank, Track
+from gsencoder.core.settings import first_difference, with_added_options
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.models.output_space import OutputSpace, read_output_space

@@ -13,10 +13,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
 
+from gsencoder.core.archive import Archive, MappedArrays, write_archive
+from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive, write_archive
-from gsencoder.core.files.mapped_arrays import MappedArrays
-from gsencoder.core.int8 import round_columns
 from gsencoder.data.archive_records import camera_arrays
 from gsencoder.fusion.basis_fit import ProjectionSums
 from gsencoder.models.output_space import OutputSpace

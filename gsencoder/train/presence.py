@@ -17,7 +17,7 @@ from datetime import timedelta
 from torch.distributed import DistNetworkError, PrefixStore, TCPStore  # type: ignore[attr-defined]
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
-from gsencoder.core.runtime.process_rank import ProcessRank, store_address
+from gsencoder.core.process import ProcessRank, store_address
 
 BEAT_SECONDS = 5.0
 """Between two counts of a process."""

@@ -11,11 +11,8 @@ import torch
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.json_values import plain
-from gsencoder.core.runtime.device_names import Device
-from gsencoder.core.runtime.process_rank import ProcessRank
-from gsencoder.core.runtime.threads import threads_of_torch
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.files import plain
+from gsencoder.core.process import Device, ProcessRank, Track, threads_of_torch, untracked
 from gsencoder.fusion.heads.store import heads_digest
 from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder

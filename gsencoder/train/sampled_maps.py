@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.fusion.teacher_maps import upright
 from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.types import FeatureMap, Scene

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.files.archive import open_archive, write_archive
-from gsencoder.core.files.json_values import plain
-from gsencoder.core.runtime.process_rank import ProcessRank
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.files import plain
+from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.fusion.basis import Moments
 from gsencoder.fusion.lift import distinct_rows
 from gsencoder.train.distributed import fail_together, value_of_first, values_of_all

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, listed
-from gsencoder.core.first_repeated import first_repeated
 from gsencoder.data.truth.split_files import read_split
 
 

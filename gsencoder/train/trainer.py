@@ -13,13 +13,10 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 
+from gsencoder.core.device import autocast_dtype
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.step_log import Log
-from gsencoder.core.runtime.device import autocast_dtype
-from gsencoder.core.runtime.process_rank import ProcessRank
-from gsencoder.core.runtime.signals import defer_signals, stop_of
-from gsencoder.core.runtime.threads import threads_of_torch
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.logs import Log
+from gsencoder.core.process import ProcessRank, Track, defer_signals, stop_of, threads_of_torch, untracked
 from gsencoder.train import distributed
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.data_workers import automatic_workers, lost_workers, start_worker

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, field
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.device_names import Precision
+from gsencoder.core.process import Precision
 
 CHANGEABLE_ON_RESUME = (
     "workers",

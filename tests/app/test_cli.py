@@ -17,7 +17,7 @@ from gsencoder.app.commands.inspect import report_table
 from gsencoder.app.commands.repair import Fix
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.runtime.signals import Stopped
+from gsencoder.core.process import Stopped
 from gsencoder.data.splat_formats.repair import FIXES, inspect_splat
 from gsencoder.data.splats import load_splat, read_raw, save_splat
 

@@ -16,7 +16,7 @@ from gsencoder.app.runs.output_file import refuse_existing
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import SUMMARY_NAME
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import write_bytes
+from gsencoder.core.files import write_bytes
 
 
 def test_a_folder_appears_whole_when_the_block_ends(tmp_path: Path) -> None:

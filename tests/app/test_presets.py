@@ -15,7 +15,7 @@ from gsencoder.app.settings.multirun import run_many
 from gsencoder.app.settings.options import options_by_key
 from gsencoder.app.settings.presets import PRESET_OPTIONS, PRESETS, describe_presets, preset_node, preset_values
 from gsencoder.core.errors import InputError
-from gsencoder.core.knobs import value_at
+from gsencoder.core.settings import value_at
 from gsencoder.fusion.budget.config import exact_config
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.infer.encode.chunks import EncodeConfig

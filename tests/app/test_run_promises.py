@@ -7,7 +7,7 @@ import pytest
 from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.promises import Budget
+from gsencoder.core.settings import Budget
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

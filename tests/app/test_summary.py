@@ -14,7 +14,7 @@ from output_folders import names
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import SUMMARY_NAME, Summary, peak_memory_mb
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import write_json
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Settings of older files are completed by what was done before an option existed."""
 
-from gsencoder.core.added_options import ADDED_OPTIONS, TRAINED, with_added_options
+from gsencoder.core.settings import ADDED_OPTIONS, TRAINED, with_added_options
 
 ADDED = {"center": True, "scale": True, "render_views": 0, "targets": "float16"}
 """What settings of scenes that an earlier version prepared lack."""
@@ -36,7 +36,7 @@ CHANGED = {"loss.contrast_clusters", "model.projector"}
 
 
 def test_each_added_option_exists_and_its_default_is_what_was_done_before_unless_it_was_changed() -> None:
-    from gsencoder.core.files.json_values import plain
+    from gsencoder.core.files import plain
     from gsencoder.train.run import TrainConfig
 
     settings = plain(TrainConfig())

@@ -12,10 +12,8 @@ from archives import as_version_1, flip_bit, header_of, rewrite
 from safetensors import safe_open
 from safetensors.numpy import load_file, save_file
 
+from gsencoder.core.archive import BLOCK_BYTES, MappedArrays, archive_bytes, open_archive, shape_only, write_archive
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.archive import archive_bytes, open_archive, shape_only, write_archive
-from gsencoder.core.files.checksums import BLOCK_BYTES
-from gsencoder.core.files.mapped_arrays import MappedArrays
 
 ARRAYS = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.arange(3, dtype=np.float32)}
 
@@ -198,7 +196,7 @@ def test_a_flip_is_seen_by_whoever_reads_its_block_and_by_nobody_else(mapped: Pa
 
 
 def test_a_block_is_checked_once(mapped: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import gsencoder.core.files.checksums as checksums
+    import gsencoder.core.archive as checksums
 
     looked_at: list[int] = []
     plain = checksums._checksum
@@ -223,7 +221,7 @@ def test_mapped_files_of_the_first_version_are_read(mapped: Path) -> None:
 def test_what_was_checked_is_remembered_until_the_file_is_written_again(
     mapped: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import gsencoder.core.files.checksums as checksums
+    import gsencoder.core.archive as checksums
 
     looked_at: list[int] = []
     plain = checksums._checksum

@@ -11,19 +11,15 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
+from gsencoder.core import files as atomic
+from gsencoder.core.archive import copy_checked, write_archive, write_safetensors
 from gsencoder.core.errors import InputError, WriteError
-from gsencoder.core.files import atomic
-from gsencoder.core.files.archive import write_archive
-from gsencoder.core.files.atomic import atomic_file, locked
-from gsencoder.core.files.copied_file import copy_checked
-from gsencoder.core.files.json_values import write_bytes
-from gsencoder.core.files.picture_file import write_picture
-from gsencoder.core.files.safetensors_bytes import write_safetensors
+from gsencoder.core.files import atomic_file, locked, write_bytes, write_picture
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files import atomic_file
 with atomic_file(Path(sys.argv[1])) as stream:
     stream.write(b"half")
     stream.flush()

@@ -2,12 +2,12 @@
 
 import pytest
 
-from gsencoder.core.runtime.clock import Clock, timed
+from gsencoder.core.process import Clock, timed
 
 
 def test_a_clock_adds_up_the_seconds_of_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
     times = iter([10.0, 11.0, 20.0, 22.5, 30.0, 34.0])
-    monkeypatch.setattr("gsencoder.core.runtime.clock.time.perf_counter", lambda: next(times))
+    monkeypatch.setattr("gsencoder.core.process.time.perf_counter", lambda: next(times))
     clock = Clock()
     for step in ("blend", "lift", "blend"):
         with clock(step):
@@ -17,7 +17,7 @@ def test_a_clock_adds_up_the_seconds_of_each_step(monkeypatch: pytest.MonkeyPatc
 
 def test_marked_functions_count_on_the_clock_that_runs_and_on_none_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     times = iter([0.0, 1.0, 10.0, 12.0, 20.0, 24.0, 30.0, 31.0])
-    monkeypatch.setattr("gsencoder.core.runtime.clock.time.perf_counter", lambda: next(times))
+    monkeypatch.setattr("gsencoder.core.process.time.perf_counter", lambda: next(times))
     double = timed("lift")(lambda number: 2 * number)
     assert double(1) == 2
     with Clock().running() as outer:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsencoder.core.runtime.device import autocast_dtype
+from gsencoder.core.device import autocast_dtype
 
 
 @pytest.mark.parametrize("training", [False, True])

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 
 
 @given(st.integers(1, 5000), st.integers(1, 6000))

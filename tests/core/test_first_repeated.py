@@ -5,7 +5,7 @@ from collections import Counter
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsencoder.core.first_repeated import first_repeated
+from gsencoder.core.arrays import first_repeated
 
 
 def test_the_value_and_both_places_are_given() -> None:

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from text_towers import save_graph, save_tokenizer
 
+from gsencoder.core import pretrained as model_files
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import model_files
-from gsencoder.core.files.model_files import check_installed, find_file, sentence_encoder_graph
+from gsencoder.core.pretrained import check_installed, find_file, sentence_encoder_graph
 from gsencoder.text import build, onnx_tower, open_vocabulary
 from gsencoder.text.build import find_tower, vocabulary_of, words_of_table
 from gsencoder.text.onnx_tower import OnnxTextConfig, OnnxTower

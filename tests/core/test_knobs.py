@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.knobs import (
+from gsencoder.core.settings import (
     Knob,
     changed_knobs,
     describe_values,

@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 
+from gsencoder.core import pretrained as model_files
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files import model_files
-from gsencoder.core.files.model_files import digest_files
-from gsencoder.core.pretrained import load_pretrained, read_config
+from gsencoder.core.pretrained import digest_files, load_pretrained, read_config
 
 
 def reason(call: Callable[[], Any]) -> str:

@@ -3,7 +3,7 @@
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.process_rank import ProcessRank, first_host, rank_from_environment
+from gsencoder.core.process import ProcessRank, first_host, rank_from_environment
 
 SLURM = {
     "SLURM_STEP_ID": "0",

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.promises import PLANNED, Budget, check_governed
-from gsencoder.core.setting_choice import best_setting, within_seconds
+from gsencoder.core.settings import PLANNED, Budget, best_setting, check_governed, within_seconds
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

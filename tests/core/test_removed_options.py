@@ -3,7 +3,7 @@
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.removed_options import (
+from gsencoder.core.settings import (
     REMOVED_OPTIONS,
     check_removed_option,
     removed_option,

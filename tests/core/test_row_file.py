@@ -5,8 +5,8 @@ import errno
 import numpy as np
 import pytest
 
+from gsencoder.core.archive import RowFile
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.row_file import RowFile
 
 
 @pytest.mark.parametrize("sizes", [[], [0], [3], [0, 5, 0, 1, 7]])
@@ -29,6 +29,6 @@ def test_rows_of_another_length_and_a_full_disk_are_refused(monkeypatch: pytest.
 
     with RowFile(4) as file, pytest.raises(InputError, match="rows: expected 4 channels, got 3"):
         file.append(np.zeros((2, 3), np.float32))
-    monkeypatch.setattr("gsencoder.core.files.row_file.TemporaryFile", Full)
+    monkeypatch.setattr("gsencoder.core.archive.TemporaryFile", Full)
     with RowFile(4) as file, pytest.raises(InputError, match="2 rows of 4 channels do not fit .*; set TMPDIR"):
         file.append(np.zeros((2, 4), np.float32))

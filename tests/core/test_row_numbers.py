@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsencoder.core.row_numbers import rise_within
+from gsencoder.core.arrays import rise_within
 
 
 @pytest.mark.parametrize(

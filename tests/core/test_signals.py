@@ -9,7 +9,7 @@ from contextlib import suppress
 
 import pytest
 
-from gsencoder.core.runtime.signals import (
+from gsencoder.core.process import (
     SIGNALS,
     Stopped,
     accept_stop,

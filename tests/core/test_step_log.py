@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.step_log import LOG_FILE, Log, read_log
+from gsencoder.core.logs import LOG_FILE, Log, read_log
 
 
 def test_rows_are_read_back(tmp_path: Path) -> None:

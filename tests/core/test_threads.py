@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import torch
 
+from gsencoder.core import process as threads
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.runtime import threads
-from gsencoder.core.runtime.threads import ahead, kernel, parallel
+from gsencoder.core.process import ahead, kernel, parallel
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -150,7 +150,7 @@ def test_work_ahead_comes_in_order_and_one_item_before_it_is_asked_for() -> None
 def test_workers_ahead_share_the_threads_and_give_results_in_order(
     threads: int, workers: int, share: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsencoder.core.runtime.threads.thread_count", lambda: threads)
+    monkeypatch.setattr("gsencoder.core.process.thread_count", lambda: threads)
     together = threading.Barrier(workers)
 
     def work(item: int) -> tuple[int, set[int]]:
@@ -176,7 +176,7 @@ def test_without_torch_there_are_as_many_threads_as_the_environment_says(stated:
     code = (
         "import os, sys\n"
         f"os.environ['OMP_NUM_THREADS'] = {stated!r}\n"
-        "from gsencoder.core.runtime.threads import thread_count\n"
+        "from gsencoder.core.process import thread_count\n"
         "cores = os.cpu_count()\n"
         f"sys.exit('torch' in sys.modules or thread_count() != {expected if expected != 'cores' else 'cores'})"
     )

@@ -8,7 +8,7 @@ import pytest
 from tuning_pairs import png
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.sealed_rows import sealed
+from gsencoder.core.files import sealed
 from gsencoder.data.prompt_store import PICTURES_FOLDER, PROMPTS_FILE, TOKENS_FOLDER, PromptStore
 
 

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.csv_text import csv_text
+from gsencoder.core.files import csv_text
 from gsencoder.evaluate.result_table import PUBLISHED, published_rows, table_of
 
 TABLES = sorted(path.stem for path in PUBLISHED.glob("*.csv"))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.csv_text import csv_text
-from gsencoder.core.runtime.peak_memory import memory_growth
+from gsencoder.core.files import csv_text
+from gsencoder.core.process import memory_growth
 from gsencoder.evaluate.boxes import Hit, aabb_iou, accuracy, queryable_objects, score_boxes
 from gsencoder.evaluate.protocols.localization import scores, scores_by_name
 from gsencoder.fusion.feature_error import field_error

@@ -14,10 +14,9 @@ from asked_rooms import save_room
 from torch.utils.data import DataLoader, Dataset
 
 from gsencoder.app import cli
+from gsencoder.core.archive import MappedArrays, open_archive, write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import open_archive, write_archive
-from gsencoder.core.files.mapped_arrays import MappedArrays
-from gsencoder.core.files.model_files import check_fetched, digest_files
+from gsencoder.core.pretrained import check_fetched, digest_files
 from gsencoder.data.readers.image_file import load_npy
 from gsencoder.text.table import load_text_table
 from gsencoder.train.data_workers import lost_workers
@@ -89,7 +88,7 @@ def test_words_that_are_cut_off_while_they_are_copied_are_named(
         yield content[: len(content) // 2]
 
     save_room(tmp_path / "features")
-    monkeypatch.setattr("gsencoder.core.files.copied_file._blocks", cut_off)
+    monkeypatch.setattr("gsencoder.core.archive._blocks", cut_off)
     assert cli.main(["pack", str(tmp_path / "features"), "form=npz", f"out={tmp_path / 'out'}", "quiet=true"]) == 2
     assert capsys.readouterr().err.startswith(f"error: {tmp_path / 'features' / 'words.safetensors'}: ")
     assert not (tmp_path / "out").exists()

@@ -26,10 +26,7 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.scene_queue import _is_finished
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.json_values import write_bytes, write_json
-from gsencoder.core.files.picture_file import write_picture
-from gsencoder.core.files.sealed_rows import sealed
-from gsencoder.core.files.written_files import check_written, checksums_of
+from gsencoder.core.files import check_written, checksums_of, sealed, write_bytes, write_json, write_picture
 from gsencoder.data.prompt_store import PROMPTS_FILE, PromptStore
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.splats import load_splat, save_splat
@@ -157,7 +154,7 @@ def test_a_flipped_bit_is_told_or_changes_nothing(kind: str, tmp_path: Path) -> 
 
 
 def test_of_the_files_of_a_run_those_without_checksums_of_their_own_are_listed(tmp_path: Path) -> None:
-    from gsencoder.core.files.archive import write_archive
+    from gsencoder.core.archive import write_archive
 
     write_archive(tmp_path / "features.safetensors", {"a": np.ones(3)}, {})
     (tmp_path / "adapter_model.safetensors").write_bytes(b"\2\0\0\0\0\0\0\0{}")

@@ -13,8 +13,8 @@ import torch
 from measured_heads import SPACE, measured
 from torch import nn
 
+from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import write_archive
 from gsencoder.fusion.heads.measure import HeadSet
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import choose_heads, find_head, has_head, heads_digest, load_heads, save_heads

@@ -10,8 +10,8 @@ from memory_samples import make_memory
 from safetensors.numpy import load_file
 from splats import random_gaussians
 
+from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import write_archive
 from gsencoder.fusion.store.folder import SCENE_FILE, load_features, load_memories, save_features, save_memories
 from gsencoder.fusion.store.memory_file import MEMORY_FILE
 from gsencoder.types import FeatureBasis, FeatureSpace, QueryMemory, Scene

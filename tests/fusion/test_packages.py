@@ -17,8 +17,8 @@ from safetensors.numpy import load_file, save_file
 from splats import front_camera, random_gaussians
 
 from gsencoder.app import cli
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.data.splats import load_splat, save_splat
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
 from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, open_package, save_package
@@ -130,7 +130,7 @@ def test_a_package_of_another_version_is_refused(package: Path) -> None:
 
 
 def test_a_package_of_the_first_version_is_held_against_its_one_sum(package: Path) -> None:
-    from gsencoder.core.files.archive import _sum_of_version_1
+    from gsencoder.core.archive import _sum_of_version_1
 
     file = package / PACKAGE_FILE
     arrays, header = load_file(file), header_of(file)

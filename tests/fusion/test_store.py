@@ -9,8 +9,8 @@ from archives import rewrite
 from safetensors.numpy import load_file
 from splats import front_camera, random_gaussians
 
+from gsencoder.core.archive import open_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import open_archive
 from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, save_features
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene, Views
 

@@ -15,8 +15,8 @@ from onnx import helper
 from symbolic import symbolic_sizes
 
 from gsencoder.app import cli
+from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
-from gsencoder.core.int8 import round_columns
 from gsencoder.data.splats import save_splat
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import TorchEncoder

@@ -8,7 +8,7 @@ import pytest
 from rooms import corner_cameras, room
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.picture_file import write_picture
+from gsencoder.core.files import write_picture
 from gsencoder.infer.views import picture_size as module
 from gsencoder.infer.views.budget import ViewsBudget
 from gsencoder.infer.views.picture_size import SizedPictures, pictures_within

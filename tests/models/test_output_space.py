@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.models.output_space import (
     OutputSpace,
     OutputSpaces,

@@ -11,7 +11,7 @@ from symbolic import symbolic_sizes
 
 from gsencoder.app import cli
 from gsencoder.app.commands.query_words import queried_scene
-from gsencoder.core.files.archive import open_archive
+from gsencoder.core.archive import open_archive
 from gsencoder.fusion.heads.measure import head_outputs
 from gsencoder.fusion.heads.store import find_head, load_heads
 from gsencoder.fusion.store.folder import load_features

@@ -11,7 +11,7 @@ from splats import random_gaussians
 from walls import cameras, wall_views
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.promises import PLANNED
+from gsencoder.core.settings import PLANNED
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.budget import (

@@ -10,7 +10,7 @@ from stability import oracles
 from stability.extremes import CHANNELS, Case
 from stability.registry import routine, worst
 
-from gsencoder.core.int8 import round_columns
+from gsencoder.core.arrays import round_columns
 from gsencoder.models.blocks import PatchAttention, Pool
 from gsencoder.models.embed import ATTRIBUTE_CHANNELS, embed
 from gsencoder.models.encoder import MIN_MERGE_WEIGHT, EncoderConfig, GaussianEncoder, encoder_inputs, merge

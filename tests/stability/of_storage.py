@@ -9,7 +9,7 @@ from stability.extremes import Case
 from stability.of_features import SPACE, VECTORS, features_of, lengths
 from stability.registry import routine, worst
 
-from gsencoder.core.int8 import round_columns
+from gsencoder.core.arrays import round_columns
 from gsencoder.fusion.store.folder import load_features, save_features
 from gsencoder.fusion.store.quantize import compact
 from gsencoder.fusion.teacher_maps import read_map, write_map

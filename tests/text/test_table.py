@@ -200,7 +200,7 @@ def test_a_header_that_claims_another_size_is_refused_before_memory_is_taken(
 def test_a_bomb_is_refused_by_the_size_that_it_states(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "bomb.npz"
     np.savez_compressed(path, names=np.array(["x"]), embeddings=np.zeros((1, 100_000), np.float32))
-    monkeypatch.setattr("gsencoder.core.files.npz.LARGEST_ARRAY", 100_000)
+    monkeypatch.setattr("gsencoder.core.archive.LARGEST_ARRAY", 100_000)
     with pytest.raises(InputError, match="claims 400,128 bytes"):
         load_text_table(path)
 

@@ -7,7 +7,7 @@ import torch
 from forked_ranks import RankServer
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.process_rank import ProcessRank, rank_from_environment
+from gsencoder.core.process import ProcessRank, rank_from_environment
 from gsencoder.train.distributed import check_agreement, fail_together, gpu_index, join_processes
 
 SLURM_TASK = {"SLURM_STEP_ID": "0", "SLURM_NTASKS": "8", "SLURM_LOCALID": "1", "SLURM_STEP_NODELIST": "gpu[03-04]"}

@@ -14,7 +14,7 @@ from joint_training import DenseTeacher
 from training_scenes import LOSSES, SMALL, SideTeacher, prepared
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.process_rank import ProcessRank
+from gsencoder.core.process import ProcessRank
 from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import save_heads

@@ -13,7 +13,7 @@ from safetensors.numpy import load_file
 from training_scenes import PREPARE, SPACE, DenseSideTeacher, prepared, samples, scene
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import plain
+from gsencoder.core.files import plain
 from gsencoder.train.memory_scene import BANK_FILE, prepare_memory
 from gsencoder.train.prepare import PrepareConfig, prepare_scene
 from gsencoder.train.prepared_dataset import PreparedDataset

@@ -11,7 +11,7 @@ from memory_scenes import PREPARE, BlendedTeacher, prepared_wall
 from training_scenes import scene as wall
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.step_log import LOG_FILE, read_log
+from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.memory.bank import BankConfig
 from gsencoder.memory.decoders import make_decoder
 from gsencoder.memory.render import render_features

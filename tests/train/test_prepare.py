@@ -12,9 +12,9 @@ from archives import rewrite
 from safetensors.numpy import load_file
 from training_scenes import PREPARE, SPACE, TABLE, DenseSideTeacher, SideTeacher, prepared, scene
 
+from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import write_archive
-from gsencoder.core.runtime.tracking import untracked
+from gsencoder.core.process import untracked
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets, nearest_codes
 from gsencoder.train.dataset_space import dataset_space, fit_space

@@ -11,7 +11,7 @@ from joint_training import DenseTeacher
 from training_scenes import PREPARE, SideTeacher, scene
 
 from gsencoder.core.errors import InputError, SceneWarning, renamed_options
-from gsencoder.core.runtime.process_rank import ProcessRank
+from gsencoder.core.process import ProcessRank
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig

@@ -10,7 +10,7 @@ import pytest
 from forked_ranks import RankServer
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.process_rank import store_address
+from gsencoder.core.process import store_address
 
 SCRIPT = """
 import os, signal, sys, time, warnings

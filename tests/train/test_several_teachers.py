@@ -9,9 +9,9 @@ import torch
 from joint_training import Datasets, batch_of, joint
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 
-from gsencoder.core.files.step_log import LOG_FILE, read_log
-from gsencoder.core.first_difference import first_difference
-from gsencoder.core.runtime.process_rank import ProcessRank
+from gsencoder.core.logs import LOG_FILE, read_log
+from gsencoder.core.process import ProcessRank
+from gsencoder.core.settings import first_difference
 from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.train.distill import Distillation, encoder_trainer
 from gsencoder.train.run import TrainConfig, resume_settings

@@ -11,7 +11,7 @@ from joint_training import Datasets, HeightTeacher
 from training_scenes import PREPARE, SideTeacher, prepared, scene, small_encoder
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.runtime.tracking import untracked
+from gsencoder.core.process import untracked
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.models.output_space import OutputSpaces

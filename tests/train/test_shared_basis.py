@@ -10,8 +10,8 @@ import pytest
 from forked_ranks import RankServer
 from training_scenes import DenseSideTeacher, SideTeacher, scene
 
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import open_archive, write_archive
 from gsencoder.fusion.basis import Moments
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.train.dataset_space import MOMENTS_FOLDER, fit_space

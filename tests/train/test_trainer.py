@@ -12,8 +12,8 @@ from trainer_runs import Prepared, losses, steps_in, trainer
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.step_log import LOG_FILE, read_log
-from gsencoder.core.runtime.process_rank import ProcessRank
+from gsencoder.core.logs import LOG_FILE, read_log
+from gsencoder.core.process import ProcessRank
 from gsencoder.train import data_workers
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
 from gsencoder.train.data_workers import automatic_workers

@@ -11,7 +11,7 @@ import pytest
 from forked_ranks import RankServer
 from trainer_runs import Prepared, assert_same_weights, losses, rows, steps_in, weights_in
 
-from gsencoder.core.files.step_log import LOG_FILE
+from gsencoder.core.logs import LOG_FILE
 
 pytestmark = pytest.mark.slow
 

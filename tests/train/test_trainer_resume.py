@@ -12,10 +12,10 @@ from safetensors.numpy import load_file
 from trainer_runs import Prepared, assert_same_weights, losses, rows, steps_in, trainer
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 
+from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.archive import write_archive
-from gsencoder.core.files.step_log import LOG_FILE, read_log
-from gsencoder.core.runtime.signals import Stopped
+from gsencoder.core.logs import LOG_FILE, read_log
+from gsencoder.core.process import Stopped
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
 from gsencoder.train.data_workers import silence_connection_errors
 from gsencoder.train.distill import encoder_trainer

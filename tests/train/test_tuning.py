@@ -13,7 +13,7 @@ from tuning_pairs import SHORT
 from tuning_runs import Pairs, losses, made, sample, samples
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.step_log import LOG_FILE, read_log
+from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
 from gsencoder.train.tuning.run import TuneConfig, Tuned, open_tuned, save_tuned, tune
 from gsencoder.train.tuning.vlm import AdapterConfig, link_served

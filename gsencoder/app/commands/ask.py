@@ -16,8 +16,8 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
 from gsencoder.app.settings.config import settings
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed
-from gsencoder.core.files.json_values import write_json
-from gsencoder.core.runtime.clock import Clock
+from gsencoder.core.files import write_json
+from gsencoder.core.process import Clock
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question
 from gsencoder.infer.ask.batch import ANSWER, ANSWERS, PROMPT, REQUEST, ask_question, ask_questions, write_answers

@@ -12,8 +12,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import atomic_file, write_json
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats import save_splat

@@ -16,8 +16,8 @@ from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings, typed
 from gsencoder.core.errors import InputError, SceneWarning, about, counted
-from gsencoder.core.files.model_files import digest_files
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.pretrained import digest_files
+from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians

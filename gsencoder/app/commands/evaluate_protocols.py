@@ -8,8 +8,7 @@ from gsencoder.app.commands.evaluate_sources import scenes_of
 from gsencoder.app.commands.evaluated_features import stored_memory
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import about
-from gsencoder.core.files.csv_text import csv_text
-from gsencoder.core.files.json_values import write_bytes
+from gsencoder.core.files import csv_text, write_bytes
 from gsencoder.evaluate.grounding import grounding_scores
 from gsencoder.evaluate.protocols.absent import (
     AbsentProtocol,

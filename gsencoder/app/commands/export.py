@@ -10,8 +10,8 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.runtime.device_names import Stored
+from gsencoder.core.files import atomic_file
+from gsencoder.core.process import Stored
 from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians

@@ -18,9 +18,9 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, counted
-from gsencoder.core.runtime.device import choose_device
-from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.process import Device
 from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig

@@ -7,8 +7,8 @@ from typing import Protocol, runtime_checkable
 from gsencoder.app.runs.progress import Progress
 from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
-from gsencoder.core.promises import MEGABYTE
-from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.process import Device
+from gsencoder.core.settings import MEGABYTE
 from gsencoder.fusion.budget.config import BudgetConfig
 from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within, realised_error
 from gsencoder.fusion.fuse import FuseConfig

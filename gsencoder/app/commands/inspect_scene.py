@@ -8,9 +8,9 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 from rich.table import Table
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import listed
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.files.picture_file import write_picture
+from gsencoder.core.files import write_picture
 from gsencoder.data.check.depth_agreement import agreement_map
 from gsencoder.data.check.epipolar import EpipolarCheck
 from gsencoder.data.check.findings import Finding

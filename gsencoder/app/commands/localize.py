@@ -21,9 +21,8 @@ from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import write_json
-from gsencoder.core.files.picture_file import write_picture
-from gsencoder.core.runtime.threads import import_ahead
+from gsencoder.core.files import write_json, write_picture
+from gsencoder.core.process import import_ahead
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.up import with_up
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply

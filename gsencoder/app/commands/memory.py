@@ -16,10 +16,9 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, about, advised, counted
-from gsencoder.core.files.picture_file import write_picture
-from gsencoder.core.files.step_log import LOG_FILE
-from gsencoder.core.runtime.device_names import Device
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.files import write_picture
+from gsencoder.core.logs import LOG_FILE
+from gsencoder.core.process import Device, retain_freed_memory
 from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally

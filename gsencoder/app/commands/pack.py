@@ -10,9 +10,9 @@ from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
+from gsencoder.core.archive import copy_checked
 from gsencoder.core.errors import InputError, counted
-from gsencoder.core.files.copied_file import copy_checked
-from gsencoder.core.promises import MEGABYTE, check_governed
+from gsencoder.core.settings import MEGABYTE, check_governed
 from gsencoder.fusion.store.budget import PackBudget
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features
 from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads

@@ -5,8 +5,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import read_foreign_text
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.files import read_foreign_text
+from gsencoder.core.pretrained import find_file
 from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.localize.localize import select_features

@@ -10,7 +10,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError, counted
-from gsencoder.core.runtime.tracking import Track
+from gsencoder.core.process import Track
 from gsencoder.data.scene_paths import check_names, find_scenes
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.truth.expressions import write_scanrefer

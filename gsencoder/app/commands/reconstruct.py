@@ -17,13 +17,12 @@ from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
 from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.core.device import choose_device
 from gsencoder.core.errors import SceneWarning, counted
-from gsencoder.core.files.picture_file import write_picture
-from gsencoder.core.files.step_log import LOG_FILE
-from gsencoder.core.promises import MEGABYTE
-from gsencoder.core.runtime.device import choose_device
-from gsencoder.core.runtime.device_names import Device
-from gsencoder.core.runtime.heap import retain_freed_memory
+from gsencoder.core.files import write_picture
+from gsencoder.core.logs import LOG_FILE
+from gsencoder.core.process import Device, retain_freed_memory
+from gsencoder.core.settings import MEGABYTE
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splats import READABLE, save_splat

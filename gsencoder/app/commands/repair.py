@@ -15,7 +15,7 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import write_json
 from gsencoder.data.scene_paths import has_views
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.splat_formats.repair import repair_splat

@@ -11,8 +11,7 @@ from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError, counted
-from gsencoder.core.files.csv_text import csv_text
-from gsencoder.core.files.json_values import write_bytes
+from gsencoder.core.files import csv_text, write_bytes
 from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
 from gsencoder.data.truth.scannetpp_classes import ids_of_benchmark
 from gsencoder.data.truth.split_files import read_split

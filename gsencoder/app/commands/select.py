@@ -13,8 +13,8 @@ from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import write_json
-from gsencoder.core.runtime.threads import import_ahead
+from gsencoder.core.files import write_json
+from gsencoder.core.process import import_ahead
 from gsencoder.data.splats import save_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features

@@ -15,8 +15,7 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, counted
-from gsencoder.core.files.csv_text import csv_text
-from gsencoder.core.files.json_values import json_bytes, write_bytes
+from gsencoder.core.files import csv_text, json_bytes, write_bytes
 from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig

@@ -16,10 +16,8 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder, folder_beside, prepared_folder
 from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE
-from gsencoder.core.runtime.device_names import Device
-from gsencoder.core.runtime.heap import retain_freed_memory
-from gsencoder.core.runtime.threads import threads_of_torch
+from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE
+from gsencoder.core.process import Device, retain_freed_memory, threads_of_torch
 from gsencoder.data.scene_paths import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.basis_fit import total_fit

@@ -16,9 +16,9 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.runs.work_folder import WorkFolder, folder_beside, prepared_folder
 from gsencoder.app.settings.config import settings
 from gsencoder.core.errors import InputError, counted
-from gsencoder.core.files.model_files import find_file
-from gsencoder.core.files.step_log import EVENTS_FOLDER, LOG_FILE, read_log
-from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE, read_log
+from gsencoder.core.pretrained import find_file
+from gsencoder.core.process import Device
 from gsencoder.data.prompt_store import PromptStore
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.infer.ask.ask import AskConfig

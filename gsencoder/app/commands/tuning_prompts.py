@@ -13,9 +13,8 @@ from typing import Any
 from gsencoder.app.commands.asker import asker_of
 from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.core.errors import BusyError, InputError, SceneWarning, about, listed
-from gsencoder.core.files.atomic import lock_folder
-from gsencoder.core.files.json_values import plain
-from gsencoder.core.runtime.tracking import Track
+from gsencoder.core.files import lock_folder, plain
+from gsencoder.core.process import Track
 from gsencoder.data.prompt_store import PROMPTS_FILE, PromptStore
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.truth.questions import Question as TruthQuestion

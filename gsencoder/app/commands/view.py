@@ -13,8 +13,8 @@ from gsencoder.app.runs.printable import printable
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.runtime.signals import accept_stop
+from gsencoder.core.files import atomic_file
+from gsencoder.core.process import accept_stop
 from gsencoder.data.scene_paths import DistinctPaths
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import with_up

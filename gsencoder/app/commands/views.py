@@ -11,9 +11,9 @@ from gsencoder.app.commands.words_options import WordsOptions
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
+from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import write_archive
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import write_json
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.heads.apply import head_space, head_tokens
 from gsencoder.fusion.heads.store import find_head

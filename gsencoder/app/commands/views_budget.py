@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
-from gsencoder.core.promises import MEGABYTE
+from gsencoder.core.settings import MEGABYTE
 from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.views.budget import BudgetViews, ViewsBudget, choose_views_within
 from gsencoder.infer.views.picture_size import pictures_within

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.infer.draw.pictures import color_bar, depth_picture, fit_pca_colors, pca_picture
 from gsencoder.infer.draw.relevancy_views import relevancy_pictures
 from gsencoder.infer.draw.report import HtmlReport

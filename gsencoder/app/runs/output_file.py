@@ -6,7 +6,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import check_writable, locked
+from gsencoder.core.files import check_writable, locked
 
 
 def refuse_existing(path: str | Path, overwrite: bool) -> None:

@@ -14,10 +14,8 @@ from typing import Any
 
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import BusyError, InputError
-from gsencoder.core.files.atomic import is_full_disk, lock_folder
-from gsencoder.core.files.json_values import json_bytes, write_bytes
-from gsencoder.core.files.written_files import SUMMARY_NAME, checksums_of
-from gsencoder.core.runtime.signals import raise_dropped_stop
+from gsencoder.core.files import SUMMARY_NAME, checksums_of, is_full_disk, json_bytes, lock_folder, write_bytes
+from gsencoder.core.process import raise_dropped_stop
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
 

@@ -15,7 +15,7 @@ from rich.progress import Progress as Bars
 from rich.segment import Segment
 
 from gsencoder.app.runs.printable import printable
-from gsencoder.core.runtime.signals import raise_dropped_stop
+from gsencoder.core.process import raise_dropped_stop
 
 T = TypeVar("T")
 

@@ -7,8 +7,7 @@ from typing import Any
 from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.knobs import describe_values, shown_value
-from gsencoder.core.promises import Budget
+from gsencoder.core.settings import Budget, describe_values, shown_value
 
 
 def report_choice(

@@ -12,10 +12,8 @@ from rich.console import Console
 from gsencoder.app.runs.printable import one_line
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import BusyError, InputError, listed
-from gsencoder.core.files.foreign_file import read_foreign_text
-from gsencoder.core.files.json_values import plain
-from gsencoder.core.files.written_files import SUMMARY_NAME
-from gsencoder.core.runtime.process_rank import refuse_several
+from gsencoder.core.files import SUMMARY_NAME, plain, read_foreign_text
+from gsencoder.core.process import refuse_several
 from gsencoder.data.scene_paths import check_names, scene_name
 
 NOT_COMPARED = ("paths", "out", "overwrite", "quiet", "worker", "resume", "device", "preset")

@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import gsencoder
-from gsencoder.core.files.json_values import plain, write_json
-from gsencoder.core.files.written_files import SUMMARY_NAME, sha256_of
-from gsencoder.core.runtime.signals import raise_dropped_stop
-from gsencoder.core.runtime.threads import available_cores
+from gsencoder.core.files import SUMMARY_NAME, plain, sha256_of, write_json
+from gsencoder.core.process import available_cores, raise_dropped_stop
 
 LIBRARIES = {
     "numpy": "numpy",

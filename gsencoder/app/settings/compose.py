@@ -32,7 +32,7 @@ from gsencoder.app.settings.options import (
 )
 from gsencoder.app.settings.several import check_options_of_one, check_single, members_of
 from gsencoder.core.errors import InputError
-from gsencoder.core.removed_options import check_removed_option, removed_option
+from gsencoder.core.settings import check_removed_option, removed_option
 
 Config = TypeVar("Config", bound=CommonConfig)
 

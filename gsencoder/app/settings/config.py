@@ -34,7 +34,7 @@ from gsencoder.app.settings.options import (
 )
 from gsencoder.app.settings.presets import DEFAULT_PRESET, Preset
 from gsencoder.core.errors import InputError
-from gsencoder.core.removed_options import REMOVED_OPTIONS, check_removed_option
+from gsencoder.core.settings import REMOVED_OPTIONS, check_removed_option
 
 T = TypeVar("T")
 

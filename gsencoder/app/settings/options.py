@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
-from gsencoder.core.removed_options import REMOVED_VALUES
+from gsencoder.core.settings import REMOVED_VALUES
 
 Kind = Literal["text", "list", "value"]
 Function = TypeVar("Function", bound=Callable[..., Any])

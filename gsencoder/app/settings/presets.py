@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from gsencoder.app.settings.options import options_by_key
-from gsencoder.core.knobs import shown_value
+from gsencoder.core.settings import shown_value
 
 Preset = Literal["fast", "balanced", "exact"]
 PRESET = "preset"

@@ -13,8 +13,8 @@ from itertools import permutations
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.check.findings import ADVICE, Finding
 from gsencoder.data.check.pose_readings import other_orders, other_poses
 from gsencoder.data.readers.undistort import load_pycolmap

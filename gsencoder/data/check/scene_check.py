@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import SceneWarning, listed
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.check.color_agreement import color_correlations, grey_pictures, view_correlations
 from gsencoder.data.check.depth_agreement import (
     Agreement,

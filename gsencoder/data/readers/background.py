@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.data.readers.image_file import read_rgba, read_small
 
 LOOKED_AT = 16

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning, readable
-from gsencoder.core.files.foreign_file import MODEL_BYTES, check_foreign, open_foreign
+from gsencoder.core.files import MODEL_BYTES, check_foreign, open_foreign
 from gsencoder.data.readers.colmap_binary import CAMERA_PARAMS, check_binary_model
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.undistort import CameraModel, check_camera, load_pycolmap

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import MODEL_BYTES, read_foreign
+from gsencoder.core.files import MODEL_BYTES, read_foreign
 from gsencoder.data.readers.undistort import load_pycolmap
 
 CAMERA_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import check_foreign
+from gsencoder.core.files import check_foreign
 from gsencoder.types.orientation import EXCHANGED
 
 if TYPE_CHECKING:

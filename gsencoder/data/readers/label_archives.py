@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import check_foreign
+from gsencoder.core.files import check_foreign
 from gsencoder.data.readers.image_file import open_picture, read_integers
 from gsencoder.data.readers.label_images import LabelFiles
 

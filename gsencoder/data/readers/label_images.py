@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import check_foreign
+from gsencoder.core.files import check_foreign
 from gsencoder.data.readers.image_file import check_picture_size, load_npy, read_integers
 from gsencoder.data.readers.images import PictureFiles, PixelGrid
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache

@@ -5,7 +5,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from gsencoder.core.runtime.threads import kernel
+from gsencoder.core.process import kernel
 
 MARGIN = 1.1
 """The square that a depth pixel covers is this much wider than the distance to its neighbor's, so that slanted surfaces

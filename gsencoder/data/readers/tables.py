@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import read_foreign_text
+from gsencoder.core.files import read_foreign_text
 
 
 def table_lines(path: Path) -> list[list[str]]:

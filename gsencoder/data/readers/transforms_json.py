@@ -23,8 +23,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import read_foreign_text
-from gsencoder.core.files.written_files import check_written
+from gsencoder.core.files import check_written, read_foreign_text
 from gsencoder.data.readers.image_file import picture_info, picture_size
 from gsencoder.data.readers.posed import (
     PosedImage,

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.data.seeding.fill_depths import interpolated_depths, supported_depths
 from gsencoder.data.seeding.hull import outside_hull

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from gsencoder.core.errors import InputError, about
-from gsencoder.core.runtime.threads import ahead, kernel
+from gsencoder.core.process import ahead, kernel
 from gsencoder.data.seeding.surface_grid import SurfaceGrid, SurfaceSamples
 from gsencoder.types import Cameras, Views
 from gsencoder.types.cameras import pixel_centers, unproject_points

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.types import Cameras, Views
 from gsencoder.types.poses import invert_rigid

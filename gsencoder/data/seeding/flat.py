@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from gsencoder.core.runtime.threads import thread_count
+from gsencoder.core.process import thread_count
 from gsencoder.types import Gaussians, sh_from_colors
 
 SIZE = 0.6

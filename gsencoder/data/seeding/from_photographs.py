@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.dense import (
     DenseConfig,

@@ -10,7 +10,7 @@ from itertools import permutations
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.data.seeding.depth import surface_pixels
 from gsencoder.types import Views
 

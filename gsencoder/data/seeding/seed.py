@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.readers.scene_splat import file_of_scene
 from gsencoder.data.seeding.depth import depth_samples, read_rgbd
 from gsencoder.data.seeding.flat import flat_gaussians

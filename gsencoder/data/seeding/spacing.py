@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.runtime.threads import thread_count
+from gsencoder.core.process import thread_count
 from gsencoder.types import Scene
 
 SPACING_SAMPLE = 100_000

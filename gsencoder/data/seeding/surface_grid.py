@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Int64, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.threads import kernel
+from gsencoder.core.process import kernel
 
 AXIS_BITS = 19
 """Bits of a voxel index along one axis: 524,288 voxels, or 10 km at 2 cm."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.data.seeding.feature_matches import (
     detect_features,

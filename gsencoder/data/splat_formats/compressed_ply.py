@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.threads import threads_unchanged
+from gsencoder.core.process import threads_unchanged
 from gsencoder.data.splat_formats.ply import PlyHeader, element_start
 from gsencoder.data.splat_formats.raw import RawSplat, logits_from_opacities, quats_from_smallest_three
 from gsencoder.types import sh_from_colors

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning, readable
-from gsencoder.core.files.foreign_file import open_foreign
+from gsencoder.core.files import open_foreign
 from gsencoder.data.splat_formats.raw import SH_COEFFICIENTS, RawSplat, logits_from_opacities, opacities_from_logits
 
 MAX_HEADER = 1 << 18

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Integer
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
 
 LOGIT_LIMIT = 20.0
 """Opacities 0 and 1 are written as this logit: 2e-9 away from the true value, and finite."""

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import read_foreign
+from gsencoder.core.files import read_foreign
 from gsencoder.data.splat_formats.raw import RawSplat, check_expansion, logits_from_opacities, quats_from_smallest_three
 
 MAX_META = 4 << 20

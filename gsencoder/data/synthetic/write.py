@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import write_bytes
-from gsencoder.core.files.picture_file import write_picture
+from gsencoder.core.files import write_bytes, write_picture
 from gsencoder.types import Scene, Views
 from gsencoder.types.poses import OPENCV_FROM_OPENGL
 

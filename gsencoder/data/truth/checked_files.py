@@ -4,8 +4,7 @@ import os
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, readable
-from gsencoder.core.files.foreign_file import open_foreign, read_foreign
-from gsencoder.core.files.written_files import check_written
+from gsencoder.core.files import check_written, open_foreign, read_foreign
 
 SCENE_BYTES = 256 << 20
 """Larger files are no predictions and no truth of one scene."""

@@ -5,8 +5,8 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.core.first_repeated import first_repeated
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.truth.checked_files import LIST_BYTES, check_file
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import write_json
 from gsencoder.data.truth.checked_files import LIST_BYTES, read_checked_text
 from gsencoder.data.truth.entries import (
     MAX_TEXT,

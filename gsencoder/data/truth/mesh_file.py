@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
 from gsencoder.core.errors import InputError, readable
-from gsencoder.core.files.foreign_file import open_foreign
+from gsencoder.core.files import open_foreign
 from gsencoder.data.splat_formats.ply import PlyElement, PlyHeader, read_header, read_property
 
 MAX_VERTICES = 100_000_000

@@ -4,10 +4,10 @@ from typing import no_type_check
 
 import numpy as np
 
-from gsencoder.core.runtime.threads import compiled
+from gsencoder.core.process import compiled
 
 
-# Without fused products, unlike `gsencoder.core.runtime.threads.kernel`: of an edge of two triangles, each then finds a
+# Without fused products, unlike `gsencoder.core.process.kernel`: of an edge of two triangles, each then finds a
 # pixel exactly as far on its side as the other finds it beyond, and no pixel between them is left to neither.
 @compiled
 @no_type_check

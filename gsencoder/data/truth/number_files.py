@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Int, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files import atomic_file
 from gsencoder.data.truth.checked_files import read_checked
 
 LARGEST = 2**31 - 1

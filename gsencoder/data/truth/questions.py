@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import write_json
 from gsencoder.data.truth.entries import (
     Corner,
     Entry,

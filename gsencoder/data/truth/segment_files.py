@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.core.first_repeated import first_repeated
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.truth.checked_files import check_file
 from gsencoder.data.truth.entries import entries_of, shown

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import write_json
 from gsencoder.data.truth.entries import Corner
 from gsencoder.data.truth.questions import SITUATED, Question
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gsencoder.core.errors import InputError, listed
-from gsencoder.core.files.foreign_file import check_foreign
+from gsencoder.core.files import check_foreign
 
 TIME_BASE = 1_000_000
 """Parts of a second in which files state how long they are."""

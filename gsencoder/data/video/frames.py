@@ -12,10 +12,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.files.foreign_file import read_foreign_text
-from gsencoder.core.files.written_files import sha256_of
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.files import atomic_file, read_foreign_text, sha256_of
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.video.choose import SIZE, choose_frames, follow
 from gsencoder.data.video.decode import Video, color_picture, grey_picture
 
@@ -139,6 +137,6 @@ def _inputs(path: Path, config: VideoConfig) -> dict[str, Any]:
 
 
 def _write(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
-    from gsencoder.core.files.picture_file import write_picture
+    from gsencoder.core.files import write_picture
 
     write_picture(path, picture, quality=QUALITY, subsampling=0)

@@ -5,8 +5,7 @@ import io
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, about
-from gsencoder.core.files.csv_text import csv_text
-from gsencoder.core.files.json_values import write_bytes
+from gsencoder.core.files import csv_text, write_bytes
 from gsencoder.data.truth.checked_files import read_checked_text
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.label_sets import COLUMNS, read_class_list, scannet_classes

@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
+from gsencoder.core.archive import read_npz
 from gsencoder.core.errors import InputError, about
-from gsencoder.core.files.json_values import write_bytes
-from gsencoder.core.files.npz import read_npz
+from gsencoder.core.files import write_bytes
 from gsencoder.data.truth.checked_files import read_checked_text
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.data.truth.number_files import mask_bytes, read_mask, read_whole_numbers

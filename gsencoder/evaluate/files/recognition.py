@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError, about
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import write_json
 from gsencoder.data.truth.entries import (
     Entry,
     entries_of,

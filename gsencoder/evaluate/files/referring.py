@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, about
-from gsencoder.core.files.json_values import write_json
+from gsencoder.core.files import write_json
 from gsencoder.data.truth.entries import (
     Corner,
     Entry,

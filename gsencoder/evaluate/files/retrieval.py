@@ -21,9 +21,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gsencoder.core.archive import read_npz
 from gsencoder.core.errors import InputError, about
-from gsencoder.core.files.json_values import write_bytes
-from gsencoder.core.files.npz import read_npz
+from gsencoder.core.files import write_bytes
 from gsencoder.data.truth.checked_files import PICKLE_SUFFIXES
 from gsencoder.evaluate.retrieval import Pooling, ScoredPairs, view_scores
 

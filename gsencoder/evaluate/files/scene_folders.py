@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, counted, listed, readable
-from gsencoder.core.files.foreign_file import check_foreign
+from gsencoder.core.files import check_foreign
 from gsencoder.data.truth.checked_files import PICKLE_SUFFIXES
 from gsencoder.data.truth.scannet_labels import AGGREGATION
 from gsencoder.data.truth.scannetpp_labels import ANNOTATION

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.core.first_repeated import first_repeated
 from gsencoder.data.truth.caption_text import wrapped_caption
 from gsencoder.data.truth.entries import Corner
 from gsencoder.data.truth.expressions import Expression

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.core.first_repeated import first_repeated
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.scores.instance_matches import OVERLAPS, SceneMatches
 

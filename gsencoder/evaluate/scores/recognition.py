@@ -9,8 +9,8 @@ classes count more, stands beside it.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.core.first_repeated import first_repeated
 from gsencoder.evaluate.scores.means import mean_of
 
 

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.core.first_repeated import first_repeated
 from gsencoder.data.truth.expressions import Expression, described
 from gsencoder.evaluate.scores.box_overlap import box_ious
 

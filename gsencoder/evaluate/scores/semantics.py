@@ -22,8 +22,8 @@ from difflib import get_close_matches
 import numpy as np
 from jaxtyping import Int64
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, listed
-from gsencoder.core.first_repeated import first_repeated
 from gsencoder.data.truth.class_table import ClassTable
 from gsencoder.evaluate.scores.means import mean_of
 

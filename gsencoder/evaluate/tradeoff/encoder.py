@@ -8,7 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.knobs import exact_settings
+from gsencoder.core.settings import exact_settings
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.data.seeding.spacing import unit_of

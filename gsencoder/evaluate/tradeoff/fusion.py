@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from gsencoder.core.knobs import exact_settings
+from gsencoder.core.settings import exact_settings
 from gsencoder.evaluate.tradeoff.fused_scene import TaughtScene, hit_scores, stored_bytes, taught_scene
 from gsencoder.evaluate.tradeoff.stage import Inputs, Judged, Score, Stage
 from gsencoder.fusion.feature_error import field_error

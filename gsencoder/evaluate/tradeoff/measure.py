@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.knobs import with_knobs
-from gsencoder.core.runtime.peak_memory import memory_growth
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, memory_growth, untracked
+from gsencoder.core.settings import with_knobs
 from gsencoder.evaluate.tradeoff.records import Record, Records, Timing
 from gsencoder.evaluate.tradeoff.stage import Stage, StageScene
 

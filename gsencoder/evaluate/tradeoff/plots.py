@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from gsencoder.core.files.json_values import plain
+from gsencoder.core.files import plain
 from gsencoder.evaluate.tradeoff.results import SettingResult
 from gsencoder.evaluate.tradeoff.scaling import ScalingResult
 from gsencoder.evaluate.tradeoff.stage import HIGHER_IS_BETTER

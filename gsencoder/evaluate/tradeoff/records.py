@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError, readable
-from gsencoder.core.files.atomic import is_full_disk
-from gsencoder.core.files.foreign_file import MODEL_BYTES, read_foreign
-from gsencoder.core.files.json_values import plain, write_bytes
-from gsencoder.core.knobs import describe_values
+from gsencoder.core.files import MODEL_BYTES, is_full_disk, plain, read_foreign, write_bytes
+from gsencoder.core.settings import describe_values
 from gsencoder.evaluate.tradeoff.stage import Judged, Score
 
 RECORDS_FILE, IDENTITY_FILE = "measured.jsonl", "sweep.json"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.knobs import describe_values
+from gsencoder.core.settings import describe_values
 from gsencoder.evaluate.tradeoff.pareto import on_front
 from gsencoder.evaluate.tradeoff.records import Record
 from gsencoder.evaluate.tradeoff.stage import HIGHER_IS_BETTER, Cost, Score

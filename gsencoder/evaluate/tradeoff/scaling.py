@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.data.seeding.spacing import unit_of

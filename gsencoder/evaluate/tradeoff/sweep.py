@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.core.first_repeated import first_repeated
-from gsencoder.core.knobs import Knob, changed_knobs, describe_values, read_value, value_at, with_knobs
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
+from gsencoder.core.settings import Knob, changed_knobs, describe_values, read_value, value_at, with_knobs
 from gsencoder.evaluate.tradeoff.encoder import encoder_stage
 from gsencoder.evaluate.tradeoff.fusion import fusion_stage
 from gsencoder.evaluate.tradeoff.halving import HalvingConfig, Rung, draw_settings, successive_halving

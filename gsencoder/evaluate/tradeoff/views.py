@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
 from gsencoder.evaluate.boxes import queryable_objects
 from gsencoder.evaluate.tradeoff.fused_scene import TaughtScene, taught_scene
 from gsencoder.evaluate.tradeoff.stage import Inputs, Judged, Score, Stage

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gsencoder.core.setting_choice import best_setting, within_seconds
+from gsencoder.core.settings import best_setting, within_seconds
 from gsencoder.fusion.basis import Moments
 from gsencoder.fusion.budget.config import BudgetConfig, exact_config
 from gsencoder.fusion.budget.limits import Measure, Pace, within_megabytes

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.promises import Budget, check_governed
+from gsencoder.core.settings import Budget, check_governed
 from gsencoder.fusion.fuse import FuseConfig
 
 GOVERNED = (

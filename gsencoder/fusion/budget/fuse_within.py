@@ -11,8 +11,7 @@ import torch
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.device_names import Device
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Device, Track, untracked
 from gsencoder.fusion.budget.choose import Choice, choose
 from gsencoder.fusion.budget.config import BudgetConfig, check_budget, exact_config
 from gsencoder.fusion.checkpoint import open_checkpoint

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.promises import MEGABYTE
+from gsencoder.core.settings import MEGABYTE
 from gsencoder.fusion.budget.config import BudgetConfig
 from gsencoder.fusion.budget.rank import RankErrors, file_bytes, rank_of_bytes
 from gsencoder.fusion.budget.settings import Setting

@@ -16,7 +16,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from gsencoder.core.runtime.threads import kernel
+from gsencoder.core.process import kernel
 from gsencoder.fusion.coverage.sight import Sight
 from gsencoder.fusion.feature_error import row_cosines
 from gsencoder.types import FeatureMap

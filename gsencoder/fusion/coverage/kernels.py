@@ -8,7 +8,7 @@ from typing import no_type_check
 
 import numpy as np
 
-from gsencoder.core.runtime.threads import kernel
+from gsencoder.core.process import kernel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 
 TILE = 8

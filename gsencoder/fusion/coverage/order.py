@@ -6,7 +6,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from gsencoder.core.runtime.threads import kernel
+from gsencoder.core.process import kernel
 
 
 def view_order(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from gsencoder.core.runtime.threads import parallel
+from gsencoder.core.process import parallel
 from gsencoder.fusion.coverage.blocks import Blocks, ShapeRows
 from gsencoder.fusion.coverage.kernels import TILE, count_rays, follow_rays, list_rays
 from gsencoder.fusion.visibility import VisibilityConfig, row_mask, visible_depths

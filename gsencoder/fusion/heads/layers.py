@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from gsencoder.core.archive import Archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive
 
 LAYER_TYPES: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
     "linear": (nn.Linear, ("weight", "bias")),

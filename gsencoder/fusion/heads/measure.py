@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64
 
+from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.device import choose_device
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.basis_fit import WORST
 from gsencoder.fusion.cell_sample import CellSample

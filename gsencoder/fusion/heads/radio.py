@@ -17,9 +17,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.core.errors import InputError, about, listed
-from gsencoder.core.files.foreign_file import read_foreign_text
-from gsencoder.core.files.model_files import check_fetched
-from gsencoder.core.pretrained import weight_files
+from gsencoder.core.files import read_foreign_text
+from gsencoder.core.pretrained import check_fetched, weight_files
 from gsencoder.fusion.heads.layers import Residual
 from gsencoder.fusion.heads.names import Part, default_part, split_name, text_kind
 from gsencoder.fusion.teachers.radio import ADAPTERS, WHAT

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from gsencoder.core.archive import Archive, open_archive, write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive, open_archive, write_archive
 from gsencoder.fusion.heads.layers import describe_layers, read_layers
 from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.names import PARTS, TEXT_KINDS, default_part, split_name

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from gsencoder.core.promises import Budget
+from gsencoder.core.settings import Budget
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float16, Float32, Int32
 
-from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import (
+from gsencoder.core.archive import (
     LONGEST_SHARE,
     Archive,
     archive_bytes,
@@ -25,8 +24,9 @@ from gsencoder.core.files.archive import (
     shape_only,
     write_archive,
 )
-from gsencoder.core.row_numbers import rise_within
-from gsencoder.core.runtime.threads import parallel
+from gsencoder.core.arrays import rise_within
+from gsencoder.core.errors import InputError
+from gsencoder.core.process import parallel
 from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.scene_paths import kind_of_path
 from gsencoder.data.splats import FINGERPRINT_DIGITS, fingerprint

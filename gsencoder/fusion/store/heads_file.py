@@ -6,9 +6,8 @@ Its layers are read by `gsencoder.fusion.heads.store`, which needs torch.
 from collections.abc import Sequence
 from pathlib import Path
 
+from gsencoder.core.archive import Archive, copy_checked, open_archive, verify_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive, open_archive, verify_archive
-from gsencoder.core.files.copied_file import copy_checked
 from gsencoder.types import FeatureSpace
 
 HEADS_FILE = "heads.safetensors"

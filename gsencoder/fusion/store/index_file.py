@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from gsencoder.core.archive import LONGEST_NUMBER, Archive, archive_bytes, shape_only, write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import LONGEST_NUMBER, Archive, archive_bytes, shape_only, write_archive
 from gsencoder.data.archive_records import read_space, scaled_halves, scene_parts, space_parts
 from gsencoder.data.splats import FINGERPRINT_DIGITS
 from gsencoder.types import GaussianFeatures, Scene

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from gsencoder.core.archive import Archive, write_archive
+from gsencoder.core.arrays import rise_within
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import Archive, write_archive
-from gsencoder.core.row_numbers import rise_within
 from gsencoder.data.archive_records import (
     bank_parts,
     check_splat,

@@ -14,18 +14,18 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Int64
 
-from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import (
+from gsencoder.core.archive import (
     LONGEST_NUMBER,
     LONGEST_SHARE,
+    MappedArrays,
     archive_bytes,
     open_archive,
     shape_only,
     write_archive,
 )
-from gsencoder.core.files.atomic import atomic_file
-from gsencoder.core.files.mapped_arrays import MappedArrays
-from gsencoder.core.promises import MEGABYTE
+from gsencoder.core.errors import InputError
+from gsencoder.core.files import atomic_file
+from gsencoder.core.settings import MEGABYTE
 from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
 from gsencoder.data.splats import FINGERPRINT_DIGITS, fingerprint, load_splat, save_splat
 from gsencoder.fusion.store.index_file import INDEX_FORM, read_index, write_index

@@ -16,11 +16,9 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
+from gsencoder.core.arrays import even_indices, rise_within
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.knobs import shown_value
-from gsencoder.core.promises import MEGABYTE
-from gsencoder.core.row_numbers import rise_within
+from gsencoder.core.settings import MEGABYTE, shown_value
 from gsencoder.fusion.store.bit_allocation import MAX_BITS, BitAllocation, cosines_of, nearest_level
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 

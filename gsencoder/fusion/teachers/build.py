@@ -7,7 +7,7 @@ from dataclasses import fields
 import numpy as np
 
 from gsencoder.core.errors import InputError, renamed_options
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.pretrained import find_file
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher

@@ -7,10 +7,9 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32
 
+from gsencoder.core.archive import read_npz
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import digest_files, find_file
-from gsencoder.core.files.npz import read_npz
-from gsencoder.core.onnx_session import choose_tensors, open_session, run_on_picture
+from gsencoder.core.pretrained import choose_tensors, digest_files, find_file, open_session, run_on_picture
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.resize import fit_to_patches, normalized
 from gsencoder.types import FeatureMap, FeatureSpace, Views

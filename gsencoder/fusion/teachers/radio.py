@@ -7,8 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import digest_files, find_file
-from gsencoder.core.pretrained import load_pretrained, read_config
+from gsencoder.core.pretrained import digest_files, find_file, load_pretrained, read_config
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.resize import fit_to_patches
 from gsencoder.types import FeatureMap, FeatureSpace, Views
@@ -67,7 +66,7 @@ class RadioTeacher:
         check_radio(folder)
         from transformers import AutoModel
 
-        from gsencoder.core.runtime.device import choose_device
+        from gsencoder.core.device import choose_device
 
         model = load_pretrained(AutoModel, folder, WHAT, known_parts=(ADAPTERS,))
         device = choose_device(config.device).type
@@ -92,7 +91,7 @@ class RadioTeacher:
         """
         import torch
 
-        from gsencoder.core.runtime.device import enough_memory, teacher_autocast
+        from gsencoder.core.device import enough_memory, teacher_autocast
 
         if views.images is None:
             raise MissingInput("teacher radio: the scene has no pictures")

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError, about
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.pretrained import find_file
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.segmenter_classes import read_classes, synonyms_of_classes
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenter, OnnxSegmenterOptions

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
-from gsencoder.core.files.foreign_file import read_foreign_text
+from gsencoder.core.files import read_foreign_text
 
 MAX_CLASSES_BYTES = 1 << 22
 

@@ -9,8 +9,7 @@ from jaxtyping import Float32, Float64, UInt8
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import digest_files
-from gsencoder.core.onnx_session import choose_tensors, open_session, run_on_picture
+from gsencoder.core.pretrained import choose_tensors, digest_files, open_session, run_on_picture
 from gsencoder.fusion.teachers.resize import fit_to_patches, normalized
 from gsencoder.fusion.teachers.segmenter_classes import read_classes
 

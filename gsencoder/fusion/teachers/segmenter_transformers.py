@@ -7,9 +7,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from gsencoder.core.files.model_files import digest_files
-from gsencoder.core.pretrained import load_companion, load_pretrained, load_tokenizer, quiet_transformers, read_config
-from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.pretrained import (
+    digest_files,
+    load_companion,
+    load_pretrained,
+    load_tokenizer,
+    quiet_transformers,
+    read_config,
+)
+from gsencoder.core.process import Device
 
 WHAT = "teacher segmenter"
 MASK_HEADS = ("mask2former", "oneformer", "maskformer", "eomt", "eomt_dinov3")
@@ -32,7 +38,7 @@ class TransformersSegmenter:
         config = read_config(folder, WHAT)
         import transformers
 
-        from gsencoder.core.runtime.device import choose_device
+        from gsencoder.core.device import choose_device
 
         self._kind = config.model_type
         universal = self._kind in MASK_HEADS

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import find_file
+from gsencoder.core.pretrained import find_file
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.tower_kinds import WHAT, tower_in
 from gsencoder.fusion.teachers.tower_preprocessing import read_preprocessing
@@ -92,7 +92,7 @@ class TransformersTeacher:
         folder = find_file(config.model, "teacher.model", folder=True)
         tower = tower_in(folder)
         self._preprocessing = read_preprocessing(folder, WHAT, floats=tower.kind.resizes_floats)
-        from gsencoder.core.runtime.device import choose_device
+        from gsencoder.core.device import choose_device
         from gsencoder.fusion.teachers.tower_network import VisionTower
 
         self._device = choose_device(config.device).type
@@ -129,7 +129,7 @@ class TransformersTeacher:
         """
         import torch
 
-        from gsencoder.core.runtime.device import enough_memory, teacher_autocast
+        from gsencoder.core.device import enough_memory, teacher_autocast
         from gsencoder.fusion.teachers.windows import map_in_windows
 
         if views.images is None:

@@ -8,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import digest_files
-from gsencoder.core.pretrained import load_part, load_pretrained, weight_files
+from gsencoder.core.pretrained import digest_files, load_part, load_pretrained, weight_files
 from gsencoder.fusion.teachers.tower_kinds import WHAT, TowerInFolder
 
 Dense = Literal["tokens", "values", "summary"]

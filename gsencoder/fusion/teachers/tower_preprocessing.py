@@ -10,7 +10,7 @@ from jaxtyping import Float32, Float64, UInt8
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import read_foreign_text
+from gsencoder.core.files import read_foreign_text
 from gsencoder.fusion.teachers.resize import fit_to_patches, normalized, patches_of
 
 FILES = ("processor_config.json", "preprocessor_config.json")

@@ -11,10 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError, SceneWarning, WriteError, about
-from gsencoder.core.files.json_values import plain, write_bytes, write_json
-from gsencoder.core.files.sealed_rows import sealed, unsealed
-from gsencoder.core.runtime.clock import Clock
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.files import plain, sealed, unsealed, write_bytes, write_json
+from gsencoder.core.process import Clock, Track, untracked
 from gsencoder.data.splats import fingerprint
 from gsencoder.infer.ask.ask import Asker, Prompt, Question, chosen_mark, prompt_messages
 from gsencoder.infer.ask.questions import BatchQuestion, read_answers

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed
-from gsencoder.core.files.foreign_file import open_foreign
+from gsencoder.core.files import open_foreign
 from gsencoder.data.truth.entries import Corner, corner_bounds, entries_of, object_of, read_benchmark_json, scene_name
 from gsencoder.data.truth.expressions import Expression, read_scanrefer
 from gsencoder.data.truth.questions import Question as TruthQuestion

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from PIL import Image, ImageDraw
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.even_indices import even_indices
 from gsencoder.infer.draw.pictures import FAINT, INK, PAPER, fit_text, label_font
 from gsencoder.infer.draw.strongest_components import PixelAttention, salient_pixel, strongest_components
 from gsencoder.render import Blend, BlendConfig, blend

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files import atomic_file
 from gsencoder.types import Box, Localization, Scene
 
 EDGES = np.array([(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1], np.int32)

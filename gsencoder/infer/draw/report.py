@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.atomic import atomic_file
+from gsencoder.core.files import atomic_file
 
 _STYLE = """
 :root { color-scheme: light dark; --paper: #fcfcfa; --ink: #1d2026; --faint: #666c76; --line: #dfe1e4; --card: #ffffff;

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float32, Int64
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
 from gsencoder.memory.render import render_queries
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians, QueryMemory

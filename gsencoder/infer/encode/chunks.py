@@ -10,9 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.runtime.device_names import Device, Precision
-from gsencoder.core.runtime.threads import ahead
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Device, Precision, Track, ahead, untracked
 from gsencoder.models.grid.curves import SceneCurves
 from gsencoder.types import Gaussians
 

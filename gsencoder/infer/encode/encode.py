@@ -6,10 +6,9 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from gsencoder.core.device import autocast_dtype, choose_device
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.device import autocast_dtype, choose_device
-from gsencoder.core.runtime.device_names import Device, Precision
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.fusion.store.words import load_tables
 from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 
-from gsencoder.core.promises import Budget, check_governed
+from gsencoder.core.settings import Budget, check_governed
 from gsencoder.infer.encode.chunks import EncodeConfig
 
 GOVERNED = ("halo", "precision")

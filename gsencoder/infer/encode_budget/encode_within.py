@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.knobs import shown_value
-from gsencoder.core.promises import MEGABYTE
-from gsencoder.core.runtime.tracking import Track, untracked
-from gsencoder.core.setting_choice import best_setting, within_seconds
+from gsencoder.core.process import Track, untracked
+from gsencoder.core.settings import MEGABYTE, best_setting, shown_value, within_seconds
 from gsencoder.fusion.feature_error import FieldError, judge
 from gsencoder.fusion.store.folder import features_bytes
 from gsencoder.infer.encode.chunks import EncodeConfig, cut, scene_regions

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 
-from gsencoder.core.runtime.device_names import Precision
+from gsencoder.core.process import Precision
 from gsencoder.fusion.feature_error import row_cosines
 from gsencoder.infer.encode.chunks import Chunk, EncodeConfig, cut, scene_regions
 from gsencoder.infer.load_encoder import Encoder

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.device_names import Stored
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Stored, Track, untracked
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import TorchEncoder

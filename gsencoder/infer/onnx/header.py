@@ -17,9 +17,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
-from gsencoder.core.int8 import round_columns
-from gsencoder.core.runtime.device_names import Stored
+from gsencoder.core.process import Stored
 from gsencoder.models.grid.serialize import ALIGN, Order
 from gsencoder.models.output_space import OutputSpace, OutputSpaces, output_spaces_parts
 from gsencoder.text.table import TextTable, tower_from_json, tower_to_json, trained_from_json, unrounded

@@ -16,7 +16,7 @@ import onnx
 from jaxtyping import Float32
 from onnx import helper, numpy_helper
 
-from gsencoder.core.int8 import round_columns
+from gsencoder.core.arrays import round_columns
 from gsencoder.infer.onnx.operators import OURS, convolve, convolve_int8, linear_int8
 
 PRODUCT_LIMIT = 63

@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning, about, readable
-from gsencoder.core.files.foreign_file import MODEL_BYTES, read_foreign
-from gsencoder.core.files.model_files import find_file
-from gsencoder.core.runtime.device_names import Device, Precision
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.files import MODEL_BYTES, read_foreign
+from gsencoder.core.pretrained import find_file
+from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.infer.onnx.header import FIELDS, OUTPUT, SETTINGS, SUM, OnnxHeader, check_sum, from_metadata
 from gsencoder.models.grid.curves import SceneCurves, cut_scene_curves

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.infer.select.seeds import Parts
 from gsencoder.infer.select.selection import SelectConfig, Votes
 from gsencoder.infer.select.shares import NEIGHBORS, object_shares

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import Track, untracked
 from gsencoder.infer.select.votes import DOMINANT, Sampling
 from gsencoder.types import Cameras, Gaussians
 

@@ -10,9 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.foreign_file import read_foreign_text
-from gsencoder.core.files.json_values import write_json
-from gsencoder.core.files.written_files import check_written
+from gsencoder.core.files import check_written, read_foreign_text, write_json
 from gsencoder.data.splats import load_property, load_splat, save_splat
 from gsencoder.infer.draw.boxes_ply import word_color
 from gsencoder.infer.localize.boxes import box_around

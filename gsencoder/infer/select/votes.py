@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from jaxtyping import Int32
 
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.process import Track, untracked
 from gsencoder.infer.select.selection import Votes
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians

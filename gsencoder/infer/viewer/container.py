@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import plain
+from gsencoder.core.files import plain
 
 MAGIC = b"GSVIEW01"
 TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32")

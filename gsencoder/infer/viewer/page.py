@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
 
-from gsencoder.core.files.json_values import plain
+from gsencoder.core.files import plain
 from gsencoder.infer.viewer.bundle import Bundle
 from gsencoder.infer.viewer.container import Container
 

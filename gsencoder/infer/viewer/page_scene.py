@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
 from gsencoder.fusion.store.quantize import compact
 from gsencoder.infer.localize import presence
 from gsencoder.infer.localize.relevancy import feature_axes, word_directions

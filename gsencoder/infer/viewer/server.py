@@ -27,7 +27,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.json_values import json_bytes
+from gsencoder.core.files import json_bytes
 from gsencoder.infer.viewer.container import Container
 from gsencoder.infer.viewer.page_scene import jpeg_of
 from gsencoder.infer.viewer.search import RELEVANCY_STEP, UNSEEN, SceneSearch

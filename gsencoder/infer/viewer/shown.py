@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32, Int64, UInt8, UInt16
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.core.even_indices import even_indices
 from gsencoder.data.splat_formats.raw import RawSplat, logits_from_opacities, logs_from_scales
 from gsencoder.data.splat_formats.spz import write_spz
 from gsencoder.infer.draw.pictures import fit_pca_colors, pca_picture

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.promises import PLANNED, Budget, check_governed
+from gsencoder.core.settings import PLANNED, Budget, check_governed
 from gsencoder.infer.views.choose import Judged, Picked, checked_gaussians, chosen_views, judge_candidates
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet

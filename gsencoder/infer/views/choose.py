@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.even_indices import even_indices
 from gsencoder.data.orbits import orbit_cameras
 from gsencoder.infer.views.closeups import closeups
 from gsencoder.infer.views.constants import CONSTANTS

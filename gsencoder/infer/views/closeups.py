@@ -7,7 +7,7 @@ near it would, and sharper than any render.
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras, Gaussians

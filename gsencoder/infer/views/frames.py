@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from gsencoder.core.even_indices import even_indices
+from gsencoder.core.arrays import even_indices
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.targets import Target

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int64, Integer
 
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.runtime.threads import parallel
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.process import parallel
 from gsencoder.data.seeding.spacing import NEIGHBOR
 from gsencoder.geometry import covariances
 from gsencoder.infer.views.constants import CONSTANTS

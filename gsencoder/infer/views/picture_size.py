@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, counted
-from gsencoder.core.files.picture_file import picture_bytes
-from gsencoder.core.knobs import shown_value
-from gsencoder.core.promises import MEGABYTE
+from gsencoder.core.files import picture_bytes
+from gsencoder.core.settings import MEGABYTE, shown_value
 from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.views.budget import ViewsBudget
 from gsencoder.infer.views.constants import CONSTANTS

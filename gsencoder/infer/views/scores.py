@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64
 
-from gsencoder.core.even_indices import even_indices
-from gsencoder.core.runtime.threads import parallel
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.process import parallel
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.targets import Target
 from gsencoder.render import Blend, BlendConfig, blend

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.core.files.picture_file import write_picture
+from gsencoder.core.files import write_picture
 from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.views.pictures import picture_kinds, view_sheet
 from gsencoder.infer.views.selection import TargetScore, ViewSet

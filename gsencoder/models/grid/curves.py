@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from gsencoder.core.runtime.threads import parallel
+from gsencoder.core.process import parallel
 from gsencoder.models.grid.serialize import (
     ALIGN,
     MAX_EXTENT,

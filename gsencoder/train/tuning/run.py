@@ -10,13 +10,11 @@ from typing import Any, Literal
 
 import torch
 
+from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.archive import open_archive, write_archive
-from gsencoder.core.files.json_values import plain
-from gsencoder.core.files.written_files import check_written
+from gsencoder.core.files import check_written, plain
 from gsencoder.core.pretrained import load_pretrained
-from gsencoder.core.runtime.process_rank import ProcessRank
-from gsencoder.core.runtime.tracking import Track, untracked
+from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.data.prompt_store import PromptStore
 from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.distributed import check_agreement

@@ -14,9 +14,15 @@ import torch
 from torch import nn
 
 from gsencoder.core.errors import InputError, listed
-from gsencoder.core.files.atomic import is_full_disk
-from gsencoder.core.files.model_files import digest_files
-from gsencoder.core.pretrained import load_companion, load_pretrained, quiet_transformers, read_config, weight_files
+from gsencoder.core.files import is_full_disk
+from gsencoder.core.pretrained import (
+    digest_files,
+    load_companion,
+    load_pretrained,
+    quiet_transformers,
+    read_config,
+    weight_files,
+)
 
 WHAT = "tune"
 SERVED_FOLDER = "served"

@@ -9,7 +9,7 @@ from command_runs import refusal, results_of
 from named_rooms import write_words
 
 from gsencoder.app import cli
-from gsencoder.core.files.step_log import read_log
+from gsencoder.core.logs import read_log
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
 from gsencoder.fusion.store.folder import load_features, load_memories

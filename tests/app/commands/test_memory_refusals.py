@@ -12,7 +12,7 @@ from splats import random_gaussians
 from gsencoder.app import cli
 from gsencoder.app.commands.memory import MemoryCommandConfig
 from gsencoder.app.settings.options import options_by_key
-from gsencoder.core.files.step_log import read_log
+from gsencoder.core.logs import read_log
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
 from gsencoder.fusion.store.folder import save_memories

@@ -12,7 +12,7 @@ from region_scenes import save_colors
 from gsencoder.app import cli
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
-from gsencoder.core.files.archive import open_archive
+from gsencoder.core.archive import open_archive
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room

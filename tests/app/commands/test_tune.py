@@ -13,7 +13,7 @@ from tiny_vlm import PATCH, SIDE
 from tuning_pairs import make_model
 
 from gsencoder.app import cli
-from gsencoder.core.files.step_log import read_log
+from gsencoder.core.logs import read_log
 from gsencoder.data.prompt_store import PromptStore
 
 pytest.importorskip("peft")

@@ -9,7 +9,7 @@ from asked_rooms import ORIGIN, save_room
 from PIL import Image
 
 from gsencoder.app import cli
-from gsencoder.core.files.archive import open_archive
+from gsencoder.core.archive import open_archive
 
 pytestmark = pytest.mark.slow
 

@@ -12,7 +12,7 @@ import pytest
 from toy_stage import Toy, ToyScene, ToySettings
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.peak_memory import Growth
+from gsencoder.core.process import Growth
 from gsencoder.evaluate.tradeoff.halving import HalvingConfig
 from gsencoder.evaluate.tradeoff.measure import interleaved, measure
 from gsencoder.evaluate.tradeoff.records import RECORDS_FILE, Record, Records, Timing

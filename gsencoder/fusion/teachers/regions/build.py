@@ -1,8 +1,7 @@
 """The `regions` teacher from its settings: masks of regions, and one vector for each (M3 sec. 3.3, LangSplat)."""
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import find_file
-from gsencoder.core.pretrained import read_config
+from gsencoder.core.pretrained import find_file, read_config
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.process import Device
 
 LARGEST_SIDE = 8192
 

@@ -9,10 +9,18 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import digest_files, find_file
-from gsencoder.core.onnx_session import choose_tensors, open_session, run_on_picture
-from gsencoder.core.pretrained import load_companion, load_pretrained, quiet_transformers, read_config
-from gsencoder.core.runtime.device_names import Device
+from gsencoder.core.pretrained import (
+    choose_tensors,
+    digest_files,
+    find_file,
+    load_companion,
+    load_pretrained,
+    open_session,
+    quiet_transformers,
+    read_config,
+    run_on_picture,
+)
+from gsencoder.core.process import Device
 from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions
 from gsencoder.fusion.teachers.resize import normalized
 from gsencoder.text.transformers_tower import JOINT
@@ -202,7 +210,7 @@ class TransformersImageTower:
         stated = read_config(folder, WHAT)
         import transformers
 
-        from gsencoder.core.runtime.device import choose_device
+        from gsencoder.core.device import choose_device
 
         kind = stated.model_type.removesuffix("_vision_model")
         loader, self._output = JOINT_IMAGE.get(kind, ("AutoModel", "pooler_output"))
@@ -233,7 +241,7 @@ class TransformersImageTower:
         """
         import torch
 
-        from gsencoder.core.runtime.device import enough_memory
+        from gsencoder.core.device import enough_memory
 
         with quiet_transformers():
             inputs = self._processor(images=Image.fromarray(picture), return_tensors="pt", **self._uncut)

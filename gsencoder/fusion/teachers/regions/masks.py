@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import digest_files
+from gsencoder.core.pretrained import digest_files
 from gsencoder.data.readers.label_images import LABEL_SUFFIXES, label_files
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.types import Scene, Views

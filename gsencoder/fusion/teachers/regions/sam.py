@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float32, Int32, UInt8
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.files.model_files import digest_files, find_file
-from gsencoder.core.pretrained import load_companion, load_pretrained, read_config
+from gsencoder.core.pretrained import digest_files, find_file, load_companion, load_pretrained, read_config
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.fusion.teachers.resize import normalized
@@ -86,7 +85,7 @@ class SamMasks:
             raise InputError(f"{WHAT}: {folder} holds a {kind} model, expected sam or sam2")
         import transformers
 
-        from gsencoder.core.runtime.device import choose_device
+        from gsencoder.core.device import choose_device
 
         self.config, self._is_first = config, kind in SAM
         loader = transformers.SamModel if self._is_first else transformers.Sam2Model
@@ -127,7 +126,7 @@ class SamMasks:
         Raises:
             InputError: outputs that are not finite.
         """
-        from gsencoder.core.runtime.device import enough_memory
+        from gsencoder.core.device import enough_memory
 
         prepared = self._prepare(image)
         size = image.shape[0], image.shape[1]
@@ -141,7 +140,7 @@ class SamMasks:
         """The masks whose predicted IoU is large enough, as that IoU and logits of the model's own resolution."""
         import torch
 
-        from gsencoder.core.runtime.device import enough_memory
+        from gsencoder.core.device import enough_memory
 
         points = grid_points(self.config.points) * np.array([prepared.columns, prepared.rows], np.float32)
         candidates: list[tuple[float, Any]] = []

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import torch
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.runtime.device_names import Device, Precision
+from gsencoder.core.process import Device, Precision
 
 
 def choose_device(name: Device, local_rank: int = 0) -> torch.device:

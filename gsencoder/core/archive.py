@@ -1,0 +1,731 @@
+"""Archives: safetensors files with a JSON header and checksums, written atomically and validated when they are read.
+
+Files are not trusted: an array of another size would otherwise be broadcast, or fail far from the cause. Against
+damage, files of version 2 carry checksums (`checksums.py`) of the header and the arrays, and each array is verified
+when it is read. Files of version 1 have none, and are read with a warning. `safetensors_bytes.py` has the bytes.
+
+Checksums of array files: a CRC-32 for each block of each array, and one SHA-256 over the header and all of these.
+
+Blocks let a reader that maps a file check only what it reads: a training step touches a small part of a scene. A CRC-32
+detects every error of up to 32 neighboring bits in a block, and misses one in 2³² of all others; it is no protection
+against deliberate changes.
+
+The bytes of safetensors files: arrays read without a memory map, and files written without a second copy of them.
+
+A process that touches a page of a map beyond the end of its file is ended by the system (SIGBUS) without a word. Read
+as here, a file that is cut off by another program is shorter than expected, and an error names it.
+"""
+
+import hashlib
+import json
+import math
+import mmap
+import os
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryFile
+from types import TracebackType
+from typing import Any, BinaryIO
+
+import numpy as np
+from jaxtyping import Float32, Int, Int64, UInt8
+
+from gsencoder.core.errors import InputError, SceneWarning, about, readable
+from gsencoder.core.files import atomic_file, check_foreign, open_foreign
+from gsencoder.core.pretrained import check_fetched
+
+BLOCK_BYTES = 1 << 18
+"""Bytes of a block, which has one checksum; the last block of an array may be shorter."""
+DIGITS = 8
+"""Hexadecimal digits of one checksum."""
+
+
+def bytes_of(array: np.ndarray) -> UInt8[np.ndarray, " bytes"]:
+    """The bytes of an array in C order, without a copy if it is contiguous."""
+    return np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+
+
+def block_checksums(array: np.ndarray) -> str:
+    """The CRC-32 of each block of an array, as one string of hexadecimal digits."""
+    data = bytes_of(array)
+    return "".join(_checksum(data, block) for block in range(-(-len(data) // BLOCK_BYTES)))
+
+
+def _checksum(data: UInt8[np.ndarray, " bytes"], block: int) -> str:
+    return f"{zlib.crc32(data[block * BLOCK_BYTES : (block + 1) * BLOCK_BYTES].data):0{DIGITS}x}"
+
+
+def damaged_blocks(
+    data: UInt8[np.ndarray, " bytes"], checksums: str, blocks: Int64[np.ndarray, " n"] | None = None
+) -> list[int]:
+    """Numbers of the blocks of an array that do not match their checksums.
+
+    Args:
+        data: the bytes of the array.
+        checksums: of `block_checksums`.
+        blocks: numbers of the blocks to verify; None = all.
+    """
+    count = -(-len(data) // BLOCK_BYTES)
+    if len(checksums) != count * DIGITS:
+        return list(range(max(count, 1)))
+    numbers = range(count) if blocks is None else blocks.tolist()
+    return [n for n in numbers if _checksum(data, n) != checksums[n * DIGITS : (n + 1) * DIGITS]]
+
+
+def file_digest(header: Mapping[str, Any], entries: Mapping[str, tuple[str, tuple[int, ...]]]) -> str:
+    """The SHA-256 over a header (the checksums of all blocks included) and over the types and shapes of the arrays.
+
+    Args:
+        header: JSON values.
+        entries: type and shape of each array.
+    """
+    arrays = {name: [dtype, list(shape)] for name, (dtype, shape) in entries.items()}
+    return hashlib.sha256(json.dumps([header, arrays], sort_keys=True).encode()).hexdigest()
+
+
+HEADER_LIMIT = 100_000_000
+"""Bytes of the longest header that the library reads."""
+DTYPES = {
+    "F16": "float16",
+    "F32": "float32",
+    "F64": "float64",
+    "I8": "int8",
+    "I32": "int32",
+    "I64": "int64",
+    "U8": "uint8",
+    "U16": "uint16",
+}
+"""The types of arrays that archives may hold, by their names in safetensors."""
+NAMES_OF_DTYPES = {dtype: name for name, dtype in DTYPES.items()}
+ORDER = ("I64", "F64", "F32", "I32", "F16", "U16", "I8", "U8")
+"""The types in the order in which safetensors writes arrays: those first that are aligned to more bytes."""
+Entries = Mapping[str, tuple[str, tuple[int, ...]]]
+"""Type and shape of each array of a file."""
+
+
+def array_offsets(stream: BinaryIO) -> dict[str, tuple[int, int]]:
+    """The first byte of each array in the file, and the byte after its last.
+
+    Args:
+        stream: of the file, whose header the library has accepted.
+
+    Raises:
+        InputError: the header is cut off, or is no longer what the library read.
+    """
+    length = int.from_bytes(read_bytes(stream, (0, 8)).tobytes(), "little")
+    text = read_bytes(stream, (8, 8 + min(length, HEADER_LIMIT))).tobytes()
+    try:
+        table = json.loads(text)
+        begin = 8 + length
+        return {
+            name: (begin + entry["data_offsets"][0], begin + entry["data_offsets"][1])
+            for name, entry in table.items()
+            if name != "__metadata__"
+        }
+    except (ValueError, KeyError, TypeError, AttributeError, IndexError) as error:
+        raise InputError("was cut off or replaced while its header was read; give the command again") from error
+
+
+def read_bytes(stream: BinaryIO, span: tuple[int, int]) -> UInt8[np.ndarray, " bytes"]:
+    """The bytes of a part of a file; fewer where the file ends before.
+
+    Args:
+        stream: of the file.
+        span: its first byte, and the byte after its last.
+    """
+    first, last = span
+    data = np.empty(max(last - first, 0), np.uint8)
+    stream.seek(first)
+    done = 0
+    # The system reads 2 GiB at once at most.
+    while done < len(data) and (count := stream.readinto(data[done:].data)):  # type: ignore[attr-defined]
+        done += count
+    return data[:done]
+
+
+def write_safetensors(path: Path, arrays: Mapping[str, np.ndarray], metadata: Mapping[str, str]) -> None:
+    """Writes the bytes that `safetensors.numpy.save` gives, without a second copy of the arrays in memory.
+
+    The library's `save_file` writes a file of a random name first, which a kill leaves in the folder for good.
+    """
+    entries = entries_of(arrays)
+    with atomic_file(path) as stream:
+        stream.write(safetensors_header(entries, metadata))
+        for name in _file_order(entries):
+            stream.write(bytes_of(arrays[name]).data)
+
+
+def entries_of(arrays: Mapping[str, np.ndarray]) -> Entries:
+    """Type and shape of each array."""
+    return {name: (array.dtype.name, array.shape) for name, array in arrays.items()}
+
+
+def _file_order(entries: Entries) -> list[str]:
+    """The names of arrays in the order in which they stand in the file."""
+    return sorted(entries, key=lambda name: (ORDER.index(NAMES_OF_DTYPES[entries[name][0]]), name))
+
+
+def safetensors_header(entries: Entries, metadata: Mapping[str, str]) -> bytes:
+    """The bytes before the arrays: the length of the table of names, types, shapes and offsets, and the table."""
+    table: dict[str, Any] = {"__metadata__": dict(metadata)}
+    end = 0
+    for name in _file_order(entries):
+        dtype, shape = entries[name]
+        begin, end = end, end + math.prod(shape) * np.dtype(dtype).itemsize
+        table[name] = {"dtype": NAMES_OF_DTYPES[dtype], "shape": list(shape), "data_offsets": [begin, end]}
+    text = json.dumps(table, separators=(",", ":"), ensure_ascii=False).encode("utf-8", "surrogatepass")
+    # Arrays begin at a multiple of eight bytes.
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text
+
+
+VERSION = 2
+WITHOUT_CHECKSUMS = 1
+"""The version without checksums, except for packages, which had one over the file."""
+RESERVED_KEYS = ("version", "checksums", "digest")
+"""Keys of the header that callers may not use: version, checksums of the blocks by array, and the digest of the rest.
+"""
+LARGEST_NUMBER = 2.0**63
+LONGEST_NUMBER = -2.2250738585072014e-308
+"""JSON writes no number in more characters: it stands for numbers of a header that are not known yet."""
+LONGEST_SHARE = abs(LONGEST_NUMBER)
+"""The same for numbers that cannot be negative."""
+DAMAGED = "the file is damaged"
+
+
+class Archive:
+    """An open archive; arrays and header values are validated as they are read.
+
+    Attributes:
+        path: of the file, for messages.
+        sizes: values of the letters in shapes, as set by the arrays that were read so far.
+    """
+
+    def __init__(self, path: Path, file: Any, stream: BinaryIO, header: dict[str, Any]) -> None:
+        """Args:
+        path: of the file.
+        file: the file, opened by safetensors, for names, types and shapes.
+        stream: the file, from which arrays are read.
+        header: its JSON header.
+
+        Raises:
+            InputError: another version, or a header that does not match its digest.
+        """
+        self.path, self.sizes = path, dict[str, int]()
+        self._file, self._header, self._names = file, header, frozenset(file.keys())
+        self._stream, self._offsets = stream, array_offsets(stream)
+        version = header.get("version")
+        self.checksums: Mapping[str, str] | None = None
+        if type(version) is int and version == WITHOUT_CHECKSUMS and not {"checksums", "digest"} & set(header):
+            if "sum" not in header:
+                warn_without_checksums(path)
+            return
+        if version != VERSION:
+            raise InputError(f"{path}: expected version {VERSION} of the format, got {str(version)[:20]}")
+        covered = {key: value for key, value in header.items() if key != "digest"}
+        checksums = header.get("checksums")
+        good = isinstance(checksums, dict) and checksums.keys() == self._names
+        if not good or header.get("digest") != file_digest(covered, {name: self._stored(name) for name in self._names}):
+            raise InputError(f"{path}: {DAMAGED}: its header does not have the checksum that was written with it")
+        self.checksums = checksums
+
+    def array(self, name: str, dtype: str, shape: tuple[int | str, ...]) -> np.ndarray:
+        """Reads an array; a letter in its shape stands for the same size in all arrays of the file.
+
+        Raises:
+            InputError: missing, of another type or size, or not finite.
+        """
+        got_dtype, got = self._stored(name)
+        expected = tuple(self.sizes.get(side, side) if isinstance(side, str) else side for side in shape)
+        same = len(got) == len(expected) and all(
+            isinstance(e, str) or e == g for e, g in zip(expected, got, strict=True)
+        )
+        if got_dtype != dtype or not same:
+            raise InputError(
+                f"{self.path}: expected {name} {dtype}[{_listed(expected)}], got {got_dtype}[{_listed(got)}]; "
+                "the file is damaged or from another program"
+            )
+        self.sizes |= {side: size for side, size in zip(expected, got, strict=True) if isinstance(side, str)}
+        values = self._read(name)
+        if values.dtype.kind == "f" and not np.isfinite(values).all():
+            bad = values.size - int(np.count_nonzero(np.isfinite(values)))
+            raise InputError(f"{self.path}: {bad} of {values.size} values of {name} are not finite")
+        return values
+
+    def shape(self, name: str, dtype: str, axes: int) -> tuple[int, ...]:
+        """The shape of an array, without reading it.
+
+        Raises:
+            InputError: missing, of another type, or with another number of axes.
+        """
+        got_dtype, shape = self._stored(name)
+        if got_dtype != dtype or len(shape) != axes:
+            raise InputError(
+                f"{self.path}: expected {name} {dtype} with {axes} axes, got {got_dtype}[{_listed(shape)}]; "
+                "the file is damaged or from another program"
+            )
+        return shape
+
+    def _read(self, name: str) -> np.ndarray:
+        values = self._values(name)
+        if self.checksums is not None and damaged_blocks(bytes_of(values), self.checksums[name]):
+            raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
+        return values
+
+    def _values(self, name: str) -> np.ndarray:
+        # Not through the memory map of safetensors, which ends the process where the file is cut off meanwhile.
+        dtype, shape = self._stored(name)
+        if dtype not in DTYPES.values():
+            raise InputError(
+                f"{self.path}: {name} is of the type {dtype}, expected one of {', '.join(DTYPES.values())}"
+            )
+        data = read_bytes(self._stream, self._offsets.get(name, (0, 0)))
+        if len(data) != np.dtype(dtype).itemsize * math.prod(shape):
+            raise InputError(f"{self.path}: was cut off or replaced while {name} was read; give the command again")
+        return data.view(dtype).reshape(shape)
+
+    def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
+        """Type and shape of an array according to the file."""
+        if name not in self._names:
+            raise InputError(f"{self.path}: the array {name!r} is missing; the file is damaged or from another program")
+        stored = self._file.get_slice(name)
+        return DTYPES.get(stored.get_dtype(), stored.get_dtype()), tuple(stored.get_shape())
+
+    def value(self, key: str, *kinds: type | None) -> Any:
+        """Reads a value of the header, which must be of one of these types.
+
+        Raises:
+            InputError: missing or of another type.
+        """
+        value = self._header.get(key)
+        # JSON's true is a Python int, and no number here is meant to be one.
+        good = (value is None and None in kinds) or isinstance(value, tuple(kind for kind in kinds if kind is not None))
+        if key not in self._header or not good or (isinstance(value, bool) and bool not in kinds):
+            names = " or ".join("null" if kind is None else kind.__name__ for kind in kinds)
+            got = f"{str(value)[:60]!r}" if key in self._header else "nothing"
+            raise InputError(f"{self.path}: expected {key} ({names}) in the header, got {got}")
+        if isinstance(value, (int, float)) and not abs(value) < LARGEST_NUMBER:
+            raise InputError(f"{self.path}: expected a finite {key} in the header, got {str(value)[:20]}")
+        return value
+
+    def verify(self) -> None:
+        """Verifies the checksums of all arrays, or of the file where its version is 1.
+
+        Raises:
+            InputError: the file is damaged, or has no checksums.
+        """
+        if self.checksums is not None:
+            for name in sorted(self._names):
+                self._read(name)
+            return
+        arrays = {name: self._values(name) for name in self._names}
+        header = {key: value for key, value in self._header.items() if key not in ("version", "sum")}
+        if self.value("sum", str) != _sum_of_version_1(arrays, header):
+            raise InputError(f"{self.path}: {DAMAGED}: it does not have the checksum that was written with it")
+
+    def section(self, prefix: str, header: Mapping[str, Any]) -> "ArchiveSection":
+        """A part of the archive: the arrays whose names begin with `prefix`, with a header of its own."""
+        return ArchiveSection(self, prefix, header)
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._header or key in self._names
+
+
+class ArchiveSection(Archive):
+    """A part of an archive, in which arrays are named without their prefix, and letters in shapes are its own."""
+
+    def __init__(self, archive: Archive, prefix: str, header: Mapping[str, Any]) -> None:
+        self.path, self.sizes = archive.path, dict[str, int]()
+        self._archive, self._prefix, self._header = archive, prefix, dict(header)
+        self._names = frozenset(name.removeprefix(prefix) for name in archive._names if name.startswith(prefix))
+
+    def _read(self, name: str) -> np.ndarray:
+        return self._archive._read(self._prefix + name)
+
+    def _stored(self, name: str) -> tuple[str, tuple[int, ...]]:
+        return self._archive._stored(self._prefix + name)
+
+
+def _listed(shape: tuple[int | str, ...]) -> str:
+    return ", ".join(map(str, shape))
+
+
+def warn_without_checksums(path: Path) -> None:
+    """Warns once for each folder, since a run may read hundreds of such files from it."""
+    if path.parent not in _WARNED:
+        _WARNED.add(path.parent)
+        warnings.warn(
+            f"{path}: was written by an earlier version, without checksums, so damage to it or to files beside it "
+            "would not be noticed; write it again to add them",
+            SceneWarning,
+            stacklevel=5,
+        )
+
+
+_WARNED: set[Path] = set()
+
+
+def _sum_of_version_1(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> str:
+    """sha256 over the header and over names, types, shapes and bytes of all arrays."""
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = _contiguous(arrays[name])
+        digest.update(f"{name} {array.dtype.name}{array.shape}".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
+
+
+def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
+    """Writes arrays and header with their checksums; an existing file is replaced once the new one is complete.
+
+    Args:
+        path: the file.
+        arrays: by name, of the types in `DTYPES`.
+        header: JSON values, under other keys than `RESERVED_KEYS`.
+
+    Raises:
+        InputError: the disk is full, or the system refuses.
+    """
+    pieces = {name: _contiguous(array) for name, array in arrays.items()}
+    assert not set(RESERVED_KEYS) & set(header)
+    assert all(array.dtype.name in DTYPES.values() for array in pieces.values()), "a type that cannot be read back"
+    checksums = {name: block_checksums(array) for name, array in pieces.items()}
+    write_safetensors(path, pieces, _metadata(entries_of(pieces), checksums, header))
+
+
+def archive_bytes(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> int:
+    """The size of the file that `write_archive` would write.
+
+    Args:
+        arrays: by name; values do not matter, so that arrays of `shape_only` will do.
+        header: as it would be written; numbers of other lengths change the size by as many bytes.
+    """
+    entries = entries_of(arrays)
+    sizes = {name: math.prod(shape) * np.dtype(dtype).itemsize for name, (dtype, shape) in entries.items()}
+    checksums = {name: "0" * (DIGITS * -(-size // BLOCK_BYTES)) for name, size in sizes.items()}
+    return len(safetensors_header(entries, _metadata(entries, checksums, header))) + sum(sizes.values())
+
+
+def shape_only(dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    """An array of zeros that takes no memory: it stands for one of its type and shape in `archive_bytes`."""
+    return np.broadcast_to(np.zeros((), dtype), shape)
+
+
+def _metadata(entries: Entries, checksums: Mapping[str, str], header: Mapping[str, Any]) -> dict[str, str]:
+    # The digest is of what a reader will see: JSON turns tuples into lists and keys into text.
+    covered = json.loads(json.dumps({**header, "version": VERSION, "checksums": checksums}))
+    return {"gsencoder": json.dumps({**covered, "digest": file_digest(covered, entries)})}
+
+
+def _contiguous(array: np.ndarray) -> np.ndarray:
+    """A contiguous copy of the same shape; np.ascontiguousarray alone gives a scalar an axis."""
+    return np.ascontiguousarray(array).reshape(array.shape)
+
+
+@contextmanager
+def open_archive(path: Path) -> Iterator[Archive]:
+    """Opens the file at `path` for the block. An `InputError` in the block that does not name the file is prefixed with
+    its path, so that errors of validation say which file they are about.
+
+    Raises:
+        InputError: missing, damaged, or of another version.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected one that gsencoder wrote")
+    try:
+        with about(path), path.open("rb", buffering=0) as stream, safe_open(path, framework="numpy") as file:
+            header = json.loads((file.metadata() or {}).get("gsencoder", "{}"))
+            if not isinstance(header, dict):
+                raise InputError(f"{path}: expected version {VERSION} of the format, got none")
+            yield Archive(path, file, stream, header)
+    except InputError:
+        raise
+    except (SafetensorError, OSError, ValueError, RecursionError) as error:
+        check_fetched(path)
+        message = " ".join(str(error).split())[:160]
+        raise InputError(f"{path}: damaged or no safetensors file: {message}") from error
+
+
+def verify_archive(path: Path) -> None:
+    """Reads an archive and verifies its checksums.
+
+    Raises:
+        InputError: missing, damaged, of another version, or without checksums.
+    """
+    with open_archive(path) as file:
+        file.verify()
+
+
+class MappedArrays:
+    """Read-only arrays of a file. A block is verified against its checksum when it is first used, and not again; values
+    are not validated otherwise. Files of version 1 have no checksums, and are read as they are.
+
+    The system ends a process that reads a page of the map beyond the end of the file (SIGBUS). So the size of the file
+    is compared whenever an array is asked for, which leaves the moment in which its values are used.
+    """
+
+    def __init__(self, path: Path, types: Mapping[str, tuple[str, int]], earlier: "MappedArrays | None" = None) -> None:
+        """Maps the file.
+
+        Args:
+            path: of the file.
+            types: dtype and number of axes of each array.
+            earlier: a closed map of these arrays; blocks that it verified are not verified again if the file has not
+                been written since.
+
+        Raises:
+            InputError: missing, damaged, or without these arrays.
+        """
+        self.path = path
+        with open_archive(path) as file:
+            shapes = {name: file.shape(name, dtype, axes) for name, (dtype, axes) in types.items()}
+            self._checksums = file.checksums
+        with about(path), open_foreign(path) as stream:
+            state, offsets = os.fstat(stream.fileno()), array_offsets(stream)
+            self._map = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        self._stamp = (state.st_ino, state.st_size, state.st_mtime_ns)
+        self._check_size()
+        raw = np.frombuffer(self._map, np.uint8)
+        self._bytes: dict[str, UInt8[np.ndarray, " bytes"]] = {}
+        self._arrays: dict[str, np.ndarray] = {}
+        for name, (dtype, _) in types.items():
+            first, last = offsets[name]
+            self._bytes[name] = raw[first:last]
+            self._arrays[name] = self._bytes[name].view(dtype).reshape(shapes[name])
+        self._unchecked: dict[str, np.ndarray] = {}
+        if self._checksums is not None:
+            blocks = {name: -(-len(data) // BLOCK_BYTES) for name, data in self._bytes.items()}
+            self._unchecked = {name: np.ones(count, bool) for name, count in blocks.items() if count}
+            if earlier is not None and earlier._stamp == self._stamp:
+                self._unchecked = earlier._unchecked
+
+    def close(self) -> None:
+        """Closes the file; only the record of verified blocks remains."""
+        self._bytes.clear()
+        self._arrays.clear()
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """The shape of an array."""
+        return self._arrays[name].shape
+
+    def array(self, name: str) -> np.ndarray:
+        """A complete array, verified; a view of the map.
+
+        Raises:
+            InputError: the file is damaged, or was cut off.
+        """
+        self._check_size()
+        if name in self._unchecked:
+            self._check(name, np.flatnonzero(self._unchecked[name]))
+        return self._arrays[name]
+
+    def rows(self, name: str, rows: Int[np.ndarray, " n"]) -> np.ndarray:
+        """Copies rows of an array.
+
+        Args:
+            name: of the array.
+            rows: indices.
+
+        Raises:
+            InputError: these rows are damaged, or the file was cut off.
+        """
+        self._check_size()
+        array = self._arrays[name]
+        if name in self._unchecked and len(rows):
+            size = array.dtype.itemsize * int(np.prod(array.shape[1:]))
+            first = rows.astype(np.int64) * size
+            touched = np.zeros(len(self._unchecked[name]), bool)
+            # A row may extend over several blocks.
+            for offset in range(0, size + BLOCK_BYTES, BLOCK_BYTES):
+                touched[(first + min(offset, max(size - 1, 0))) // BLOCK_BYTES] = True
+            self._check(name, np.flatnonzero(touched & self._unchecked[name]))
+        values: np.ndarray = array[rows]
+        return values
+
+    def row_range(self, name: str, first: int, last: int) -> np.ndarray:
+        """Rows `first` to `last`, exclusive, of an array; a view of the map.
+
+        Raises:
+            InputError: these rows are damaged, or the file was cut off.
+        """
+        self._check_size()
+        array = self._arrays[name]
+        if name in self._unchecked and last > first:
+            size = array.dtype.itemsize * int(np.prod(array.shape[1:]))
+            blocks = np.arange(first * size // BLOCK_BYTES, -(-last * size // BLOCK_BYTES))
+            self._check(name, blocks[self._unchecked[name][blocks]])
+        return array[first:last]
+
+    def _check_size(self) -> None:
+        _, written, _ = self._stamp
+        if (now := self._map.size()) < written:
+            raise InputError(
+                f"{self.path}: was cut off while it was in use: {now:,} of {written:,} bytes are left; write it again"
+            )
+
+    def _check(self, name: str, blocks: Int64[np.ndarray, " n"]) -> None:
+        assert self._checksums is not None
+        if damaged_blocks(self._bytes[name], self._checksums[name], blocks):
+            raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
+        self._unchecked[name][blocks] = False
+        if not self._unchecked[name].any():
+            del self._unchecked[name]
+
+
+LARGEST_ARRAY = 1 << 29
+"""Largest size of an array, bytes: a thousand masks of half a million vertices."""
+MAX_TEXT = 1 << 12
+"""Largest number of characters of an entry of a text array; numpy stores all entries with the length of the longest."""
+
+
+_KINDS = {"U": "text", "f": "floating point", "b": "bool", "i": "signed integers", "u": "unsigned integers"}
+"""What messages call numpy's kinds of types."""
+
+
+def read_npz(
+    file: Path,
+    required: Mapping[str, tuple[str, int]],
+    optional: Mapping[str, tuple[str, int]] | None = None,
+    *,
+    max_text: int = MAX_TEXT,
+) -> dict[str, np.ndarray]:
+    """Reads arrays of an .npz by name.
+
+    Args:
+        file: the archive.
+        required: kind of type ("U" text, "f" floating point, "b" bool, "i" and "u" integers) and number of axes of each
+            array.
+        optional: the same for arrays that may be missing.
+        max_text: largest number of characters of an entry of text.
+
+    Raises:
+        InputError: damaged or hostile, or an array is missing or of another kind.
+    """
+    try:
+        check_foreign(file)
+        with zipfile.ZipFile(file) as archive:
+            present = set(archive.namelist())
+            missing = [name for name in required if f"{name}.npy" not in present]
+            if missing:
+                raise InputError(f"{file}: expected the arrays {' and '.join(required)}, {missing[0]} is missing")
+            types = {**required, **{k: v for k, v in (optional or {}).items() if f"{k}.npy" in present}}
+            return {name: _read_member(archive, name, *kind, file, max_text) for name, kind in types.items()}
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError, MemoryError) as error:
+        message = (" ".join(str(error).split()) or type(error).__name__)[:200]
+        raise InputError(f"{file}: cannot be read as .npz: {message}") from error
+
+
+def _described(dtype: np.dtype, shape: tuple[int, ...]) -> str:
+    name = "Python objects, which would run code" if dtype.hasobject else f"{dtype}"
+    return f"{' × '.join(f'{each:,}' for each in shape) or 'one'} of {name}"
+
+
+def _read_member(archive: zipfile.ZipFile, name: str, kind: str, ndim: int, file: Path, max_text: int) -> np.ndarray:
+    """Reads an array; its header must match the size in the archive, which is checked before memory is allocated."""
+    where, size = f"{file}: {name}", archive.getinfo(f"{name}.npy").file_size
+    if size > LARGEST_ARRAY:
+        raise InputError(f"{where} claims {size:,} bytes; at most {LARGEST_ARRAY:,} are read")
+    with archive.open(f"{name}.npy") as stream:
+        version = np.lib.format.read_magic(stream)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+        if read is None:
+            raise InputError(f"{where}: unknown .npy version {version}")
+        shape, fortran, dtype = read(stream)
+        count = int(np.prod(shape, dtype=object))
+        if dtype.kind != kind or len(shape) != ndim:
+            raise InputError(
+                f"{where}: expected {ndim} {'axis' if ndim == 1 else 'axes'} of {_KINDS[kind]}, got "
+                f"{_described(dtype, shape)}"
+            )
+        length = dtype.itemsize // np.dtype("U1").itemsize
+        if kind == "U" and length > max_text:
+            raise InputError(f"{where}: entries of {length:,} characters, expected at most {max_text:,}")
+        expected = size - stream.tell()
+        if count * dtype.itemsize != expected:
+            raise InputError(f"{where}: header claims {count * dtype.itemsize:,} bytes, the file holds {expected:,}")
+        data = stream.read(expected)
+    if len(data) != expected:
+        raise InputError(f"{where}: truncated, {expected - len(data):,} of {expected:,} bytes are missing")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
+
+
+class RowFile:
+    """Rows that are appended part by part and then read as one array, whose pages the system loads and drops.
+
+    The file is in the folder for temporary files (TMPDIR) and has no name, so that it goes with the process.
+    """
+
+    def __init__(self, channels: int) -> None:
+        """Args:
+        channels: of a row.
+        """
+        self._channels, self._count = channels, 0
+        self._file = TemporaryFile()  # noqa: SIM115
+
+    def append(self, rows: Float32[np.ndarray, "n D"]) -> None:
+        """Adds rows after those that are there.
+
+        Raises:
+            InputError: rows of another length, or the disk is full.
+        """
+        if rows.shape[1] != self._channels:
+            raise InputError(f"rows: expected {self._channels} channels, got {rows.shape[1]}")
+        try:
+            self._file.write(np.ascontiguousarray(rows, np.float32).tobytes())
+            self._file.flush()
+        except OSError as error:
+            raise InputError(
+                f"rows: {self._count + len(rows):,} rows of {self._channels} channels do not fit into the folder for "
+                f"temporary files ({error.strerror or error}); set TMPDIR to a folder with more room"
+            ) from error
+        self._count += len(rows)
+
+    def array(self) -> Float32[np.ndarray, "n D"]:
+        """All rows, mapped from the file; they are valid until it is closed."""
+        if not self._count:
+            return np.zeros((0, self._channels), np.float32)
+        return np.memmap(self._file, np.float32, "r", shape=(self._count, self._channels))
+
+    def __enter__(self) -> "RowFile":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._file.close()
+
+
+def copy_checked(source: Path, target: Path, check: Callable[[Path], object]) -> None:
+    """Copies a file and checks the copy, since the source may have been cut off while it was copied. An earlier target
+    is replaced once the copy is complete and checked.
+
+    Args:
+        source: the file.
+        target: its copy.
+        check: reads the copy; raises InputError where it is damaged.
+
+    Raises:
+        InputError: the source cannot be read, the copy cannot be written, or is damaged; then the source is named.
+    """
+    with atomic_file(target) as stream:
+        for block in _blocks(source):
+            stream.write(block)
+        stream.flush()
+        try:
+            check(Path(stream.name))
+        except InputError as error:
+            raise InputError(str(error).replace(stream.name, str(source))) from error
+
+
+def _blocks(path: Path) -> Iterator[bytes]:
+    with readable(path), open_foreign(path) as stream:
+        while block := stream.read(BLOCK_BYTES):
+            yield block

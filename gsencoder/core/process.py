@@ -1,0 +1,652 @@
+"""The process of a command: signals, rank, progress, clock, memory, threads and the names of devices.
+
+The rank of this process among those that one launcher started.
+
+torchrun and SLURM (srun, submitit) give a process its rank through environment variables; without either there is one
+process. No other module reads these variables.
+
+Heap settings of a CPU process that runs networks: freed blocks are reused instead of returned to the system.
+
+glibc returns every block above 32 MB to the system when it is freed, and threads other than the first get heaps that
+cannot grow beyond 64 MB. Each layer's activations are then new pages, which the system must clear: that costs more than
+the arithmetic (`bench/cpu.py`).
+
+CPU kernels: numba functions without the GIL, called from a pool of Python threads.
+
+numba's parallel loops are not used, since an OpenMP pool aborts a process that was forked after its first use, as data
+loaders do. Work is cut into a fixed number of pieces, so that results do not depend on the number of threads.
+"""
+
+import contextlib
+import ctypes
+import functools
+import gc
+import importlib
+import math
+import os
+import re
+import signal
+import sys
+import threading
+import time
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass
+from functools import wraps
+from pathlib import Path
+from types import FrameType
+from typing import Any, Literal, ParamSpec, TypeVar
+
+import numpy as np
+from jaxtyping import Int64
+
+from gsencoder.core.errors import InputError, SceneWarning
+
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name))
+"""Signals with which a user, a shell or a cluster ends a process."""
+
+
+class Stopped(BaseException):
+    """The process received a signal to end; raised where it was running, so that half-written output is removed."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(number)
+        self.number = number
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C. A class of its own, since `python -m` ends by SIGINT in place of its exit code if a `KeyboardInterrupt`
+    proper has left an `exec`, such as dataclasses run when they are made, even though it was caught."""
+
+
+def stop_of(error: BaseException) -> Stopped | KeyboardInterrupt | None:
+    """The signal or interrupt behind an exception, or None. A signal that arrives within a compiled function leaves it
+    wrapped in a `SystemError`, and in one more for each function that had called it."""
+    inner: BaseException | None = error
+    while isinstance(inner, SystemError):
+        inner = inner.__cause__ or inner.__context__
+    return inner if isinstance(inner, Stopped | KeyboardInterrupt) else None
+
+
+_received: int | None = None
+"""The last signal that a command received; None where `stopping_signals` is not entered, as in a library."""
+
+
+@contextmanager
+def stopping_signals() -> Iterator[None]:
+    """Signals that end the process raise an exception within the block, and are remembered; for the main thread of a
+    command, others are left as they are.
+
+    An exception that a handler raises does not always get through: in a destructor, a weakref's callback (the import
+    system has one) or a callback of compiled code Python prints and drops it, and libraries have `except:` clauses.
+    `raise_dropped_stop` raises it again. Signals that are ignored (nohup) remain so.
+    """
+    global _received
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(number: int, _: FrameType | None) -> None:
+        global _received
+        _received = number
+        raise _stop(number)
+
+    def report(dropped: Any) -> None:
+        if not isinstance(dropped.exc_value, Stopped | KeyboardInterrupt):
+            report_before(dropped)
+
+    replaced = {number: signal.getsignal(number) for number in SIGNALS}
+    replaced = {
+        number: handler
+        for number, handler in replaced.items()
+        if handler in (signal.SIG_DFL, signal.default_int_handler)
+    }
+    report_before, sys.unraisablehook = sys.unraisablehook, report
+    try:
+        for number in replaced:
+            signal.signal(number, stop)
+        yield
+        raise_dropped_stop()
+    except Exception as error:
+        if _received is None:
+            raise
+        # What a library, or a line that names its errors, made of the exception.
+        stopped = _stop(_received)
+        stopped.__notes__ = getattr(error, "__notes__", [])
+        raise stopped from error
+    finally:
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
+        sys.unraisablehook, _received = report_before, None
+
+
+def raise_dropped_stop() -> None:
+    """Raises the exception of a signal that the command has received, unless it is on its way: commands call this
+    between steps, and before results appear.
+
+    Raises:
+        Stopped, KeyboardInterrupt: the signal has not ended the command.
+    """
+    if _received is None or threading.current_thread() is not threading.main_thread():
+        return
+    handled = sys.exc_info()[1]
+    while handled is not None:
+        if stop_of(handled) is not None:
+            return
+        handled = handled.__context__
+    raise _stop(_received)
+
+
+def accept_stop() -> None:
+    """Forgets the signal that was received, where it ends what a command does in the usual way."""
+    global _received
+    _received = None
+
+
+def _stop(number: int) -> Stopped | KeyboardInterrupt:
+    return Interrupted() if number == signal.SIGINT else Stopped(number)
+
+
+@contextmanager
+def defer_signals() -> Iterator[None]:
+    """Signals that end the process are handled after the block, so that they do not interrupt it.
+
+    Handlers run in the main thread alone; in other threads nothing is deferred.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before: dict[int, Callable[[int, FrameType | None], Any]] = {}
+    deferred: list[tuple[int, FrameType | None]] = []
+    block_ended = False
+
+    def defer(number: int, frame: FrameType | None) -> None:
+        if block_ended:
+            before[number](number, frame)
+        else:
+            deferred.append((number, frame))
+
+    try:
+        for number in SIGNALS:
+            handler = signal.getsignal(number)
+            if callable(handler):
+                before[number] = handler
+                signal.signal(number, defer)
+        yield
+    finally:
+        block_ended = True
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number, frame in deferred:
+            before[number](number, frame)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProcessRank:
+    """The rank of a process among those that one launcher started.
+
+    Attributes:
+        rank: its number among all processes, from 0.
+        world_size: number of processes.
+        local_rank: its number among the processes of its machine.
+        local_world_size: number of processes of its machine; 1 where the launcher does not state it.
+    """
+
+    rank: int = 0
+    world_size: int = 1
+    local_rank: int = 0
+    local_world_size: int = 1
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this is the process that writes files and prints."""
+        return self.rank == 0
+
+
+def rank_from_environment(environment: Mapping[str, str]) -> tuple[ProcessRank, str]:
+    """Reads the rank of this process from environment variables of torchrun or SLURM.
+
+    Returns:
+        The rank, and the init_method for `torch.distributed`: "tcp://…" under SLURM, "env://" under torchrun, else "".
+
+    Raises:
+        InputError: the variables contradict each other.
+    """
+    if "RANK" in environment and "WORLD_SIZE" in environment:
+        names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
+        rank, size, local = (_read_number(environment, name, "0") for name in names)
+        local_size = _read_number(environment, "LOCAL_WORLD_SIZE", "1")
+        init_method = "env://"
+    elif "SLURM_STEP_ID" in environment and _read_number(environment, "SLURM_NTASKS", "1") > 1:
+        # Without a step this is the batch script itself, which runs once for any number of tasks.
+        names = ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_LOCALID")
+        rank, size, local = (_read_number(environment, name, "0") for name in names)
+        local_size = _local_tasks(environment)
+        nodes = environment.get("SLURM_STEP_NODELIST") or environment.get("SLURM_JOB_NODELIST", "")
+        host = environment.get("MASTER_ADDR") or first_host(nodes)
+        # Jobs that share a machine need different ports; their job ids differ.
+        port = environment.get("MASTER_PORT") or str(20_000 + _read_number(environment, "SLURM_JOB_ID", "0") % 20_000)
+        init_method = f"tcp://{host}:{port}"
+    else:
+        return ProcessRank(), ""
+    if not 0 <= rank < size:
+        raise InputError(f"{names[0]}={rank} is not below {names[1]}={size}; start all processes with one launcher")
+    return (
+        ProcessRank(rank=rank, world_size=size, local_rank=local, local_world_size=max(1, min(local_size, size))),
+        init_method,
+    )
+
+
+def store_address(environment: Mapping[str, str], init_method: str) -> tuple[str, int]:
+    """The host and the port at which the processes of a launcher meet.
+
+    Raises:
+        InputError: the variables do not say it.
+    """
+    if init_method.startswith("tcp://"):
+        host, _, port = init_method.removeprefix("tcp://").rpartition(":")
+        environment = {"MASTER_ADDR": host, "MASTER_PORT": port}
+    if not (environment.get("MASTER_ADDR") and environment.get("MASTER_PORT")):
+        raise InputError(
+            "RANK and WORLD_SIZE are set, and MASTER_ADDR or MASTER_PORT is not: give the host of process 0 and a free "
+            "port there to all processes, or unset RANK and WORLD_SIZE for one process"
+        )
+    return environment["MASTER_ADDR"], _read_number(environment, "MASTER_PORT", "")
+
+
+def refuse_several(subject: str, advice: str) -> None:
+    """Checks that a launcher started this process alone, for work that is not shared: all would write the same results.
+
+    Args:
+        subject: what runs in one process, for the error.
+        advice: what to do instead.
+
+    Raises:
+        InputError: in every process: there are several.
+    """
+    process, _ = rank_from_environment(os.environ)
+    if process.world_size > 1:
+        raise InputError(
+            f"{subject}: runs in one process, and this is process {process.rank} of {process.world_size} that a "
+            f"launcher (torchrun, SLURM) started; {advice}"
+        )
+
+
+def first_host(nodes: str) -> str:
+    """The first host of a SLURM node list such as `a[03-07,9],b1`.
+
+    Raises:
+        InputError: the list is empty.
+    """
+    match = re.match(r"([^\[,\s]+)(?:\[([^\]]*)\])?([^\[,\s]*)", nodes)
+    if not match:
+        raise InputError("SLURM: the node list (SLURM_STEP_NODELIST) is empty; set MASTER_ADDR")
+    prefix, numbers, suffix = match.groups()
+    return prefix + (re.split(r"[-,]", numbers)[0] if numbers else "") + suffix
+
+
+def _local_tasks(environment: Mapping[str, str]) -> int:
+    """The number of tasks on this node, the first of a list such as `8(x3),4`: a step's nodes rarely differ, and fewer
+    threads than cores are no error."""
+    tasks = environment.get("SLURM_STEP_TASKS_PER_NODE") or environment.get("SLURM_TASKS_PER_NODE", "1")
+    match = re.match(r"\d+", tasks)
+    return int(match[0]) if match else 1
+
+
+def _read_number(environment: Mapping[str, str], name: str, default: str) -> int:
+    value = environment.get(name, default)
+    if not value.isdigit():
+        raise InputError(f"{name}: expected a whole number in the environment variable, got {value!r}")
+    return int(value)
+
+
+Track = Callable[[Iterable[Any], str], Iterable[Any]]
+"""Yields the items of a loop and shows its progress; the text says what the loop does."""
+
+
+def untracked(items: Iterable[Any], label: str) -> Iterable[Any]:  # noqa: ARG001
+    """Yields the items and shows nothing."""
+    return items
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+_running: ContextVar["Clock | None"] = ContextVar("running_clock", default=None)
+
+
+class Clock:
+    """Adds up the seconds that each step of a stage takes.
+
+    A step is a block, `with clock("lift"): …`, or, between `with clock.running():`, a call of a function that is
+    decorated with `@timed("lift")`.
+
+    Attributes:
+        seconds: by step, in order of first start.
+    """
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, step: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[step] = self.seconds.get(step, 0.0) + time.perf_counter() - start
+
+    @contextmanager
+    def running(self) -> Iterator["Clock"]:
+        """Lets functions decorated with `timed` that this thread calls inside the block count towards this clock."""
+        token = _running.set(self)
+        try:
+            yield self
+        finally:
+            _running.reset(token)
+
+    def share_out(self, seconds: float, steps: Iterable[Mapping[str, float]]) -> None:
+        """Adds seconds of the wall clock in which several threads were at work: each step receives its share of the
+        seconds of all threads.
+
+        Args:
+            seconds: of the wall clock.
+            steps: the seconds of each thread by step, or of each piece of its work.
+        """
+        of_threads: dict[str, float] = {}
+        for each in steps:
+            for step, seconds_of_step in each.items():
+                of_threads[step] = of_threads.get(step, 0.0) + seconds_of_step
+        total = sum(of_threads.values())
+        for step, seconds_of_step in of_threads.items():
+            self.seconds[step] = self.seconds.get(step, 0.0) + (seconds * seconds_of_step / total if total else 0.0)
+
+
+def timed(step: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Decorates a function as one step of a stage: its calls are timed while a clock is running."""
+
+    def mark(function: Callable[P, R]) -> Callable[P, R]:
+        @wraps(function)
+        def call(*arguments: P.args, **settings: P.kwargs) -> R:
+            clock = _running.get()
+            if clock is None:
+                return function(*arguments, **settings)
+            with clock(step):
+                return function(*arguments, **settings)
+
+        return call
+
+    return mark
+
+
+STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+class Growth:
+    """The result of `memory_growth`, set when its block ends.
+
+    Attributes:
+        mib: peak resident memory minus that at the start, MiB; NaN where the system does not report it.
+    """
+
+    def __init__(self) -> None:
+        self.mib = math.nan
+
+
+@contextmanager
+def memory_growth() -> Iterator[Growth]:
+    """Measures the memory of a block, which may run many times in one process.
+
+    Linux records the peak of resident memory of each process (VmHWM) and can reset it to the present value. Freed heap
+    memory is returned to the system first, so that the block cannot reuse what an earlier one freed. On other systems
+    the result is NaN.
+    """
+    growth = Growth()
+    gc.collect()
+    with suppress(OSError, AttributeError):
+        ctypes.CDLL(None).malloc_trim(0)
+    try:
+        CLEAR.write_text("5")
+        before = _kib("VmRSS")
+    except OSError:
+        yield growth
+        return
+    yield growth
+    growth.mib = max(_kib("VmHWM") - before, 0) / 1024
+
+
+def _kib(name: str) -> int:
+    for line in STATUS.read_text().splitlines():
+        if line.startswith(name + ":"):
+            return int(line.split()[1])
+    raise OSError(f"{STATUS} has no {name}")
+
+
+MEMINFO = Path("/proc/meminfo")
+
+
+def free_memory() -> int:
+    """Bytes that can be taken without swapping, as the system estimates them; where it does not, half of all memory."""
+    if MEMINFO.is_file():
+        for line in MEMINFO.read_text().splitlines():
+            name, _, value = line.partition(":")
+            if name == "MemAvailable":
+                return 1024 * int(value.split()[0])
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2
+
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
+_NEVER_TRIM = (1 << 31) - 1
+
+
+def retain_freed_memory() -> bool:
+    """Makes this process reuse freed memory from now on; False if the C library does not support it (glibc does).
+
+    The process then never shrinks below its peak. Meant for commands, which have a process of their own. To be called
+    before the first network runs, since oneDNN reads the capacity of its cache of compiled products once; the default
+    of 1,024 is too small for the sizes that occur in a training.
+    """
+    os.environ.setdefault("ONEDNN_PRIMITIVE_CACHE_CAPACITY", "16384")
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return False
+    settings = ((_M_MMAP_THRESHOLD, 1 << 30), (_M_TRIM_THRESHOLD, _NEVER_TRIM), (_M_ARENA_MAX, 1))
+    accepted = [mallopt(name, value) for name, value in settings]
+    return accepted == [1, 1, 1]
+
+
+Result = TypeVar("Result")
+
+PIECES = 32
+"""Number of pieces that work is cut into: enough to balance a dozen cores, few enough to cost nothing on two."""
+
+
+def kernel(function: Callable[..., Any]) -> Any:
+    """Compiles a function for `parallel`; reassociation is off, so that sums have one order."""
+    return compiled(function, fastmath={"contract", "nsz"})
+
+
+def compiled(function: Callable[..., Any], **options: Any) -> Any:
+    """Compiles a function that does not hold the GIL, with further options of numba, and stores what was compiled.
+
+    Warns:
+        SceneWarning: it cannot be stored for later runs; once a process.
+    """
+    # Threads are also asked for where nothing is compiled, and numba takes half a second to load.
+    from numba import njit
+
+    options |= {"nogil": True, "error_model": "numpy"}
+    try:
+        return njit(cache=True, **options)(function)
+    except RuntimeError as error:
+        # A package that another user installed, and no home that can be written, as in some containers.
+        if "no locator available" not in str(error):
+            raise
+        _warn_uncached()
+        return njit(**options)(function)
+
+
+@functools.cache
+def _warn_uncached() -> None:
+    warnings.warn(
+        "compiled kernels cannot be stored beside the package or in the user's cache, so that every run compiles them "
+        "anew, for up to a minute; NUMBA_CACHE_DIR=FOLDER names a folder that can be written",
+        SceneWarning,
+        stacklevel=3,
+    )
+
+
+_here = threading.local()
+
+
+def _limit_threads(threads: int) -> None:
+    """Lets work on this thread have so many threads of its own."""
+    _here.threads = threads
+
+
+def thread_count() -> int:
+    """As many threads as torch uses, or would use if it were loaded."""
+    cores = os.cpu_count() or 1
+    torch_threads = getattr(sys.modules.get("torch"), "get_num_threads", None)
+    if torch_threads is not None:
+        return min(int(torch_threads()), cores)
+    stated = os.environ.get("OMP_NUM_THREADS", "")
+    return min(max(int(stated), 1), cores) if stated.isdecimal() else cores
+
+
+def available_cores() -> int:
+    """The cores that this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def threads_of_torch(count: int) -> Iterator[None]:
+    """Lets torch and the kernels use so many threads within the block. torchrun starts each of several processes with
+    one thread, which suits a training on GPUs and leaves most cores idle where a CPU computes."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def threads_unchanged() -> Iterator[None]:
+    """Gives torch the threads again that it had before the block. Where a library runs a parallel loop of numba, OpenMP
+    has as many threads as numba ever after, and torch with it."""
+    torch = sys.modules.get("torch")
+    before = torch.get_num_threads() if torch is not None else 0
+    try:
+        yield
+    finally:
+        if torch is not None:
+            torch.set_num_threads(before)
+
+
+def parallel(work: Callable[[int], Result], pieces: Iterable[int]) -> list[Result]:
+    """Runs `work` for each piece in `thread_count` threads, the caller's among them, and returns the results in order.
+    A nested call runs its pieces one after the other, since all threads are busy.
+
+    Raises:
+        BaseException: what `work` raised of the first piece that failed; pieces that no thread has begun are left out.
+    """
+    waiting = list(pieces)
+    threads = min(getattr(_here, "threads", thread_count()), len(waiting))
+    if threads <= 1:
+        return [work(piece) for piece in waiting]
+    results: dict[int, Result] = {}
+    errors: dict[int, BaseException] = {}
+    # Each thread takes the next piece by itself: handing pieces over one by one costs more than small ones take.
+    following = iter(range(len(waiting)))
+
+    def run() -> None:
+        with _one_thread():
+            for number in following:
+                try:
+                    results[number] = work(waiting[number])
+                except BaseException as error:
+                    errors[number] = error
+                if errors:
+                    return
+
+    others = [threading.Thread(target=run) for _ in range(threads - 1)]
+    try:
+        for thread in others:
+            thread.start()
+        run()
+        _join(others)
+    except BaseException:
+        # Interrupted between two pieces, or while it waits: nothing goes on when this returns.
+        deque(following, maxlen=0)
+        _join(others)
+        raise
+    if errors:
+        raise errors[min(errors)]
+    return [results[number] for number in range(len(waiting))]
+
+
+def _join(threads: Iterable[threading.Thread]) -> None:
+    for thread in threads:
+        if thread.ident is not None:
+            thread.join()
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Lets work within the block have no threads but the one that it runs on."""
+    before = getattr(_here, "threads", None)
+    _limit_threads(1)
+    try:
+        yield
+    finally:
+        if before is None:
+            del _here.threads
+        else:
+            _limit_threads(before)
+
+
+def ahead(work: Callable[[int], Result], items: Iterable[int], workers: int = 1) -> Iterator[Result]:
+    """`work` of each item, in order; the next ones are computed in `workers` threads while the caller uses the last.
+    The threads that `parallel` has are shared out among the workers."""
+    share = max(1, thread_count() // workers)
+    pending: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(workers, initializer=_limit_threads, initargs=(share,)) as pool:
+        try:
+            for item in items:
+                pending.append(pool.submit(work, item))
+                if len(pending) > workers:
+                    yield pending.popleft().result()
+            while pending:
+                yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()
+
+
+def import_ahead(module: str) -> None:
+    """Starts to import a module in a thread. Whoever imports it later waits for that, and meets its errors."""
+
+    def load() -> None:
+        with contextlib.suppress(Exception):
+            importlib.import_module(module)
+
+    threading.Thread(target=load).start()
+
+
+def even_cuts(starts: Int64[np.ndarray, " n_plus_1"]) -> Int64[np.ndarray, " pieces_plus_1"]:
+    """Cuts the rows of a compressed array into pieces with about equally many entries."""
+    inner = np.searchsorted(starts, np.linspace(0, starts[-1], PIECES + 1)[1:-1])
+    return np.concatenate(([0], inner, [len(starts) - 1]))
+
+
+Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["auto", "float32", "bfloat16"]
+Stored = Literal["float32", "float16", "int8_weights", "int8_dynamic"]
+"""Precision of an exported graph."""

@@ -1,0 +1,438 @@
+"""Values of settings: knobs, limits of budgets, choices, and the first difference between two sets of them.
+
+Knobs: the values of a stage's settings that trade cost for accuracy, and how they are put into its frozen settings.
+
+Each stage that has knobs lists them beside its settings (`gsencoder.fusion.knobs`, `gsencoder.reconstruct.knobs`,
+`gsencoder.infer.knobs`), so that whoever chooses settings, a sweep or a budget, needs no more than such a list.
+
+Budgets: what the section `budget` of a command may promise, and how promises are checked, ordered and worded.
+
+Each stage with budgets has a frozen dataclass of its promises beside its code (`gsencoder.reconstruct.budget`,
+`gsencoder.fusion.budget.config`, `gsencoder.fusion.store.budget`, `gsencoder.infer.encode_budget.config`,
+`gsencoder.infer.views.budget`), with those fields of `PROMISES` that mean something there.
+
+Options that were added after settings had been stored in files, each with the value that says what was done before.
+
+Prepared scenes and checkpoints are used only with the settings that they were made with. Files that are older than an
+option do not have it, and are compared as if they had this value. Older ones also hold the path of each scene, where
+later ones say that it was trained on: a data set may have been moved since.
+"""
+
+import typing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from math import inf
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar, get_args, get_origin, runtime_checkable
+
+from gsencoder.core.errors import InputError
+
+Settings = TypeVar("Settings")
+
+SHOWN_DIGITS = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Knob:
+    """One knob of a stage.
+
+    Attributes:
+        name: short, unique within the stage; it stands in tables and options.
+        key: where it lies in the stage's settings, with dots between sections ("blend.rays_per_patch").
+        values: worth trying, in any order; the default need not be among them.
+        exact: the value at which it costs no accuracy; None where there is no such value.
+        needs: values of other knobs, by name, without which it has no effect; it is tried alone beside these.
+    """
+
+    name: str
+    key: str
+    values: tuple[Any, ...]
+    exact: Any = None
+    needs: Mapping[str, Any] = field(default_factory=dict)
+
+
+def value_at(settings: object, key: str) -> Any:
+    """The value of a key with dots in nested settings."""
+    for name in key.split("."):
+        settings = getattr(settings, name)
+    return settings
+
+
+def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
+    """The settings with other values; those of one section change together, so that it checks them together.
+
+    Args:
+        settings: a frozen dataclass, sections of which are frozen dataclasses.
+        values: by key, with dots between sections.
+
+    Raises:
+        InputError: no such key, or a value that the settings refuse.
+    """
+    assert is_dataclass(settings)
+    assert not isinstance(settings, type)
+    names = {item.name for item in fields(settings)}
+    sections: dict[str, dict[str, Any]] = {}
+    direct: dict[str, Any] = {}
+    for key, value in values.items():
+        name, _, rest = key.partition(".")
+        if name not in names:
+            raise InputError(f"{key}: no such setting of {type(settings).__name__}; it has {', '.join(sorted(names))}")
+        if rest:
+            sections.setdefault(name, {})[rest] = value
+        else:
+            direct[name] = value
+    for name, inner in sections.items():
+        direct[name] = with_values(direct.get(name, getattr(settings, name)), inner)
+    return typing.cast(Settings, replace(settings, **direct))
+
+
+def with_knobs(settings: Settings, knobs: Sequence[Knob], values: Mapping[str, Any]) -> Settings:
+    """The settings with values of knobs, by the knobs' names.
+
+    Raises:
+        InputError: no such knob, or a value that the settings refuse; the knobs are named.
+    """
+    by_name = {knob.name: knob for knob in knobs}
+    for name in values:
+        if name not in by_name:
+            raise InputError(f"{name}: no such knob; expected one of {', '.join(by_name)}")
+    try:
+        return with_values(settings, {by_name[name].key: value for name, value in values.items()})
+    except InputError as error:
+        raise InputError(f"{describe_values(values)}: {error}") from error
+
+
+def exact_settings(settings: Settings, knobs: Sequence[Knob]) -> Settings:
+    """The settings with every knob that has an exact value at it."""
+    return with_values(settings, {knob.key: knob.exact for knob in knobs if knob.exact is not None})
+
+
+def describe_values(values: Mapping[str, Any]) -> str:
+    """Values of knobs as one line, such as `views=8, rays=16`; `defaults` where there are none."""
+    return ", ".join(f"{name}={shown_value(value)}" for name, value in values.items()) or "defaults"
+
+
+def shown_value(value: Any) -> str:
+    """A value as it is written in tables and options."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        return f"{value:.{SHOWN_DIGITS}g}"
+    return str(value) if value not in ("", None) else "none"
+
+
+def changed_knobs(base: object, knobs: Iterable[Knob], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values that differ from those of the base settings, in the order of the knobs."""
+    return {
+        knob.name: values[knob.name]
+        for knob in knobs
+        if knob.name in values and values[knob.name] != value_at(base, knob.key)
+    }
+
+
+def read_value(settings: object, knob: Knob, text: str) -> Any:
+    """A value of a knob from text, of the type that the settings declare.
+
+    Raises:
+        InputError: text of another type.
+    """
+    *sections, name = knob.key.split(".")
+    owner = value_at(settings, ".".join(sections)) if sections else settings
+    annotation = typing.get_type_hints(type(owner))[name]
+    kinds = [kind for kind in get_args(annotation) or (annotation,) if kind is not type(None)]
+    if get_origin(annotation) is Literal:
+        if text in get_args(annotation):
+            return text
+        raise InputError(f"{knob.name}: expected one of {', '.join(map(str, get_args(annotation)))}, got {text!r}")
+    if bool in kinds and text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        if kind in kinds:
+            try:
+                return kind(text)
+            except ValueError:
+                continue
+    if str in kinds:
+        return "" if text == "none" else text
+    names = {int: "a whole number", float: "a number", bool: "true or false"}
+    expected = " or ".join(names.get(kind, str(kind)) for kind in kinds)
+    raise InputError(f"{knob.name}: expected {expected}, got {text!r}")
+
+
+PROMISES = {"error": "", "seconds": " s", "megabytes": " MB"}
+"""What can be promised, with its unit. Where promises conflict, the one that stands first wins."""
+MEGABYTE = 1_000_000
+PLANNED = 0.85
+"""Share of promised seconds that is planned with, since times vary."""
+
+
+class Budget:
+    """Promises: a frozen dataclass with fields `error`, `seconds` or `megabytes`, None where nothing is promised.
+
+    A field `seed`, where there is one, is of what the choice draws.
+
+    Raises:
+        InputError: a promise that means nothing, or a negative seed.
+    """
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for name in self.promised:
+            value = self.promise(name)
+            if name == "error" and not 0 < value < 1:
+                raise InputError(f"error: expected a number between 0 and 1, got {value}")
+            if not 0 < value < inf:
+                raise InputError(f"{name}: expected a number above 0, got {value}")
+        if (seed := getattr(self, "seed", 0)) < 0:
+            raise InputError(f"seed: expected 0 or more, got {seed}")
+
+    @property
+    def promised(self) -> tuple[str, ...]:
+        """The promises that are made, the one that wins first."""
+        return tuple(name for name in PROMISES if getattr(self, name, None) is not None)
+
+    def promise(self, name: str) -> float:
+        """The value of a promise that is made."""
+        return float(getattr(self, name))
+
+    @property
+    def names(self) -> str:
+        """The options of the promises that are made, for messages."""
+        return " and ".join(f"budget.{name}" for name in self.promised)
+
+    def shown(self, name: str) -> str:
+        """A promise as it is written on the command line."""
+        return f"budget.{name}={shown_value(self.promise(name))}"
+
+    def conflict(self, first: str, other: str, needed: float) -> str:
+        """What is said where a promise cannot be kept beside one that comes before it.
+
+        Args:
+            first: the promise that wins.
+            other: the one that is broken.
+            needed: what it becomes.
+        """
+        return (
+            f"{self.shown(first)} takes about {needed:.3g}{PROMISES[other]}, more than {self.shown(other)}; "
+            f"budget.{first} comes first"
+        )
+
+
+def check_governed(budget: Budget, settings: object, default: object, keys: Iterable[str], section: str) -> None:
+    """Refuses options that a budget chooses where they are set by hand.
+
+    Args:
+        budget: any of its promises.
+        settings: of the stage.
+        default: such settings with every option at its default.
+        keys: of the options, with dots between sections.
+        section: that the settings are on the command line.
+
+    Raises:
+        InputError: an option has another value than its default.
+    """
+    if not budget.promised:
+        return
+    for key in keys:
+        if (value := value_at(settings, key)) != value_at(default, key):
+            raise InputError(
+                f"{section}.{key}={shown_value(value)}: is chosen by {budget.names}; leave it (or the preset that sets "
+                "it) out, or the budget"
+            )
+
+
+@runtime_checkable
+class PredictedSetting(Protocol):
+    """A setting with what is predicted of it.
+
+    Attributes:
+        error: predicted.
+        bound: what the error stays below in all likelihood.
+        cost: in units that all settings of a choice share.
+    """
+
+    @property
+    def error(self) -> float: ...
+
+    @property
+    def bound(self) -> float: ...
+
+    @property
+    def cost(self) -> float: ...
+
+
+Setting = TypeVar("Setting", bound=PredictedSetting)
+
+
+def best_setting(settings: Sequence[Setting], error: float | None = None) -> Setting:
+    """The cheapest setting that keeps a promised error, of equal ones the most exact; where no error is promised, the
+    most exact setting, of equal ones the cheapest."""
+    if error is None:
+        return min(settings, key=lambda setting: (setting.error, setting.cost))
+    return min(
+        (setting for setting in settings if setting.bound <= error), key=lambda setting: (setting.cost, setting.error)
+    )
+
+
+def within_seconds(
+    settings: Sequence[Setting], best: Setting, budget: Budget, seconds: Callable[[Setting], float]
+) -> tuple[Setting, tuple[str, ...]]:
+    """The best setting that keeps promised seconds; the fastest where none does. A promised error comes first.
+
+    Args:
+        settings: to choose among.
+        best: `best_setting` of them.
+        budget: that promises seconds.
+        seconds: that a setting takes, from the beginning of the choice.
+
+    Returns:
+        The setting, and notes about a promise that is not kept.
+    """
+    limit = budget.promise("seconds")
+    if "error" in budget.promised:
+        needed = seconds(best)
+        return best, (budget.conflict("error", "seconds", needed),) if needed > limit else ()
+    fast_enough = [setting for setting in settings if seconds(setting) <= PLANNED * limit]
+    if fast_enough:
+        return best_setting(fast_enough), ()
+    fastest = min(settings, key=lambda setting: (seconds(setting), setting.error))
+    return fastest, (
+        f"{budget.shown('seconds')}: the fastest setting takes about {seconds(fastest):.3g} s; it is used",
+    )
+
+
+class Removed(NamedTuple):
+    """A removed option.
+
+    Attributes:
+        default: its former default, which still describes what the code does.
+        reason: why it was removed.
+    """
+
+    default: Any
+    reason: str
+
+
+REMOVED_OPTIONS: Mapping[str, Removed] = {
+    "localize.margin": Removed(0.0, "margins made boxes worse: a tenth of a spacing costs 0.04 of mean IoU"),
+    "dense.alike": Removed(0.6, "no measurement supports another correlation"),
+    "dense.agree": Removed(0.02, "no measurement supports another tolerance of depths"),
+    "dense.color": Removed(0.06, "no measurement supports another tolerance of colors"),
+}
+"""Removed options by their full name on the command line."""
+
+REMOVED_VALUES: Mapping[str, str] = {
+    "precision=int8_static": "it was slower and less accurate than int8_dynamic, which needs no scenes to calibrate on",
+    "localize.mode=centred": "it is written centered",
+}
+"""Removed values of options that exist, as they were written on the command line, with the reason."""
+
+
+def removed_option(key: str, options: Iterable[str]) -> str | None:
+    """The full name of a removed option that `key` stands for, with or without its section; None if there is none.
+
+    Args:
+        key: as it was written.
+        options: full names of the options of the command; only its sections are searched.
+    """
+    sections = {name.rpartition(".")[0] for name in options}
+    for name in REMOVED_OPTIONS:
+        section, _, last = name.rpartition(".")
+        if section in sections and key in (name, last):
+            return name
+    return None
+
+
+def check_removed_option(name: str, value: Any) -> None:
+    """Accepts the former default of a removed option, since that is what the code does.
+
+    Args:
+        name: its full name.
+        value: as a number, or as it was written.
+
+    Raises:
+        InputError: another value.
+    """
+    default, reason = REMOVED_OPTIONS[name]
+    try:
+        same = float(value) == default
+    except (TypeError, ValueError):
+        same = value == default
+    if not same:
+        raise InputError(f"{name}: this option was removed ({reason}); leave it out. The value is always {default}")
+
+
+def without_removed_options(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Saved settings of an earlier version without the removed options that have their former default.
+
+    Args:
+        settings: nested dicts of JSON values.
+        prefix: the section that they are.
+    """
+    current: dict[str, Any] = {}
+    for key, value in settings.items():
+        removed = REMOVED_OPTIONS.get(f"{prefix}{key}")
+        if removed is None or value != removed.default:
+            current[key] = without_removed_options(value, f"{key}.") if isinstance(value, dict) else value
+    return current
+
+
+ADDED_OPTIONS: Mapping[str, Any] = {
+    "model.stem": 3,
+    "model.transformer.shuffle_orders": "once",
+    "model.projector": 0,
+    "loss.confidence": True,
+    "loss.divide_by_alpha": True,
+    "loss.contrast_clusters": True,
+    "loss.teacher_weights": [],
+    "prepare.fusion.view_share": 1.0,
+    "prepare.fusion.view_choice": "even",
+    "prepare.center": True,
+    "prepare.scale": True,
+    "prepare.render_views": 0,
+    "prepare.targets": "float16",
+}
+
+
+TRAINED = "trained on"
+"""What the settings of prepared scenes say of each scene that defines their space."""
+
+
+def with_added_options(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Stored settings with the added options that they lack, in the sections that they have.
+
+    Args:
+        stored: settings by section, as JSON values; in those of a training the section `prepared` holds those of its
+            prepared scenes, or of those of each of several teachers.
+    """
+    settings = _copy(stored)
+    prepared = settings.get("prepared")
+    roots = [settings, prepared, *(prepared.values() if isinstance(prepared, dict) else ())]
+    for key, value in ADDED_OPTIONS.items():
+        *sections, name = key.split(".")
+        for root in roots:
+            section: Any = root
+            for part in sections:
+                section = section.get(part) if isinstance(section, dict) else None
+            if isinstance(section, dict):
+                section.setdefault(name, value)
+    for root in roots:
+        scenes = root.get("scenes") if isinstance(root, dict) else None
+        if isinstance(scenes, dict) and all(isinstance(path, str) for path in scenes.values()):
+            root["scenes"] = dict.fromkeys(scenes, TRAINED)
+    return settings
+
+
+def _copy(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _copy(value) if isinstance(value, Mapping) else value for name, value in settings.items()}
+
+
+def first_difference(saved: Mapping[str, Any], current: Mapping[str, Any], prefix: str = "") -> str:
+    """Describes the first setting in which a saved run and the current one differ."""
+    for key in sorted({*saved, *current}):
+        old, new = saved.get(key), current.get(key)
+        if isinstance(old, dict) and isinstance(new, dict) and old != new:
+            return first_difference(old, new, f"{prefix}{key}.")
+        if old != new:
+            return f"{prefix}{key}={old}, and this run asks {prefix}{key}={new}"
+    return "other settings"
