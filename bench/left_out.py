@@ -34,7 +34,7 @@ from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.render import blend
 from gsencoder.types import FeatureMap, GaussianFeatures, Gaussians, Scene
-from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
+from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 
 MIN_ALPHA = 0.5
 SPLAT = "splat.ply"

@@ -45,7 +45,7 @@ from gsencoder.fusion.orbit_views import with_views
 from gsencoder.render import blend
 from gsencoder.render.images import view_colors
 from gsencoder.types import Gaussians, Scene
-from gsencoder.types.poses import OPENCV_FROM_OPENGL
+from gsencoder.types.checks import OPENCV_FROM_OPENGL
 
 FURNITURE = Path("/usr/share/sweethome3d/furniture")
 SAMPLES = 40_000

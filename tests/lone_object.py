@@ -12,7 +12,7 @@ from textured_box import blotches
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.synthetic.shapes import Solid
 from gsencoder.types import Cameras
-from gsencoder.types.poses import OPENCV_FROM_OPENGL
+from gsencoder.types.checks import OPENCV_FROM_OPENGL
 
 Ground = Literal["transparent", "white", "black"]
 DISTANCE, FIELD = 4.0, 0.69

@@ -3,7 +3,7 @@
 import numpy as np
 
 from gsencoder.types import FeatureSpace, MemoryBank, QueryMemory
-from gsencoder.types.memory import Scoring
+from gsencoder.types.features import Scoring
 
 TEMPERATURE = {"centered": 0.05, "cosine": 0.05, "dot": 1.0}
 

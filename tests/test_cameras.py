@@ -12,8 +12,7 @@ from splats import random_cameras
 
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.types import Cameras
-from gsencoder.types.cameras import intrinsic_matrix, pixel_centers, project_points, unproject_points
-from gsencoder.types.poses import (
+from gsencoder.types.checks import (
     OPENCV_FROM_OPENGL,
     invert_rigid,
     look_at,
@@ -22,6 +21,7 @@ from gsencoder.types.poses import (
     perpendicular,
     transform,
 )
+from gsencoder.types.scene import intrinsic_matrix, pixel_centers, project_points, unproject_points
 
 EXTREME = (1e-6, 1.0, 1e6, 1e12)
 """Lengths at which laws must hold alike."""

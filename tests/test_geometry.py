@@ -20,8 +20,8 @@ from gsencoder.geometry import (
     transform,
     unproject_points,
 )
-from gsencoder.types import cameras as numpy_cameras
-from gsencoder.types import poses as numpy_poses
+from gsencoder.types import checks as numpy_poses
+from gsencoder.types import scene as numpy_cameras
 from gsencoder.types import sh_from_colors
 
 

@@ -13,7 +13,7 @@ from shape_checks import checked
 
 from gsencoder.core.files import plain
 from gsencoder.types import FeatureMap, FeatureSpace, Gaussians
-from gsencoder.types.cameras import pixel_centers
+from gsencoder.types.scene import pixel_centers
 
 
 def on(target: Any) -> Any:

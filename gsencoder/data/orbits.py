@@ -7,8 +7,8 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.types import Cameras, Gaussians
-from gsencoder.types.cameras import intrinsic_matrix
-from gsencoder.types.poses import look_at, perpendicular
+from gsencoder.types.checks import look_at, perpendicular
+from gsencoder.types.scene import intrinsic_matrix
 
 COVERED = 0.95
 """Opacity-weighted share of the Gaussians that must fit into the picture."""

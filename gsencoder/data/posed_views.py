@@ -19,8 +19,8 @@ from gsencoder.data.readers.masks import EmptyFiles, MaskFiles
 from gsencoder.data.readers.posed import PosedImage, PosedImages, choose_origin
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
 from gsencoder.types import Cameras, Views
+from gsencoder.types.checks import invert_rigid, move_origin
 from gsencoder.types.orientation import EXCHANGED, INVERSE, UNMIRRORED
-from gsencoder.types.poses import invert_rigid, move_origin
 
 FEW_CAMERAS = 8
 FEWEST_STEPS = 64

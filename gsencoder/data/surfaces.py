@@ -8,8 +8,8 @@ from jaxtyping import Float64
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.check.depth_agreement import SAMPLES, depth_views
 from gsencoder.types import Gaussians, Views
-from gsencoder.types.cameras import unproject_points
-from gsencoder.types.poses import invert_rigid, transform
+from gsencoder.types.checks import invert_rigid, transform
+from gsencoder.types.scene import unproject_points
 
 MAX_SAMPLES = 20_000
 """So many Gaussians are looked at."""

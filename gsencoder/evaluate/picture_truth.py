@@ -17,7 +17,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.infer.views.photographs import photograph_window
 from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Cameras, Scene, Views
-from gsencoder.types.poses import move_origin
+from gsencoder.types.checks import move_origin
 
 LEAST_WEIGHT = 0.5
 """Blending weight of one instance from which on a rendered pixel shows it."""

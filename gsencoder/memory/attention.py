@@ -10,7 +10,7 @@ from torch.nn.functional import scaled_dot_product_attention
 from torch.utils.checkpoint import checkpoint
 
 from gsencoder.types import MemoryBank
-from gsencoder.types.memory import EPS, Scoring, attention_keys
+from gsencoder.types.features import EPS, Scoring, attention_keys
 
 BLOCK_SCORES = 1 << 24
 """Scores of queries and components that are held at once; 64 MiB."""

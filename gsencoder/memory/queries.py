@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError
 from gsencoder.types import GaussianFeatures, MemoryBank, QueryMemory
-from gsencoder.types.memory import Scoring, attention_keys
+from gsencoder.types.features import Scoring, attention_keys
 
 BLOCK = 1 << 14
 """Rows that are taken at a time."""

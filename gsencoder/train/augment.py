@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from gsencoder.core.errors import InputError
 from gsencoder.geometry import sh_basis
 from gsencoder.types import SH_C0, Gaussians
-from gsencoder.types.poses import perpendicular
+from gsencoder.types.checks import perpendicular
 
 _DIRECTIONS = 64
 """Directions over which harmonics are turned: more than enough for the 16 coefficients of degree 3."""

@@ -23,7 +23,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.train.memory_scene import MemoryScene
 from gsencoder.train.prepared_scene import PreparedScene
 from gsencoder.train.render_rows import RenderRows, gaussian_rows, join_rows, sample_rows
-from gsencoder.types.memory import Scoring
+from gsencoder.types.features import Scoring
 
 EPS = 1e-12
 MAX_CHANNELS = 1024

@@ -6,14 +6,18 @@ pixel centers lie at .5; quaternions are wxyz; depth is z. Values are physical: 
 opacities are probabilities, never logarithms or logits.
 """
 
-from gsencoder.types.cameras import Cameras
 from gsencoder.types.checks import UNIT_TOLERANCE, check_unit
-from gsencoder.types.features import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
-from gsencoder.types.gaussians import SH_C0, Gaussians, sh_from_colors
-from gsencoder.types.localization import Box, Localization
-from gsencoder.types.memory import MemoryBank, QueryMemory
-from gsencoder.types.mesh_labels import MeshLabels
-from gsencoder.types.scene import Scene, SceneObject, Views
+from gsencoder.types.features import (
+    Box,
+    FeatureBasis,
+    FeatureMap,
+    FeatureSpace,
+    GaussianFeatures,
+    Localization,
+    MemoryBank,
+    QueryMemory,
+)
+from gsencoder.types.scene import SH_C0, Cameras, Gaussians, MeshLabels, Scene, SceneObject, Views, sh_from_colors
 
 __all__ = [
     "SH_C0",

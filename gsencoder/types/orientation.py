@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.types.cameras import Cameras
 from gsencoder.types.features import FeatureMap
-from gsencoder.types.scene import LAZY, Scene, Views
+from gsencoder.types.scene import LAZY, Cameras, Scene, Views
 
 TURNS = {
     1: (False, False, False), 2: (False, True, False), 3: (False, True, True), 4: (False, False, True),

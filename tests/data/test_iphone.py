@@ -16,7 +16,7 @@ from gsencoder.data.scene_paths import find_scenes
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.types import Scene, Views
-from gsencoder.types.poses import OPENCV_FROM_OPENGL
+from gsencoder.types.checks import OPENCV_FROM_OPENGL
 
 Poses = Literal["colmap", "nerfstudio", "arkit"]
 EVERY = 10

@@ -10,7 +10,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.posed import rigid_pose
 from gsencoder.data.readers.transforms_json import read_transforms
 from gsencoder.data.scenes import load_scene
-from gsencoder.types.poses import invert_rigid
+from gsencoder.types.checks import invert_rigid
 
 
 def test_opengl_axes_become_opencv_axes(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.evaluate.picture_truth import PictureTruth
 from gsencoder.types import Scene
-from gsencoder.types.poses import move_origin
+from gsencoder.types.checks import move_origin
 
 ORIGIN = np.array([1000.0, -2000.0, 0.0])
 

@@ -17,7 +17,7 @@ from gsencoder.memory.render import render_features
 from gsencoder.render import BlendConfig, blend
 from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, QueryMemory, Scene
-from gsencoder.types.memory import Scoring
+from gsencoder.types.features import Scoring
 
 CHANNELS = 24
 SPACE = FeatureSpace(name="s", channels=CHANNELS, text_encoder="toy")

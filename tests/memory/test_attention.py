@@ -13,8 +13,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.memory import attention as attention_module
 from gsencoder.memory.attention import MemoryAttention, random_projection
 from gsencoder.types import FeatureBasis, FeatureSpace, QueryMemory
-from gsencoder.types import memory as memory_types
-from gsencoder.types.memory import Scoring
+from gsencoder.types import features as memory_types
+from gsencoder.types.features import Scoring
 
 SCORINGS: list[Scoring] = ["centered", "cosine", "dot"]
 

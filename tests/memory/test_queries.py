@@ -9,7 +9,7 @@ from feature_fields import SPACE, make_features
 from gsencoder.core.errors import InputError
 from gsencoder.memory.queries import memory_of_features, principal_queries
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank
-from gsencoder.types.memory import Scoring
+from gsencoder.types.features import Scoring
 
 
 def bank_of(features: GaussianFeatures, scoring: Scoring = "centered") -> MemoryBank:

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from gsencoder.data.check.depth_agreement import MIN_SAMPLES, DepthViews, shared_samples
 from gsencoder.types import Views
-from gsencoder.types.cameras import project_points
+from gsencoder.types.scene import project_points
 
 
 def grey_pictures(views: Views, rows: Int64[np.ndarray, " V"], shape: tuple[int, int]) -> Float32[np.ndarray, "V h w"]:

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float32, Float64, Int64
 
 from gsencoder.data.readers.depth_images import ray_lengths
 from gsencoder.types import Views
-from gsencoder.types.cameras import pixel_centers, project_points
-from gsencoder.types.poses import invert_rigid, transform
+from gsencoder.types.checks import invert_rigid, transform
+from gsencoder.types.scene import pixel_centers, project_points
 
 MAX_SIDE = 320
 """Longer side in pixels of the depth images that are compared; larger ones are sampled."""

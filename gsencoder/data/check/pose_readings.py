@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float, Float64
 
-from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
+from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 
 PLACES = (-2, -1, 1, 2)
 """So many places in the order of the views poses may be moved by."""

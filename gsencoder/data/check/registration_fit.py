@@ -13,7 +13,7 @@ from jaxtyping import Float64, Int64
 
 from gsencoder.data.check.depth_agreement import DepthViews, shared_samples
 from gsencoder.types import Views
-from gsencoder.types.cameras import project_points
+from gsencoder.types.scene import project_points
 
 PICTURE_SIZE = 640
 """Longer side in pixels of the photographs that are compared; smaller ones keep theirs."""

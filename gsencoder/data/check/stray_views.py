@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.data.check.depth_agreement import CLIP, DepthViews, residuals, world_samples
-from gsencoder.types.cameras import project_points
-from gsencoder.types.poses import invert_rigid, transform
+from gsencoder.types.checks import invert_rigid, transform
+from gsencoder.types.scene import project_points
 
 REACHES = (0.15,) * 4 + (0.1,) * 4 + (0.07,) * 3 + (0.05, 0.04, 0.03, 0.03, 0.03)
 """Samples are matched to the surface on their pixel's ray in another view if its depth differs by at most this share,

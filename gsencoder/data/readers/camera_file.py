@@ -20,8 +20,8 @@ from gsencoder.core.errors import InputError, listed
 from gsencoder.data.readers.posed import number, rigid_pose
 from gsencoder.data.readers.transforms_json import read_json, read_matrix
 from gsencoder.types import Cameras
-from gsencoder.types.cameras import intrinsic_matrix
-from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid, move_origin
+from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid, move_origin
+from gsencoder.types.scene import intrinsic_matrix
 
 MAX_CAMERAS = 10_000
 MAX_PIXELS = 1 << 24

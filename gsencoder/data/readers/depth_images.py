@@ -12,7 +12,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.readers.image_file import load_npy, read_integers
 from gsencoder.data.readers.images import PictureFiles, PixelGrid
 from gsencoder.data.readers.undistort import RemapCache, pinhole_for
-from gsencoder.types.cameras import pixel_centers, unproject_points
+from gsencoder.types.scene import pixel_centers, unproject_points
 
 DepthMeasure = Literal["z", "ray"]
 """What the numbers of a depth file are: the coordinate z in the camera, or the distance from its center."""

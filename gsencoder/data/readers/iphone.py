@@ -24,7 +24,7 @@ from gsencoder.data.readers.image_file import picture_size
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.transforms_json import read_json, read_transforms
 from gsencoder.data.readers.undistort import CameraModel
-from gsencoder.types.poses import invert_rigid
+from gsencoder.types.checks import invert_rigid
 
 PICTURES, DEPTHS, MASKS = "rgb", "depth", "rgb_masks"
 VIDEOS = ("rgb.mkv", "rgb.mp4")

@@ -13,7 +13,7 @@ from gsencoder.data.readers.frames import PICTURE_SUFFIXES, SkippedFrames, files
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, number, rigid_pose, warn_left_out
 from gsencoder.data.readers.tables import read_numbers
 from gsencoder.data.readers.transforms_json import read_json
-from gsencoder.types.poses import invert_rigid
+from gsencoder.types.checks import invert_rigid
 
 TRAJECTORY, PARAMETERS, PICTURES = "traj.txt", "cam_params.json", "results"
 DEFAULT_PARAMETERS = {"fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale": 6553.5}

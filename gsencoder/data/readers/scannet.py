@@ -15,7 +15,7 @@ from gsencoder.data.readers.image_file import picture_size
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.tables import read_numbers
 from gsencoder.data.readers.undistort import CameraModel
-from gsencoder.types.poses import invert_rigid
+from gsencoder.types.checks import invert_rigid
 
 MILLIMETRES = 1e-3
 

@@ -18,7 +18,7 @@ from gsencoder.data.readers.frames import SkippedFrames, is_lost, pinhole_of
 from gsencoder.data.readers.image_file import picture_size
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.tables import read_numbers
-from gsencoder.types.poses import invert_rigid
+from gsencoder.types.checks import invert_rigid
 
 FRAME = re.compile(r"(frame-\d+)\.color\.(png|jpg|jpeg)", re.IGNORECASE)
 INTRINSICS_FILE = "camera-intrinsics.txt"

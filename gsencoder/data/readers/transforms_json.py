@@ -35,8 +35,8 @@ from gsencoder.data.readers.posed import (
 )
 from gsencoder.data.readers.undistort import CameraModel, check_camera
 from gsencoder.data.splat_formats.ply import read_points
+from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 from gsencoder.types.orientation import EXCHANGED
-from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
 
 PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 NERFSTUDIO_DEPTH_SCALE = 1e-3

@@ -21,7 +21,7 @@ from gsencoder.data.readers.image_file import picture_size
 from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, warn_left_out
 from gsencoder.data.readers.tables import read_numbers, table_lines
 from gsencoder.data.readers.undistort import CameraModel
-from gsencoder.types.poses import invert_rigid
+from gsencoder.types.checks import invert_rigid
 
 COLOR_FILE, DEPTH_FILE, POSE_FILE = "rgb.txt", "depth.txt", "groundtruth.txt"
 MAX_APART = 0.02

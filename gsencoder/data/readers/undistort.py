@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.types.cameras import intrinsic_matrix, pixel_centers, project_points, unproject_points
+from gsencoder.types.scene import intrinsic_matrix, pixel_centers, project_points, unproject_points
 
 MAX_HALF_FIELD = math.radians(85)
 """Rays further from the optical axis than this (a field of view of 170°) are not used."""

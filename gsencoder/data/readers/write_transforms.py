@@ -7,7 +7,7 @@ from typing import Any
 from gsencoder.core.errors import InputError
 from gsencoder.data.readers.posed import PosedImage, PosedImages
 from gsencoder.data.readers.undistort import CameraModel, focal_count
-from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
+from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 
 DISTORTION = {
     "SIMPLE_PINHOLE": (),

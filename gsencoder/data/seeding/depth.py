@@ -14,7 +14,7 @@ from gsencoder.core.errors import InputError, about
 from gsencoder.core.process import ahead, kernel
 from gsencoder.data.seeding.surface_grid import SurfaceGrid, SurfaceSamples
 from gsencoder.types import Cameras, Views
-from gsencoder.types.cameras import pixel_centers, unproject_points
+from gsencoder.types.scene import pixel_centers, unproject_points
 
 LINEAR = 3.0
 """A second difference of inverse depth within this many of its noise's standard deviations counts as zero."""

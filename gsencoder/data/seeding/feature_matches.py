@@ -13,7 +13,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.process import Track, untracked
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.types import Cameras, Views
-from gsencoder.types.poses import invert_rigid
+from gsencoder.types.checks import invert_rigid
 
 
 def picture_name(view: int) -> str:

@@ -23,7 +23,7 @@ from gsencoder.data.seeding.mesh import mesh_bounds, seed_from_mesh, seed_from_t
 from gsencoder.data.seeding.points import seed_from_points, typical_spacing
 from gsencoder.data.seeding.room_frame import room_frame
 from gsencoder.types import Gaussians, Scene, Views
-from gsencoder.types.poses import invert_rigid, transform
+from gsencoder.types.checks import invert_rigid, transform
 
 __all__ = ["SeedConfig", "seed", "seed_from_depth", "seed_from_mesh", "seed_from_points", "seed_from_tsdf"]
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from gsencoder.data.photographs import ScaledPhotograph
 from gsencoder.geometry import invert_rigid, project_points, transform, unproject_points
 from gsencoder.types import Cameras
-from gsencoder.types.cameras import pixel_centers
+from gsencoder.types.scene import pixel_centers
 
 WINDOW = 5
 """Side of the windows that are compared, in pixels of the small pictures."""

@@ -11,7 +11,7 @@ import numpy as np
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_bytes, write_picture
 from gsencoder.types import Scene, Views
-from gsencoder.types.poses import OPENCV_FROM_OPENGL
+from gsencoder.types.checks import OPENCV_FROM_OPENGL
 
 
 def write_room(scene: Scene, folder: str | Path) -> None:

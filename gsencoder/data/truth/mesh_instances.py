@@ -14,7 +14,7 @@ from jaxtyping import Float32, Float64, Int32
 
 from gsencoder.core.errors import InputError
 from gsencoder.types import MeshLabels, Views
-from gsencoder.types.poses import move_origin, transform
+from gsencoder.types.checks import move_origin, transform
 
 TOLERANCE = 0.1
 """Difference from sensor depth up to which a pixel shows the mesh, metres, near the camera …"""

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from gsencoder.core.errors import InputError
 from gsencoder.memory.raw_features import RawSample
 from gsencoder.types import MemoryBank
-from gsencoder.types.memory import attention_keys
+from gsencoder.types.features import attention_keys
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

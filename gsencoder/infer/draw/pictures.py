@@ -14,8 +14,8 @@ from PIL import Image, ImageDraw, ImageFont
 from gsencoder.core.errors import InputError
 from gsencoder.infer.draw.boxes_ply import EDGES, box_corners, word_color
 from gsencoder.types import Box
-from gsencoder.types.cameras import project_points
-from gsencoder.types.poses import transform
+from gsencoder.types.checks import transform
+from gsencoder.types.scene import project_points
 
 Picture = UInt8[np.ndarray, "_h _w 3"]
 

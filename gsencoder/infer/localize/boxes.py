@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64, Integer
 
 from gsencoder.types import Box, Gaussians
-from gsencoder.types.poses import perpendicular
+from gsencoder.types.checks import perpendicular
 
 Extent = Literal["means", "sigma"]
 EMPTY_EXTENT = 1e-5

@@ -11,7 +11,7 @@ from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.targets import Target
 from gsencoder.types import Cameras, Gaussians, Scene
-from gsencoder.types.poses import look_rotation
+from gsencoder.types.checks import look_rotation
 
 
 def shell_cameras(

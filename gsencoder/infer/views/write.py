@@ -11,7 +11,7 @@ from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.views.pictures import picture_kinds, view_sheet
 from gsencoder.infer.views.selection import TargetScore, ViewSet
 from gsencoder.types import Box, Scene
-from gsencoder.types.poses import move_origin
+from gsencoder.types.checks import move_origin
 
 SHEET = "sheet.png"
 SUFFIX = ".png"

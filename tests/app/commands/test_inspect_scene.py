@@ -21,7 +21,7 @@ from gsencoder.data.readers.undistort import CameraModel
 from gsencoder.data.readers.write_transforms import transforms_of
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.types import Cameras
-from gsencoder.types.poses import OPENCV_FROM_OPENGL
+from gsencoder.types.checks import OPENCV_FROM_OPENGL
 
 VIEWS = 4
 Change = Callable[[dict[str, Any]], None]

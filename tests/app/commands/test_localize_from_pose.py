@@ -14,7 +14,7 @@ from gsencoder.app import cli
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_memories
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import MemoryBank, QueryMemory
-from gsencoder.types.poses import OPENCV_FROM_OPENGL
+from gsencoder.types.checks import OPENCV_FROM_OPENGL
 
 pytestmark = pytest.mark.slow
 

@@ -28,7 +28,7 @@ from gsencoder.data.check.registration_fit import MIN_SHARED, _details, fit_regi
 from gsencoder.data.check.scene_check import _needed, check_depth, check_scene
 from gsencoder.data.check.stray_views import fit_pose, surface_normals, view_spreads
 from gsencoder.types import Views
-from gsencoder.types.poses import invert_rigid, transform
+from gsencoder.types.checks import invert_rigid, transform
 
 COUNT = 6
 

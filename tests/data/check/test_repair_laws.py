@@ -15,7 +15,7 @@ from gsencoder.data.readers.posed import PosedImage, PosedImages
 from gsencoder.data.readers.transforms_json import read_transforms
 from gsencoder.data.readers.undistort import CameraModel
 from gsencoder.data.readers.write_transforms import DISTORTION, transforms_of
-from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
+from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 
 PINHOLE = CameraModel(model="PINHOLE", width=64, height=48, params=(50.0, 51.0, 32.0, 24.0))
 

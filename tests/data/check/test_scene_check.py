@@ -27,7 +27,7 @@ from gsencoder.data.check.scene_check import (
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.seeding.feature_matches import PairMatches, match_photographs
 from gsencoder.types import Cameras, Scene, Views
-from gsencoder.types.poses import OPENCV_FROM_OPENGL, invert_rigid
+from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 
 ROW = 4
 """The view that alone is wrong."""

@@ -15,7 +15,7 @@ from gsencoder.data.readers.replica import DEFAULT_PARAMETERS, read_replica
 from gsencoder.data.readers.scannetpp import device_folder, read_scannetpp
 from gsencoder.data.readers.seven_scenes import is_seven_scenes, read_seven_scenes
 from gsencoder.data.readers.tum import KINECTS, interpolate_pose, is_tum, read_trajectory, read_tum
-from gsencoder.types.poses import invert_rigid
+from gsencoder.types.checks import invert_rigid
 
 
 def picture(path: Path, width: int, height: int, mode: str = "RGB") -> None:

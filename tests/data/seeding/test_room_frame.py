@@ -12,7 +12,7 @@ from gsencoder.data.seeding.room_frame import room_frame
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.synthetic.room import make_room
 from gsencoder.types import Scene, Views
-from gsencoder.types.poses import invert_rigid
+from gsencoder.types.checks import invert_rigid
 
 
 def moved(views: Views, other_from_world: np.ndarray) -> Views:
