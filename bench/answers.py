@@ -67,8 +67,8 @@ from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.infer.views.write import views_to_json
 from gsencoder.render import blend
-from gsencoder.text.build import words_of_table
 from gsencoder.text.table import load_text_table
+from gsencoder.text.vocabulary import words_of_table
 from gsencoder.types import Scene
 
 WORDS = "clip_vitb32_names.npz"

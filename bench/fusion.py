@@ -20,7 +20,7 @@ from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.text.build import TableTextConfig
+from gsencoder.text.vocabulary import TableTextConfig
 
 
 def main() -> None:

@@ -30,7 +30,7 @@ from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.text.build import OnnxTextConfig, vocabulary_of
+from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
 from gsencoder.types import SceneObject
 
 LEAST_IOU = 0.25

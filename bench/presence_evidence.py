@@ -29,7 +29,7 @@ from gsencoder.fusion.teachers.build import words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.infer.localize.localize import find_candidates
-from gsencoder.text.build import OnnxTextConfig, TableTextConfig, Words, words_of_table
+from gsencoder.text.vocabulary import OnnxTextConfig, TableTextConfig, Words, words_of_table
 from gsencoder.types import GaussianFeatures, Scene
 
 OTHER_WORDS = {

@@ -25,7 +25,7 @@ from gsencoder.evaluate.sources import fusion_source, load_scenes
 from gsencoder.fusion.teachers.build import LabelsConfig, words_of
 from gsencoder.fusion.teachers.palette import lab_from_rgb
 from gsencoder.fusion.teachers.regions.config import RegionsConfig
-from gsencoder.text.onnx_tower import OnnxTextConfig
+from gsencoder.text.models import OnnxTextConfig
 from gsencoder.types import GaussianFeatures, Scene
 
 STEP, ITERATIONS, COMPACTNESS = 4, 6, 20.0

@@ -25,7 +25,7 @@ from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
 from gsencoder.render import blend
-from gsencoder.text.build import OnnxTextConfig, vocabulary_of
+from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
 
 MIN_ALPHA = 0.5
 """Pixels of a render below this alpha are not compared."""

@@ -52,7 +52,7 @@ from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.select.select import select
 from gsencoder.render import Blend, blend
 from gsencoder.render.images import render_image
-from gsencoder.text.build import Words
+from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, Gaussians, Scene, SceneObject, Views
 
 MIN_WEIGHT = 1.0

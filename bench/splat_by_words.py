@@ -30,7 +30,7 @@ from gsencoder.fusion.orbit_views import with_views
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
 from gsencoder.infer.draw.pictures import contact_sheet
-from gsencoder.text.build import OnnxTextConfig, vocabulary_of
+from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
 from gsencoder.types import GaussianFeatures
 
 

@@ -48,7 +48,7 @@ from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.threshold import ThresholdConfig
-from gsencoder.text.build import Words, stating_trained
+from gsencoder.text.vocabulary import Words, stating_trained
 from gsencoder.types import Scene
 
 RIM = 2

@@ -14,8 +14,7 @@ from splats import front_camera, random_gaussians
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.regions.config import RegionsConfig
-from gsencoder.text.table import TextTable, make_text_table
-from gsencoder.text.towers import unit
+from gsencoder.text.table import TextTable, make_text_table, unit
 from gsencoder.types import Cameras, Scene, SceneObject, Views
 
 HEIGHT, WIDTH = 24, 32

@@ -12,9 +12,8 @@ from splats import front_camera
 
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
-from gsencoder.text.open_vocabulary import OpenVocabulary
-from gsencoder.text.table import TextTable, make_text_table
-from gsencoder.text.towers import unit
+from gsencoder.text.table import TextTable, make_text_table, unit
+from gsencoder.text.vocabulary import OpenVocabulary
 from gsencoder.types import Views
 
 NAMES = ("other", "wall", "chair, seat", "table")

@@ -99,7 +99,7 @@ def test_the_first_commands_of_the_readme_need_nothing_but_gsencoder(
     """Each `fuse` and `localize` of a labeled room, of a bare splat, and of photographs with a splat."""
     monkeypatch.delenv("GSENCODER_MODELS", raising=False)
     # Embedding all of them takes seconds.
-    monkeypatch.setattr("gsencoder.text.open_vocabulary.REFERENCE_NOUNS", ("chair", "table", "tree"))
+    monkeypatch.setattr("gsencoder.text.vocabulary.REFERENCE_NOUNS", ("chair", "table", "tree"))
     monkeypatch.chdir(tmp_path)
     shutil.copytree(field_room.room, "outputs/demo/room")
     content = field_room.copy_photographs(Path("splat"))

@@ -30,7 +30,7 @@ from gsencoder.data.truth.checked_files import read_checked
 from gsencoder.data.truth.mesh_file import read_mesh
 from gsencoder.evaluate.files.scene_folders import scene_files
 from gsencoder.infer.ask.question_sets import is_question_set
-from gsencoder.text.onnx_tower import _load_tokenizer
+from gsencoder.text.models import _load_tokenizer
 
 READERS: dict[str, Callable[[Path], object]] = {
     "picture.png": open_picture,

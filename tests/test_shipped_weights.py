@@ -20,7 +20,7 @@ from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.localize.localize import localize
 from gsencoder.models.weights import SHIPPED_WEIGHTS, load_weights
-from gsencoder.text.build import words_of_table
+from gsencoder.text.vocabulary import words_of_table
 from gsencoder.train.run import CHANGEABLE_ON_RESUME
 
 pytestmark = pytest.mark.slow

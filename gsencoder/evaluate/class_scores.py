@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.infer.localize.relevancy import relevancy
-from gsencoder.text.encoder import TextEncoder, check_space
+from gsencoder.text.table import TextEncoder, check_space
 from gsencoder.types import GaussianFeatures
 
 NAMES_AT_ONCE = 16

@@ -17,8 +17,8 @@ from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder
-from gsencoder.text.build import Words
 from gsencoder.text.table import TextTable
+from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, Scene
 
 FeatureSource = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]

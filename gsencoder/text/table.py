@@ -1,22 +1,189 @@
-"""Text tables: closed vocabularies of names with their embeddings, and their files."""
+"""Text tables: closed vocabularies of names with their embeddings, their files, and what makes them.
+
+A cache of phrases and their vectors on disk, one file for each tower and set of templates.
+
+Loading a tower takes longer than embedding a word, and a vocabulary of thousands takes seconds. The file is an archive
+with checksums. It holds nothing that cannot be computed again, so a damaged one is replaced, with a warning.
+"""
 
 import difflib
+import hashlib
 import json
+import os
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.archive import open_archive, read_npz, warn_without_checksums, write_archive
-from gsencoder.core.errors import InputError, about, readable
+from gsencoder.core.errors import InputError, SceneWarning, about, readable
 from gsencoder.core.files import open_foreign
-from gsencoder.text.towers import TowerRecord
 from gsencoder.types import FeatureSpace
+
+KINDS = ("onnx", "transformers")
+SLOT = "{}"
+"""Where a template takes the phrase."""
+NO_TEMPLATES = (SLOT,)
+MAX_TEMPLATES = 1000
+MAX_PHRASE = 1000
+"""Largest number of characters of a phrase: longer than any description of a thing, and quickly tokenized."""
+
+
+@runtime_checkable
+class TextTower(Protocol):
+    """Embeds phrases as they are, one at a time: the vector of a phrase does not depend on the others.
+
+    Attributes:
+        name: for people; the name of the folder that it was read from.
+        identity: kind and digest of all files and settings that its vectors depend on, and never where they lie.
+        pooling: how it makes one vector of those of the tokens.
+        lower: whether it lower-cases phrases and removes their punctuation before they are tokenized.
+        channels: D.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def identity(self) -> str: ...
+
+    @property
+    def pooling(self) -> str: ...
+
+    @property
+    def lower(self) -> bool: ...
+
+    @property
+    def channels(self) -> int: ...
+
+    def embed(self, phrases: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
+        """A unit vector for each phrase; InputError for a phrase that the tower cannot read completely."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TowerRecord:
+    """Which tower made a table of names, as it is stored with the table.
+
+    Attributes:
+        kind: of tower.
+        name: of the folder that it was read from then.
+        identity, pooling: see `TextTower`.
+        templates: the sentences that each name was put into; their vectors were averaged.
+        lower: whether phrases are lower-cased and lose their punctuation before they are tokenized.
+    """
+
+    kind: str
+    name: str
+    identity: str
+    pooling: str
+    templates: tuple[str, ...] = NO_TEMPLATES
+    lower: bool = False
+
+    def __post_init__(self) -> None:
+        texts = (self.kind, self.name, self.identity, self.pooling)
+        if not all(isinstance(text, str) and 0 < len(text) <= MAX_PHRASE for text in texts) or self.kind not in KINDS:
+            raise InputError(f"text tower: expected a kind among {', '.join(KINDS)}, a name, an identity and a pooling")
+        check_templates(self.templates)
+
+    def describe(self) -> str:
+        """The tower in words, for messages."""
+        return f"{self.name!r} ({self.identity})"
+
+
+def check_templates(templates: Sequence[str]) -> None:
+    """Checks that each template has one slot for a phrase.
+
+    Raises:
+        InputError: none or too many templates, or one without its slot.
+    """
+    if not 1 <= len(templates) <= MAX_TEMPLATES:
+        raise InputError(f"templates: expected 1 to {MAX_TEMPLATES} sentences, got {len(templates)}")
+    for template in templates:
+        if not isinstance(template, str) or template.count(SLOT) != 1 or len(template) > MAX_PHRASE:
+            raise InputError(
+                f"templates: expected sentences with one {SLOT} each, such as 'a photo of a {SLOT}', got "
+                f"{str(template)[:80]!r}"
+            )
+
+
+def check_phrase(phrase: str) -> str:
+    """The phrase with single blanks between its words, which no tokenizer reads otherwise.
+
+    Raises:
+        InputError: it is empty, too long, or holds no letter and no digit.
+    """
+    if len(phrase) > MAX_PHRASE:
+        raise InputError(f"query {phrase[:40]!r}…: has {len(phrase):,} characters; expected at most {MAX_PHRASE:,}")
+    text = re.sub(r"\s+", " ", phrase).strip()
+    if not text:
+        raise InputError(f"query {phrase!r}: is empty; expected a word or a phrase")
+    if not any(character.isalnum() for character in text):
+        raise InputError(f"query {text[:40]!r}: holds no letter and no digit; expected a word or a phrase")
+    return text
+
+
+def check_known(phrase: str, tokens: Sequence[int], unknown: int | None) -> None:
+    """Checks that a tokenizer knows all of a phrase; with a part of it unknown another phrase would be embedded.
+
+    Args:
+        phrase: for the message.
+        tokens: of the phrase, without special ones at its ends.
+        unknown: the token for what is not known; None where there is none.
+
+    Raises:
+        InputError: nothing, or not all of it, is known.
+    """
+    if not tokens or all(token == unknown for token in tokens):
+        raise InputError(f"query {phrase[:60]!r}: holds no word that its tokenizer knows")
+    if unknown in tokens:
+        raise InputError(
+            f"query {phrase[:60]!r}: its tokenizer does not know {tokens.count(unknown)} of its {len(tokens)} parts; "
+            "leave these out"
+        )
+
+
+def embed_in_templates(
+    tower: TextTower, phrases: Sequence[str], templates: Sequence[str]
+) -> Float32[np.ndarray, "Q D"]:
+    """The mean of a phrase's vectors over templates, of unit length.
+
+    Args:
+        tower: to embed with.
+        phrases: words or descriptions.
+        templates: sentences with a slot.
+
+    Raises:
+        InputError: a phrase is empty, too long, or not readable for the tower; or vectors are not finite.
+    """
+    total = np.zeros((len(phrases), tower.channels))
+    for template in templates:
+        with about(f"text tower {tower.name}"):
+            vectors = tower.embed([template.replace(SLOT, check_phrase(phrase)) for phrase in phrases])
+        if not np.isfinite(vectors).all():
+            raise InputError(f"text tower {tower.name}: its vectors are not finite; check the model")
+        total += vectors
+    return unit(total)
+
+
+def unit(vectors: np.ndarray) -> Float32[np.ndarray, "Q D"]:
+    """Rows of unit length, computed in float64.
+
+    Raises:
+        InputError: a row has no direction.
+    """
+    values = np.asarray(vectors, np.float64)
+    norms = np.sqrt((values**2).sum(axis=1, keepdims=True))
+    if not (norms > 1e-12).all():
+        raise InputError("a vector of a phrase has no length; check the model and the templates")
+    return (values / norms).astype(np.float32)
+
 
 NORM_TOLERANCE = 1e-2
 """Largest difference from 1 of the norm of a stored embedding; float16 rounding is about 1e-3."""
@@ -341,3 +508,159 @@ def _read_npz(file: Path, encoder: str) -> TextTable:
 
 def _one_line(error: BaseException) -> str:
     return (" ".join(str(error).split()) or type(error).__name__)[:200]
+
+
+@runtime_checkable
+class TextEncoder(Protocol):
+    """Encodes words as vectors of a feature space.
+
+    Attributes:
+        space: the feature space; its `text_encoder` is the name of this encoder.
+        mean: the mean of text vectors, which centered cosines subtract from words.
+    """
+
+    @property
+    def space(self) -> FeatureSpace: ...
+
+    @property
+    def mean(self) -> Float32[np.ndarray, " D"]: ...
+
+    def encode(self, words: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
+        """A unit vector for each word; InputError for an unknown word."""
+        ...
+
+
+def check_space(features: FeatureSpace, text: FeatureSpace) -> None:
+    """Checks that words and features have the same text encoder.
+
+    Raises:
+        InputError: the features have no text encoder, or another encoder or width; both spaces are named.
+    """
+    if not features.text_encoder:
+        raise InputError(
+            f"features of space ({features.describe()}) cannot be queried with words: it has no text encoder; "
+            "fuse with a teacher that has one"
+        )
+    if features.text_encoder != text.text_encoder or features.channels != text.channels:
+        raise InputError(
+            f"features of space ({features.describe()}) cannot be compared with words of space ({text.describe()}): "
+            f"use the text encoder {features.text_encoder!r}"
+        )
+
+
+CACHE_VARIABLE = "GSENCODER_CACHE"
+"""A folder; "off" = no cache; not set = gsencoder in the user's folder of caches."""
+OFF = "off"
+MAX_PHRASES = 20_000
+"""A file that would grow beyond is begun anew."""
+
+
+def cache_folder() -> Path | None:
+    """The folder of cached vectors, or None where caching is off."""
+    stated = os.environ.get(CACHE_VARIABLE, "")
+    if stated == OFF:
+        return None
+    if stated:
+        return Path(stated) / "text"
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    return Path(base) / "gsencoder" / "text"
+
+
+def cached_vectors(
+    identity: str,
+    templates: Sequence[str],
+    phrases: Sequence[str],
+    compute: Callable[[list[str]], Float32[np.ndarray, "missing D"]],
+) -> Float32[np.ndarray, "Q D"]:
+    """The vectors of phrases, from the cache where it has them.
+
+    Args:
+        identity: of the tower.
+        templates: that phrases are put into.
+        phrases: to be embedded.
+        compute: embeds those that the cache does not have; called only if there are such.
+
+    Warns:
+        SceneWarning: the file of the cache is damaged, or cannot be written.
+    """
+    path = _file_of(identity, templates)
+    cached = _read(path) if path is not None else {}
+    missing = list(dict.fromkeys(phrase for phrase in phrases if phrase not in cached))
+    if missing:
+        computed = dict(zip(missing, compute(missing), strict=True))
+        if path is not None:
+            _write(path, computed if len(cached) + len(computed) > MAX_PHRASES else cached | computed)
+        cached = cached | computed
+    return np.stack([cached[phrase] for phrase in phrases])
+
+
+def _file_of(identity: str, templates: Sequence[str]) -> Path | None:
+    folder = cache_folder()
+    if folder is None:
+        return None
+    digest = hashlib.sha256(repr((identity, tuple(templates))).encode("utf-8", "backslashreplace")).hexdigest()
+    return folder / f"{digest[:24]}.safetensors"
+
+
+def _read(path: Path) -> dict[str, Float32[np.ndarray, " D"]]:
+    if not path.is_file():
+        return {}
+    try:
+        with open_archive(path) as archive:
+            phrases = archive.value("phrases", list)
+            vectors = archive.array("vectors", "float32", ("Q", "D"))
+        if len(phrases) != len(vectors) or not all(isinstance(phrase, str) for phrase in phrases):
+            raise InputError(f"{path}: expected one vector for each phrase")
+    except InputError as error:
+        warnings.warn(f"cached text vectors are computed again: {error}", SceneWarning, stacklevel=3)
+        return {}
+    return dict(zip(phrases, vectors, strict=True))
+
+
+def _write(path: Path, cached: dict[str, Float32[np.ndarray, " D"]]) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_archive(path, {"vectors": np.stack(list(cached.values()))}, {"phrases": list(cached)})
+    except (OSError, InputError) as error:
+        warnings.warn(
+            f"text vectors are not cached: {error} ({CACHE_VARIABLE}={OFF} turns the cache off)",
+            SceneWarning,
+            stacklevel=3,
+        )
+
+
+_LIST = """
+air conditioner, airplane, alarm clock, animal, apple, armchair, backpack, bag, ball, balloon, banana, basin,
+basket, bathtub, battery, bean bag, bear, bed, bedside table, bell, belt, bench, bicycle, bin, bird, blanket,
+blender, blinds, board, boat, book, bookshelf, boot, bottle, bowl, box, bread, brick, bridge, broom, brush, bucket,
+building, bulletin board, bus, bush, cabinet, cable, cake, calculator, calendar, camera, can, candle, cap, car,
+card, cardboard box, carpet, cat, ceiling, ceiling fan, ceiling lamp, cereal box, chair, chandelier, chest of
+drawers, chopping board, clock, cloth, clothes, coat, coat rack, coffee machine, coffee table, column, computer,
+computer mouse, container, cooker, cookie, counter, cow, cracker, cradle, crib, cucumber, cup, cupboard, curtain,
+cushion, cutting board, desk, desk lamp, dish, dishwasher, display, dog, doll, door, door frame, doorknob, doormat,
+drawer, dress, dresser, drill, dryer, duck, dumbbell, egg, elevator, envelope, eraser, extinguisher, fan, faucet,
+fence, field, file cabinet, fireplace, fish, flag, flashlight, floor, floor lamp, flower, flower pot, folder, food,
+football, footstool, fork, fountain, frame, fridge, fruit, frying pan, garage, garden, gate, glass, glasses, glove,
+grapes, grass, grill, ground, guitar, hair dryer, hairbrush, hammer, handbag, handle, handrail, hanger, hat,
+headphones, heater, helmet, hill, hook, horse, hose, house, iron, jacket, jar, jeans, jug, juice, kettle, key,
+keyboard, kitchen island, knife, ladder, lake, lamp, lamp shade, laptop, laundry basket, leaf, lego brick, lemon,
+letter, light, light bulb, light switch, lock, lunch box, machine, magazine, magnet, mailbox, map, marker, mat,
+mattress, meat, medal, microphone, microwave, milk, mirror, monitor, mop, motorcycle, mountain, mouse pad, mug,
+nail, napkin, newspaper, nightstand, notebook, nut, office chair, onion, orange, ottoman, oven, package, paddle,
+padlock, painting, pan, paper, paper towel, parasol, park, path, peach, pear, pen, pencil, pencil case, pepper,
+person, phone, piano, picture, pillow, pipe, pitcher, pizza, plant, plastic bag, plate, pliers, plug, plum, pole,
+poster, pot, potato, power drill, power strip, printer, projector, pump, purse, puzzle, quilt, rack, radiator,
+radio, railing, refrigerator, remote control, rice cooker, river, road, robot, rock, roof, rope, rug, ruler, salt
+shaker, sand, sandwich, scale, scarf, scissors, screen, screw, screwdriver, sculpture, sea, seat, sheet, shelf,
+ship, shirt, shoe, shoe rack, shopping bag, shower, shower curtain, sidewalk, sign, sink, skateboard, skirt, sky,
+slipper, snow, soap, soap dispenser, soccer ball, sock, socket, sofa, soup can, spatula, speaker, sponge, spoon,
+spray bottle, stairs, stapler, statue, stick, stone, stool, stove, strawberry, street light, string, suitcase, sun,
+sunglasses, sweater, swimming pool, switch, table, table lamp, tablecloth, tape, teapot, teddy bear, telephone,
+television, tennis ball, tennis racket, tent, tie, tile, tire, tissue box, toaster, toilet, toilet brush, toilet
+paper, tomato, tool, toolbox, toothbrush, toothpaste, towel, towel rack, toy, toy car, train, trash can, tray, tree,
+trophy, trousers, truck, tube, umbrella, vacuum cleaner, van, vase, vegetable, vent, wall, wallet, wardrobe, washing
+machine, watch, water, water bottle, watermelon, wheel, wheelchair, whiteboard, window, window sill, wine bottle,
+wine glass, wood, wrench, wristwatch, yoga mat
+"""
+
+REFERENCE_NOUNS = tuple(" ".join(noun.split()) for noun in _LIST.split(","))

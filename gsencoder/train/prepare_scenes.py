@@ -18,7 +18,7 @@ from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig
 from gsencoder.models.output_space import check_distinct
-from gsencoder.text.build import Words, closed_table
+from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
 from gsencoder.train.dataset_space import fit_space
 from gsencoder.train.distributed import check_agreement, fail_together

@@ -17,8 +17,8 @@ from gsencoder.fusion.heads.store import heads_digest
 from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces
-from gsencoder.text.build import Words, closed_table
 from gsencoder.text.table import TextTable
+from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.train.adapter_heads import dataset_heads, render_heads, required_heads, teacher_of_heads
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, check_same_teachers

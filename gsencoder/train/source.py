@@ -18,7 +18,7 @@ from gsencoder.fusion.teachers import MissingInput, Teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, options_of_member
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.regions.config import RegionsConfig
-from gsencoder.text.build import TableTextConfig, TextConfig, Words
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.train.prepare import PrepareConfig
 from gsencoder.types import Scene
 

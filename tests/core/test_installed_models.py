@@ -10,9 +10,11 @@ from text_towers import save_graph, save_tokenizer
 from gsencoder.core import pretrained as model_files
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import check_installed, find_file, sentence_encoder_graph
-from gsencoder.text import build, onnx_tower, open_vocabulary
-from gsencoder.text.build import find_tower, vocabulary_of, words_of_table
-from gsencoder.text.onnx_tower import OnnxTextConfig, OnnxTower
+from gsencoder.text import models as onnx_tower
+from gsencoder.text import vocabulary as build
+from gsencoder.text import vocabulary as open_vocabulary
+from gsencoder.text.models import OnnxTextConfig, OnnxTower
+from gsencoder.text.vocabulary import find_tower, vocabulary_of, words_of_table
 
 MINILM = OnnxTextConfig(model="minilm_l6", pooling="mean")
 

@@ -13,8 +13,8 @@ from gsencoder.app.cli import main
 from gsencoder.app.commands import evaluate_sources
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, space_of_words
-from gsencoder.text.build import stating_trained
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
+from gsencoder.text.vocabulary import stating_trained
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, Scene
 
 WORDS = {name: make_text_table(("mug", "cup"), np.eye(2, dtype=np.float32), f"{name}-words") for name in "abc"}

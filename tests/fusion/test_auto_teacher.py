@@ -13,8 +13,8 @@ from gsencoder.fusion.teachers.auto import SEGMENTER, SENTENCES, AutoConfig, cho
 from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.palette import PaletteConfig
-from gsencoder.text.build import TableTextConfig, TextConfig, Words
-from gsencoder.text.onnx_tower import OnnxTextConfig
+from gsencoder.text.models import OnnxTextConfig
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene
 
 TABLE = text_table_of(LabelsConfig())

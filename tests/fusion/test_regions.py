@@ -31,10 +31,9 @@ from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.regions.captions import read_captions
 from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.fusion.teachers.regions.masks import label_paths
-from gsencoder.text.onnx_tower import OnnxTextConfig
-from gsencoder.text.open_vocabulary import OpenVocabulary
-from gsencoder.text.reference_nouns import REFERENCE_NOUNS
-from gsencoder.text.table import save_text_table
+from gsencoder.text.models import OnnxTextConfig
+from gsencoder.text.table import REFERENCE_NOUNS, save_text_table
+from gsencoder.text.vocabulary import OpenVocabulary
 from gsencoder.types import Scene
 
 

@@ -17,8 +17,8 @@ from gsencoder.fusion.teacher_maps import read_map, write_map
 from gsencoder.fusion.teachers.build import build_teacher, words_beside
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.segmenter_classes import synonyms_of_classes
-from gsencoder.text.open_vocabulary import make_vocabulary
-from gsencoder.text.towers import unit
+from gsencoder.text.table import unit
+from gsencoder.text.vocabulary import make_vocabulary
 from gsencoder.types import FeatureMap, Scene, SceneObject, Views
 
 

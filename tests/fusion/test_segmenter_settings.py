@@ -16,7 +16,7 @@ from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher, softmax
 from gsencoder.fusion.teachers.segmenter_classes import MAX_CLASSES_BYTES, read_classes
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
-from gsencoder.text.onnx_tower import OnnxTextConfig
+from gsencoder.text.models import OnnxTextConfig
 from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.types import Scene, Views
 

@@ -15,8 +15,8 @@ from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig
 from gsencoder.fusion.teachers.segmenter_classes import synonyms_of_classes
-from gsencoder.text.onnx_tower import OnnxTextConfig
-from gsencoder.text.reference_nouns import REFERENCE_NOUNS
+from gsencoder.text.models import OnnxTextConfig
+from gsencoder.text.table import REFERENCE_NOUNS
 from gsencoder.types import Scene
 
 TOWER = OnnxTextConfig(model="nowhere")

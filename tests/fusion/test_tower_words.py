@@ -23,10 +23,10 @@ from gsencoder.data.synthetic.write import write_room
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of, words_of
 from gsencoder.fusion.teachers.tower import TransformersConfig
-from gsencoder.text import open_vocabulary
-from gsencoder.text.build import TextConfig, vocabulary_of, words_of_table
+from gsencoder.text import vocabulary as open_vocabulary
+from gsencoder.text.models import TransformersTextConfig
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
-from gsencoder.text.transformers_tower import TransformersTextConfig
+from gsencoder.text.vocabulary import TextConfig, vocabulary_of, words_of_table
 from gsencoder.types import GaussianFeatures, Scene
 
 transformers = pytest.importorskip("transformers")

@@ -14,8 +14,7 @@ from gsencoder.infer.draw.boxes_ply import EDGES, box_corners, write_boxes_ply
 from gsencoder.infer.localize.localization_json import localization_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, localize, spacing_of
 from gsencoder.infer.localize.threshold import ThresholdConfig
-from gsencoder.text.encoder import TextEncoder
-from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.text.table import TextEncoder, TextTable, make_text_table
 from gsencoder.types import Box, FeatureBasis, GaussianFeatures, Gaussians, Localization, Scene
 
 WORDS = ("mug", "chair", "lamp", "spoon", "rug", "door")

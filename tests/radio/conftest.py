@@ -7,14 +7,14 @@ import pytest
 from radio_world import QUICK, SEEDS, World, run
 
 from gsencoder.app import cli
-from gsencoder.text.reference_nouns import REFERENCE_NOUNS
+from gsencoder.text.table import REFERENCE_NOUNS
 
 
 @pytest.fixture(scope="module", autouse=True)
 def few_nouns() -> Iterator[None]:
     """Towers embed twenty reference nouns instead of four hundred."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gsencoder.text.open_vocabulary.REFERENCE_NOUNS", REFERENCE_NOUNS[:20])
+        patch.setattr("gsencoder.text.vocabulary.REFERENCE_NOUNS", REFERENCE_NOUNS[:20])
         yield
 
 

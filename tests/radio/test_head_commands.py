@@ -17,9 +17,9 @@ from gsencoder.fusion.heads.store import find_head, load_heads
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.threshold import ThresholdConfig
-from gsencoder.text.build import vocabulary_of
+from gsencoder.text.models import TransformersTextConfig
 from gsencoder.text.table import make_text_table, save_text_table
-from gsencoder.text.transformers_tower import TransformersTextConfig
+from gsencoder.text.vocabulary import vocabulary_of
 from gsencoder.types import GaussianFeatures
 
 pytestmark = pytest.mark.slow

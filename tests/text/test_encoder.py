@@ -3,7 +3,7 @@
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.text.encoder import check_space
+from gsencoder.text.table import check_space
 from gsencoder.types import FeatureSpace
 
 

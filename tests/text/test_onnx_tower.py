@@ -12,7 +12,7 @@ from text_towers import CHANNELS, WORDS, save_graph, save_tokenizer
 from tokenizers import Tokenizer
 
 from gsencoder.core.errors import InputError
-from gsencoder.text.onnx_tower import OnnxTextConfig, OnnxTower
+from gsencoder.text.models import OnnxTextConfig, OnnxTower
 
 
 @pytest.fixture

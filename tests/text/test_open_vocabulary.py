@@ -9,14 +9,20 @@ import pytest
 from text_towers import WORDS, save_graph, save_tokenizer
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.text.build import find_tower, vocabulary_of, words_of_table
-from gsencoder.text.embedding_cache import CACHE_VARIABLE, cache_folder, cached_vectors
-from gsencoder.text.onnx_tower import OnnxTextConfig, OnnxTower
-from gsencoder.text.open_vocabulary import OpenVocabulary, make_vocabulary
-from gsencoder.text.reference_nouns import REFERENCE_NOUNS
-from gsencoder.text.table import TextTable, load_text_table, save_text_table
-from gsencoder.text.towers import TowerRecord, embed_in_templates, unit
-from gsencoder.text.transformers_tower import TransformersTextConfig
+from gsencoder.text.models import OnnxTextConfig, OnnxTower, TransformersTextConfig
+from gsencoder.text.table import (
+    CACHE_VARIABLE,
+    REFERENCE_NOUNS,
+    TextTable,
+    TowerRecord,
+    cache_folder,
+    cached_vectors,
+    embed_in_templates,
+    load_text_table,
+    save_text_table,
+    unit,
+)
+from gsencoder.text.vocabulary import OpenVocabulary, find_tower, make_vocabulary, vocabulary_of, words_of_table
 
 
 class HashTower:
@@ -227,7 +233,7 @@ def test_a_cache_that_cannot_be_written_is_a_warning(tmp_path: Path, monkeypatch
 
 def test_a_cache_of_too_many_phrases_is_begun_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
-    monkeypatch.setattr("gsencoder.text.embedding_cache.MAX_PHRASES", 3)
+    monkeypatch.setattr("gsencoder.text.table.MAX_PHRASES", 3)
     tower = HashTower()
     for phrase in ("a", "b", "c", "a", "d", "d", "a"):
         np.testing.assert_array_equal(

@@ -11,7 +11,7 @@ import transformers
 from text_towers import WORDS, save_tokenizer
 
 from gsencoder.core.errors import InputError
-from gsencoder.text.transformers_tower import TransformersTextConfig, TransformersTower, canonical
+from gsencoder.text.models import TransformersTextConfig, TransformersTower, canonical
 
 PHRASES = ("red mug", "a chair", "mug")
 SMALL: dict[str, Any] = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 2, "num_attention_heads": 2}

@@ -28,7 +28,7 @@ from gsencoder.infer.ask.questions import BatchQuestion, read_questions
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.text.build import TableTextConfig, TextConfig
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 
 PREDICTIONS = "predictions.json"
 

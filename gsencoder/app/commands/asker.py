@@ -11,7 +11,7 @@ from gsencoder.infer.ask.ask import AskConfig, Asker
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.localize.localize import LocalizeConfig, select_features
 from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.text.build import TableTextConfig, TextConfig, Words
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene
 
 

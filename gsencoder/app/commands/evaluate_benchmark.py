@@ -32,7 +32,7 @@ from gsencoder.evaluate.protocols.referring import ReferringProtocol, read_expre
 from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, classes_of
 from gsencoder.evaluate.scores.semantics import check_excluded
 from gsencoder.evaluate.sources import FeatureSource
-from gsencoder.text.build import Words, check_known
+from gsencoder.text.vocabulary import Words, check_known
 from gsencoder.train.distributed import fail_together, join_processes, value_of_first, values_of_all
 
 CLASS_IDS = "class_ids.csv"

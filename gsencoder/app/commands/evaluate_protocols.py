@@ -34,7 +34,7 @@ from gsencoder.evaluate.protocols.naming import NamingProtocol, evaluate_naming,
 from gsencoder.evaluate.sources import (
     FeatureSource,
 )
-from gsencoder.text.build import Words, check_known
+from gsencoder.text.vocabulary import Words, check_known
 from gsencoder.types import QueryMemory, Scene
 
 

@@ -20,7 +20,7 @@ from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol, evaluate_r
 from gsencoder.evaluate.retrieval import ScoredPairs
 from gsencoder.evaluate.score_retrieval import score_retrieval
 from gsencoder.evaluate.sources import FeatureSource
-from gsencoder.text.build import Words, check_known
+from gsencoder.text.vocabulary import Words, check_known
 from gsencoder.types import QueryMemory, Scene
 
 PREDICTIONS, TRUTH = "predictions.npz", "truth.json"

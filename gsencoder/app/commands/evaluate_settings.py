@@ -26,7 +26,7 @@ from gsencoder.fusion.teachers.build import TeacherConfig
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.text.build import TableTextConfig, TextConfig
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

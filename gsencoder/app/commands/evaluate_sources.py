@@ -27,7 +27,7 @@ from gsencoder.fusion.store.heads_file import heads_beside
 from gsencoder.fusion.teachers.build import words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.load_encoder import file_of_encoder, load_encoder
-from gsencoder.text.build import TableTextConfig, Words, stating_trained, words_of_table
+from gsencoder.text.vocabulary import TableTextConfig, Words, stating_trained, words_of_table
 from gsencoder.types import Scene
 
 

@@ -10,7 +10,7 @@ from gsencoder.app.commands.from_poses import memory_of
 from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import load_features
-from gsencoder.text.build import TableTextConfig, TextConfig, Words
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.types import GaussianFeatures, QueryMemory, Scene
 
 

@@ -14,7 +14,7 @@ from gsencoder.data.readers.camera_file import read_cameras
 from gsencoder.fusion.store.folder import load_memories, teachers_in
 from gsencoder.fusion.store.memory_file import MEMORY_FILE
 from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.text.encoder import TextEncoder
+from gsencoder.text.table import TextEncoder
 from gsencoder.types import Cameras, QueryMemory, Scene
 
 FROM_POSE = "from_pose.json"

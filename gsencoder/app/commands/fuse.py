@@ -40,8 +40,8 @@ from gsencoder.fusion.teachers.auto import AutoConfig, choose_teacher
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_beside, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.models.output_space import OutputSpaces, name_of_space
-from gsencoder.text.build import TableTextConfig, TextConfig
 from gsencoder.text.table import TextTable, save_text_table
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
 
 

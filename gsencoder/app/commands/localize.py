@@ -28,7 +28,7 @@ from gsencoder.data.up import with_up
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize.localization_json import localization_to_json, words_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize
-from gsencoder.text.build import TableTextConfig, TextConfig
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Localization
 
 

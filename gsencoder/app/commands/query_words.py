@@ -10,8 +10,8 @@ from gsencoder.core.pretrained import find_file
 from gsencoder.fusion.store.folder import WORDS_FILE
 from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.localize.localize import select_features
-from gsencoder.text.build import TableTextConfig, TextConfig, Words, stating_trained, vocabulary_of, words_of_table
 from gsencoder.text.table import TextTable, load_text_table
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, stating_trained, vocabulary_of, words_of_table
 from gsencoder.types import FeatureSpace, Scene
 
 MAX_QUERIES_BYTES = 1 << 20

@@ -12,7 +12,7 @@ from gsencoder.infer.ask.ask import Asker
 from gsencoder.infer.ask.question_sets import SetQuestion, caption_question
 from gsencoder.infer.localize.localize import localize
 from gsencoder.infer.views.targets import best_boxes
-from gsencoder.text.build import closed_table
+from gsencoder.text.vocabulary import closed_table
 
 
 def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:

@@ -24,7 +24,7 @@ from gsencoder.infer.select.file_names import file_stems
 from gsencoder.infer.select.labels_file import LABELS_JSON, LABELS_PLY, labels_to_json, write_labels
 from gsencoder.infer.select.select import select
 from gsencoder.infer.select.selection import SelectConfig, Selection
-from gsencoder.text.build import TableTextConfig, TextConfig
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Scene
 
 Part = Literal["objects", "rest", "labels"]

@@ -12,11 +12,17 @@ from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import find_head, load_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE
 from gsencoder.infer.localize.localize import select_features
-from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table, vocabulary_of, words_of_table
-from gsencoder.text.open_vocabulary import OpenVocabulary
-from gsencoder.text.table import TextTable, load_text_table
-from gsencoder.text.towers import TextTower
-from gsencoder.text.transformers_tower import TransformersTower
+from gsencoder.text.models import TransformersTower
+from gsencoder.text.table import TextTable, TextTower, load_text_table
+from gsencoder.text.vocabulary import (
+    OpenVocabulary,
+    TableTextConfig,
+    TextConfig,
+    Words,
+    closed_table,
+    vocabulary_of,
+    words_of_table,
+)
 from gsencoder.types import GaussianFeatures, Scene
 
 

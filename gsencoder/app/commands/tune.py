@@ -25,7 +25,7 @@ from gsencoder.infer.ask.ask import AskConfig
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.text.build import TableTextConfig, TextConfig
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.tuning.run import TuneConfig, open_processor, save_tuned, tune
 from gsencoder.train.tuning.vlm import SERVED_FOLDER, check_peft, check_targets, link_served

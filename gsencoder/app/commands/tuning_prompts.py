@@ -24,7 +24,7 @@ from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.ask.stored_prompts import store_prompt
 from gsencoder.infer.localize.localize import LocalizeConfig, select_features
 from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.text.build import TextConfig
+from gsencoder.text.vocabulary import TextConfig
 from gsencoder.train.tuning.samples import TuningPair
 from gsencoder.train.tuning.towers import TowerLayout
 from gsencoder.types import GaussianFeatures

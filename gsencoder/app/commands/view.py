@@ -28,7 +28,7 @@ from gsencoder.infer.viewer.search import SceneSearch
 from gsencoder.infer.viewer.server import ViewServer
 from gsencoder.infer.viewer.shown import drawn_scene
 from gsencoder.infer.views.photographs import with_photographs
-from gsencoder.text.build import TableTextConfig, TextConfig, Words
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene, SceneObject
 from gsencoder.types.orientation import upright_scene
 

@@ -29,7 +29,7 @@ from gsencoder.infer.views.targets import Target, best_boxes, targets_of
 from gsencoder.infer.views.tokens import Fit, feature_tokens, token_blends, tower_grid
 from gsencoder.infer.views.write import SHEET, views_to_json, write_pictures
 from gsencoder.render import BlendConfig
-from gsencoder.text.build import TableTextConfig, TextConfig
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Box, Scene
 
 VIEWS, TOKENS = "views.json", "tokens.safetensors"

@@ -23,7 +23,7 @@ from gsencoder.evaluate.boxes import is_seen
 from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.text.encoder import TextEncoder
+from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures, Scene, SceneObject
 
 BINS = 10

@@ -24,7 +24,7 @@ from gsencoder.infer.localize.pixel_relevancy import pixel_features
 from gsencoder.infer.localize.relevancy import word_directions
 from gsencoder.render import blend
 from gsencoder.render.rays import strided_lattice
-from gsencoder.text.encoder import TextEncoder, check_space
+from gsencoder.text.table import TextEncoder, check_space
 from gsencoder.types import GaussianFeatures, QueryMemory, Scene, SceneObject
 
 

@@ -18,7 +18,7 @@ from gsencoder.evaluate.labeled_points import LabeledPoints
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
 from gsencoder.evaluate.scores.instance_matches import MIN_REGION
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.text.encoder import TextEncoder
+from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures, Scene
 
 Proposals = Literal["clusters", "truth"]

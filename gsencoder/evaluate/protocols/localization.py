@@ -18,7 +18,7 @@ from gsencoder.evaluate.boxes import Hit, accuracy, queryable_objects, score_box
 from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.text.build import Words
+from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, Scene
 
 IOU_THRESHOLDS = (0.25, 0.5)

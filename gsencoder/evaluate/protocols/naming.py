@@ -19,7 +19,7 @@ from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
-from gsencoder.text.build import Words
+from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, Scene
 
 CHUNK_ROWS = 16_384

@@ -11,7 +11,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.evaluate.class_scores import class_cosines
 from gsencoder.evaluate.labeled_points import LabeledPoints
 from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames
-from gsencoder.text.encoder import TextEncoder
+from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures
 
 RANKED = 10

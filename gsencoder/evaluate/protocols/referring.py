@@ -19,7 +19,7 @@ from gsencoder.data.truth.expressions import Expression, read_nr3d, read_scanref
 from gsencoder.evaluate.scores.referring import PredictedBoxes
 from gsencoder.infer.ask.question_words import words_in
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.text.build import Words, closed_table
+from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.types import GaussianFeatures, Localization, Scene
 
 CANDIDATES = 10

@@ -21,7 +21,7 @@ from gsencoder.infer.localize.gaussian_products import GaussianProducts
 from gsencoder.infer.localize.pixel_relevancy import pixel_features
 from gsencoder.infer.localize.relevancy import Mode, word_directions
 from gsencoder.render import blend
-from gsencoder.text.encoder import TextEncoder, check_space
+from gsencoder.text.table import TextEncoder, check_space
 from gsencoder.types import GaussianFeatures, QueryMemory, Scene
 
 BLOCK_TEXTS = 64

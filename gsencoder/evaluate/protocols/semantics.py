@@ -20,7 +20,7 @@ from gsencoder.data.truth.nearest_vertices import VOTERS, labels_of_vertices
 from gsencoder.evaluate.class_scores import nearest_class
 from gsencoder.evaluate.labeled_points import LabeledPoints
 from gsencoder.evaluate.scores.semantics import BACKGROUND
-from gsencoder.text.encoder import TextEncoder
+from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures, Gaussians
 
 NO_CLASS, NO_CLASS_BESIDE_ZERO = 0, -100

@@ -9,8 +9,8 @@ from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
-from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table
-from gsencoder.text.onnx_tower import OnnxTextConfig
+from gsencoder.text.models import OnnxTextConfig
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.types import Scene
 
 NAMES_TABLE = LabelsConfig().words

@@ -19,9 +19,8 @@ from gsencoder.fusion.teachers.regions.config import RegionsConfig
 from gsencoder.fusion.teachers.regions.crops import is_joint
 from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
 from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
-from gsencoder.text.build import TableTextConfig, TextConfig, Words, closed_table, vocabulary_of
-from gsencoder.text.open_vocabulary import OpenVocabulary
 from gsencoder.text.table import TextTable, load_text_table, make_text_table
+from gsencoder.text.vocabulary import OpenVocabulary, TableTextConfig, TextConfig, Words, closed_table, vocabulary_of
 from gsencoder.types import Scene
 
 TeacherConfig = (

@@ -19,7 +19,7 @@ from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.segmenter_classes import read_classes, synonyms_of_classes
 from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenter, OnnxSegmenterOptions
 from gsencoder.fusion.teachers.segmenter_transformers import TransformersSegmenter
-from gsencoder.text.build import Words
+from gsencoder.text.vocabulary import Words
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 SUM_TOLERANCE = 1e-2

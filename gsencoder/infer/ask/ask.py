@@ -19,7 +19,7 @@ from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
 from gsencoder.infer.views.selection import ViewsConfig, ViewSet
 from gsencoder.infer.views.targets import Target, best_boxes, target_of, targets_of
-from gsencoder.text.build import Words, closed_table
+from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.types import Box, Scene
 
 MAX_CACHED_PICTURES = 8

@@ -25,7 +25,7 @@ from gsencoder.infer.localize.relevancy import Mode, word_directions
 from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.rays import strided_lattice
-from gsencoder.text.encoder import TextEncoder, check_space
+from gsencoder.text.table import TextEncoder, check_space
 from gsencoder.types import Cameras, QueryMemory, Scene
 
 MEMORY_STRIDE = 4

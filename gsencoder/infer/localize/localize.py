@@ -16,10 +16,8 @@ from gsencoder.infer.localize.cluster import EPS_SPACINGS, cluster, cluster_by_g
 from gsencoder.infer.localize.presence import Evidence, Presence, probability
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
-from gsencoder.text.build import closed_table
-from gsencoder.text.encoder import TextEncoder, check_space
-from gsencoder.text.open_vocabulary import OpenVocabulary
-from gsencoder.text.table import TextTable
+from gsencoder.text.table import TextEncoder, TextTable, check_space
+from gsencoder.text.vocabulary import OpenVocabulary, closed_table
 from gsencoder.types import GaussianFeatures, Gaussians, Localization, Scene
 
 

@@ -14,7 +14,7 @@ from gsencoder.infer.localize.localize import LocalizeConfig, localize, select_f
 from gsencoder.infer.select.grow import grow
 from gsencoder.infer.select.seeds import box_parts, labels_of_parts, threshold_parts
 from gsencoder.infer.select.selection import SelectConfig, Selection
-from gsencoder.text.encoder import TextEncoder
+from gsencoder.text.table import TextEncoder
 from gsencoder.types import Localization, Scene
 
 MOST_WORDS = 64

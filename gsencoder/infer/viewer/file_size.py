@@ -11,8 +11,7 @@ from gsencoder.infer.viewer.page import file_page
 from gsencoder.infer.viewer.page_scene import FileOptions, file_container
 from gsencoder.infer.viewer.search import SceneSearch
 from gsencoder.infer.viewer.shown import drawn_scene
-from gsencoder.text.build import Words, closed_table
-from gsencoder.text.open_vocabulary import OpenVocabulary
+from gsencoder.text.vocabulary import OpenVocabulary, Words, closed_table
 from gsencoder.types import Scene, SceneObject
 
 FEWEST_GAUSSIANS = 1000

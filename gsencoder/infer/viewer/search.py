@@ -16,9 +16,8 @@ from gsencoder.infer.localize.localize import LocalizeConfig, localize, spacing_
 from gsencoder.infer.localize.relevancy import word_directions
 from gsencoder.infer.localize.threshold import threshold
 from gsencoder.infer.viewer.shown import ShownScene
-from gsencoder.text.build import Words, closed_table
-from gsencoder.text.encoder import check_space
-from gsencoder.text.table import TextTable
+from gsencoder.text.table import TextTable, check_space
+from gsencoder.text.vocabulary import Words, closed_table
 
 RELEVANCY_STEP = 1 / 32767
 """Relevancies are sent in such steps, as 16-bit integers."""

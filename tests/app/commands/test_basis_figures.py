@@ -18,7 +18,7 @@ from gsencoder.fusion.store.folder import load_features
 from gsencoder.fusion.teachers.palette import PaletteConfig, PaletteTeacher
 from gsencoder.infer.onnx.export import random_cloud
 from gsencoder.models.weights import load_weights
-from gsencoder.text.reference_nouns import REFERENCE_NOUNS
+from gsencoder.text.table import REFERENCE_NOUNS
 
 pytestmark = pytest.mark.slow
 

@@ -129,7 +129,7 @@ def test_names_of_objects_through_minilm_are_those_of_labels(
 ) -> None:
     # Embedding all of them takes seconds.
     nouns = ("chair", "dining table", "tree")
-    monkeypatch.setattr("gsencoder.text.open_vocabulary.REFERENCE_NOUNS", nouns)
+    monkeypatch.setattr("gsencoder.text.vocabulary.REFERENCE_NOUNS", nouns)
     # Both fusions read the same names with the same tower.
     monkeypatch.setenv("GSENCODER_CACHE", str(tmp_path / "cache"))
     scene, fields = shared / "scenes/house/train_040", []

@@ -13,8 +13,7 @@ from gsencoder.fusion.teachers.regions.masks import FileMasks, InstanceMasks, Re
 from gsencoder.fusion.teachers.regions.sam import SamMasks
 from gsencoder.fusion.teachers.regions.vectors import MapVectors, PicturedRegions, RegionVectors
 from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
-from gsencoder.text.build import Words
-from gsencoder.text.open_vocabulary import OpenVocabulary
+from gsencoder.text.vocabulary import OpenVocabulary, Words
 from gsencoder.types import Scene
 
 RegionsTeacher = CaptionedRegions | PicturedRegions

@@ -10,7 +10,7 @@ from jaxtyping import Float32, Int32
 from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.fusion.teachers.regions.captions import Captions
 from gsencoder.fusion.teachers.regions.masks import RegionMasks
-from gsencoder.text.build import Words
+from gsencoder.text.vocabulary import Words
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 IDENTITY = np.array([[1.0, 0, 0], [0, 1.0, 0]])

@@ -23,7 +23,7 @@ from gsencoder.core.pretrained import (
 from gsencoder.core.process import Device
 from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions
 from gsencoder.fusion.teachers.resize import normalized
-from gsencoder.text.transformers_tower import JOINT
+from gsencoder.text.models import JOINT
 from gsencoder.types import FeatureSpace, Views
 
 WHAT = "teacher regions"
