@@ -47,7 +47,7 @@ from gsencoder.reconstruct.parameters import camera_of, gaussians_of, parameters
 from gsencoder.reconstruct.prune import PruneConfig
 from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.render import blend
-from gsencoder.render.image_metrics import psnr
+from gsencoder.render.images import psnr
 from gsencoder.render.rasterize import RasterConfig, rasterize
 from gsencoder.train.memory import first_queries, memory_training, train_memory
 from gsencoder.train.memory_network import MemoryConfig

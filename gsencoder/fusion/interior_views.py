@@ -7,7 +7,7 @@ from jaxtyping import Float64, Int64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.orbits import looking_cameras, spiral_directions
-from gsencoder.render.zbuffer import OPAQUE, visible_shares
+from gsencoder.render.images import OPAQUE, visible_shares
 from gsencoder.types import Cameras, Gaussians
 
 FIELD_OF_VIEW = np.deg2rad(75.0)

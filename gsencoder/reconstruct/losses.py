@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gsencoder.data.photographs import ScaledPhotograph
-from gsencoder.render.image_metrics import ssim
+from gsencoder.render.images import ssim
 from gsencoder.render.rasterize import Raster
 
 

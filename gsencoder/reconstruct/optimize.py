@@ -26,7 +26,7 @@ from gsencoder.reconstruct.parameters import (
 )
 from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.render.image_metrics import WINDOW as SSIM_WINDOW
+from gsencoder.render.images import WINDOW as SSIM_WINDOW
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
 from gsencoder.types import Gaussians
 

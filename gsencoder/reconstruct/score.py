@@ -14,7 +14,7 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.stereo import confirms, sample_depth, world_points
 from gsencoder.reconstruct.exposure_prediction import predict_exposures
 from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.render.image_metrics import inner, psnr, ssim
+from gsencoder.render.images import inner, psnr, ssim
 
 MIN_PHOTOGRAPHS = 2
 """Smallest number of photographs that a splat can be fitted to."""

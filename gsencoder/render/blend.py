@@ -97,7 +97,7 @@ class Blend:
     def transposed(self) -> tuple[Int64[Tensor, " M"], Int64[Tensor, " M_plus_1"], Int32[Tensor, " nnz"], Tensor]:
         """The M columns that occur, and Bᵀ restricted to them: (columns, crow, row, weight)."""
         if self._on_numba:
-            from gsencoder.render import sparse_cpu as products
+            from gsencoder.render import blend_cpu as products
 
             arrays = (self.crow.numpy(), self.col.numpy(), self.weight.numpy())
             columns, crow, row, weight = map(torch.from_numpy, products.transpose(*arrays, self.gaussians))
@@ -171,7 +171,7 @@ class Blend:
         Rows of code −1 give nothing. By linearity `sums @ table` is what lifting `table[codes]` would have given.
         """
         if self._on_numba:
-            from gsencoder.render import sparse_cpu as products
+            from gsencoder.render import blend_cpu as products
 
             products.add_codes(*(part.numpy() for part in (self.crow, self.col, self.weight, codes, sums)))
         else:
@@ -188,7 +188,7 @@ class Blend:
     def keep_between(self, least: Float[Tensor, " P"], most: Float[Tensor, " P"]) -> "Blend":
         """The same blend with only the Gaussians whose depth lies from `least` to `most` of their row."""
         if self._on_numba:
-            from gsencoder.render import sparse_cpu as products
+            from gsencoder.render import blend_cpu as products
 
             arrays = (self.crow, self.col, self.weight, self.depths, least, most)
             selected = products.keep_between(*(array.numpy() for array in arrays))
@@ -203,7 +203,7 @@ def _multiply_into(
     crow: Tensor, col: Tensor, weight: Tensor, values: Tensor, targets: Tensor, out: Tensor, *, on_numba: bool
 ) -> None:
     if on_numba and values.dtype in (torch.float32, torch.float64):
-        from gsencoder.render import sparse_cpu as products
+        from gsencoder.render import blend_cpu as products
 
         arrays = (crow, col, weight, values.detach().contiguous(), targets, out)
         products.product(*(array.numpy() for array in arrays))

@@ -14,7 +14,7 @@ from gsencoder.infer.draw.pictures import enlarge, legible_factor
 from gsencoder.infer.draw.relevancy_views import best_views, relevancy_pictures
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.render import blend
-from gsencoder.render.zbuffer import visible_shares
+from gsencoder.render.images import visible_shares
 from gsencoder.types import Cameras, Gaussians, Localization, Scene, Views
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -6,7 +6,7 @@ import torch
 from scipy.ndimage import correlate1d
 
 from gsencoder.core.errors import InputError
-from gsencoder.render.image_metrics import psnr, ssim, ssim_map
+from gsencoder.render.images import psnr, ssim, ssim_map
 
 
 def pictures(height: int = 37, width: int = 50) -> tuple[torch.Tensor, torch.Tensor]:

@@ -9,8 +9,7 @@ from splats import front_camera, random_gaussians
 from torch import Tensor
 
 from gsencoder.core.errors import InputError
-from gsencoder.render.raster_gsplat import rasterize_gsplat
-from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
+from gsencoder.render.rasterize import Raster, RasterConfig, rasterize, rasterize_gsplat
 
 
 def stand_in(

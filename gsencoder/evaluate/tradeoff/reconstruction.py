@@ -17,8 +17,7 @@ from gsencoder.evaluate.tradeoff.stage import Inputs, Judged, Score, Stage
 from gsencoder.reconstruct.exposure import apply_colors
 from gsencoder.reconstruct.knobs import RECONSTRUCTION_KNOBS, ReconstructionSettings
 from gsencoder.reconstruct.run import Reconstruction, reconstruct
-from gsencoder.render.image_metrics import psnr, ssim
-from gsencoder.render.images import view_colors
+from gsencoder.render.images import psnr, ssim, view_colors
 from gsencoder.render.rasterize import RasterConfig, rasterize
 from gsencoder.types import Cameras, Gaussians, Scene
 

@@ -10,8 +10,7 @@ from PIL import Image
 from gsencoder.core.errors import InputError
 from gsencoder.infer.draw.pictures import contact_sheet, draw_boxes, relevancy_overlay
 from gsencoder.render import BlendConfig, blend
-from gsencoder.render.images import render_image
-from gsencoder.render.zbuffer import visible_shares
+from gsencoder.render.images import render_image, visible_shares
 from gsencoder.types import Cameras, Gaussians, Localization, Scene
 from gsencoder.types.orientation import upright_views
 
