@@ -32,8 +32,8 @@ from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.encode import chunks as chunks_module
 from gsencoder.infer.encode.chunks import EncodeConfig, cut, scene_regions
 from gsencoder.infer.encode.encode import encode
+from gsencoder.models import neighbors
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.grid import neighbors
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.models.weights import load_weights
 from gsencoder.text.table import load_text_table

@@ -24,10 +24,9 @@ from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
-from gsencoder.models.grid.cells import grid_coords
-from gsencoder.models.grid.neighbors import NeighborConv, neighbor_table
-from gsencoder.models.grid.plan import join_plans
-from gsencoder.models.grid.serialize import morton_codes
+from gsencoder.models.grid import morton_codes
+from gsencoder.models.neighbors import NeighborConv, neighbor_table
+from gsencoder.models.plan import grid_coords, join_plans
 from gsencoder.train.losses import LossConfig, match_loss
 
 

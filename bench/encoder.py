@@ -32,9 +32,9 @@ from gsencoder.core.process import retain_freed_memory
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
-from gsencoder.models.grid.neighbors import _append_zero_row, _gather_neighborhoods, _row_blocks
-from gsencoder.models.grid.plan import plan_cloud
+from gsencoder.models.neighbors import _append_zero_row, _gather_neighborhoods, _row_blocks
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
+from gsencoder.models.plan import plan_cloud
 from gsencoder.train import samples
 from gsencoder.train.batch import Batch, join_samples
 from gsencoder.train.distill import Distillation

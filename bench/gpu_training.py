@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 
 from gsencoder.core.process import Precision
-from gsencoder.models.blocks import DropPath
+from gsencoder.models.transformer import DropPath
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.distributed import join_processes
 from gsencoder.train.prepared_dataset import PreparedDataset

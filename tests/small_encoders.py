@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, encoder_inputs
-from gsencoder.models.grid.plan import join_plans
-from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.models.plan import join_plans
+from gsencoder.models.transformer import TransformerConfig
 from gsencoder.types import Gaussians
 
 TINY = TransformerConfig(

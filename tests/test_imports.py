@@ -41,7 +41,7 @@ TORCH_FREE = [
     "gsencoder.fusion.checkpoint",
     "gsencoder.fusion.store.folder",
     "gsencoder.memory.reduction",
-    "gsencoder.models.grid.curves",
+    "gsencoder.models.grid",
     "gsencoder.infer.encode.chunks",
     "gsencoder.infer.load_encoder",
     "gsencoder.infer.onnx.header",

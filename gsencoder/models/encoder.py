@@ -11,11 +11,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsencoder.core.errors import InputError
-from gsencoder.models.embed import ATTRIBUTE_CHANNELS, Attribute, embed, input_channels
-from gsencoder.models.grid.curves import SceneCurves
-from gsencoder.models.grid.neighbors import KernelSize, NeighborConv
-from gsencoder.models.grid.plan import CloudPlan, Plan, join_plans, plan_cloud
-from gsencoder.models.point_transformer import PointTransformer, TransformerConfig
+from gsencoder.models.grid import SceneCurves
+from gsencoder.models.neighbors import KernelSize, NeighborConv
+from gsencoder.models.plan import CloudPlan, Plan, join_plans, plan_cloud
+from gsencoder.models.transformer import (
+    ATTRIBUTE_CHANNELS,
+    Attribute,
+    PointTransformer,
+    TransformerConfig,
+    embed,
+    input_channels,
+)
 from gsencoder.types import Gaussians
 
 MIN_MERGE_WEIGHT = 1e-3

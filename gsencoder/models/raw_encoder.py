@@ -10,11 +10,8 @@ import torch
 from jaxtyping import Float32, Float64, Int32, Int64, Integer
 from torch import Tensor, nn
 
-from gsencoder.models.embed import embed
 from gsencoder.models.encoder import GaussianEncoder
-from gsencoder.models.grid.neighbors import KernelSize, forward_columns
-from gsencoder.models.grid.plan import Level, Plan
-from gsencoder.models.grid.serialize import (
+from gsencoder.models.grid import (
     ALIGN,
     INVALID_CODE,
     MAX_LEVELS,
@@ -23,8 +20,10 @@ from gsencoder.models.grid.serialize import (
     morton_codes,
     swap_xy,
 )
+from gsencoder.models.neighbors import KernelSize, forward_columns
 from gsencoder.models.output_space import OutputSpaces
-from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.models.plan import Level, Plan
+from gsencoder.models.transformer import TransformerConfig, embed
 
 
 class TokenLevel(NamedTuple):

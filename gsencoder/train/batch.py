@@ -8,7 +8,7 @@ from jaxtyping import Float, Float16, Int64
 from torch import Tensor
 
 from gsencoder.core.errors import InputError
-from gsencoder.models.grid.plan import CloudPlan, Plan, join_plans
+from gsencoder.models.plan import CloudPlan, Plan, join_plans
 from gsencoder.train.render_rows import RenderRows, empty_rows, join_rows
 
 

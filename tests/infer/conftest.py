@@ -14,7 +14,7 @@ from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.onnx.export import lower
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
-from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.models.transformer import TransformerConfig
 from gsencoder.models.weights import save_weights
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace

@@ -16,7 +16,7 @@ from gsencoder.infer.encode.chunks import EncodeConfig, cut, encode_by_chunks, s
 from gsencoder.infer.encode.encode import encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
-from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.models.transformer import TransformerConfig
 from gsencoder.types import FeatureSpace, Gaussians
 
 SPACE = OutputSpace(space=FeatureSpace(name="s", channels=5), mean=np.arange(5, dtype=np.float32), scale=2.0)

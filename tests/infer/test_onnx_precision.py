@@ -25,7 +25,7 @@ from gsencoder.infer.onnx.header import from_metadata, to_metadata
 from gsencoder.infer.onnx.operators import OPSET, OURS, in_standard_operators
 from gsencoder.infer.onnx.precision import PRODUCT_LIMIT
 from gsencoder.infer.onnx.runtime import OnnxEncoder
-from gsencoder.models.grid.neighbors import convolve_reference, neighbor_table
+from gsencoder.models.neighbors import convolve_reference, neighbor_table
 
 pytestmark = pytest.mark.slow
 

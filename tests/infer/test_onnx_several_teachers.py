@@ -17,7 +17,7 @@ from gsencoder.infer.onnx.export import Cloud, check_cosines, check_parity, expo
 from gsencoder.infer.onnx.runtime import OnnxEncoder
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
-from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.models.transformer import TransformerConfig
 from gsencoder.models.weights import save_weights
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians

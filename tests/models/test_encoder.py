@@ -8,8 +8,8 @@ import torch
 from small_encoders import CONFIG, TINY, encoder, run, splat
 
 from gsencoder.geometry import rotmats_from_quats
-from gsencoder.models.embed import ATTRIBUTE_CHANNELS, embed, input_channels
 from gsencoder.models.encoder import encoder_inputs
+from gsencoder.models.transformer import ATTRIBUTE_CHANNELS, embed, input_channels
 
 
 def test_a_batch_gives_what_its_clouds_give_alone() -> None:

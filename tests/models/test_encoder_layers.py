@@ -10,8 +10,8 @@ from small_encoders import CONFIG, TINY, encoder, run, splat
 
 from gsencoder.core.errors import InputError
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs, merge
-from gsencoder.models.grid.plan import join_plans, plan_cloud
-from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.models.plan import join_plans, plan_cloud
+from gsencoder.models.transformer import TransformerConfig
 
 
 def test_in_bfloat16_features_stay_close_and_come_as_float32() -> None:

@@ -7,8 +7,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsencoder.models.grid import neighbors
-from gsencoder.models.grid.neighbors import NeighborConv, convolve_reference, neighbor_table
+from gsencoder.models import neighbors
+from gsencoder.models.neighbors import NeighborConv, convolve_reference, neighbor_table
 
 
 def distinct_cells(count: int, extent: int, seed: int = 0) -> torch.Tensor:

@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsencoder.models.grid.curves import cut_scene_curves
-from gsencoder.models.grid.plan import ORDERS, Level, Plan, _round_up_size, join_plans, plan_cloud
+from gsencoder.models.grid import cut_scene_curves
+from gsencoder.models.plan import ORDERS, Level, Plan, _round_up_size, join_plans, plan_cloud
 
 VOXEL = 0.1
 

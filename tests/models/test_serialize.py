@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.models.grid.cells import grid_coords
-from gsencoder.models.grid.serialize import (
+from gsencoder.models.grid import (
     ALIGN,
     INVALID_CODE,
     MAX_EXTENT,
@@ -22,6 +21,7 @@ from gsencoder.models.grid.serialize import (
     hilbert_from_morton,
     morton_codes,
 )
+from gsencoder.models.plan import grid_coords
 
 ORDERS = ("z", "z-trans", "hilbert", "hilbert-trans")
 

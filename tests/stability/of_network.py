@@ -11,14 +11,11 @@ from stability.extremes import CHANNELS, Case
 from stability.registry import routine, worst
 
 from gsencoder.core.arrays import round_columns
-from gsencoder.models.blocks import PatchAttention, Pool
-from gsencoder.models.embed import ATTRIBUTE_CHANNELS, embed
 from gsencoder.models.encoder import MIN_MERGE_WEIGHT, EncoderConfig, GaussianEncoder, encoder_inputs, merge
-from gsencoder.models.grid.cells import grid_coords
-from gsencoder.models.grid.neighbors import NeighborConv, neighbor_table
-from gsencoder.models.grid.plan import join_plans, plan_cloud
-from gsencoder.models.grid.serialize import coordinate_bits, hilbert_from_morton, morton_codes
-from gsencoder.models.point_transformer import TransformerConfig
+from gsencoder.models.grid import coordinate_bits, hilbert_from_morton, morton_codes
+from gsencoder.models.neighbors import NeighborConv, neighbor_table
+from gsencoder.models.plan import grid_coords, join_plans, plan_cloud
+from gsencoder.models.transformer import ATTRIBUTE_CHANNELS, PatchAttention, Pool, TransformerConfig, embed
 from gsencoder.types import SH_C0
 
 Wide = oracles.Wide

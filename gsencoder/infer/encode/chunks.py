@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float32, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Device, Precision, Track, ahead, untracked
-from gsencoder.models.grid.curves import SceneCurves
+from gsencoder.models.grid import SceneCurves
 from gsencoder.types import Gaussians
 
 MUCH_WORK, MANY_TIMES = 100_000, 3.0

@@ -12,7 +12,7 @@ from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.fusion.store.words import load_tables
 from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
-from gsencoder.models.grid.curves import SceneCurves, cut_scene_curves
+from gsencoder.models.grid import SceneCurves, cut_scene_curves
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.models.weights import find_weights, load_weights
 from gsencoder.text.table import TextTable

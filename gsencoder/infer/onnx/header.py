@@ -20,7 +20,7 @@ import numpy as np
 from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Stored
-from gsencoder.models.grid.serialize import ALIGN, Order
+from gsencoder.models.grid import ALIGN, Order
 from gsencoder.models.output_space import OutputSpace, OutputSpaces, output_spaces_parts
 from gsencoder.text.table import TextTable, tower_from_json, tower_to_json, trained_from_json, unrounded
 from gsencoder.types import FeatureBasis, FeatureSpace

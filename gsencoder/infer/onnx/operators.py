@@ -15,9 +15,9 @@ from onnxscript import opset18 as traced
 from onnxscript import opset20 as op
 from onnxscript.values import OnnxFunction, Opset
 
-import gsencoder.models.grid.neighbors
+import gsencoder.models.neighbors
 import gsencoder.models.raw_encoder  # noqa: F401  these two define the operators that are translated
-from gsencoder.models.grid.serialize import MAX_LEVELS, hilbert_table, start_orientation
+from gsencoder.models.grid import MAX_LEVELS, hilbert_table, start_orientation
 
 OPSET = 20
 ROWS_AT_ONCE = 1024
@@ -82,7 +82,7 @@ def with_row(x: FLOAT, value: FLOAT) -> FLOAT:
 
 @script(OURS, default_opset=op)
 def convolve(x: FLOAT, neighbors: INT32, weight: FLOAT) -> FLOAT:
-    """As `gsencoder.models.grid.neighbors.NeighborConv`."""
+    """As `gsencoder.models.neighbors.NeighborConv`."""
     table = in_blocks(neighbors)
     padded = with_row(x, op.CastLike(0.0, x))
     columns = op.Gather(op.Shape(weight), op.Constant(value_ints=[2]))
@@ -132,7 +132,7 @@ _STARTS = onnx.numpy_helper.from_array(
 
 @script(OURS, default_opset=op)
 def hilbert(morton: INT64) -> INT64:
-    """As `gsencoder.models.grid.serialize.hilbert_from_morton`, looking no further than the largest code has digits to
+    """As `gsencoder.models.grid.hilbert_from_morton`, looking no further than the largest code has digits to
     the base 64."""
     table = op.Constant(value=_TABLE)
     largest = op.ReduceMax(morton, keepdims=0)

@@ -16,8 +16,7 @@ from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.infer.onnx.header import FIELDS, OUTPUT, SETTINGS, SUM, OnnxHeader, check_sum, from_metadata
-from gsencoder.models.grid.curves import SceneCurves, cut_scene_curves
-from gsencoder.models.grid.serialize import INVALID_CODE, check_extent
+from gsencoder.models.grid import INVALID_CODE, SceneCurves, check_extent, cut_scene_curves
 from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, check_unit
 

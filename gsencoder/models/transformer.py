@@ -1,0 +1,424 @@
+"""The point transformer (PTv3, Wu et al. 2024): input channels, attention in patches, pooling and unpooling.
+
+Input channels of the encoder, computed from Gaussian attributes.
+
+The channels do not depend on where the scene lies, nor on the sign and the axis order that a file chose. A quaternion
+and three scales describe the same ellipsoid in 48 ways, and a network would have to learn that they are equal. The
+logarithm of the covariance has one value for each ellipsoid, is linear in log-scales, and stays within a few units for
+scales from 1e-9 to 1e4. `rotation` is its trace-free part and `scale` the sorted log-scales, so that either can be left
+out.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+import torch
+from jaxtyping import Bool, Float, Int64, Integer
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.utils.checkpoint import checkpoint
+
+from gsencoder.core.errors import InputError
+from gsencoder.geometry import rotmats_from_quats
+from gsencoder.models.grid import ALIGN, Order
+from gsencoder.models.neighbors import NeighborConv
+from gsencoder.models.plan import ORDERS, Level, Plan
+from gsencoder.types import SH_C0
+
+MASKED_SCORE = -3e4
+"""Added to attention scores of masked slots in an exported graph; finite in half precision."""
+
+
+class PatchAttention(nn.Module):
+    """Multi-head self-attention among the tokens of a patch."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.project = nn.Linear(channels, channels)
+
+    def forward(
+        self,
+        x: Float[Tensor, "T C"],
+        gather_index: Int64[Tensor, " slots"],
+        scatter_index: Int64[Tensor, " T"],
+        attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
+        patch_width: int,
+    ) -> Float[Tensor, "T C"]:
+        """Gathers tokens into patches, attends within each patch, and scatters the results back; see `plan.Level`."""
+        channels = x.shape[1]
+        if torch.compiler.is_exporting():
+            return self._forward_exported(x.index_select(0, gather_index), scatter_index, attn_mask, patch_width)
+        gathered = self.qkv(x.index_select(0, gather_index))
+        # On a CPU torch's backward pass of attention is five times slower in bfloat16 than in float32.
+        upcast = gathered.device.type == "cpu" and gathered.dtype == torch.bfloat16 and torch.is_grad_enabled()
+        qkv = (gathered.float() if upcast else gathered).view(-1, patch_width, 3, self.heads, channels // self.heads)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4)
+        with torch.autocast(gathered.device.type, enabled=False):
+            attended = functional.scaled_dot_product_attention(q, k, v, attn_mask=attn_mask)
+        flat = attended.transpose(1, 2).reshape(-1, channels)
+        out: Tensor = self.project(flat.index_select(0, scatter_index))
+        return out
+
+    def _forward_exported(
+        self,
+        gathered: Float[Tensor, "slots C"],
+        scatter_index: Int64[Tensor, " T"],
+        attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
+        patch_width: int,
+    ) -> Float[Tensor, "T C"]:
+        """The same in operators that ONNX has. Queries, keys and values come from separate products, so that the graph
+        need not split them; every patch has a slot that is not masked, so that the softmax is defined."""
+        channels = gathered.shape[1]
+        row_slices = [slice(i * channels, (i + 1) * channels) for i in range(3)]
+        q, k, v = (
+            functional.linear(gathered, self.qkv.weight[rows], self.qkv.bias[rows])
+            .view(-1, patch_width, self.heads, channels // self.heads)
+            .transpose(1, 2)
+            for rows in row_slices
+        )
+        scores = (q * q.shape[3] ** -0.5) @ k.transpose(2, 3)
+        if attn_mask is not None:
+            scores = scores + torch.where(attn_mask, 0.0, MASKED_SCORE).to(scores.dtype)
+        attended = scores.softmax(dim=3) @ v
+        out: Tensor = self.project(attended.transpose(1, 2).reshape(-1, channels).index_select(0, scatter_index))
+        return out
+
+
+class DropPath(nn.Module):
+    """Stochastic depth: in training, drops a residual branch for random tokens and scales it up for the others."""
+
+    def __init__(self, drop_prob: float) -> None:
+        super().__init__()
+        self.drop_prob = drop_prob
+
+    def forward(self, x: Float[Tensor, "T C"]) -> Float[Tensor, "T C"]:
+        if not self.training or self.drop_prob == 0:
+            return x
+        keep_mask = torch.rand(len(x), 1, device=x.device) >= self.drop_prob
+        return x * (keep_mask / (1 - self.drop_prob)).to(x.dtype)
+
+
+class Block(nn.Module):
+    """A transformer block: x + position(x); x + attention(norm(x)); x + mlp(norm(x)).
+
+    The conditional position encoding is a 3³ sparse convolution, a linear layer and a norm.
+    """
+
+    def __init__(self, channels: int, heads: int, *, mlp_ratio: float, drop_path: float) -> None:
+        super().__init__()
+        hidden = int(channels * mlp_ratio)
+        self.position = NeighborConv(channels, channels)
+        self.mix = nn.Linear(channels, channels)
+        self.norm_position = nn.LayerNorm(channels)
+        self.norm_attention = nn.LayerNorm(channels)
+        self.attention = PatchAttention(channels, heads)
+        self.norm_mlp = nn.LayerNorm(channels)
+        self.expand = nn.Linear(channels, hidden)
+        self.contract = nn.Linear(hidden, channels)
+        self.drop_path = DropPath(drop_path)
+
+    def forward(
+        self,
+        x: Float[Tensor, "T C"],
+        neighbors: Integer[Tensor, "T 27"],
+        gather_index: Int64[Tensor, " slots"],
+        scatter_index: Int64[Tensor, " T"],
+        attn_mask: Bool[Tensor, "patches 1 1 width"] | None,
+        patch_width: int,
+    ) -> Float[Tensor, "T C"]:
+        x = x + self.norm_position(self.mix(self.position(x, neighbors)))
+        x = x + self.drop_path(
+            self.attention(self.norm_attention(x), gather_index, scatter_index, attn_mask, patch_width)
+        )
+        hidden = functional.gelu(self.expand(self.norm_mlp(x)))
+        out: Tensor = x + self.drop_path(self.contract(hidden))
+        return out
+
+
+class Pool(nn.Module):
+    """Pooling to the next coarser level: a linear layer, the maximum over the tokens of a coarser cell, and a norm."""
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(channels_in, channels_out)
+        self.norm = nn.LayerNorm(channels_out)
+
+    def forward(self, x: Float[Tensor, "T C"], children: Int64[Tensor, "M 8"]) -> Float[Tensor, "M D"]:
+        projected = self.project(x)
+        gathered = projected.index_select(0, children.flatten()).view(-1, 8, projected.shape[1])
+        return functional.gelu(self.norm(gathered.amax(dim=1)))
+
+
+class Unpool(nn.Module):
+    """Unpooling to the next finer level: the features of each token's parent plus its own skip connection."""
+
+    def __init__(self, channels_in: int, channels_skip: int, channels_out: int) -> None:
+        super().__init__()
+        self.project = nn.Linear(channels_in, channels_out)
+        self.norm = nn.LayerNorm(channels_out)
+        self.project_skip = nn.Linear(channels_skip, channels_out)
+        self.norm_skip = nn.LayerNorm(channels_out)
+
+    def forward(
+        self, x: Float[Tensor, "M C"], skip: Float[Tensor, "T S"], parents: Int64[Tensor, " T"]
+    ) -> Float[Tensor, "T D"]:
+        from_parents = functional.gelu(self.norm(self.project(x)))
+        return functional.gelu(self.norm_skip(self.project_skip(skip))) + from_parents.index_select(0, parents)
+
+
+MAX_CHANNELS, MAX_BLOCKS, MAX_MLP_RATIO = 1 << 14, 1000, 64
+"""Limits beyond any network that was ever trained on points; larger sizes are typing errors, or damaged files that
+would fill the memory."""
+
+Shuffle = Literal["once", "pooling", "never"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TransformerConfig:
+    """Sizes of the network. Tuples have one entry per level, finest first; those of the decoder have one fewer."""
+
+    encoder_depths: tuple[int, ...] = field(
+        default=(1, 1, 2, 2, 1), metadata={"help": "number of encoder blocks of each level, finest first"}
+    )
+    encoder_channels: tuple[int, ...] = field(
+        default=(32, 64, 96, 128, 128), metadata={"help": "encoder channels of each level"}
+    )
+    decoder_depths: tuple[int, ...] = field(
+        default=(0, 1, 1, 1), metadata={"help": "number of decoder blocks of each level but the coarsest"}
+    )
+    decoder_channels: tuple[int, ...] = field(
+        default=(64, 64, 96, 128), metadata={"help": "decoder channels of each level but the coarsest"}
+    )
+    head_channels: int = field(default=32, metadata={"help": "channels per attention head"})
+    patch: int = field(
+        default=128, metadata={"help": "largest number of tokens in a patch, within which attention is computed"}
+    )
+    orders: tuple[Order, ...] = field(
+        default=ORDERS,
+        metadata={"help": "space-filling curves along which patches are cut; blocks use them in turn"},
+    )
+    shuffle_orders: Shuffle = field(
+        default="once",
+        metadata={
+            "help": "in training, permute the orders at random: once for all levels, or again at each pooling, as PTv3 "
+            "does; outside training they are never permuted"
+        },
+    )
+    mlp_ratio: float = field(
+        default=4.0, metadata={"help": "hidden channels of a block's MLP, as a multiple of its channels"}
+    )
+    drop_path: float = field(
+        default=0.1, metadata={"help": "rate of stochastic depth in training, reached at the last encoder block"}
+    )
+    checkpoint: bool = field(
+        default=False, metadata={"help": "recompute activations of blocks in the backward pass to save memory"}
+    )
+
+    def __post_init__(self) -> None:
+        levels = len(self.encoder_depths)
+        # With more levels a part of a scene would be pooled differently from the full scene.
+        max_levels = ALIGN.bit_length()
+        if not 1 <= levels <= max_levels:
+            raise InputError(
+                f"encoder_depths: expected one entry per level and 1 to {max_levels} levels, got {levels} entries"
+            )
+        if self.head_channels < 1 or self.patch < 1:
+            raise InputError(f"head_channels and patch: expected 1 or more, got {self.head_channels} and {self.patch}")
+        if len(self.encoder_channels) != levels:
+            raise InputError(
+                f"encoder_channels: expected one entry per level as in encoder_depths ({levels}), "
+                f"got {len(self.encoder_channels)}"
+            )
+        for name in ("decoder_depths", "decoder_channels"):
+            if len(getattr(self, name)) != levels - 1:
+                raise InputError(
+                    f"{name}: expected {levels - 1} entries, one fewer than encoder_depths, got "
+                    f"{len(getattr(self, name))}"
+                )
+        if min((*self.encoder_depths, *self.decoder_depths)) < 0:
+            raise InputError("encoder_depths and decoder_depths: expected 0 or more blocks at every level")
+        for channels in (*self.encoder_channels, *self.decoder_channels):
+            if channels < 1 or channels % self.head_channels:
+                raise InputError(
+                    f"encoder_channels and decoder_channels: expected multiples of head_channels "
+                    f"({self.head_channels}), got {channels}"
+                )
+        if not self.orders:
+            raise InputError("orders: expected at least one of z, z-trans, hilbert, hilbert-trans")
+        if self.shuffle_orders not in get_args(Shuffle):
+            raise InputError(f"shuffle_orders: expected once, pooling or never, got {self.shuffle_orders!r}")
+        if not 0 <= self.drop_path < 1:
+            raise InputError(f"drop_path: expected a number in [0, 1), got {self.drop_path}")
+        if not 0 < self.mlp_ratio <= MAX_MLP_RATIO:
+            raise InputError(f"mlp_ratio: expected a number above 0 and at most {MAX_MLP_RATIO}, got {self.mlp_ratio}")
+        for kind, limit in (("channels", MAX_CHANNELS), ("depths", MAX_BLOCKS)):
+            for name in (f"encoder_{kind}", f"decoder_{kind}"):
+                if max(getattr(self, name), default=0) > limit:
+                    raise InputError(f"{name}: expected at most {limit} per level, got {max(getattr(self, name))}")
+
+    @property
+    def levels(self) -> int:
+        return len(self.encoder_depths)
+
+    @property
+    def orders_followed(self) -> tuple[frozenset[int], ...]:
+        """For each level, the indices into `orders` that its blocks follow outside training."""
+        depths = [(level, depth) for level, depth in enumerate(self.encoder_depths)]
+        depths += reversed([(level, depth) for level, depth in enumerate(self.decoder_depths)])
+        block_levels = [level for level, depth in depths for _ in range(depth)]
+        block_orders = [(level, block % len(self.orders)) for block, level in enumerate(block_levels)]
+        return tuple(
+            frozenset(order for block_level, order in block_orders if block_level == level)
+            for level in range(self.levels)
+        )
+
+    @property
+    def channels_out(self) -> int:
+        """Channels of the output tokens."""
+        return (*self.decoder_channels, *self.encoder_channels)[0]
+
+
+class PointTransformer(nn.Module):
+    """The network from embedded tokens to tokens of the finest level; all indices come from a plan."""
+
+    def __init__(self, config: TransformerConfig) -> None:
+        super().__init__()
+        self.config = config
+        down, up = config.encoder_channels, config.decoder_channels
+        blocks_down = sum(config.encoder_depths)
+        rates = [config.drop_path * block / max(blocks_down - 1, 1) for block in range(blocks_down)]
+        self.down = nn.ModuleList()
+        for level, depth in enumerate(config.encoder_depths):
+            begin = sum(config.encoder_depths[:level])
+            self.down.append(_make_blocks(config, down[level], rates[begin : begin + depth]))
+        self.pools = nn.ModuleList(Pool(down[i], down[i + 1]) for i in range(config.levels - 1))
+        self.up, self.unpools = nn.ModuleList(), nn.ModuleList()
+        for level, depth in enumerate(config.decoder_depths):
+            coarser = up[level + 1] if level + 2 < config.levels else down[-1]
+            self.unpools.append(Unpool(coarser, down[level], up[level]))
+            self.up.append(_make_blocks(config, up[level], [config.drop_path * level / config.levels] * depth))
+
+    def forward(self, x: Float[Tensor, "T C"], plan: Plan) -> Float[Tensor, "T D"]:
+        """Runs all blocks; they follow the orders in turn, in training permuted as `shuffle_orders` says.
+
+        The permutations are drawn from torch's generator on the CPU, which the training loop seeds by the step.
+
+        Args:
+            x: embedded tokens, C = encoder_channels[0].
+            plan: made with the levels, patch and orders of the configuration.
+        """
+        permutations = self._permutations()
+        skips: list[Tensor] = []
+        first_block = 0
+        for level, blocks in enumerate(self.down):
+            if level:
+                skips.append(x)
+                x = self.pools[level - 1](x, plan.levels[level - 1].children)
+            x = self._run(blocks, x, plan.levels[level], permutations[level], first_block)
+            first_block += self.config.encoder_depths[level]
+        for level in reversed(range(len(self.up))):
+            x = self.unpools[level](x, skips[level], plan.levels[level].parents)
+            x = self._run(self.up[level], x, plan.levels[level], permutations[level], first_block)
+            first_block += self.config.decoder_depths[level]
+        return x
+
+    def _permutations(self) -> list[list[int]]:
+        """For each level, the permutation of the orders that its blocks follow in encoder and decoder."""
+        count, levels = len(self.config.orders), self.config.levels
+        if not self.training or self.config.shuffle_orders == "never":
+            return [list(range(count))] * levels
+        if self.config.shuffle_orders == "once":
+            return [torch.randperm(count).tolist()] * levels
+        return [torch.randperm(count).tolist() for _ in range(levels)]
+
+    def _run(self, blocks: nn.Module, x: Tensor, level: Level, permutation: list[int], first_block: int) -> Tensor:
+        assert isinstance(blocks, nn.ModuleList)
+        for number, block in enumerate(blocks, start=first_block):
+            order = permutation[number % len(permutation)]
+            mask = level.attn_mask[order] if level.attn_mask is not None else None
+            level_inputs = (
+                level.neighbors,
+                level.gather_index[order],
+                level.scatter_index[order],
+                mask,
+                level.patch_width,
+            )
+            if self.config.checkpoint and self.training:
+                x = checkpoint(block, x, *level_inputs, use_reentrant=False)
+            else:
+                x = block(x, *level_inputs)
+        return x
+
+
+def _make_blocks(config: TransformerConfig, channels: int, rates: list[float]) -> nn.ModuleList:
+    heads = channels // config.head_channels
+    return nn.ModuleList(Block(channels, heads, mlp_ratio=config.mlp_ratio, drop_path=rate) for rate in rates)
+
+
+Attribute = Literal["offset", "color", "opacity", "scale", "rotation"]
+
+ATTRIBUTE_CHANNELS: dict[Attribute, int] = {"offset": 3, "color": 3, "opacity": 1, "scale": 3, "rotation": 6}
+
+MAX_ABS_LOG_SCALE = 12.0
+"""Limit to which log-scales relative to the voxel are clamped: no useful Gaussian is smaller or larger than e^±12
+voxels."""
+
+
+def input_channels(attributes: tuple[Attribute, ...]) -> int:
+    """The number of channels that attributes have in total."""
+    return sum(ATTRIBUTE_CHANNELS[name] for name in attributes)
+
+
+def embed(
+    means: Float[Tensor, "N 3"],
+    quats: Float[Tensor, "N 4"],
+    scales: Float[Tensor, "N 3"],
+    opacities: Float[Tensor, " N"],
+    sh_dc: Float[Tensor, "N 3"],
+    *,
+    voxel: float | Float[Tensor, ""],
+    attributes: tuple[Attribute, ...],
+) -> Float[Tensor, "N C"]:
+    """Computes the input channels, all of order one.
+
+    offset: position of the center in its voxel, −1 to 1. color: degree-0 color, −1 for black to 1 for white, clamped to
+    ±2. opacity: −1 to 1. scale: ¼ of log(scale / voxel), largest first. rotation: ¼ of the six distinct entries of
+    R diag(log s − mean log s) Rᵀ, the off-diagonal ones times √2, so that distances between inputs are Frobenius
+    distances between matrices.
+
+    Args:
+        means: world units.
+        quats: wxyz; normalized here.
+        scales: standard deviations > 0, world units.
+        opacities: in [0, 1].
+        sh_dc: degree-0 spherical-harmonic coefficients.
+        voxel: edge length of the token grid's cells, world units; a tensor in an exported graph, where it is an input.
+        attributes: the attributes to embed; their channels are concatenated in this order.
+    """
+    channels: list[Tensor] = []
+    log_scales = torch.log(scales.double() / voxel).clamp(-MAX_ABS_LOG_SCALE, MAX_ABS_LOG_SCALE).to(means.dtype)
+    for name in attributes:
+        if name == "offset":
+            scaled = means.double() / voxel
+            channels.append((2 * (scaled - torch.floor(scaled)) - 1).to(means.dtype))
+        elif name == "color":
+            channels.append((2 * SH_C0 * sh_dc).clamp(-2, 2))
+        elif name == "opacity":
+            channels.append(2 * opacities.unsqueeze(1) - 1)
+        elif name == "scale":
+            channels.append(log_scales.sort(dim=1, descending=True).values / 4)
+        else:
+            channels.append(_symmetric_matrix(quats, log_scales - log_scales.mean(dim=1, keepdim=True)) / 4)
+    return torch.cat(channels, dim=1)
+
+
+def _symmetric_matrix(quats: Float[Tensor, "N 4"], eigenvalues: Float[Tensor, "N 3"]) -> Float[Tensor, "N 6"]:
+    """The entries xx, yy, zz, √2·xy, √2·xz, √2·yz of R diag(eigenvalues) Rᵀ."""
+    rotation = rotmats_from_quats(quats)
+    x, y, z = rotation.unbind(dim=1)
+    root = math.sqrt(2)
+    entries = (x * x, y * y, z * z, root * x * y, root * x * z, root * y * z)
+    return torch.stack([(entry * eigenvalues).sum(dim=1) for entry in entries], dim=1)
