@@ -28,10 +28,8 @@ from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.infer.load_encoder import load_encoder
-from gsencoder.memory.bank import build_bank
+from gsencoder.memory.bank import MapStream, build_bank, memory_of_features
 from gsencoder.memory.index import index_features
-from gsencoder.memory.queries import memory_of_features
-from gsencoder.memory.raw_features import MapStream
 from gsencoder.train.memory import memory_training, train_memory
 from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.train.memory_scene import prepare_memory

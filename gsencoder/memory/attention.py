@@ -1,6 +1,12 @@
-"""Gaussian memory attention in torch, for training and rendering (M3 Eq. 2)."""
+"""Gaussian memory attention in torch, for training and rendering (M3 Eq. 2), and the decoders it is compared with.
+
+What M3 compares Gaussian memory attention with: low-dimensional features and a decoder, at the same width.
+
+A linear decoder is that of Feature-3DGS (Zhou et al. 2024), a perceptron that of Feature-Splatting (Qiu et al. 2024).
+"""
 
 import math
+from typing import Literal
 
 import numpy as np
 import torch
@@ -9,7 +15,9 @@ from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 from torch.utils.checkpoint import checkpoint
 
-from gsencoder.types import MemoryBank
+from gsencoder.core.errors import InputError
+from gsencoder.render import Blend
+from gsencoder.types import MemoryBank, QueryMemory
 from gsencoder.types.features import EPS, Scoring, attention_keys
 
 BLOCK_SCORES = 1 << 24
@@ -85,3 +93,66 @@ def unit_queries(queries: Float[Tensor, "n s"], gram: Float[Tensor, "s s"]) -> F
 def random_projection(query_channels: int, channels: int, generator: torch.Generator) -> Float[Tensor, "s D"]:
     """A random W_m of queries with s channels and components with D, with rows of length 1 on average."""
     return torch.randn(query_channels, channels, generator=generator) / math.sqrt(channels)
+
+
+def render_features(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, "P D"], Float32[np.ndarray, " P"]]:
+    """The features of the rows of B, and how opaque these rows are. Where nothing is hit a feature means nothing.
+
+    Args:
+        memory: of the Gaussians of B.
+        b: of pixels or patches.
+
+    Raises:
+        InputError: B has other Gaussians.
+    """
+    queries, _ = render_queries(memory, b)
+    return memory.attend(queries), b.alpha.numpy()
+
+
+def render_queries(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, "P s"], Float32[np.ndarray, " P"]]:
+    """The queries of the rows of B, and the share of each row that is hit with a query; Gaussians without one take no
+    part in the mean. Where that share is 0 a query is zero and means nothing.
+
+    Args:
+        memory: of the Gaussians of B.
+        b: of pixels or patches.
+
+    Raises:
+        InputError: B has other Gaussians.
+    """
+    if b.gaussians != len(memory):
+        raise InputError(f"memory: queries of {len(memory):,} Gaussians, and a view of {b.gaussians:,}")
+    seen = torch.from_numpy((memory.weights > 0).astype(np.float32))
+    queries, alpha = b.render(torch.from_numpy(memory.queries)), b.render(seen)
+    return (queries / alpha.clamp(min=1e-12)[:, None]).numpy(), alpha.numpy()
+
+
+Decoder = Literal["linear", "mlp"]
+
+
+def make_decoder(
+    kind: Decoder, projection: Float[Tensor, "s C"], *, hidden: int = 64, generator: torch.Generator | None = None
+) -> nn.Module:
+    """A decoder from s channels to C.
+
+    Args:
+        kind: linear, or a perceptron of one hidden layer.
+        projection: initial weights of the linear decoder.
+        hidden: units of the perceptron.
+        generator: of the perceptron's initial weights.
+    """
+    channels, width = projection.shape
+    if kind == "linear":
+        linear = nn.Linear(channels, width)
+        with torch.no_grad():
+            linear.weight.copy_(projection.T)
+            linear.bias.zero_()
+        return linear
+    layers = nn.Sequential(nn.Linear(channels, hidden), nn.ReLU(), nn.Linear(hidden, width))
+    with torch.no_grad():
+        for layer in (layers[0], layers[2]):
+            assert isinstance(layer, nn.Linear)
+            bound = layer.in_features**-0.5
+            for parameter in (layer.weight, layer.bias):
+                parameter.uniform_(-bound, bound, generator=generator)
+    return layers

@@ -1,6 +1,13 @@
-"""Building a memory bank: the principal scene components of a scene's feature maps (M3 sec. 3.3, Algorithm 1)."""
+"""Building a memory bank: the principal scene components of a scene's feature maps (M3 sec. 3.3, Algorithm 1).
 
-from collections.abc import Iterator
+Queries without training: the coordinates of features in the principal directions of a bank.
+
+The features may be fused, which gives queries to start an optimization from, or predicted by an encoder, which gives
+the memory of a scene that nothing was optimized for.
+"""
+
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -11,7 +18,6 @@ from gsencoder.core.archive import RowFile
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.process import free_memory
-from gsencoder.memory.raw_features import MapStream, raw_features
 from gsencoder.memory.reduction import (
     ROUNDING,
     CoverReduction,
@@ -20,7 +26,76 @@ from gsencoder.memory.reduction import (
     reduce_units_as_published,
     unit_rows,
 )
-from gsencoder.types import FeatureSpace, MemoryBank
+from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory
+from gsencoder.types.features import Scoring, attention_keys
+
+MapStream = Callable[[], Iterator[tuple[int, FeatureMap]]]
+"""Gives the maps of a scene with the numbers of their views, any number of times."""
+
+
+def raw_features(view: int, feature_map: FeatureMap) -> tuple[Float32[np.ndarray, "n D"], Int32[np.ndarray, "n 3"]]:
+    """The features of a map, and the view, row and column of their cells: of every cell that has a feature; of a coded
+    map each vector that occurs, once, in the first cell that has it."""
+    if feature_map.codes is not None:
+        assert feature_map.table is not None
+        codes, cells = np.unique(feature_map.codes.ravel(), return_index=True)
+        rows, cells = feature_map.table[codes[codes >= 0]], cells[codes >= 0]
+    else:
+        rows = feature_map.rows()
+        cells = np.flatnonzero(~np.isnan(rows[:, 0]))
+        rows = rows[cells]
+    line, column = np.divmod(cells, feature_map.width)
+    return rows, np.stack([np.full(len(cells), view), line, column], axis=1).astype(np.int32)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RawSample:
+    """Raw features of one teacher in one scene.
+
+    Attributes:
+        features: the sample, in the order of the maps.
+        total: number of raw features that it was drawn from.
+    """
+
+    features: Float32[np.ndarray, "n D"]
+    total: int
+
+
+def draw_sample(maps: MapStream, space: FeatureSpace, limit: int, *, seed: int = 0) -> RawSample:
+    """Draws raw features without replacement, each with the same probability.
+
+    Every feature gets a random number, and those with the smallest numbers are the sample. Every n-th feature would
+    come from the same few columns of maps whose width divides n.
+
+    Args:
+        maps: of the scene; read once.
+        space: of the maps.
+        limit: largest number of features.
+        seed: of the random numbers.
+
+    Raises:
+        InputError: a limit below 1.
+    """
+    if limit < 1:
+        raise InputError(f"limit: expected 1 or more, got {limit}")
+    features = np.zeros((0, space.channels), np.float32)
+    numbers, total = np.zeros(0), 0
+    for view, feature_map in maps():
+        rows, _ = raw_features(view, feature_map)
+        drawn = np.random.default_rng([seed, view]).random(len(rows))
+        total += len(rows)
+        if len(numbers) == limit:
+            # Most views give few features or none, and the sample is not copied for these.
+            better = drawn < numbers.max()
+            rows, drawn = rows[better], drawn[better]
+        if not len(rows):
+            continue
+        features, numbers = np.concatenate([features, rows]), np.concatenate([numbers, drawn])
+        if len(numbers) > limit:
+            smallest = np.sort(np.argsort(numbers, kind="stable")[:limit])
+            features, numbers = features[smallest], numbers[smallest]
+    return RawSample(features=features, total=total)
+
 
 BLOCK = 4096
 """Features that are compared with the components at once."""
@@ -335,3 +410,91 @@ def _most_used(counts: Int64[np.ndarray, " M"], share: float) -> Int64[np.ndarra
     order = np.argsort(-counts, kind="stable")
     enough = int(np.searchsorted(counts[order].cumsum(), share * counts.sum() - 0.5)) + 1
     return np.sort(order[:enough])
+
+
+QUERY_BLOCK = 1 << 14
+"""Rows that are taken at a time."""
+
+
+def principal_queries(
+    features: GaussianFeatures, bank: MemoryBank, channels: int, scoring: Scoring = "centered"
+) -> tuple[Float32[np.ndarray, "N s"], Float32[np.ndarray, "s D"]]:
+    """Queries and a projection W_m whose product is the features about their mean, in the s directions in which the
+    components of the bank differ most.
+
+    Each component counts once, by its direction about the mean: where many Gaussians are walls, the principal
+    directions of the Gaussians' features would leave out those that tell a mug from a cup.
+
+    A cosine that is not centered depends on the mean as well, whose coordinate, the first one, is 1 for every Gaussian.
+    With cosines queries have unit variance and rows of the projection the length √D, so that one learning rate serves
+    both; with products they are in the units of the space.
+
+    Args:
+        features: of the Gaussians; those never seen have queries of zero.
+        bank: that the queries will attend to.
+        channels: s. Where the components have fewer directions, further channels are zero.
+        scoring: how queries will be compared with components.
+
+    Raises:
+        InputError: features and bank are of different spaces, or no Gaussian has features.
+    """
+    if features.space != bank.space:
+        raise InputError(
+            f"memory: the features are of ({features.space.describe()}), and the bank is of ({bank.space.describe()})"
+        )
+    seen = np.flatnonzero(features.seen)
+    if not len(seen):
+        raise InputError("memory: no Gaussian has features")
+    basis, space = features.basis, features.space
+    offset = features.mean if basis is None else np.zeros(basis.rank, np.float32)
+    constant = int(scoring != "centered")
+    keys = attention_keys(bank.components, features.mean, "centered").astype(np.float64)
+    if basis is not None:
+        keys = keys @ basis.components.T
+    directions = np.linalg.eigh(keys.T @ keys)[1][:, ::-1][:, : max(0, channels - constant)].astype(np.float32)
+    part = slice(constant, constant + directions.shape[1])
+    queries = np.zeros((len(features), channels), np.float32)
+    for start in range(0, len(seen), QUERY_BLOCK):
+        chunk = seen[start : start + QUERY_BLOCK]
+        queries[chunk, part] = (features.stored(chunk) - offset) @ directions
+    projection = np.zeros((channels, space.channels), np.float32)
+    projection[part] = directions.T if basis is None else directions.T @ basis.components
+    if constant:
+        queries[seen, 0], projection[0] = 1, features.mean
+    if scoring == "dot":
+        return queries, projection
+    spread = np.float32(float(queries[seen].std()) or 1.0)
+    return queries / spread, projection * np.float32(math.sqrt(space.channels))
+
+
+def memory_of_features(
+    features: GaussianFeatures,
+    bank: MemoryBank,
+    *,
+    channels: int = 16,
+    scoring: Scoring = "centered",
+    temperature: float = 0.05,
+) -> QueryMemory:
+    """The memory of features without any training.
+
+    Args:
+        features: of the Gaussians, fused or predicted by an encoder.
+        bank: of the scene's own views, or of other scenes.
+        channels: of a query.
+        scoring: how queries are compared with components.
+        temperature: of the attention.
+
+    Raises:
+        InputError: features and bank are of different spaces, or no Gaussian has features.
+    """
+    queries, projection = principal_queries(features, bank, channels, scoring)
+    return QueryMemory(
+        queries=queries,
+        weights=features.weights,
+        projection=projection,
+        bank=bank,
+        scoring=scoring,
+        temperature=temperature,
+        mean=features.mean,
+        basis=features.basis,
+    )

@@ -14,9 +14,8 @@ from torch import nn
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
-from gsencoder.memory.attention import MemoryAttention, random_projection
-from gsencoder.memory.decoders import Decoder, make_decoder
-from gsencoder.memory.queries import principal_queries
+from gsencoder.memory.attention import Decoder, MemoryAttention, make_decoder, random_projection
+from gsencoder.memory.bank import principal_queries
 from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.memory_network import MemoryConfig, MemoryNetwork, MemoryObjective, ViewSamples, join_views
 from gsencoder.train.memory_scene import MemoryScene

@@ -27,8 +27,7 @@ from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teacher_maps import CachedTeacher, upright
 from gsencoder.fusion.teachers import Teacher
-from gsencoder.memory.bank import BankConfig, build_bank
-from gsencoder.memory.raw_features import MapStream, RawSample, draw_sample
+from gsencoder.memory.bank import BankConfig, MapStream, RawSample, build_bank, draw_sample
 from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
 from gsencoder.train.prepare import PrepareConfig, view_rows
 from gsencoder.train.prepared_file import write_prepared

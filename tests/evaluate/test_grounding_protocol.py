@@ -26,7 +26,7 @@ from gsencoder.evaluate.protocols.grounding import (
     phrase_mean,
     scores_by_phrase,
 )
-from gsencoder.memory.queries import memory_of_features
+from gsencoder.memory.bank import memory_of_features
 from gsencoder.render import blend
 from gsencoder.text.table import make_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, Scene, SceneObject, Views

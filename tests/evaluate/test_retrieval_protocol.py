@@ -17,8 +17,8 @@ from gsencoder.data.synthetic.room import make_room
 from gsencoder.data.synthetic.write import write_room
 from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol, score_views
 from gsencoder.infer.localize.relevancy import word_directions
-from gsencoder.memory.queries import memory_of_features
-from gsencoder.memory.render import render_queries
+from gsencoder.memory.attention import render_queries
+from gsencoder.memory.bank import memory_of_features
 from gsencoder.render import blend
 from gsencoder.text.table import load_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, Scene

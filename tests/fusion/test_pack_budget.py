@@ -15,7 +15,7 @@ from gsencoder.app import cli
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.store.folder import load_features, save_features
 from gsencoder.fusion.store.package import PACKAGE_FILE
-from gsencoder.memory import index_budget
+from gsencoder.memory import index as index_budget
 from gsencoder.types import GaussianFeatures, Scene, Views
 
 N = 2000

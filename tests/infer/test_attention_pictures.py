@@ -30,8 +30,8 @@ from gsencoder.infer.draw.strongest_components import (
     salient_pixel,
     strongest_components,
 )
+from gsencoder.memory.attention import render_features, render_queries
 from gsencoder.memory.bank import BankConfig
-from gsencoder.memory.render import render_features, render_queries
 from gsencoder.render import blend
 from gsencoder.render.images import render_image
 from gsencoder.train.memory import untrained_memory

@@ -15,7 +15,7 @@ from gsencoder.infer.draw.component_scatter import (
     principal_plane,
     umap_plane,
 )
-from gsencoder.memory.raw_features import RawSample
+from gsencoder.memory.bank import RawSample
 from gsencoder.types import FeatureSpace, MemoryBank
 
 

@@ -7,7 +7,7 @@ from splats import front_camera, one_gaussian
 
 from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig, from_pose
 from gsencoder.infer.localize.relevancy import word_directions
-from gsencoder.memory.render import render_features
+from gsencoder.memory.attention import render_features
 from gsencoder.render import blend
 from gsencoder.types import MemoryBank, QueryMemory, Scene
 

@@ -13,7 +13,7 @@ from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig, fro
 from gsencoder.infer.localize.gaussian_products import GaussianProducts
 from gsencoder.infer.localize.relevancy import Mode, relevancy, word_directions
 from gsencoder.infer.localize.threshold import ThresholdConfig
-from gsencoder.memory.render import render_features
+from gsencoder.memory.attention import render_features
 from gsencoder.render import BlendConfig, blend
 from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, QueryMemory, Scene

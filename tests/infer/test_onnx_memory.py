@@ -14,8 +14,8 @@ from splats import random_gaussians
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.store.folder import save_memories
-from gsencoder.infer.onnx import memory as module
-from gsencoder.infer.onnx.memory import export_memory
+from gsencoder.memory import onnx as module
+from gsencoder.memory.onnx import export_memory
 from gsencoder.types import FeatureSpace, Scene
 
 

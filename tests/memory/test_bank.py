@@ -8,8 +8,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.memory import bank as bank_module
-from gsencoder.memory.bank import BankConfig, build_bank
-from gsencoder.memory.raw_features import MapStream, raw_features
+from gsencoder.memory.bank import BankConfig, MapStream, build_bank, raw_features
 from gsencoder.memory.reduction import reduce_as_published
 from gsencoder.types import FeatureMap, FeatureSpace
 

@@ -7,8 +7,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.memory import bank as bank_module
-from gsencoder.memory.bank import BankConfig, build_bank
-from gsencoder.memory.raw_features import MapStream
+from gsencoder.memory.bank import BankConfig, MapStream, build_bank
 from gsencoder.types import FeatureMap, FeatureSpace, MemoryBank
 
 SPACE = FeatureSpace(name="s", channels=16)

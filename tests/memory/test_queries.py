@@ -7,7 +7,7 @@ import pytest
 from feature_fields import SPACE, make_features
 
 from gsencoder.core.errors import InputError
-from gsencoder.memory.queries import memory_of_features, principal_queries
+from gsencoder.memory.bank import memory_of_features, principal_queries
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank
 from gsencoder.types.features import Scoring
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.memory.bank import build_bank
-from gsencoder.memory.raw_features import MapStream, draw_sample, raw_features
+from gsencoder.memory.bank import MapStream, build_bank, draw_sample, raw_features
 from gsencoder.types import FeatureMap, FeatureSpace
 
 SPACE = FeatureSpace(name="numbers", channels=2)

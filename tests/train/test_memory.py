@@ -12,9 +12,8 @@ from training_scenes import scene as wall
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.logs import LOG_FILE, read_log
+from gsencoder.memory.attention import make_decoder, render_features
 from gsencoder.memory.bank import BankConfig
-from gsencoder.memory.decoders import make_decoder
-from gsencoder.memory.render import render_features
 from gsencoder.render import blend
 from gsencoder.train.memory import first_queries, memory_training, train_decoder, train_memory, untrained_memory
 from gsencoder.train.memory_network import (

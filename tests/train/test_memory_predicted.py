@@ -11,8 +11,8 @@ from training_scenes import scene as wall
 from gsencoder.app.commands.memory import fit_errors, in_space
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.rendered import RenderedTally
+from gsencoder.memory.attention import render_queries
 from gsencoder.memory.bank import BankConfig
-from gsencoder.memory.render import render_queries
 from gsencoder.render import BlendConfig, blend
 from gsencoder.train.memory import memory_training, train_memory, untrained_memory
 from gsencoder.train.memory_network import MemoryConfig

@@ -8,8 +8,7 @@ from memory_scenes import PREPARE, BlendedTeacher
 from training_scenes import scene as wall
 
 from gsencoder.core.errors import InputError
-from gsencoder.memory.bank import BankConfig
-from gsencoder.memory.raw_features import raw_features
+from gsencoder.memory.bank import BankConfig, raw_features
 from gsencoder.train.memory_scene import open_raw_sample, prepare_memory
 
 

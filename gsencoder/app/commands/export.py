@@ -31,8 +31,8 @@ from gsencoder.infer.onnx.export import (
     lower,
     random_cloud,
 )
-from gsencoder.infer.onnx.memory import export_memory
 from gsencoder.infer.onnx.runtime import SUFFIX
+from gsencoder.memory.onnx import export_memory
 from gsencoder.types import QueryMemory
 
 MAX_SIZE = 10_000_000

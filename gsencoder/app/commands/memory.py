@@ -29,8 +29,7 @@ from gsencoder.fusion.teachers.build import build_teacher, words_beside, words_b
 from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import load_encoder
-from gsencoder.memory.bank import BankConfig
-from gsencoder.memory.raw_features import RawSample
+from gsencoder.memory.bank import BankConfig, RawSample
 from gsencoder.models.output_space import check_distinct, name_of_space
 from gsencoder.text.table import TextTable
 from gsencoder.train.distributed import fail_together, join_processes

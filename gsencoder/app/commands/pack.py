@@ -28,8 +28,7 @@ from gsencoder.fusion.store.package import (
 )
 from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.localize.localize import select_features
-from gsencoder.memory.index import IndexConfig, index_features
-from gsencoder.memory.index_budget import index_within
+from gsencoder.memory.index import IndexConfig, index_features, index_within
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import GaussianFeatures, Scene

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.memory.raw_features import RawSample
+from gsencoder.memory.bank import RawSample
 from gsencoder.types import MemoryBank
 from gsencoder.types.features import attention_keys
 

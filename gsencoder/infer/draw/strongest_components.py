@@ -7,7 +7,7 @@ from jaxtyping import Float32, Int64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.memory.render import render_queries
+from gsencoder.memory.attention import render_queries
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians, QueryMemory
 

@@ -15,7 +15,7 @@ from jaxtyping import Float32, Float64
 from gsencoder.core.errors import InputError
 from gsencoder.infer.localize.gaussian_products import GaussianProducts
 from gsencoder.infer.localize.relevancy import EPS, MIN_RELATIVE_NORM, Mode
-from gsencoder.memory.render import render_queries
+from gsencoder.memory.attention import render_queries
 from gsencoder.render import Blend
 from gsencoder.types import QueryMemory
 
