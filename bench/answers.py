@@ -33,13 +33,13 @@ from gsencoder.app.commands.query_words import load_words
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import write_json
 from gsencoder.core.pretrained import find_file
+from gsencoder.data.labels.expressions import Expression
+from gsencoder.data.labels.made_expressions import make_expressions
+from gsencoder.data.labels.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
+from gsencoder.data.labels.questions import Question as TruthQuestion
+from gsencoder.data.labels.seen_objects import see_objects
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.data.truth.expressions import Expression
-from gsencoder.data.truth.made_expressions import make_expressions
-from gsencoder.data.truth.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
-from gsencoder.data.truth.questions import Question as TruthQuestion
-from gsencoder.data.truth.seen_objects import see_objects
 from gsencoder.evaluate.answer_sheets import add_expressions, add_questions
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.evaluate.picture_truth import LEAST_WEIGHT, PictureTruth

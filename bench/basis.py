@@ -17,8 +17,7 @@ from json_option import add_json_option, write_figures
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.arrays import even_indices
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import load_scene
+from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.fusion.basis import Moments, fit_basis
 from gsencoder.fusion.basis_fit import ProjectionSums
 from gsencoder.fusion.teachers import Teacher

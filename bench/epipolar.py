@@ -21,10 +21,8 @@ from scipy.spatial.transform import Rotation
 from gsencoder import load_scene
 from gsencoder.data.check.epipolar import FEATURES, PICTURE_SIZE, EpipolarCheck, consistent_matches, judge_matches
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.data.seeding.feature_matches import PairMatches, match_photographs
-from gsencoder.data.seeding.view_pairs import typical_distance
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.shapes import Solid
+from gsencoder.data.seeding.matches import PairMatches, match_photographs, typical_distance
+from gsencoder.data.synthetic import Solid, make_room
 from gsencoder.types import Cameras, Views
 
 OFF = {"kitchen": (4, 32, 33, 37)}

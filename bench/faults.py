@@ -39,7 +39,7 @@ from fault_runs import CUT, DENY, FULL, HALT, IO_ERROR, KILL, READ_ERROR, SHORT,
 from json_option import add_json_option, write_figures
 from safetensors.numpy import load_file
 
-from gsencoder.data.splats import load_splat
+from gsencoder.data.splats.files import load_splat
 
 FAULTS = {"kill": (KILL,), "tear": (TEAR,), "full": (FULL, SHORT_FULL), "error": (IO_ERROR,), "short": (SHORT,)}
 FAULTS |= {"inputs": (DENY, VANISH, CUT, READ_ERROR), "two": (HALT,)}

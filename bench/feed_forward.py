@@ -20,8 +20,8 @@ import numpy as np
 from json_option import add_json_option, write_figures
 
 from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.evaluate.protocols.naming import compare_names, naming_scores
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers import Teacher

@@ -19,20 +19,17 @@ import test_flipped_bits
 
 from gsencoder.core import archive
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.camera_file import read_cameras
-from gsencoder.data.readers.objects_json import read_objects
+from gsencoder.data.labels.captions import read_texts, read_view_captions
+from gsencoder.data.labels.classes import read_class_list, read_label_map
+from gsencoder.data.labels.expressions import read_nr3d, read_scanrefer
+from gsencoder.data.labels.files import read_mask, read_split, read_whole_numbers
+from gsencoder.data.labels.mesh import read_mesh, read_vertex_labels
+from gsencoder.data.labels.questions import Question, read_scanqa, read_sqa3d
+from gsencoder.data.labels.scans import read_axis_alignment, read_groups, read_segments
+from gsencoder.data.readers.transforms_json import read_cameras, read_objects
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.splat_formats.repair import inspect_splat, repair_splat
-from gsencoder.data.splats import gaussians_from_raw, load_splat, read_raw
-from gsencoder.data.truth.expressions import read_nr3d, read_scanrefer
-from gsencoder.data.truth.label_sets import read_class_list, read_label_map
-from gsencoder.data.truth.mesh_file import read_mesh, read_vertex_labels
-from gsencoder.data.truth.number_files import read_mask, read_whole_numbers
-from gsencoder.data.truth.questions import Question, read_scanqa, read_sqa3d
-from gsencoder.data.truth.scannet_labels import read_axis_alignment
-from gsencoder.data.truth.segment_files import read_groups, read_segments
-from gsencoder.data.truth.split_files import read_split
-from gsencoder.data.truth.view_captions import read_texts, read_view_captions
+from gsencoder.data.splats.files import gaussians_from_raw, load_splat, read_raw
+from gsencoder.data.splats.repair import inspect_splat, repair_splat
 from gsencoder.evaluate.files.answer_predictions import read_answer_predictions
 from gsencoder.evaluate.files.instances import read_instance_prediction, read_instance_truth
 from gsencoder.evaluate.files.recognition import (

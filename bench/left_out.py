@@ -26,9 +26,9 @@ from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.data.seeding.spacing import unit_of
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.infer.load_encoder import load_encoder

@@ -19,7 +19,7 @@ from json_option import add_json_option, write_figures
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import seed
-from gsencoder.data.splats import load_splat
+from gsencoder.data.splats.files import load_splat
 
 
 def timed(work: Callable[[], Any], runs: int) -> tuple[float, Any]:

@@ -36,10 +36,10 @@ from gsencoder.core.errors import SceneWarning
 from gsencoder.data.enclosure import enclosure_of
 from gsencoder.data.orbits import orbit_cameras
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeding.flat import flat_gaussians
+from gsencoder.data.seeding.points import flat_gaussians
 from gsencoder.data.seeding.seed import seed
-from gsencoder.data.splats import load_splat
-from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.splats.files import load_splat
+from gsencoder.data.synthetic import make_room
 from gsencoder.data.up import with_up
 from gsencoder.fusion.orbit_views import with_views
 from gsencoder.render import blend

@@ -26,7 +26,7 @@ def measure(model: str, splat: str) -> dict[str, float]:
     """One process's figures; runs in the child."""
     from gsencoder.app.runs.summary import peak_memory_mb
     from gsencoder.core.process import retain_freed_memory
-    from gsencoder.data.splats import load_splat
+    from gsencoder.data.splats.files import load_splat
     from gsencoder.infer.encode.chunks import EncodeConfig
     from gsencoder.infer.load_encoder import load_encoder
 
@@ -63,7 +63,7 @@ def main() -> None:
 
     from gsencoder.data.scenes import load_scene
     from gsencoder.data.seeding.seed import with_gaussians
-    from gsencoder.data.splats import save_splat
+    from gsencoder.data.splats.files import save_splat
 
     everything = with_gaussians(load_scene(chosen.scene)).gaussians
     assert everything is not None

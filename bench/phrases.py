@@ -22,8 +22,7 @@ from json_option import add_json_option, write_figures
 from sklearn.metrics import roc_auc_score
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import load_scene
+from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import seed
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.fuse import fuse

@@ -20,8 +20,7 @@ from errors import comma_separated, one_line_errors, output_folder, positive
 
 from gsencoder.core.errors import listed
 from gsencoder.core.process import retain_freed_memory
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import load_scene
+from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.absent import AbsentProtocol, names_of, words_to_ask
 from gsencoder.evaluate.sources import encoder_source, fusion_source, with_features

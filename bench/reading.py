@@ -26,7 +26,7 @@ from synthetic_teacher import SyntheticTeacher
 
 import gsencoder
 from gsencoder import encode, fuse, load_weights, localize
-from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic import make_room
 from gsencoder.models.weights import SHIPPED_WEIGHTS
 from gsencoder.text.table import load_text_table
 

@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from json_option import add_json_option, write_figures
 
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.number_files import write_whole_numbers
+from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.files import write_whole_numbers
 from gsencoder.evaluate.files.instances import match_instance_files, write_instance_prediction
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth
 from gsencoder.evaluate.scores.instance_matches import match_instances

@@ -40,8 +40,8 @@ from scipy.ndimage import binary_dilation
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.evaluate.boxes import is_seen, queryable_objects, score_boxes
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teachers.build import build_teacher, words_of

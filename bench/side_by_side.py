@@ -14,7 +14,7 @@ import numpy as np
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 from gsencoder.types import Gaussians
 
 COLUMNS = 4

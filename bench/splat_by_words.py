@@ -23,7 +23,7 @@ from PIL import Image
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.data.splats import load_splat
+from gsencoder.data.splats.files import load_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.orbit_views import with_views

@@ -18,8 +18,7 @@ from json_option import add_json_option, write_figures
 from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import load_scene
+from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import seed
 from gsencoder.data.up import up_of_scene, with_up
 from gsencoder.evaluate.boxes import queryable_objects

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.labels.captions import ViewCaption, write_view_captions
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.truth.view_captions import ViewCaption, write_view_captions
 
 
 def shares_of(path: str) -> dict[tuple[str, str], dict[str, float]]:

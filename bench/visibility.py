@@ -16,8 +16,7 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.files import csv_text
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import load_scene
+from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.evaluate.boxes import Hit
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores

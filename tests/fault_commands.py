@@ -193,8 +193,7 @@ def _room(given: Path) -> None:
 
     from named_rooms import write_words
 
-    from gsencoder.data.synthetic.room import make_room
-    from gsencoder.data.synthetic.write import write_room
+    from gsencoder.data.synthetic import make_room, write_room
 
     room = make_room(0, objects=2, views=3, width=64, height=48, spacing=0.15)
     write_room(room, given / "room")

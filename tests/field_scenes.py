@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import seed
-from gsencoder.data.splats import save_splat
-from gsencoder.data.synthetic.room import make_room, write_room
+from gsencoder.data.splats.files import save_splat
+from gsencoder.data.synthetic import make_room, write_room
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 CAMERA = "PINHOLE 160 120 112 112 80 60"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
 from gsencoder.evaluate.scores.instance_matches import match_instances
 from gsencoder.evaluate.scores.instances import InstanceScores, instance_scores

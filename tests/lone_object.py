@@ -10,7 +10,7 @@ from PIL import Image
 from textured_box import blotches
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.data.synthetic.shapes import Solid
+from gsencoder.data.synthetic import Solid
 from gsencoder.types import Cameras
 from gsencoder.types.checks import OPENCV_FROM_OPENGL
 

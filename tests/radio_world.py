@@ -5,8 +5,7 @@ from pathlib import Path
 from radios import small_joint_model, small_radio
 
 from gsencoder.app import cli
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 
 SEEDS = ("seeds.voxel=0.06",)
 QUICK = (

@@ -10,7 +10,7 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
-from gsencoder.data.splats import RawSplat, save_splat
+from gsencoder.data.splats.files import RawSplat, save_splat
 from gsencoder.types import Gaussians
 
 

@@ -19,15 +19,15 @@ from gsencoder.core.files import (
     read_foreign_text,
 )
 from gsencoder.core.pretrained import load_companion, open_session, read_config
-from gsencoder.data.readers.colmap_binary import check_binary_model
-from gsencoder.data.readers.image_file import load_npy, open_picture
-from gsencoder.data.readers.tables import table_lines
+from gsencoder.data.labels.files import read_checked
+from gsencoder.data.labels.mesh import read_mesh
+from gsencoder.data.readers.colmap import check_binary_model
+from gsencoder.data.readers.images import load_npy, open_picture
+from gsencoder.data.readers.label_images import table_lines
 from gsencoder.data.readers.transforms_json import read_json
-from gsencoder.data.scene_paths import kind_of_path
-from gsencoder.data.splat_formats.ply import read_points
-from gsencoder.data.splats import load_property, load_splat
-from gsencoder.data.truth.checked_files import read_checked
-from gsencoder.data.truth.mesh_file import read_mesh
+from gsencoder.data.scenes import kind_of_path
+from gsencoder.data.splats.files import load_property, load_splat
+from gsencoder.data.splats.ply import read_points
 from gsencoder.evaluate.files.scene_folders import scene_files
 from gsencoder.infer.ask.question_sets import is_question_set
 from gsencoder.text.models import _load_tokenizer

@@ -15,10 +15,10 @@ import splat_samples
 import test_flipped_bits
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.splat_formats.repair import inspect_splat
-from gsencoder.data.splats import RawSplat
-from gsencoder.data.truth.expressions import read_nr3d
-from gsencoder.data.truth.number_files import read_whole_numbers
+from gsencoder.data.labels.expressions import read_nr3d
+from gsencoder.data.labels.files import read_whole_numbers
+from gsencoder.data.splats.files import RawSplat
+from gsencoder.data.splats.repair import inspect_splat
 from gsencoder.evaluate.files.instances import read_instance_prediction
 from gsencoder.infer.ask.questions import read_questions
 

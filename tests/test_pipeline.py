@@ -11,7 +11,7 @@ import pytest
 
 from gsencoder.app import cli
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.splats import load_splat
+from gsencoder.data.splats.files import load_splat
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.store.folder import load_features
 

@@ -9,8 +9,7 @@ from command_runs import refusal, results_of
 from named_rooms import write_words
 
 from gsencoder.app import cli
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.onnx.export import header_of

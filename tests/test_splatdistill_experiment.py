@@ -10,8 +10,7 @@ from gsencoder.app import cli
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.errors import InputError
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.onnx.export import random_cloud
 from gsencoder.models.output_space import OutputSpace

@@ -9,7 +9,7 @@ import numpy as np
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 from gsencoder.types import Gaussians
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image
 from tiny_vlm import SIDE, save_tiny_vlm
 
-from gsencoder.data.prompt_store import PromptStore
+from gsencoder.data.prompts import PromptStore
 from gsencoder.train.trainer_config import TrainerConfig
 from gsencoder.train.tuning.run import TuneConfig
 from gsencoder.train.tuning.samples import TuningPair

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.logs import LOG_FILE, read_log
-from gsencoder.data.prompt_store import PromptStore
+from gsencoder.data.prompts import PromptStore
 from gsencoder.train.tuning.run import open_processor
 from gsencoder.train.tuning.samples import PairSamples, TuningPair, TuningSample
 

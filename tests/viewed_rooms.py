@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsencoder.data.synthetic.room import make_room, write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.viewer.bundle import Bundle

@@ -1,8 +1,17 @@
-"""Loading of scenes in any supported layout, or of a splat alone."""
+"""Loading of scenes in any supported layout, or of a splat alone.
 
+Paths of scenes: which paths are scenes, the scenes in folders and lists of paths, and their names; and what other
+paths are.
+
+Judged by names of files alone; `scenes.py` reads them.
+"""
+
+import json
 import math
 import os
 import warnings
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -10,29 +19,401 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float64, UInt8
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.posed_views import make_views
-from gsencoder.data.readers.depth_images import DepthMeasure
-from gsencoder.data.readers.frames import pinhole_of
-from gsencoder.data.readers.layouts import ReadOptions, layout_of, read_transforms_file
-from gsencoder.data.readers.objects_json import read_objects
-from gsencoder.data.readers.posed import MAX_COORDINATE, PosedImage, PosedImages, rigid_pose
-from gsencoder.data.readers.scene_splat import (
-    file_of_scene,
-    find_splat,
-    read_bare_splat,
-    warn_of_unused_splat,
-)
-from gsencoder.data.readers.transforms_json import TRANSFORMS
-from gsencoder.data.scene_paths import is_transforms_file, name_of_folder
-from gsencoder.data.splats import load_splat
-from gsencoder.data.truth.scene_labels import (
+from gsencoder.core.files import SUMMARY_NAME, read_foreign_text
+from gsencoder.data.labels.scans import (
     labels_of_layout,
     objects_of_labels,
     with_archived_instances,
     with_mesh_instances,
 )
-from gsencoder.types import Scene
+from gsencoder.data.readers.depth_images import DepthFiles, DepthMeasure, DepthSensor
+from gsencoder.data.readers.images import (
+    ImageFiles,
+    InstanceFiles,
+    PixelGrid,
+    is_deep_grey,
+    picture_info,
+    picture_size,
+    pinhole_of,
+    read_integers,
+)
+from gsencoder.data.readers.layouts import (
+    SPLAT_SUFFIXES,
+    ReadOptions,
+    describe_layouts,
+    file_of_scene,
+    find_splat,
+    layout_of,
+    read_bare_splat,
+    read_transforms_file,
+    warn_of_unused_splat,
+)
+from gsencoder.data.readers.masks import EmptyFiles, MaskFiles, find_background
+from gsencoder.data.readers.posed import MAX_COORDINATE, PosedImage, PosedImages, choose_origin, rigid_pose
+from gsencoder.data.readers.transforms_json import TRANSFORMS, read_objects
+from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
+from gsencoder.data.splats.files import load_splat
+from gsencoder.types import Cameras, Scene, Views
+from gsencoder.types.checks import invert_rigid, move_origin
+from gsencoder.types.orientation import EXCHANGED, INVERSE, UNMIRRORED
+
+FEATURES_FILE = "scene.safetensors"
+"""The file by which a folder of features, or of a memory of a scene, is recognized."""
+UNFINISHED_FILE = "unfinished.txt"
+"""The file by which the state of an unfinished run is recognized."""
+
+
+def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
+    """The scenes at paths: a path is a scene, a folder of scenes, which are sorted by name, or a list of paths (.txt).
+
+    A folder is a scene if `load_scene` recognizes it; of any other folder the direct subfolders are searched.
+
+    Raises:
+        InputError: a path does not exist, a folder holds no scene, or a scene is given twice, also by different paths.
+    """
+    scenes = DistinctPaths()
+    for path in listed_paths(paths):
+        try:
+            if not path.exists():
+                raise InputError(f"{path}: no such file or folder")
+            scenes_of_path = [path] if is_scene(path) else sorted(filter(_is_scene_folder, path.iterdir()))
+        except (OSError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{str(path)[:200]!r} cannot be read ({type(error).__name__})") from error
+        if not scenes_of_path and (path / FEATURES_FILE).is_file():
+            raise InputError(
+                f"{path}: a folder of features, not a scene; localize, views, ask, pack and evaluate features= take it"
+            )
+        if not scenes_of_path:
+            raise InputError(
+                f"{path}: {kind_of_path(path)}, neither a scene nor a folder of scenes; a scene holds one of: "
+                f"{describe_layouts()}; a splat"
+            )
+        scenes.add(scenes_of_path)
+    return scenes.paths
+
+
+class DistinctPaths:
+    """Paths of scenes, of which none is given twice: whether the second was meant to be another, nobody can tell."""
+
+    def __init__(self) -> None:
+        self._by_target: dict[Path, Path] = {}
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """In the order in which they were added."""
+        return tuple(self._by_target.values())
+
+    def add(self, paths: Iterable[Path]) -> None:
+        """Adds paths.
+
+        Raises:
+            InputError: one is there already, also under another name or by a link.
+        """
+        for path in paths:
+            target = path.resolve()
+            first = self._by_target.get(target)
+            if first == path:
+                raise InputError(f"{path}: is given twice; give it once")
+            if first is not None:
+                raise InputError(f"{path}: is the same as {first}, which is given as well; give one of them")
+            self._by_target[target] = path
+
+
+def listed_paths(paths: Iterable[str | Path]) -> list[Path]:
+    """Paths, with those in list files in place of the files: text files (.txt) with one path a line, relative to the
+    file; blank lines and those that begin with # are left out.
+
+    Raises:
+        InputError: a list cannot be read, or is empty.
+    """
+    result: list[Path] = []
+    for path in map(Path, paths):
+        try:
+            is_list = path.suffix.lower() == ".txt" and path.is_file()
+        except (OSError, ValueError):
+            is_list = False
+        if not is_list:
+            result.append(path)
+            continue
+        try:
+            lines = read_foreign_text(path).splitlines()
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path}: not a readable list of scenes ({type(error).__name__})") from error
+        names = [line.strip() for line in lines if line.strip() and not line.strip().startswith("#")]
+        if not names:
+            raise InputError(f"{path}: lists no scene; expected one path a line")
+        result += [path.parent / name for name in names]
+    return result
+
+
+def is_scene(path: Path) -> bool:
+    """Whether `load_scene` recognizes a folder itself as a scene; True for any file."""
+    if path.is_file():
+        return True
+    return (
+        (path / "meta.json").is_file()
+        or layout_of(path) is not None
+        or any(entry.suffix.lower() in SPLAT_SUFFIXES and entry.is_file() for entry in path.iterdir())
+    )
+
+
+def _is_scene_folder(entry: Path) -> bool:
+    return entry.is_dir() and not entry.name.startswith(".") and is_scene(entry)
+
+
+def has_views(path: Path) -> bool:
+    """Whether a path is a scene with posed views, as opposed to a splat, judged by names of files alone."""
+    return is_transforms_file(path) if path.is_file() else layout_of(path) is not None
+
+
+def is_transforms_file(path: Path) -> bool:
+    """Whether a file is to be read as transforms.json: any .json but the meta.json of an unpacked .sog."""
+    return path.suffix.lower() == ".json" and path.name != "meta.json"
+
+
+def scene_name(path: Path) -> str:
+    """The name that `load_scene` gives the scene at an existing path."""
+    if path.is_file():
+        return name_of_folder(path.absolute().parent) if is_transforms_file(path) else path.stem
+    return name_of_folder(path)
+
+
+def name_of_folder(folder: Path) -> str:
+    """The name of a scene and of its output folder; "." and ".." are resolved."""
+    return (folder if folder.name not in ("", "..") else folder.resolve()).name or "scene"
+
+
+def check_names(paths: Sequence[Path]) -> None:
+    """Checks that no two scenes have the same name, since their results would be in one folder.
+
+    Raises:
+        InputError: two have.
+    """
+    first: dict[str, Path] = {}
+    for path in paths:
+        name = scene_name(path)
+        if name in first:
+            raise InputError(
+                f"{path} and {first[name]} are both called {name!r}, so their results would be in one folder; "
+                "rename one, or run them with different out="
+            )
+        first[name] = path
+
+
+def kind_of_path(path: str | Path) -> str:
+    """What a path is, judged by names of files and by the record of the run that wrote it: such as "a folder that
+    `gsencoder fuse` wrote", or "an empty folder"."""
+    path = Path(path)
+    with suppress(OSError, ValueError):
+        if path.is_dir():
+            return _kind_of_folder(path)
+        if path.is_file():
+            if path.suffix.lower() in SPLAT_SUFFIXES:
+                return "a splat"
+            return f"a {path.suffix.lower()} file" if path.suffix else "a file"
+    return "no file or folder"
+
+
+def _kind_of_folder(folder: Path) -> str:
+    with suppress(OSError, ValueError, TypeError, AttributeError):
+        command = json.loads(read_foreign_text(folder / SUMMARY_NAME))["command"]
+        if isinstance(command, str) and command.isalpha() and len(command) < 20:
+            return f"a folder that `gsencoder {command}` wrote"
+    if (folder / UNFINISHED_FILE).is_file():
+        return "the state of an unfinished run, which its command continues"
+    if (folder / FEATURES_FILE).is_file():
+        return "a folder of features"
+    if is_scene(folder):
+        return "a scene"
+    entries = list(folder.iterdir())
+    if not entries:
+        return "an empty folder"
+    inner = sorted(entry for entry in entries if entry.is_dir() and (entry / FEATURES_FILE).is_file())
+    if inner:
+        return f"a folder of folders of features ({inner[0].name}, …)"
+    return "a folder of other files"
+
+
+FEW_CAMERAS = 8
+FEWEST_STEPS = 64
+"""Integer depth images whose largest value is smaller have lost most of what was measured."""
+MEASURED = 0.05
+"""Where depth was measured on a larger share of it, what looks like a background is a wall."""
+
+
+def make_views(
+    posed: PosedImages, *, max_views: int = 0, image_scale: float = 1.0, mask_background: bool = False
+) -> tuple[Views, Float64[np.ndarray, "3"]]:
+    """Cameras without distortion and lazy pictures, and the origin that was subtracted from the cameras.
+
+    Args:
+        posed: views as their files describe them.
+        max_views: see SceneConfig.
+        image_scale: see SceneConfig.
+        mask_background: whether a background of one color is looked for, and masked with a warning.
+
+    Raises:
+        InputError: no picture, a picture or depth of the wrong size, a camera that cannot be undistorted.
+    """
+    images = posed.images
+    if not images:
+        raise InputError(f"{posed.source}: no view")
+    if max_views:
+        images = tuple(images[row] for row in even_indices(len(images), max_views))
+    cam_from_world = np.stack([image.cam_from_world for image in images])
+    origin = choose_origin(invert_rigid(cam_from_world)[:, :3, 3])
+    pinholes: dict[CameraModel, Pinhole] = {}
+    grids, depth_grids = [], []
+    transparent: list[Path | None] = []
+    orientations: list[int] = []
+    for image in images:
+        where = f"{posed.source}: view {image.name[:120]!r}"
+        if image.camera not in pinholes:
+            pinholes[image.camera] = pinhole_for(image.camera, where)
+        pinhole = pinholes[image.camera]
+        width = max(1, round(pinhole.width * image_scale))
+        height = max(1, round(pinhole.height * image_scale))
+        size, is_transparent, orientation = picture_info(image.image)
+        # A photograph that is stored sideways, with the camera of the upright picture, is turned on load. With the
+        # camera of its stored pixels it is not, and a mask whose sides are exchanged belongs to the upright picture.
+        camera_size = image.camera.width, image.camera.height
+        exchanged = orientation in EXCHANGED and size[::-1] == camera_size != size
+        turn = orientation if exchanged else INVERSE[orientation]
+        orientations.append(1 if exchanged else orientation)
+        grids.append(PixelGrid(source=image.camera, pinhole=pinhole, width=width, height=height, turn=turn))
+        depth_grids.append(replace(grids[-1], source=image.depth_camera or image.camera))
+        _check_sizes(image, grids[-1], depth_grids[-1], size, where)
+        transparent.append(image.image if is_transparent else None)
+    remaps = RemapCache()
+    cameras = Cameras(
+        cam_from_world=move_origin(cam_from_world, origin).astype(np.float32),
+        Ks=np.array([grid.pinhole.matrix(grid.width, grid.height) for grid in grids]).astype(np.float32),
+        widths=np.array([grid.width for grid in grids], np.int32),
+        heights=np.array([grid.height for grid in grids], np.int32),
+    )
+    depths = [image.depth for image in images]
+    masks = [image.mask for image in images]
+    instances = [image.instance for image in images]
+    partial = _have_empty_pixels({(grid.pinhole, grid.source, grid.reduction) for grid in grids}, remaps)
+    background = None
+    if mask_background and not _any(masks) and not _any(transparent) and not any(map(_is_fisheye, images)):
+        background = find_background([image.image for image in images])
+    outlined = transparent if background is None else [image.image for image in images]
+    has_outlines = _any(outlined)
+    views = Views(
+        cameras=cameras,
+        names=tuple(image.name for image in images),
+        images=ImageFiles([image.image for image in images], grids, remaps),
+        depths=DepthFiles(depths, depth_grids, remaps, [_depth_sensor(image) for image in images])
+        if _any(depths)
+        else None,
+        masks=MaskFiles(masks, grids, remaps, outlined, background) if _any(masks) or has_outlines or partial else None,
+        empty=EmptyFiles(masks, grids, remaps, outlined, background) if has_outlines else None,
+        instances=InstanceFiles(instances, grids, remaps) if _any(instances) else None,
+        orientations=tuple(orientations) if max(orientations) > 1 else None,
+    )
+    _warn_of_odd_files(posed.source, images)
+    mirrored = sum(UNMIRRORED[orientation] != orientation for orientation in orientations)
+    if mirrored:
+        _warn(
+            f"{posed.source}: {mirrored} of {len(images)} photographs are stored mirrored (EXIF orientation 2, 4, 5, "
+            "7), and poses belong to the stored pixels: the scene may be a mirror image"
+        )
+    if background is not None:
+        if _is_measured(views):
+            return make_views(posed, max_views=max_views, image_scale=image_scale)
+        _warn(
+            f"{posed.source}: the photographs have a background of one color ({background.describe()}); it is masked "
+            "and taken for empty space (data.background=none uses it)"
+        )
+    return views, origin
+
+
+def _warn_of_odd_files(source: str, images: Sequence[PosedImage]) -> None:
+    """Warns if photographs look like depth images, or depth images like meters in integers; one file of each is
+    looked at."""
+    middle = images[len(images) // 2]
+    if is_deep_grey(middle.image):
+        _warn(
+            f"{source}: {middle.image.name} has one channel of 16 bits, as depth images have; is it listed as a "
+            "photograph by mistake?"
+        )
+    depths = [image.depth for image in images if image.depth is not None and image.depth.suffix.lower() != ".npy"]
+    if depths:
+        file = depths[len(depths) // 2]
+        largest = 0
+        # A file that cannot be read is an error when the depth of its view is.
+        with suppress(InputError):
+            largest = int(read_integers(file, "depth", wide=True).max(initial=0))
+        if 0 < largest < FEWEST_STEPS:
+            _warn(
+                f"{source}: {file.name} holds depths of at most {largest} steps; if these are meters, the rest was "
+                "lost when they were saved as integers: save millimeters in 16 bits, or floating-point numbers as .npy"
+            )
+
+
+def _is_fisheye(image: PosedImage) -> bool:
+    """Whether the picture may be a disc in a black frame."""
+    return "FISHEYE" in image.camera.model
+
+
+def _is_measured(views: Views) -> bool:
+    """Whether a sensor saw surfaces where the background is."""
+    if views.depths is None or views.empty is None:
+        return False
+    rows = even_indices(len(views), 4)
+    shares = [float((views.depths[int(row)][views.empty[int(row)]] > 0).mean()) for row in rows]
+    return float(np.nan_to_num(shares).mean()) > MEASURED
+
+
+def _depth_sensor(image: PosedImage) -> DepthSensor:
+    transform = image.depth_from_color
+    return DepthSensor(
+        scale=image.depth_scale,
+        no_depth=image.no_depth,
+        measure=image.depth_measure,
+        color_from_depth=None if transform is None else invert_rigid(transform),
+    )
+
+
+def _any(paths: Sequence[Path | None]) -> bool:
+    return any(path is not None for path in paths)
+
+
+def _check_sizes(image: PosedImage, grid: PixelGrid, depth_grid: PixelGrid, size: tuple[int, int], where: str) -> None:
+    """Checks the sizes in the headers of the files; `size` is the photograph's."""
+    camera = image.camera
+    if image.depth is not None and image.depth == image.image:
+        raise InputError(f"{where}: {image.image} is listed as photograph and as depth image; list the photograph")
+    if (size[::-1] if grid.is_exchanged(*size) else size) != (camera.width, camera.height):
+        raise InputError(
+            f"{where}: {image.image} has {size[0]}×{size[1]} pixels but its camera {camera.width}×{camera.height}; "
+            "give the images at the size of the intrinsics (image_scale makes them smaller on load)"
+        )
+    for file, expected in ((image.depth, depth_grid), (image.mask, grid), (image.instance, grid)):
+        if file is not None and not expected.fits(*(actual := picture_size(file))):
+            raise InputError(
+                f"{where}: {file} has {actual[0]}×{actual[1]} pixels but {image.image} has {size[0]}×{size[1]}; "
+                "both must have the same shape"
+            )
+
+
+def _have_empty_pixels(cameras: set[tuple[Pinhole, CameraModel, int]], remaps: RemapCache) -> bool:
+    """Whether some pixel of a pinhole camera is outside the distorted picture. With many cameras the check would cost
+    more than masks do, and the result is True."""
+    distorted = [camera for camera in cameras if not camera[1].is_pinhole]
+    if len(distorted) > FEW_CAMERAS:
+        return True
+    maps = [remaps.get(*camera) for camera in distorted]
+    return any(remap is not None and not remap.valid.all() for remap in maps)
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, SceneWarning, stacklevel=3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,8 +17,13 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.enclosure import enclosure_of
-from gsencoder.data.surfaces import Surfaces, planes_of_gaussians, surfaces_of_depth, surfaces_of_gaussians
+from gsencoder.data.enclosure import (
+    Surfaces,
+    enclosure_of,
+    planes_of_gaussians,
+    surfaces_of_depth,
+    surfaces_of_gaussians,
+)
 from gsencoder.types import Cameras, Scene
 from gsencoder.types.orientation import upright_views
 

@@ -9,9 +9,9 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from gsencoder.core.files import read_foreign
-from gsencoder.data.truth.expressions import Expression
-from gsencoder.data.truth.made_questions import kind_of
-from gsencoder.data.truth.questions import Question
+from gsencoder.data.labels.expressions import Expression
+from gsencoder.data.labels.made_questions import kind_of
+from gsencoder.data.labels.questions import Question
 from gsencoder.evaluate.picture_truth import PictureTruth
 from gsencoder.evaluate.scripted_answerer import AnswerSheet, Fact, SentPicture, request_digest, request_pictures
 from gsencoder.infer.ask.batch import ANSWERS, REQUEST

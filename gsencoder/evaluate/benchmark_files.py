@@ -11,13 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsencoder.core.files import read_foreign_text, write_json
+from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.expressions import Expression, boxes_from_labels, write_scanrefer
+from gsencoder.data.labels.files import write_whole_numbers
+from gsencoder.data.labels.scans import find_labels, find_scannet_files
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.expression_boxes import boxes_from_labels
-from gsencoder.data.truth.expressions import Expression, write_scanrefer
-from gsencoder.data.truth.number_files import write_whole_numbers
-from gsencoder.data.truth.scannet_labels import find_scannet_files
-from gsencoder.data.truth.scene_labels import find_labels
 from gsencoder.evaluate.files.instances import write_instance_prediction
 from gsencoder.evaluate.files.recognition import write_recognition_predictions, write_recognition_truth
 from gsencoder.evaluate.files.referring import write_referring_predictions

@@ -69,7 +69,7 @@ def is_seen(scene_object: SceneObject, *, min_views: int, min_pixels: int) -> bo
     if scene_object.views is None or scene_object.max_pixels is None:
         raise InputError(
             f"object {scene_object.id}: the views that show it were not counted; with_counted_views of "
-            "gsencoder.data.truth.scene_labels counts them"
+            "gsencoder.data.labels.scans counts them"
         )
     return scene_object.views >= min_views and scene_object.max_pixels >= min_pixels
 

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, counted
-from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.files.instances import match_instance_files
 from gsencoder.evaluate.files.recognition import read_recognition_truth, recognize_files
 from gsencoder.evaluate.files.semantics import count_label_files

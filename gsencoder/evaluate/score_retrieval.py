@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.core.errors import InputError, counted, listed
-from gsencoder.data.truth.view_captions import read_view_captions
+from gsencoder.data.labels.captions import read_view_captions
 from gsencoder.evaluate.files.retrieval import read_scored_pairs
 from gsencoder.evaluate.result_table import table_of
 from gsencoder.evaluate.retrieval import RECALLS, Pooling, Retrieval, ScoredPairs, retrieve

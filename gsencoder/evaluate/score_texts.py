@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.core.errors import InputError, counted
-from gsencoder.data.truth.expressions import read_scanrefer
-from gsencoder.data.truth.questions import read_questions
+from gsencoder.data.labels.expressions import read_scanrefer
+from gsencoder.data.labels.questions import read_questions
 from gsencoder.evaluate.files.answer_predictions import read_answer_predictions
 from gsencoder.evaluate.files.caption_predictions import read_caption_predictions
 from gsencoder.evaluate.result_table import table_of

@@ -7,8 +7,8 @@ from pathlib import Path
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.heads.apply import head_features

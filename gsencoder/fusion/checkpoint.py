@@ -14,7 +14,7 @@ from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files import atomic_file, read_foreign_text
 from gsencoder.core.settings import first_difference
-from gsencoder.data.splats import fingerprint
+from gsencoder.data.splats.files import fingerprint
 from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.fusion.teachers import Teacher
 from gsencoder.types import FeatureBasis, Gaussians, Views

@@ -17,7 +17,7 @@ from jaxtyping import Float64, Int64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.scene_splat import file_of_scene
+from gsencoder.data.readers.layouts import file_of_scene
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splat_frame import DATAPARSER, SplatFrame, identity_frame, moved, stated_frames, usual_frames
 from gsencoder.geometry import colors_from_sh

@@ -17,7 +17,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.archive import Archive
 from gsencoder.core.errors import InputError
-from gsencoder.data.archive_records import read_space, space_parts
+from gsencoder.data.scene_arrays import read_space, space_parts
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 

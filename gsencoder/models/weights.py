@@ -13,7 +13,7 @@ from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import open_foreign
 from gsencoder.core.pretrained import find_file
-from gsencoder.data.scene_paths import kind_of_path
+from gsencoder.data.scenes import kind_of_path
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces, output_spaces_parts, read_output_spaces
 

@@ -7,7 +7,7 @@ from typing import Any
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import plain
 from gsencoder.core.settings import check_governed
-from gsencoder.data.seeding.dense import DenseConfig
+from gsencoder.data.seeding.from_photographs import DenseConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.budget import BudgetConfig
 from gsencoder.reconstruct.optimize_config import OptimizeConfig

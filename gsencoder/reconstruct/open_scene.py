@@ -9,10 +9,8 @@ from pathlib import Path
 from gsencoder.core.errors import InputError, SceneWarning, advised, listed
 from gsencoder.core.process import Clock, Track, untracked
 from gsencoder.data.readers.posed import inside
-from gsencoder.data.scene_paths import DistinctPaths, find_scenes, is_scene, listed_paths
-from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.video.decode import is_video
-from gsencoder.data.video.frames import VideoConfig, take_frames
+from gsencoder.data.scenes import DistinctPaths, SceneConfig, find_scenes, is_scene, listed_paths, load_scene
+from gsencoder.data.video import VideoConfig, is_video, take_frames
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
 from gsencoder.reconstruct.sfm import (
     PLACED_FILE,

@@ -14,7 +14,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import MEGABYTE
-from gsencoder.data.splat_formats.ply import inria_row_bytes
+from gsencoder.data.splats.ply import inria_row_bytes
 from gsencoder.reconstruct.budget import SMALLEST_REDUCTION, BudgetConfig, affordable_steps, least_pixels
 from gsencoder.reconstruct.checkpoint import PLANNED_DEGREE
 from gsencoder.reconstruct.expected_time import Costs

@@ -13,9 +13,9 @@ from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.files import atomic_file, read_foreign_text, sha256_of
-from gsencoder.data.readers.image_file import check_picture
+from gsencoder.data.readers.images import check_picture
 from gsencoder.data.readers.undistort import load_pycolmap
-from gsencoder.data.video.decode import SUFFIXES as VIDEO_SUFFIXES
+from gsencoder.data.video import SUFFIXES as VIDEO_SUFFIXES
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")
 OTHER_SUFFIXES = (".webp", ".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".nef", ".arw", *VIDEO_SUFFIXES)

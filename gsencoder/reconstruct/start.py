@@ -5,8 +5,13 @@ from dataclasses import dataclass, replace
 
 from gsencoder.core.process import Track, untracked
 from gsencoder.data.photographs import Photographs
-from gsencoder.data.seeding.dense import DenseConfig, DenseSeeds, densify
-from gsencoder.data.seeding.from_photographs import MAX_DENSE_SPACING, seeds_of_photographs
+from gsencoder.data.seeding.from_photographs import (
+    MAX_DENSE_SPACING,
+    DenseConfig,
+    DenseSeeds,
+    densify,
+    seeds_of_photographs,
+)
 from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
 from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
 from gsencoder.types import Gaussians, Scene

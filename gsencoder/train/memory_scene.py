@@ -21,8 +21,8 @@ from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files import plain, read_foreign, write_json
 from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import first_difference, with_added_options
-from gsencoder.data.archive_records import bank_parts, read_bank
-from gsencoder.data.splats import fingerprint
+from gsencoder.data.scene_arrays import bank_parts, read_bank
+from gsencoder.data.splats.files import fingerprint
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teacher_maps import CachedTeacher, upright

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Int32, Int64
 from gsencoder.core.archive import Archive, MappedArrays, write_archive
 from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
-from gsencoder.data.archive_records import camera_arrays
+from gsencoder.data.scene_arrays import camera_arrays
 from gsencoder.fusion.basis_fit import ProjectionSums
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import GaussianFeatures, Scene

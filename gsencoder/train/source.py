@@ -8,9 +8,9 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError, about
 from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.data.seeding.spacing import unit_of
-from gsencoder.data.splats import READABLE
+from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits, with_views
 from gsencoder.fusion.store.folder import TEACHER_NAME

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, listed
-from gsencoder.data.truth.split_files import read_split
+from gsencoder.data.labels.files import read_split
 
 
 def split_scenes(

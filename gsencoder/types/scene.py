@@ -365,7 +365,7 @@ class SceneObject:
         aabb_min: lower corner, world units.
         aabb_max: upper corner.
         placed: one of the small objects, as opposed to furniture; of scanned scenes whatever is no part of the building
-            (`gsencoder.data.truth.scene_labels.is_placed`).
+            (`gsencoder.data.labels.scans.is_placed`).
         views: in how many views it shows; None where nobody counted (`with_counted_views` of the same module does).
         max_pixels: its largest visible area in a view; None as above.
     """

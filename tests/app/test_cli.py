@@ -18,8 +18,8 @@ from gsencoder.app.commands.repair import Fix
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Stopped
-from gsencoder.data.splat_formats.repair import FIXES, inspect_splat
-from gsencoder.data.splats import load_splat, read_raw, save_splat
+from gsencoder.data.splats.files import load_splat, read_raw, save_splat
+from gsencoder.data.splats.repair import FIXES, inspect_splat
 
 
 def broken_splat(path: Path) -> Path:

@@ -16,7 +16,7 @@ from gsencoder.app import cli
 from gsencoder.app.commands import COMMANDS, Command
 from gsencoder.app.settings.compose import compose
 from gsencoder.app.settings.config import CommonConfig
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
 

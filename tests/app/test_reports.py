@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from gsencoder.app import cli
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.text.table import make_text_table, save_text_table
 
 SCENE = "<script>alert(1)<"

@@ -9,8 +9,7 @@ import pytest
 from command_runs import refusal
 
 from gsencoder.app.commands import COMMANDS
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 
 GIVEN = {"ask": ["features", "question=where"], "score": ["answers"], "demo": []}
 """What a command needs to come as far as its start."""

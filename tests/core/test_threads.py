@@ -188,7 +188,7 @@ def test_a_parallel_loop_of_gsply_leaves_torch_the_threads_of_the_environment() 
     code = (
         "import sys, torch\n"
         "from splat_samples import make_raw\n"
-        "from gsencoder.data.splat_formats.compressed_ply import packed_bytes\n"
+        "from gsencoder.data.splats.ply import packed_bytes\n"
         "assert torch.get_num_threads() == 1\n"
         "packed_bytes(make_raw())\n"
         "sys.exit(torch.get_num_threads() != 1)"

@@ -10,7 +10,7 @@ from textured_box import box_cameras
 from textured_box import look as look_at_walls
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.background import Background, background_pixels, find_background, outline
+from gsencoder.data.readers.masks import Background, background_pixels, find_background, outline
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.types import Views
 

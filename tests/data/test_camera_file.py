@@ -9,7 +9,7 @@ import pytest
 from splats import random_rotation
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.camera_file import MAX_PIXELS, read_cameras
+from gsencoder.data.readers.transforms_json import MAX_PIXELS, read_cameras
 from gsencoder.types.checks import OPENCV_FROM_OPENGL
 
 ORIGIN = np.zeros(3)
@@ -145,7 +145,7 @@ def test_principal_points_beside_the_picture_and_pictures_of_the_largest_size_ar
 
 
 def test_more_cameras_than_are_read_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsencoder.data.readers.camera_file.MAX_CAMERAS", 3)
+    monkeypatch.setattr("gsencoder.data.readers.transforms_json.MAX_CAMERAS", 3)
     entry = {"cam_from_world": np.eye(4).tolist(), **INTRINSICS}
     assert len(read_cameras(write(tmp_path / "three.json", [entry] * 3), ORIGIN)) == 3
     with pytest.raises(InputError, match="a list of 1 to 3 cameras, got 4"):

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from scene_files import photograph, save, world_from_cams, write_colmap
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.colmap import read_colmap
-from gsencoder.data.readers.colmap_binary import CAMERA_PARAMS, check_binary_model
+from gsencoder.data.readers.colmap import CAMERA_PARAMS, check_binary_model, read_colmap
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.data.scenes import SceneConfig, load_scene
 

@@ -7,8 +7,15 @@ from walls import DEPTH, TILT, cameras, seen, wall_points, wall_views
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
-from gsencoder.data.seeding.dense import DenseConfig, average_by_voxel, carve, covered_share, densify
-from gsencoder.data.seeding.fill_depths import interpolate, splat_depths
+from gsencoder.data.seeding.from_photographs import (
+    DenseConfig,
+    average_by_voxel,
+    carve,
+    covered_share,
+    densify,
+    interpolate,
+    splat_depths,
+)
 from gsencoder.data.seeding.stereo import DepthMap, count_agreeing, source_views, sweep, window_mean, world_points
 
 SMALL = DenseConfig(spacing=3.0, size=96, sources=3, samples=1)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsencoder.data.enclosure import MIN_GAUSSIANS, Enclosure, enclosure_of
-from gsencoder.data.seeding.flat import flat_gaussians
+from gsencoder.data.seeding.points import flat_gaussians
 from gsencoder.data.up import with_up
 from gsencoder.fusion.orbit_views import with_explained_views
 from gsencoder.types import Gaussians, Scene

@@ -16,7 +16,10 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.check.scene_check import plain_photographs
 from gsencoder.data.readers import images
 from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
-from gsencoder.data.readers.image_file import (
+from gsencoder.data.readers.images import (
+    ImageFiles,
+    InstanceFiles,
+    PixelGrid,
     picture_info,
     picture_size,
     read_integers,
@@ -24,12 +27,10 @@ from gsencoder.data.readers.image_file import (
     read_rgba,
     read_small,
 )
-from gsencoder.data.readers.images import ImageFiles, InstanceFiles, PixelGrid
 from gsencoder.data.readers.masks import MaskFiles
 from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.fit import SmallViews
 from gsencoder.types.orientation import EXCHANGED, INVERSE, turned
 

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.layouts import layout_of
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import load_scene
-from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.scenes import find_scenes, load_scene
+from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
 from gsencoder.types.checks import OPENCV_FROM_OPENGL
 

@@ -8,12 +8,11 @@ import pytest
 from rgbd_layouts import WRITERS, write_replica, write_seven_scenes, write_tum
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.readers.depth_images import register_depth
 from gsencoder.data.readers.layouts import LAYOUTS, layout_of
-from gsencoder.data.readers.registration import register_depth
-from gsencoder.data.readers.tum import nearest_within
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.readers.rgbd import nearest_within
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
 
 
@@ -166,7 +165,7 @@ def test_intrinsics_and_a_depth_sensor_beside_the_camera_can_be_stated(room: Sce
 
 
 def test_transforms_json_may_state_the_depth_sensor(room: Scene, tmp_path: Path) -> None:
-    from gsencoder.data.synthetic.write import write_room
+    from gsencoder.data.synthetic import write_room
 
     write_room(room, tmp_path / "room")
     path = tmp_path / "room" / "transforms.json"

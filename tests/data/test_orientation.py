@@ -11,7 +11,7 @@ from PIL import Image, ImageOps
 from scene_files import photograph
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.data.readers.image_file import picture_info, read_rgba
+from gsencoder.data.readers.images import picture_info, read_rgba
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import up_of_scene
 from gsencoder.fusion.fuse import FuseConfig, fuse

@@ -9,7 +9,7 @@ from tuning_pairs import png
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import sealed
-from gsencoder.data.prompt_store import PICTURES_FOLDER, PROMPTS_FILE, TOKENS_FOLDER, PromptStore
+from gsencoder.data.prompts import PICTURES_FOLDER, PROMPTS_FILE, TOKENS_FOLDER, PromptStore
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:

@@ -10,8 +10,8 @@ import pytest
 import splat_samples as samples
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.splat_formats.repair import FIXES, inspect_splat, repair_splat
-from gsencoder.data.splats import RawSplat, gaussians_from_raw, read_raw
+from gsencoder.data.splats.files import RawSplat, gaussians_from_raw, read_raw
+from gsencoder.data.splats.repair import FIXES, inspect_splat, repair_splat
 
 Plant = Callable[[RawSplat], RawSplat]
 

@@ -5,7 +5,7 @@ import pytest
 from scene_files import photograph, save, write_scannet
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.scannet import read_scannet
+from gsencoder.data.readers.rgbd import read_scannet
 from gsencoder.data.scenes import SceneConfig, load_scene
 
 

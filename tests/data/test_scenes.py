@@ -19,10 +19,9 @@ from scene_files import (
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.posed import choose_origin
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 from gsencoder.types import Scene
 
 

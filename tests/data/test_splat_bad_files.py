@@ -15,8 +15,8 @@ import pytest
 import splat_samples as samples
 
 from gsencoder.core.errors import InputError
-from gsencoder.data import splats
-from gsencoder.data.splats import load_splat, read_raw, save_splat
+from gsencoder.data.splats import files as splats
+from gsencoder.data.splats.files import load_splat, read_raw, save_splat
 
 
 def spz4(count: int, sizes: list[tuple[int, int]], body: bytes = b"", degree: int = 0) -> bytes:

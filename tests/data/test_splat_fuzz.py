@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.splat_formats.repair import inspect_splat, repair_splat
-from gsencoder.data.splats import RawSplat, gaussians_from_raw, load_splat, read_raw
+from gsencoder.data.splats.files import RawSplat, gaussians_from_raw, load_splat, read_raw
+from gsencoder.data.splats.repair import inspect_splat, repair_splat
 
 pytestmark = pytest.mark.slow
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import splat_samples as samples
 
-from gsencoder.data import splats
-from gsencoder.data.splats import fingerprint, load_splat, read_raw, save_splat
+from gsencoder.data.splats import files as splats
+from gsencoder.data.splats.files import fingerprint, load_splat, read_raw, save_splat
 
 pytestmark = pytest.mark.slow
 

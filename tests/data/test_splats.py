@@ -14,8 +14,8 @@ import pytest
 import splat_samples as samples
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data import splats
-from gsencoder.data.splats import fingerprint, load_splat, read_raw, save_splat
+from gsencoder.data.splats import files as splats
+from gsencoder.data.splats.files import fingerprint, load_splat, read_raw, save_splat
 
 C0 = 0.28209479177387814
 
@@ -271,7 +271,7 @@ def test_a_fingerprint_changes_with_one_bit_and_with_the_order_of_rows() -> None
 
 def test_loading_needs_neither_torch_nor_numba(tmp_path: Path) -> None:
     save_splat(tmp_path / "a.ply", samples.make_gaussians(3, 0))
-    code = f"import sys; from gsencoder.data.splats import load_splat; load_splat({str(tmp_path / 'a.ply')!r})"
+    code = f"import sys; from gsencoder.data.splats.files import load_splat; load_splat({str(tmp_path / 'a.ply')!r})"
     code += "; print([m for m in ('torch', 'numba', 'gsply', 'open3d', 'scipy') if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert result.stdout.strip() == "[]"

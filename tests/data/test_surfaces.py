@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsencoder.data.surfaces import MAX_SAMPLES, planes_of_gaussians, surfaces_of_depth, surfaces_of_gaussians
+from gsencoder.data.enclosure import MAX_SAMPLES, planes_of_gaussians, surfaces_of_depth, surfaces_of_gaussians
 from gsencoder.types import Cameras, Gaussians, Views
 
 

@@ -6,9 +6,19 @@ from PIL import Image
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.synthetic.plan import _CATALOGUE, COLORS, FIRST_ID, HALF_ROOM, SHELF, TABLE
-from gsencoder.data.synthetic.room import color_words, make_room, plan_room, write_room
-from gsencoder.data.synthetic.shapes import Solid
+from gsencoder.data.synthetic import (
+    _CATALOGUE,
+    COLORS,
+    FIRST_ID,
+    HALF_ROOM,
+    SHELF,
+    TABLE,
+    Solid,
+    color_words,
+    make_room,
+    plan_room,
+    write_room,
+)
 
 
 @pytest.fixture(scope="module")

@@ -12,17 +12,18 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.seeding.feature_matches import fundamental_matrix
 from gsencoder.data.seeding.from_photographs import seed_from_photographs, seeds_of_photographs
-from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
-from gsencoder.data.seeding.triangulate import on_epipolar_lines, triangulate
-from gsencoder.data.seeding.view_pairs import (
+from gsencoder.data.seeding.matches import (
     choose_pairs,
     depth_range_of_cameras,
+    fundamental_matrix,
     nearest_distances,
+    on_epipolar_lines,
     overlaps,
+    triangulate,
     typical_distance,
 )
+from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
 from gsencoder.types import Cameras, Scene
 
 

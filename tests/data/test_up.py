@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.enclosure import Surfaces, surfaces_of_depth, surfaces_of_gaussians
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.surfaces import Surfaces, surfaces_of_depth, surfaces_of_gaussians
-from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic import make_room
 from gsencoder.data.up import (
     Up,
     _bells,

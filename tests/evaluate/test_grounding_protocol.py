@@ -14,8 +14,7 @@ from rooms import room
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.grounding import GroundedPair
 from gsencoder.evaluate.protocols.grounding import (
     GroundingProtocol,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic import make_room
 from gsencoder.evaluate.picture_truth import PictureTruth
 from gsencoder.types import Scene
 from gsencoder.types.checks import move_origin

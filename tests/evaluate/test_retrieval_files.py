@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.view_captions import ViewCaption, read_texts, read_view_captions, write_view_captions
+from gsencoder.data.labels.captions import ViewCaption, read_texts, read_view_captions, write_view_captions
 from gsencoder.evaluate.files.retrieval import read_scored_pairs, write_scored_pairs
 from gsencoder.evaluate.retrieval import ScoredPairs, image_to_text, retrieve, text_to_image
 from gsencoder.evaluate.score_retrieval import score_retrieval

@@ -13,8 +13,7 @@ from named_rooms import write_words
 from rooms import room
 
 from gsencoder.app import cli
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol, score_views
 from gsencoder.infer.localize.relevancy import word_directions
 from gsencoder.memory.attention import render_queries

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.number_files import write_whole_numbers
+from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.files import write_whole_numbers
 from gsencoder.evaluate.files.instances import write_instance_prediction
 from gsencoder.evaluate.score_boxes import score_referring
 from gsencoder.evaluate.score_files import EQUAL_SCORES, score_instances, score_recognition, score_semantics

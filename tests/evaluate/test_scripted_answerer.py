@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.expressions import Expression
-from gsencoder.data.truth.questions import Question
+from gsencoder.data.labels.expressions import Expression
+from gsencoder.data.labels.questions import Question
 from gsencoder.evaluate.answer_sheets import add_expressions, add_questions
 from gsencoder.evaluate.scripted_answerer import (
     AnswerSheet,

@@ -7,7 +7,7 @@ import pytest
 from splats import random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.labeled_points import LabeledPoints, labeled_points
 from gsencoder.evaluate.protocols.instances import true_instances
 from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, predict_semantics, semantic_truth

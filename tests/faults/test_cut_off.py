@@ -17,7 +17,7 @@ from gsencoder.app import cli
 from gsencoder.core.archive import MappedArrays, open_archive, write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import check_fetched, digest_files
-from gsencoder.data.readers.image_file import load_npy
+from gsencoder.data.readers.images import load_npy
 from gsencoder.text.table import load_text_table
 from gsencoder.train.data_workers import lost_workers
 

@@ -27,11 +27,11 @@ from gsencoder.app.runs.scene_queue import _is_finished
 from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import check_written, checksums_of, sealed, write_bytes, write_json, write_picture
-from gsencoder.data.prompt_store import PROMPTS_FILE, PromptStore
+from gsencoder.data.labels.files import read_checked
+from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
 from gsencoder.data.readers.transforms_json import read_json
-from gsencoder.data.splats import load_splat, save_splat
-from gsencoder.data.truth.checked_files import read_checked
-from gsencoder.data.video.frames import RECORD_FILE, _taken
+from gsencoder.data.splats.files import load_splat, save_splat
+from gsencoder.data.video import RECORD_FILE, _taken
 from gsencoder.evaluate.tradeoff.records import IDENTITY_FILE, RECORDS_FILE, Records
 from gsencoder.fusion.checkpoint import SETTINGS_FILE, FusionCheckpoint
 from gsencoder.infer.ask.batch import ANSWERS, _answered

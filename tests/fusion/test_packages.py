@@ -19,7 +19,7 @@ from splats import front_camera, random_gaussians
 from gsencoder.app import cli
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.splats import load_splat, save_splat
+from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
 from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, open_package, save_package
 from gsencoder.text.table import make_text_table, save_text_table

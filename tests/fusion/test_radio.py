@@ -11,7 +11,7 @@ from region_scenes import toy_words
 from splats import front_camera
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic import make_room
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.types import Views

@@ -12,7 +12,7 @@ from region_scenes import CAPTIONS, HEIGHT, WIDTH, WORDS, captioned_teacher, lab
 from scene_files import save
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.image_file import read_integers
+from gsencoder.data.readers.images import read_integers
 from gsencoder.fusion.teachers import MissingInput
 from gsencoder.fusion.teachers.build import build_teacher
 from gsencoder.fusion.teachers.regions.captions import read_captions

@@ -18,8 +18,7 @@ from gsencoder.app import cli
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.errors import InputError
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of, words_of
 from gsencoder.fusion.teachers.tower import TransformersConfig

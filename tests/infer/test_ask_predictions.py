@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.truth.caption_text import wrapped_caption
-from gsencoder.data.truth.entries import box_corners
+from gsencoder.data.labels.captions import wrapped_caption
+from gsencoder.data.labels.files import box_corners
 from gsencoder.infer.ask.ask import Question
 from gsencoder.infer.ask.predictions import answer_text, predictions, short_answer, target_corners
 from gsencoder.infer.ask.question_sets import QuestionSet, caption_question, is_question_set, read_question_set

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gsencoder.data.seeding.spacing import scene_spacing
+from gsencoder.data.seeding.points import scene_spacing
 from gsencoder.infer.localize.boxes import Extents, box_around, oriented_axes, score_clusters
 from gsencoder.infer.localize.cluster import cluster
 from gsencoder.types import Gaussians
@@ -53,7 +53,7 @@ def test_the_spacing_of_a_sample_does_not_depend_on_order(
 ) -> None:
     points = rng.random((4000, 3)).astype(np.float32)
     whole = scene_spacing(points)
-    monkeypatch.setattr("gsencoder.data.seeding.spacing.SPACING_SAMPLE", 500)
+    monkeypatch.setattr("gsencoder.data.seeding.points.SPACING_SAMPLE", 500)
     sampled = scene_spacing(points)
     assert sampled == scene_spacing(rng.permutation(points))
     assert sampled == pytest.approx(whole, rel=0.1)

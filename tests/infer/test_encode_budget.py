@@ -11,7 +11,7 @@ from splats import random_gaussians
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.store.folder import features_bytes, load_features, save_features
 from gsencoder.infer.encode import chunks

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gsencoder.app import cli
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 from gsencoder.infer.onnx.export import TOLERANCE, random_cloud
 
 pytestmark = pytest.mark.slow

@@ -17,7 +17,7 @@ from symbolic import symbolic_sizes
 from gsencoder.app import cli
 from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.onnx.export import Cloud, check_cosines, export_onnx, lower, random_cloud

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.truth.entries import box_corners
+from gsencoder.data.labels.files import box_corners
 from gsencoder.infer.ask.ask import Question
 from gsencoder.infer.ask.predictions import predictions, short_answer
 from gsencoder.infer.ask.question_sets import QuestionSet, is_question_set, read_question_set

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from selected_rooms import selected_room
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.splats import load_property, load_splat, save_splat
+from gsencoder.data.splats.files import load_property, load_splat, save_splat
 from gsencoder.infer.draw.boxes_ply import word_color
 from gsencoder.infer.select.file_names import file_stems
 from gsencoder.infer.select.labels_file import LABELS_JSON, LABELS_PLY, read_labels, write_labels

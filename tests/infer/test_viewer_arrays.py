@@ -13,7 +13,7 @@ from viewed_rooms import room_scene, save_viewed_room, search_of
 from viewer_containers import read_container
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.splats import load_splat
+from gsencoder.data.splats.files import load_splat
 from gsencoder.infer.localize import presence
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.localize.relevancy import feature_axes

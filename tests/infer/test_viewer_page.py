@@ -16,7 +16,7 @@ from viewed_rooms import HOSTILE, STUB, name_features, room_scene, save_viewed_r
 from viewer_containers import read_container
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.splats import load_splat
+from gsencoder.data.splats.files import load_splat
 from gsencoder.fusion.store.quantize import compact
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.relevancy import relevancy

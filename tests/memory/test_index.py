@@ -11,7 +11,7 @@ from splats import random_gaussians
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.splats import load_splat, save_splat
+from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
 from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_index_package
 from gsencoder.infer.localize.relevancy import relevancy

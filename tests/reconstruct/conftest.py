@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.types import Scene
 
 

@@ -8,8 +8,7 @@ import torch
 from walls import DEPTH, TILT, cameras, wall_points, wall_views
 
 from gsencoder.data.photographs import Photographs
-from gsencoder.data.seeding.dense import DenseConfig, covered_share, densify
-from gsencoder.data.seeding.hull import outside_hull
+from gsencoder.data.seeding.from_photographs import DenseConfig, covered_share, densify, outside_hull
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.losses import losses_of
 from gsencoder.reconstruct.optimize import Optimizer

@@ -12,7 +12,7 @@ from reconstructions import cut_at, refusal, summary_of
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig, seed
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 from gsencoder.reconstruct import Reconstruction, reconstruct
 from gsencoder.reconstruct import plan as planning
 from gsencoder.reconstruct.budget import BudgetConfig

@@ -10,7 +10,7 @@ from walls import DEPTH, TILT, wall_points, wall_views
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.photographs import Photographs
-from gsencoder.data.seeding.dense import DenseConfig
+from gsencoder.data.seeding.from_photographs import DenseConfig
 from gsencoder.data.seeding.seed import SeedConfig, seed_from_depth
 from gsencoder.reconstruct.start import Start, initial_gaussians
 from gsencoder.types import Scene

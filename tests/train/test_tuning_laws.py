@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.prompt_store import StoredPrompt
+from gsencoder.data.prompts import StoredPrompt
 from gsencoder.train.trainer_config import TrainerConfig
 from gsencoder.train.tuning import run, vlm
 from gsencoder.train.tuning.network import TERM, AnswerObjective

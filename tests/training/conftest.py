@@ -7,8 +7,7 @@ from named_rooms import write_words
 from short_training import QUICK
 
 from gsencoder.app import cli
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 
 
 @pytest.fixture(scope="session")

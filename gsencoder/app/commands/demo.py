@@ -15,8 +15,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file, write_json
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
-from gsencoder.data.splats import save_splat
-from gsencoder.data.synthetic.room import color_words, make_room, write_room
+from gsencoder.data.splats.files import save_splat
+from gsencoder.data.synthetic import color_words, make_room, write_room
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features

@@ -18,11 +18,10 @@ from gsencoder.app.settings.config import CommonConfig, settings, typed
 from gsencoder.core.errors import InputError, SceneWarning, about, counted
 from gsencoder.core.pretrained import digest_files
 from gsencoder.core.process import retain_freed_memory
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.data.seeding.spacing import unit_of
-from gsencoder.data.splats import READABLE
+from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.store.folder import FEATURES_FILE, file_of_teacher, save_features
 from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads, heads_beside
 from gsencoder.fusion.store.words import save_tables

@@ -11,7 +11,7 @@ from gsencoder.app.runs.progress import console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import refuse_several
-from gsencoder.data.scene_paths import check_names, find_scenes
+from gsencoder.data.scenes import check_names, find_scenes
 from gsencoder.evaluate.benchmark_files import BenchmarkProtocol
 from gsencoder.evaluate.protocols.absent import (
     AbsentProtocol,

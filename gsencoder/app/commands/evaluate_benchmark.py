@@ -15,10 +15,8 @@ from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import settings
 from gsencoder.core.errors import InputError, SceneWarning, about, advised, listed
-from gsencoder.data.scene_paths import find_scenes, scene_name
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
-from gsencoder.data.truth.scannetpp_classes import ids_of_benchmark
+from gsencoder.data.labels.classes import COLUMNS, DEFAULT_COLUMN, ClassTable, ids_of_benchmark, read_label_map
+from gsencoder.data.scenes import find_scenes, scene_name
 from gsencoder.evaluate.benchmark_files import (
     BenchmarkProtocol,
     merge_lists,

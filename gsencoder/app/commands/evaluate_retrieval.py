@@ -12,9 +12,8 @@ from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.runs.output_folder import output_folder
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError, SceneWarning, advised, counted, listed
-from gsencoder.data.scene_paths import find_scenes, scene_name
-from gsencoder.data.scenes import load_scene
-from gsencoder.data.truth.view_captions import read_texts, read_view_captions, write_view_captions
+from gsencoder.data.labels.captions import read_texts, read_view_captions, write_view_captions
+from gsencoder.data.scenes import find_scenes, load_scene, scene_name
 from gsencoder.evaluate.files.retrieval import write_scored_pairs
 from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol, evaluate_retrieval, views_of
 from gsencoder.evaluate.retrieval import ScoredPairs

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.data.splats import READABLE
+from gsencoder.data.splats.files import READABLE
 from gsencoder.evaluate.protocols.absent import (
     AbsentProtocol,
 )

@@ -9,8 +9,7 @@ from gsencoder.app.commands.through_head import words_of_head
 from gsencoder.app.runs.progress import Progress
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import retain_freed_memory
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import load_scene
+from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.evaluate.sources import (
     FeatureSource,
     encoder_source,

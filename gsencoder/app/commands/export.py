@@ -12,11 +12,10 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file
 from gsencoder.core.process import Stored
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.data.seeding.spacing import unit_of
-from gsencoder.data.splats import READABLE
+from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.store.folder import load_memories
 from gsencoder.fusion.store.heads_file import copy_heads, heads_beside, heads_of_graph
 from gsencoder.infer.encode.encode import TorchEncoder

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from gsencoder.core.errors import InputError, listed
-from gsencoder.data.readers.camera_file import read_cameras
+from gsencoder.data.readers.transforms_json import read_cameras
 from gsencoder.fusion.store.folder import load_memories, teachers_in
 from gsencoder.fusion.store.memory_file import MEMORY_FILE
 from gsencoder.infer.localize.localize import LocalizeConfig
@@ -38,7 +38,7 @@ def requested_cameras(scene: Scene, pose: str, views: Sequence[str]) -> Requeste
 
     Args:
         scene: whose views and origin they are.
-        pose: path of a JSON file in the form of `gsencoder.data.readers.camera_file`, or empty.
+        pose: path of a JSON file in the form of `gsencoder.data.readers.transforms_json`, or empty.
         views: names of views.
 
     Raises:

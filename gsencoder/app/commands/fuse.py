@@ -21,10 +21,9 @@ from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.process import Device
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import SceneConfig
+from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.data.splats import READABLE
+from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.budget.config import BudgetConfig, check_budget
 from gsencoder.fusion.budget.fuse_within import BudgetFusion
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse

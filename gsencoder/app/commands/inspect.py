@@ -12,12 +12,11 @@ from gsencoder.app.runs.progress import Progress, console
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
-from gsencoder.data.readers.scene_splat import find_splat
-from gsencoder.data.scene_paths import DistinctPaths, find_scenes, has_views, scene_name
-from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
-from gsencoder.data.splat_formats.repair import SplatReport, inspect_splat
-from gsencoder.data.splats import READABLE, read_raw
-from gsencoder.data.video.decode import refuse_video
+from gsencoder.data.readers.layouts import find_splat
+from gsencoder.data.scenes import DistinctPaths, SceneConfig, find_scenes, has_views, load_scene, read_posed, scene_name
+from gsencoder.data.splats.files import READABLE, read_raw
+from gsencoder.data.splats.repair import SplatReport, inspect_splat
+from gsencoder.data.video import refuse_video
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -102,7 +101,7 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
         scene_table,
     )
     from gsencoder.data.check.scene_check import check_scene, findings_of, is_decided
-    from gsencoder.data.scene_facts import scene_facts
+    from gsencoder.data.facts import scene_facts
 
     with summary.step("read"):
         scene = load_scene(path, options=config.data)

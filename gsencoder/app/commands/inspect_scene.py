@@ -11,12 +11,12 @@ from rich.table import Table
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import listed
 from gsencoder.core.files import write_picture
-from gsencoder.data.check.depth_agreement import agreement_map
+from gsencoder.data.check.agreement import agreement_map
 from gsencoder.data.check.epipolar import EpipolarCheck
 from gsencoder.data.check.findings import Finding
 from gsencoder.data.check.scene_check import DepthCheck
-from gsencoder.data.scene_facts import SceneFacts
-from gsencoder.data.seeding.feature_matches import epipolar_distances, fundamental_matrix
+from gsencoder.data.facts import SceneFacts
+from gsencoder.data.seeding.matches import epipolar_distances, fundamental_matrix
 from gsencoder.infer.draw.pictures import contact_sheet, depth_picture
 from gsencoder.types import Views
 from gsencoder.types.orientation import turned

@@ -19,8 +19,8 @@ from gsencoder.core.errors import InputError, about, advised, counted
 from gsencoder.core.files import write_picture
 from gsencoder.core.logs import LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.seeding.spacing import unit_of
+from gsencoder.data.scenes import find_scenes
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
 from gsencoder.fusion.store.folder import file_of_teacher, save_memories
 from gsencoder.fusion.store.memory_file import MEMORY_FILE

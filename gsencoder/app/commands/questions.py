@@ -11,15 +11,12 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.process import Track
-from gsencoder.data.scene_paths import check_names, find_scenes
-from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.truth.expressions import write_scanrefer
-from gsencoder.data.truth.made_expressions import make_expressions
-from gsencoder.data.truth.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
-from gsencoder.data.truth.made_situations import make_situations
-from gsencoder.data.truth.questions import write_scanqa
-from gsencoder.data.truth.seen_objects import SeenScene, see_objects
-from gsencoder.data.truth.write_sqa3d import write_sqa3d
+from gsencoder.data.labels.expressions import write_scanrefer
+from gsencoder.data.labels.made_expressions import make_expressions
+from gsencoder.data.labels.made_questions import KINDS, QuestionsConfig, kind_of, make_questions, make_situations
+from gsencoder.data.labels.questions import write_scanqa, write_sqa3d
+from gsencoder.data.labels.seen_objects import SeenScene, see_objects
+from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene
 
 QUESTIONS, EXPRESSIONS, SITUATED = "questions.json", "expressions.json", "situated_questions.json"
 

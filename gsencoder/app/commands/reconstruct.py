@@ -25,8 +25,8 @@ from gsencoder.core.process import Device, retain_freed_memory
 from gsencoder.core.settings import MEGABYTE
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.data.splats import READABLE, save_splat
-from gsencoder.data.video.frames import RECORD_FILE, VideoConfig
+from gsencoder.data.splats.files import READABLE, save_splat
+from gsencoder.data.video import RECORD_FILE, VideoConfig
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.infer.draw.pictures import contact_sheet
 from gsencoder.reconstruct.budget import choose_scale

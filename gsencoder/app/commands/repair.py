@@ -16,10 +16,8 @@ from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
-from gsencoder.data.scene_paths import has_views
-from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
-from gsencoder.data.splat_formats.repair import repair_splat
-from gsencoder.data.splats import (
+from gsencoder.data.scenes import SceneConfig, has_views, load_scene, read_posed
+from gsencoder.data.splats.files import (
     READABLE,
     WRITABLE,
     RawSplat,
@@ -28,6 +26,7 @@ from gsencoder.data.splats import (
     read_raw,
     save_splat,
 )
+from gsencoder.data.splats.repair import repair_splat
 from gsencoder.types import Scene
 
 Fix = Literal["activated", "nonfinite", "quats", "scales", "opacities", "huge", "duplicates", "floaters", "all"]
@@ -110,7 +109,7 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
     # Only scenes need Pillow and, for some depth sensors, torch.
     from gsencoder.data.check.repair_scene import repair_posed
     from gsencoder.data.check.scene_check import check_scene, findings_of, fit_of, is_decided
-    from gsencoder.data.readers.write_transforms import transforms_of
+    from gsencoder.data.readers.transforms_json import transforms_of
 
     assert config.out is not None
     track, screen = Progress(quiet=config.quiet), console(config.quiet)

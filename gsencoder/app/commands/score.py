@@ -12,9 +12,8 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, write_bytes
-from gsencoder.data.truth.label_sets import COLUMNS, DEFAULT_COLUMN, read_label_map
-from gsencoder.data.truth.scannetpp_classes import ids_of_benchmark
-from gsencoder.data.truth.split_files import read_split
+from gsencoder.data.labels.classes import COLUMNS, DEFAULT_COLUMN, ids_of_benchmark, read_label_map
+from gsencoder.data.labels.files import read_split
 from gsencoder.evaluate.files.class_files import load_classes
 from gsencoder.evaluate.retrieval import Pooling
 from gsencoder.evaluate.score_boxes import score_referring

@@ -15,7 +15,7 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
 from gsencoder.core.process import import_ahead
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.localize.localization_json import words_to_json

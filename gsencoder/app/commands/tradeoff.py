@@ -16,8 +16,7 @@ from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, json_bytes, write_bytes
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.scenes import SceneConfig
+from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol
 from gsencoder.evaluate.tradeoff.halving import HalvingConfig

@@ -18,7 +18,7 @@ from gsencoder.app.runs.work_folder import WorkFolder, folder_beside, prepared_f
 from gsencoder.app.settings.config import CommonConfig, settings
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory, threads_of_torch
-from gsencoder.data.scene_paths import find_scenes
+from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.basis_fit import total_fit
 from gsencoder.fusion.heads.measure import HeadSet

@@ -19,7 +19,7 @@ from gsencoder.core.errors import InputError, counted
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE, read_log
 from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import Device
-from gsencoder.data.prompt_store import PromptStore
+from gsencoder.data.prompts import PromptStore
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.infer.ask.ask import AskConfig
 from gsencoder.infer.ask.server import VlmConfig

@@ -15,10 +15,10 @@ from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.core.errors import BusyError, InputError, SceneWarning, about, listed
 from gsencoder.core.files import lock_folder, plain
 from gsencoder.core.process import Track
-from gsencoder.data.prompt_store import PROMPTS_FILE, PromptStore
+from gsencoder.data.labels.questions import Question as TruthQuestion
+from gsencoder.data.labels.questions import read_questions
+from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.data.truth.questions import Question as TruthQuestion
-from gsencoder.data.truth.questions import read_questions
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.ask.stored_prompts import store_prompt

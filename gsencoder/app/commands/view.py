@@ -15,8 +15,7 @@ from gsencoder.app.runs.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file
 from gsencoder.core.process import accept_stop
-from gsencoder.data.scene_paths import DistinctPaths
-from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.scenes import DistinctPaths, SceneConfig, load_scene
 from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.localize.localize import LocalizeConfig, select_features

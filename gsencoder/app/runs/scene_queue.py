@@ -14,7 +14,7 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import BusyError, InputError, listed
 from gsencoder.core.files import SUMMARY_NAME, plain, read_foreign_text
 from gsencoder.core.process import refuse_several
-from gsencoder.data.scene_paths import check_names, scene_name
+from gsencoder.data.scenes import check_names, scene_name
 
 NOT_COMPARED = ("paths", "out", "overwrite", "quiet", "worker", "resume", "device", "preset")
 """Settings in which two runs with the same results may differ; what a preset sets is compared."""

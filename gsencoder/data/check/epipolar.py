@@ -15,16 +15,15 @@ from jaxtyping import Float64, Int64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.process import Track, untracked
-from gsencoder.data.check.findings import ADVICE, Finding
-from gsencoder.data.check.pose_readings import other_orders, other_poses
+from gsencoder.data.check.findings import ADVICE, Finding, other_orders, other_poses
 from gsencoder.data.readers.undistort import load_pycolmap
-from gsencoder.data.seeding.feature_matches import (
+from gsencoder.data.seeding.matches import (
     PairMatches,
     epipolar_distances,
     fundamental_matrix,
     match_photographs,
+    typical_distance,
 )
-from gsencoder.data.seeding.view_pairs import typical_distance
 from gsencoder.types import Cameras, Views
 
 PICTURE_SIZE = 640

@@ -7,9 +7,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.check.findings import Finding
-from gsencoder.data.check.pose_readings import other_poses
-from gsencoder.data.check.registration_fit import RegistrationFit
+from gsencoder.data.check.agreement import RegistrationFit
+from gsencoder.data.check.findings import Finding, other_poses
 from gsencoder.data.readers.posed import PosedImage, PosedImages
 from gsencoder.data.readers.undistort import CameraModel, focal_count
 

@@ -3,19 +3,191 @@
 A pixel of the photograph is used if its mask file is not 0, alpha is at least one half, it is no background of one
 color (background.py), and it has content in the distorted picture; each counts only where it exists. After scaling a
 pixel counts only if all that it covers does.
+
+Photographs of an object before a background of one color, as renderings and product pictures have.
+
+The color is looked for along the borders of some photographs. It counts as a background where nearly all of them have
+it along nearly all of their border, to within rounding or the noise of JPEG: walls and skies of real photographs vary
+by more, and windows do not surround the picture. In a view the background is what has this color and is connected to
+the border, so that white parts of an object stay.
 """
 
+from collections import Counter
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, UInt8
 
-from gsencoder.data.readers.background import Background, outline
-from gsencoder.data.readers.image_file import read_mask
-from gsencoder.data.readers.images import PictureFiles, PixelGrid
+from gsencoder.core.arrays import even_indices
+from gsencoder.data.readers.images import PictureFiles, PixelGrid, read_mask, read_rgba, read_small
 from gsencoder.data.readers.undistort import RemapCache
+
+LOOKED_AT = 16
+"""So many photographs, evenly spaced, are looked at."""
+EXCEPTIONS = 3
+"""So many of them may lack the background, since the object fills them."""
+MIN_PICTURES = 3
+BORDER_SHARE = 0.8
+"""Share of a picture's border that has the color."""
+EXACT, LOSSY = 2, 10
+"""Largest difference of a color's channels from the background's, of 255, in files that keep every value and others."""
+LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
+SMALLEST_OBJECT = 24
+"""Islands of fewer pixels in the background of a lossy file are noise."""
+DARK = 24
+"""A darker color may also be a part of the picture that the lens or undistortion leaves empty …"""
+SAME_OUTLINE = 0.97
+"""… which is the same in all pictures: of the pixels that are dark in either, this share is dark in both."""
+MIN_SHARE, MAX_SHARE = 0.02, 0.995
+"""Mean share of the pictures' pixels that a background has."""
+SEAM = 2
+"""Pixels this near to the background mix both colors, and are not used."""
+SMALL_SIDE = 400
+"""JPEG files are looked at in about this many pixels a side."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Background:
+    """A background of one color.
+
+    Attributes:
+        color: RGB.
+        share: of the pixels that have it, in the photographs that were looked at.
+    """
+
+    color: tuple[int, int, int]
+    share: float
+
+    def describe(self) -> str:
+        """The color and the share in words."""
+        names = {(255, 255, 255): "white", (0, 0, 0): "black"}
+        return f"{names.get(self.color, f'RGB {self.color}')}, {self.share:.0%} of the pixels"
+
+
+def find_background(paths: Sequence[Path]) -> Background | None:
+    """The background that nearly all photographs have in common; None where there is none.
+
+    Photographs are looked at until so many lack a background that there can be none, which is after four in most
+    scenes.
+
+    Args:
+        paths: of the photographs, none of which has transparency.
+
+    Raises:
+        InputError: a file that is damaged.
+    """
+    sample = [paths[int(row)] for row in even_indices(len(paths), LOOKED_AT)]
+    if len(sample) < MIN_PICTURES:
+        return None
+    return _find(tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in sample))
+
+
+@lru_cache(maxsize=64)
+def _find(files: tuple[tuple[Path, int, int], ...]) -> Background | None:
+    allowed = min(EXCEPTIONS, (len(files) - 1) // 3)
+    colors: list[tuple[int, int, int]] = []
+    pictures: list[tuple[UInt8[np.ndarray, "h w 3"], Path]] = []
+    for path, _, _ in files:
+        picture = read_small(path, SMALL_SIDE)
+        color = _border_color(picture, tolerance_of(path))
+        if color is None:
+            allowed -= 1
+            if allowed < 0:
+                return None
+            continue
+        colors.append(color)
+        pictures.append((picture, path))
+    common = Counter(colors).most_common(1)[0][0]
+    apart = np.abs(np.array(colors) - common).max(axis=1)
+    if int((apart > EXACT).sum()) > allowed:
+        return None
+    regions = [
+        background_pixels(picture, common, path)
+        for (picture, path), far in zip(pictures, apart, strict=True)
+        if far <= EXACT
+    ]
+    share = float(np.mean([region.mean() for region in regions]))
+    if not MIN_SHARE <= share <= MAX_SHARE or (max(common) < DARK and _is_one_outline(regions)):
+        return None
+    return Background(color=common, share=share)
+
+
+def tolerance_of(path: Path) -> int:
+    """How far the background of a file may differ from its color."""
+    return LOSSY if path.suffix.lower() in LOSSY_SUFFIXES else EXACT
+
+
+def _border_color(picture: UInt8[np.ndarray, "h w 3"], tolerance: int) -> tuple[int, int, int] | None:
+    """The color that nearly all of a picture's border has."""
+    border = np.concatenate((picture[0], picture[-1], picture[:, 0], picture[:, -1])).astype(np.int64)
+    middle = np.median(border, axis=0)
+    near = np.abs(border - middle).max(axis=1) <= tolerance
+    if near.mean() < BORDER_SHARE:
+        return None
+    values, counts = np.unique(border[near], axis=0, return_counts=True)
+    red, green, blue = values[counts.argmax()].tolist()
+    # Skies and walls may stay within the noise of JPEG, but not within half of it.
+    spread = np.abs(border[near] - (red, green, blue)).max(axis=1).mean()
+    return (red, green, blue) if spread <= tolerance / 8 else None
+
+
+def background_pixels(
+    picture: UInt8[np.ndarray, "h w 3"], color: tuple[int, int, int], path: Path
+) -> Bool[np.ndarray, "h w"]:
+    """The pixels of a picture that have the color of the background and are connected to the border.
+
+    Args:
+        picture: RGB.
+        color: of the background.
+        path: the file, whose format says how exact the color is.
+    """
+    from scipy import ndimage
+
+    difference = np.abs(picture.astype(np.int16) - np.array(color, np.int16)).max(axis=2)
+    alike = np.asarray(difference <= tolerance_of(path))
+    labels, _ = ndimage.label(alike)
+    on_border = np.unique(np.concatenate((labels[0], labels[-1], labels[:, 0], labels[:, -1])))
+    region = np.isin(labels, on_border[on_border > 0])
+    if path.suffix.lower() in LOSSY_SUFFIXES:
+        islands, count = ndimage.label(~region, structure=np.ones((3, 3), int))
+        small = np.bincount(islands.ravel(), minlength=count + 1) < SMALLEST_OBJECT
+        small[0] = False
+        region |= small[islands]
+    return np.asarray(region)
+
+
+def _is_one_outline(regions: Sequence[Bool[np.ndarray, "h w"]]) -> bool:
+    """Whether all pictures have the same background pixels."""
+    if len({region.shape for region in regions}) > 1:
+        return False
+    first = regions[0]
+    same = [float((first & region).sum() / max(1, (first | region).sum())) for region in regions[1:]]
+    return bool(same) and float(np.median(same)) >= SAME_OUTLINE
+
+
+def outline(path: Path, background: Background | None) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    """Which pixels of a photograph show something, and which show that nothing is there; those between do neither.
+
+    Alpha of one half and more shows something, none (below 1/64) that nothing is there. Beside a background of one
+    color the two nearest pixels do neither.
+
+    Args:
+        path: of the photograph.
+        background: of its scene; None = only its alpha counts.
+    """
+    from scipy import ndimage
+
+    picture, alpha = read_rgba(path)
+    if alpha is not None:
+        return np.asarray(alpha >= 128), np.asarray(alpha < 4)
+    if background is None:
+        return np.ones(picture.shape[:2], bool), np.zeros(picture.shape[:2], bool)
+    region = background_pixels(picture, background.color, path)
+    foreground = ~ndimage.binary_dilation(region, iterations=SEAM)
+    return foreground, np.asarray(ndimage.binary_erosion(region, iterations=1, border_value=1))
 
 
 class _OutlineFiles(PictureFiles[Bool[np.ndarray, "H W"]]):

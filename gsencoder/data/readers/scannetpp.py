@@ -5,18 +5,175 @@ transforms.json, else through its COLMAP model; iphone.py reads the other folder
 photographs, or where it is given itself. The world is that of the laser scan: metres, z up. The COLMAP models and
 the meshes are in it; nerfstudio/transforms.json is not, since its poses went through nerfstudio's convention, which
 exchanges x and y and turns z around. They are taken back here.
+
+The iphone/ folder of a ScanNet++ scene.
+
+It is published as streams: rgb.mkv (rgb.mp4 in older releases), rgb_mask.mkv and depth.bin. The data set's toolkit
+(iphone/prepare_iphone_data.py) extracts them to rgb/frame_NNNNNN.jpg, rgb_masks/frame_NNNNNN.png and
+depth/frame_NNNNNN.png, counted from 0; these are what is read here. Depth is in millimetres, in the photographs' field
+of view at its own size (256 × 192).
+
+Poses are taken from colmap/ (every tenth frame, OPENCV cameras, points), else from nerfstudio/transforms.json, else
+from pose_intrinsic_imu.json: `aligned_pose` there is world_from_camera with OpenCV axes of ARKit's tracking, carried
+into the world of the scan, and `intrinsic` is K.
 """
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float64
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
-from gsencoder.data.readers.iphone import in_world_of_scan, is_iphone, read_iphone
-from gsencoder.data.readers.posed import PosedImages
-from gsencoder.data.readers.transforms_json import read_transforms
+from gsencoder.data.readers.images import SkippedFrames, files_by_stem, is_lost, picture_size, pinhole_of
+from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
+from gsencoder.data.readers.transforms_json import read_json, read_transforms
+from gsencoder.data.readers.undistort import CameraModel
+from gsencoder.types.checks import invert_rigid
+
+PICTURES, DEPTHS, MASKS = "rgb", "depth", "rgb_masks"
+VIDEOS = ("rgb.mkv", "rgb.mp4")
+DEPTH_STREAM = "depth.bin"
+ARKIT_POSES, TRANSFORMS_FILE = "pose_intrinsic_imu.json", "nerfstudio/transforms.json"
+MILLIMETRES = 1e-3
+NERFSTUDIO_FROM_SCAN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+"""(x, y, z) of the scan is (y, x, -z) in transforms.json; the matrix is its own inverse."""
+
+
+def is_iphone(folder: Path) -> bool:
+    """Whether a folder is such a folder, extracted or not."""
+    has_poses = is_colmap_model(folder / "colmap") or any(
+        (folder / name).is_file() for name in (TRANSFORMS_FILE, ARKIT_POSES)
+    )
+    streams = any((folder / name).is_file() for name in (*VIDEOS, DEPTH_STREAM))
+    return has_poses and ((folder / PICTURES).is_dir() or streams or folder.name == "iphone")
+
+
+def read_iphone(folder: Path, *, allow_outside: bool = False, depth_scale: float | None = None) -> PosedImages:
+    """Reads the extracted frames that have a pose.
+
+    Args:
+        folder: iphone/ of a scene.
+        allow_outside: let links in it lead out of it.
+        depth_scale: metres for each step of a depth file; None = 0.001.
+
+    Raises:
+        InputError: frames are not extracted, or none has a pose, and as `read_colmap` and `read_transforms`.
+
+    Warns:
+        SceneWarning: depth is not extracted, or missing for some frames.
+    """
+    pictures = folder / PICTURES
+    if not pictures.is_dir():
+        video = next((name for name in VIDEOS if (folder / name).is_file()), None)
+        stream = video or f"{VIDEOS[0]}, which is not here either,"
+        raise InputError(
+            f"{folder}: the frames are still to be extracted from {stream} to {PICTURES}/ by the toolkit of ScanNet++ "
+            f"(iphone/prepare_iphone_data.py) or by: mkdir {PICTURES}; ffmpeg -i {video or VIDEOS[0]} -start_number 0 "
+            f"-q:v 1 {PICTURES}/frame_%06d.jpg"
+        )
+    if is_colmap_model(folder / "colmap"):
+        # Names in the model of some releases begin with the name of a folder.
+        posed = read_colmap(folder / "colmap", pictures, folder, allow_outside=allow_outside, base_names=True)
+    elif (folder / TRANSFORMS_FILE).is_file():
+        posed = in_world_of_scan(
+            read_transforms(
+                folder / TRANSFORMS_FILE,
+                allow_outside=allow_outside,
+                pictures=pictures,
+                masks=folder / MASKS if (folder / MASKS).is_dir() else None,
+            )
+        )
+    else:
+        posed = _read_arkit(folder, allow_outside=allow_outside)
+    scale = depth_scale or MILLIMETRES
+    images = tuple(_with_files(image, folder, scale, allow_outside=allow_outside) for image in posed.images)
+    if (folder / DEPTHS).is_dir():
+        without_depth = [image.name for image in images if image.depth is None]
+        warn_left_out(without_depth, len(images), str(folder), "depth files", "those views have no depth")
+    elif (folder / DEPTH_STREAM).is_file():
+        warnings.warn(
+            f"{folder}: {DEPTH_STREAM} is still to be extracted to {DEPTHS}/ by the toolkit of ScanNet++ "
+            "(iphone/prepare_iphone_data.py); the views have no depth",
+            SceneWarning,
+            stacklevel=2,
+        )
+    return replace(posed, images=images)
+
+
+def in_world_of_scan(posed: PosedImages) -> PosedImages:
+    """Views of a nerfstudio/transforms.json of ScanNet++, in the world of its scan."""
+    images = tuple(replace(image, cam_from_world=image.cam_from_world @ NERFSTUDIO_FROM_SCAN) for image in posed.images)
+    # Row vectors times R are Rᵀ times column vectors: the inverse of the exchange.
+    return replace(posed, images=images, points=posed.points @ NERFSTUDIO_FROM_SCAN[:3, :3])
+
+
+def _read_arkit(folder: Path, *, allow_outside: bool) -> PosedImages:
+    """Frames with the poses of ARKit."""
+    path = folder / ARKIT_POSES
+    frames = read_json(path)
+    if not isinstance(frames, dict) or not all(isinstance(frame, dict) for frame in frames.values()):
+        raise InputError(f"{path}: expected an object of frames with aligned_pose and intrinsic")
+    pictures = files_by_stem(folder / PICTURES, (".jpg", ".jpeg", ".png"))
+    skipped = SkippedFrames(str(folder / PICTURES), len(pictures))
+    images: list[PosedImage] = []
+    for stem, picture in pictures.items():
+        where = f"{path}: {stem[:120]}"
+        inside(folder, str(picture.relative_to(folder)), where, allow_outside=allow_outside)
+        if stem not in frames:
+            skipped.add(f"are not in {ARKIT_POSES}", picture.name)
+            continue
+        if frames[stem].get("aligned_pose") is None:
+            skipped.add("have no aligned_pose", picture.name)
+            continue
+        pose = _matrix(frames[stem], "aligned_pose", 4, where)
+        if is_lost(pose):
+            skipped.add("lost tracking", picture.name)
+            continue
+        K = _matrix(frames[stem], "intrinsic", 3, where)
+        images.append(
+            PosedImage(
+                name=picture.name,
+                camera=pinhole_of(K[0, 0], K[1, 1], K[0, 2], K[1, 2], picture, where),
+                cam_from_world=invert_rigid(rigid_pose(pose, where)),
+                image=picture,
+            )
+        )
+    if not images:
+        raise InputError(f"{folder}: no view: of {len(pictures)} pictures in {PICTURES}/ {skipped.describe()}")
+    skipped.warn()
+    return PosedImages(source=str(path), images=tuple(images))
+
+
+def _matrix(frame: dict[str, object], key: str, size: int, where: str) -> Float64[np.ndarray, "n n"]:
+    try:
+        matrix = np.array(frame.get(key), np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    if matrix.shape != (size, size):
+        raise InputError(f"{where}: {key} must have {size} rows of {size} numbers")
+    return matrix
+
+
+def _with_files(image: PosedImage, folder: Path, scale: float, *, allow_outside: bool) -> PosedImage:
+    """A frame with its mask and depth. Depth has its own size: its camera is the photograph's, scaled, without
+    distortion."""
+    mask, depth = (folder / name / f"{image.image.stem}.png" for name in (MASKS, DEPTHS))
+    for file in (mask, depth):
+        if file.is_file():
+            inside(folder, str(file.relative_to(folder)), f"{folder}: {image.name}", allow_outside=allow_outside)
+    if mask.is_file():
+        image = replace(image, mask=mask)
+    if not depth.is_file():
+        return image
+    width, height = picture_size(depth)
+    x, y = width / image.camera.width, height / image.camera.height
+    fx, fy, cx, cy = image.camera.pinhole_params()
+    camera = CameraModel(model="PINHOLE", width=width, height=height, params=(fx * x, fy * y, cx * x, cy * y))
+    return replace(image, depth=depth, depth_camera=camera, depth_scale=scale)
+
 
 NERFSTUDIO = ("nerfstudio/transforms.json", "nerfstudio/transforms_undistorted.json")
 DSLR_PICTURES = ("resized_images", "undistorted_images")

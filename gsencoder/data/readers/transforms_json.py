@@ -12,19 +12,31 @@ Beside the keys of those programs these are read: `instance_file_path` (integers
 file's pixels) and `depth_from_color` (4×4, OpenCV axes, world units), where depth is not registered to color,
 `depth_measure` ("z", the default, or "ray", the distance from the camera) and `no_depth` (a step that means none,
 besides 0).
+
+Cameras from a JSON file: poses that a user asks from, in world coordinates.
+
+A file holds one camera or a list of cameras, each an object of
+
+    cam_from_world     4×4 (or its upper 3 rows), OpenCV axes; or, in its place,
+    transform_matrix   world_from_camera with OpenGL axes, as in nerfstudio's transforms.json
+    fx, fy, cx, cy     in pixels, pixel centers at .5; or nerfstudio's fl_x and fl_y
+    width, height      in pixels; or nerfstudio's w and h
+
+Other keys are refused, since lens distortion and misspelled keys are among them.
 """
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, listed
 from gsencoder.core.files import check_written, read_foreign_text
-from gsencoder.data.readers.image_file import picture_info, picture_size
+from gsencoder.data.readers.images import picture_info, picture_size
 from gsencoder.data.readers.posed import (
     PosedImage,
     PosedImages,
@@ -33,10 +45,12 @@ from gsencoder.data.readers.posed import (
     rigid_pose,
     warn_left_out,
 )
-from gsencoder.data.readers.undistort import CameraModel, check_camera
-from gsencoder.data.splat_formats.ply import read_points
-from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
+from gsencoder.data.readers.undistort import CameraModel, check_camera, focal_count
+from gsencoder.data.splats.ply import read_points
+from gsencoder.types import Cameras, SceneObject
+from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid, move_origin
 from gsencoder.types.orientation import EXCHANGED
+from gsencoder.types.scene import intrinsic_matrix
 
 PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
 NERFSTUDIO_DEPTH_SCALE = 1e-3
@@ -354,3 +368,227 @@ def _focal(data: dict[str, Any], frame: dict[str, Any], length: str, angle: str,
                 raise InputError(f"{where}: {angle} must lie between 0 and pi radians, got {field:g}")
             return side / (2 * math.tan(field / 2))
     return None
+
+
+DISTORTION = {
+    "SIMPLE_PINHOLE": (),
+    "PINHOLE": (),
+    "SIMPLE_RADIAL": ("k1",),
+    "RADIAL": ("k1", "k2"),
+    "OPENCV": ("k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+    "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+}
+"""Names of the parameters that follow the principal point, of the camera models that transforms.json can express."""
+
+
+def transforms_of(posed: PosedImages, folder: Path) -> dict[str, Any]:
+    """The content of a transforms.json in `folder` for posed images; points are part of it where a .ply holds them.
+
+    Raises:
+        InputError: a camera model that the format does not have.
+    """
+    content: dict[str, Any] = {}
+    if posed.metres_per_unit is not None:
+        content["metres_per_unit"] = posed.metres_per_unit
+    if posed.up is not None:
+        content["up"] = posed.up.tolist()
+    if posed.points_file is not None:
+        content["ply_file_path"] = _relative(posed.points_file, folder)
+    content["frames"] = [_frame(image, folder) for image in posed.images]
+    return content
+
+
+def _frame(image: PosedImage, folder: Path) -> dict[str, Any]:
+    frame: dict[str, Any] = {"file_path": _relative(image.image, folder), **_camera_entry(image.camera)}
+    world_from_cam = invert_rigid(image.cam_from_world) @ OPENCV_FROM_OPENGL
+    frame["transform_matrix"] = world_from_cam.tolist()
+    if image.depth is not None:
+        frame["depth_file_path"] = _relative(image.depth, folder)
+        frame["depth_unit_scale_factor"] = image.depth_scale
+        if image.depth_measure != "z":
+            frame["depth_measure"] = image.depth_measure
+        if image.no_depth is not None:
+            frame["no_depth"] = image.no_depth
+        if image.depth_camera is not None:
+            frame["depth_camera"] = _camera_entry(image.depth_camera)
+        if image.depth_from_color is not None:
+            frame["depth_from_color"] = image.depth_from_color.tolist()
+    if image.mask is not None:
+        frame["mask_path"] = _relative(image.mask, folder)
+    if image.instance is not None:
+        frame["instance_file_path"] = _relative(image.instance, folder)
+    return frame
+
+
+def _camera_entry(camera: CameraModel) -> dict[str, Any]:
+    if camera.model not in DISTORTION or (camera.model == "FULL_OPENCV" and any(camera.params[9:])):
+        raise InputError(
+            f"camera model {camera.model} cannot be written to a transforms.json; it has {', '.join(DISTORTION)}"
+        )
+    fx, fy, cx, cy = camera.pinhole_params()
+    names, first = DISTORTION[camera.model], focal_count(camera) + 2
+    return {
+        "camera_model": "OPENCV_FISHEYE" if camera.model == "OPENCV_FISHEYE" else "OPENCV",
+        "w": camera.width,
+        "h": camera.height,
+        "fl_x": fx,
+        "fl_y": fy,
+        "cx": cx,
+        "cy": cy,
+        **{name: value for name, value in zip(names, camera.params[first:], strict=False) if value},
+    }
+
+
+def _relative(path: Path, folder: Path) -> str:
+    return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
+
+
+MAX_NAME = 1000
+"""Largest number of characters of a name, as in a text table."""
+
+
+def read_objects(path: Path) -> tuple[SceneObject, ...]:
+    """Reads a list of {id, name or null, aabb_min, aabb_max, placed, views, max_pixels}; boxes in world coordinates.
+
+    Ids start at 1, since 0 stands for no object in an instance map.
+
+    Raises:
+        InputError: not such a list, a repeated id, or a box whose lower corner is not below the upper one.
+    """
+    rows = read_json(path)
+    if not isinstance(rows, list):
+        raise InputError(f"{path}: expected a list of objects")
+    objects: list[SceneObject] = []
+    for index, row in enumerate(rows):
+        where = f"{path}: object {index}"
+        if not isinstance(row, dict):
+            raise InputError(f"{where}: expected an object with id, name, aabb_min and aabb_max")
+        name = row.get("name")
+        if name is not None and not isinstance(name, str):
+            raise InputError(f"{where}: name must be a word or null, got {str(name)[:40]!r}")
+        if name is not None and len(name) > MAX_NAME:
+            raise InputError(f"{where}: name has {len(name):,} characters, expected at most {MAX_NAME:,}")
+        lower, upper = _corner(row, "aabb_min", where), _corner(row, "aabb_max", where)
+        if (lower > upper).any():
+            raise InputError(f"{where}: aabb_min {lower.tolist()} is not below aabb_max {upper.tolist()}")
+        placed = row.get("placed", True)
+        if not isinstance(placed, bool):
+            raise InputError(f"{where}: placed must be true or false, got {str(placed)[:40]!r}")
+        objects.append(
+            SceneObject(
+                id=_count(row, "id", where, None, minimum=1),
+                name=name,
+                aabb_min=lower,
+                aabb_max=upper,
+                placed=placed,
+                views=_count(row, "views", where, 0),
+                max_pixels=_count(row, "max_pixels", where, 0),
+            )
+        )
+    ids: set[int] = set()
+    for item in objects:
+        if item.id in ids:
+            raise InputError(f"{path}: id {item.id} belongs to several objects")
+        ids.add(item.id)
+    return tuple(objects)
+
+
+def _count(row: dict[str, Any], key: str, where: str, default: int | None, minimum: int = 0) -> int:
+    value = row.get(key, default)
+    if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value < 2**31:
+        raise InputError(f"{where}: {key} must be a whole number from {minimum}, got {str(value)[:40]!r}")
+    return value
+
+
+def _corner(row: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "3"]:
+    values = row.get(key)
+    good = isinstance(values, list) and len(values) == 3
+    good = good and all(isinstance(v, (int, float)) and not isinstance(v, bool) and abs(v) < 1e15 for v in values or [])
+    if not good or not all(map(math.isfinite, values or [])):
+        raise InputError(f"{where}: {key} must be three finite numbers, got {str(values)[:60]}")
+    return np.array(values, np.float64)
+
+
+MAX_CAMERAS = 10_000
+MAX_PIXELS = 1 << 24
+"""A blend of so many pixels takes gigabytes."""
+POSES = ("cam_from_world", "transform_matrix")
+INTRINSICS = (("fx", "fl_x"), ("fy", "fl_y"), ("cx",), ("cy",), ("width", "w"), ("height", "h"))
+"""Each with the names that it may have."""
+
+
+def read_cameras(path: Path, origin: Float64[np.ndarray, "3"]) -> Cameras:
+    """Reads the cameras of a JSON file.
+
+    Args:
+        path: of the file.
+        origin: of the scene, which is taken off the poses in float64.
+
+    Returns:
+        The cameras in the order of the file, relative to the origin.
+
+    Raises:
+        InputError: no such file, not JSON, no camera, a key that is missing or unknown, a pose that is not rigid,
+            values that are not finite, sizes or focal lengths that are not positive; the message names the camera.
+    """
+    data = read_json(path, unique_keys=True)
+    entries = data if isinstance(data, list) else [data]
+    if not 1 <= len(entries) <= MAX_CAMERAS:
+        raise InputError(f"{path}: expected a camera or a list of 1 to {MAX_CAMERAS:,} cameras, got {len(entries)}")
+    poses, Ks, sizes = [], [], []
+    for index, entry in enumerate(entries):
+        where = f"{path}: camera {index}" if isinstance(data, list) else str(path)
+        if not isinstance(entry, dict):
+            raise InputError(f"{where}: expected an object with cam_from_world, fx, …, got {str(entry)[:40]!r}")
+        pose, K, size = _camera_of_file(entry, where)
+        poses.append(move_origin(pose, origin))
+        Ks.append(K)
+        sizes.append(size)
+    widths, heights = np.array(sizes, np.int32).T.copy()
+    return Cameras(
+        cam_from_world=np.array(poses, np.float32), Ks=np.array(Ks, np.float32), widths=widths, heights=heights
+    )
+
+
+def _camera_of_file(
+    entry: dict[str, Any], where: str
+) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "3 3"], tuple[int, int]]:
+    """Pose, intrinsics and size (width, height)."""
+    keys = (*POSES, *(name for names in INTRINSICS for name in names))
+    unknown = [str(key)[:40] for key in entry if key not in keys]
+    if unknown:
+        raise InputError(f"{where}: unknown keys {listed(unknown)}; expected {', '.join(keys)}")
+    pose_key = _key(entry, POSES, where)
+    pose = rigid_pose(read_matrix(entry, pose_key, where), f"{where}: {pose_key}")
+    if pose_key == "transform_matrix":
+        pose = invert_rigid(pose @ OPENCV_FROM_OPENGL)
+    fx, fy, cx, cy, width, height = (_number(entry, _key(entry, names, where), where) for names in INTRINSICS)
+    for name, focal in (("fx", fx), ("fy", fy)):
+        # Cameras are held in float32, in which 1e-50 is zero and 1e300 infinite.
+        if not 1e-9 <= focal <= 1e9:
+            raise InputError(f"{where}: {name} must be a positive number of pixels, 1e-9 to 1e9, got {focal:g}")
+    for name, value in (("cx", cx), ("cy", cy)):
+        if not abs(value) <= 1e9:
+            raise InputError(f"{where}: {name} must lie within 1e9 pixels, got {value:g}")
+    for name, side in (("width", width), ("height", height)):
+        if side < 1 or side != int(side):
+            raise InputError(f"{where}: {name} must be a whole number of pixels from 1, got {side:g}")
+    if width * height > MAX_PIXELS:
+        raise InputError(f"{where}: {width:g}×{height:g} pixels are too many; expected at most {MAX_PIXELS:,}")
+    return pose, intrinsic_matrix(fx, fy, cx, cy), (int(width), int(height))
+
+
+def _key(entry: dict[str, Any], names: tuple[str, ...], where: str) -> str:
+    """The one of these names that an object has."""
+    there = [name for name in names if entry.get(name) is not None]
+    if len(there) != 1:
+        expected = " or ".join(names)
+        raise InputError(f"{where}: {expected} is missing" if not there else f"{where}: expected {expected}, got both")
+    return there[0]
+
+
+def _number(entry: dict[str, Any], key: str, where: str) -> float:
+    value = number(entry, key, where)
+    assert value is not None
+    return value

@@ -8,10 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.seeding.depth import read_rgbd
-from gsencoder.data.seeding.flat import flat_gaussians
-from gsencoder.data.seeding.points import seed_from_points
-from gsencoder.data.seeding.surface_grid import SurfaceGrid
+from gsencoder.data.seeding.depth import SurfaceGrid, read_rgbd
+from gsencoder.data.seeding.points import flat_gaussians, seed_from_points
 from gsencoder.types import Gaussians, Views
 
 LATTICE = 0.5

@@ -13,7 +13,7 @@ from typing import Any
 
 from gsencoder.core.errors import InputError, SceneWarning, counted
 from gsencoder.core.files import write_json
-from gsencoder.data.truth.entries import (
+from gsencoder.data.labels.files import (
     Corner,
     box_corners,
     entries_of,
@@ -27,7 +27,7 @@ from gsencoder.data.truth.entries import (
     text_list,
     text_value,
 )
-from gsencoder.data.truth.questions import Question
+from gsencoder.data.labels.questions import Question
 from gsencoder.evaluate.scores.answers import TOP
 
 EXPECTED = "question_id and answer_top10, or scene_id, situation, question and answer"

@@ -11,8 +11,8 @@ from typing import Any
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
-from gsencoder.data.truth.caption_text import wrapped_caption
-from gsencoder.data.truth.entries import (
+from gsencoder.data.labels.captions import wrapped_caption
+from gsencoder.data.labels.files import (
     Entry,
     box_corners,
     corner_bounds,

@@ -6,10 +6,8 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.files import csv_text, write_bytes
-from gsencoder.data.truth.checked_files import read_checked_text
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.label_sets import COLUMNS, read_class_list, scannet_classes
-from gsencoder.data.truth.scannetpp_classes import read_instance_classes
+from gsencoder.data.labels.classes import COLUMNS, ClassTable, read_class_list, read_instance_classes, scannet_classes
+from gsencoder.data.labels.files import read_checked_text
 
 MAX_CLASS_BYTES = 4 << 20
 

@@ -16,9 +16,8 @@ import numpy as np
 from gsencoder.core.archive import read_npz
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.files import write_bytes
-from gsencoder.data.truth.checked_files import read_checked_text
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.number_files import mask_bytes, read_mask, read_whole_numbers
+from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.files import mask_bytes, read_checked_text, read_mask, read_whole_numbers
 from gsencoder.evaluate.files.scan_truth import instances_of_scan
 from gsencoder.evaluate.files.scene_folders import scene_files
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks

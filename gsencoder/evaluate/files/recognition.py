@@ -11,7 +11,7 @@ from typing import Any
 
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.files import write_json
-from gsencoder.data.truth.entries import (
+from gsencoder.data.labels.files import (
     Entry,
     entries_of,
     name_value,

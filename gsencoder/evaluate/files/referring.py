@@ -17,7 +17,9 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.files import write_json
-from gsencoder.data.truth.entries import (
+from gsencoder.data.labels.classes import COLUMNS, read_label_map
+from gsencoder.data.labels.expressions import boxes_from_scans, described, read_scanrefer
+from gsencoder.data.labels.files import (
     Corner,
     Entry,
     annotation_id,
@@ -31,9 +33,6 @@ from gsencoder.data.truth.entries import (
     scene_name,
     shown,
 )
-from gsencoder.data.truth.expression_boxes import boxes_from_scans
-from gsencoder.data.truth.expressions import described, read_scanrefer
-from gsencoder.data.truth.label_sets import COLUMNS, read_label_map
 from gsencoder.evaluate.scores.referring import (
     PredictedBoxes,
     ReferredObject,

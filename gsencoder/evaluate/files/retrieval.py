@@ -24,7 +24,7 @@ import numpy as np
 from gsencoder.core.archive import read_npz
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.files import write_bytes
-from gsencoder.data.truth.checked_files import PICKLE_SUFFIXES
+from gsencoder.data.labels.files import PICKLE_SUFFIXES
 from gsencoder.evaluate.retrieval import Pooling, ScoredPairs, view_scores
 
 EXPECTED = "an .npz with queries and scores, or with queries, views and texts"

@@ -1,6 +1,6 @@
 """Truth of instances and of semantic labels from the labels of scans of ScanNet or ScanNet++, without files in between.
 
-It is what `gsencoder.data.truth.write_truth` writes, and what ScanNet's own export writes: class id · 1000 + objectId
+It is what `gsencoder.data.labels.expressions` writes, and what ScanNet's own export writes: class id · 1000 + objectId
 + 1, and class ids.
 """
 
@@ -10,11 +10,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Int64
 
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.label_sets import ids_of_names, vertex_classes
-from gsencoder.data.truth.scannet_labels import find_scannet_files, read_scannet_labels
-from gsencoder.data.truth.scannetpp_labels import find_scannetpp_files, read_scannetpp_labels
-from gsencoder.data.truth.write_truth import instance_truth
+from gsencoder.data.labels.classes import ClassTable, ids_of_names, vertex_classes
+from gsencoder.data.labels.expressions import instance_truth
+from gsencoder.data.labels.scans import (
+    find_scannet_files,
+    find_scannetpp_files,
+    read_scannet_labels,
+    read_scannetpp_labels,
+)
 from gsencoder.evaluate.scores.instance_masks import InstanceTruth
 from gsencoder.types import MeshLabels
 

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError, counted, listed, readable
 from gsencoder.core.files import check_foreign
-from gsencoder.data.truth.checked_files import PICKLE_SUFFIXES
-from gsencoder.data.truth.scannet_labels import AGGREGATION
-from gsencoder.data.truth.scannetpp_labels import ANNOTATION
+from gsencoder.data.labels.files import PICKLE_SUFFIXES
+from gsencoder.data.labels.scans import AGGREGATION, ANNOTATION
 
 RESULT_FILES = ("semantic_instance_evaluation.txt", "semantic_label_evaluation.txt")
 """What ScanNet's scripts write into the folder of the predictions."""

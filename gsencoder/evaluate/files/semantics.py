@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Int64
 
 from gsencoder.core.errors import InputError, about
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.number_files import read_whole_numbers
-from gsencoder.data.truth.write_truth import IDS_PER_CLASS
+from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.expressions import IDS_PER_CLASS
+from gsencoder.data.labels.files import read_whole_numbers
 from gsencoder.evaluate.files.scan_truth import classes_of_scan
 from gsencoder.evaluate.files.scene_folders import scene_files
 from gsencoder.evaluate.scores.semantics import LabelCounts, count_labels

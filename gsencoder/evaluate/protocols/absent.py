@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.data.truth.scene_labels import with_counted_views
 from gsencoder.evaluate.boxes import is_seen
 from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features

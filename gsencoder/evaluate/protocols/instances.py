@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 
 from gsencoder.core.errors import InputError, about
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.write_truth import instance_truth
+from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.expressions import instance_truth
 from gsencoder.evaluate.class_scores import class_cosines
 from gsencoder.evaluate.labeled_points import LabeledPoints
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.data.truth.scene_labels import with_counted_views
 from gsencoder.evaluate.boxes import Hit, accuracy, queryable_objects, score_boxes
 from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features

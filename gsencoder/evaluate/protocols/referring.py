@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.truth.expressions import Expression, read_nr3d, read_scanrefer
+from gsencoder.data.labels.expressions import Expression, read_nr3d, read_scanrefer
 from gsencoder.evaluate.scores.referring import PredictedBoxes
 from gsencoder.infer.ask.question_words import words_in
 from gsencoder.infer.localize.localize import LocalizeConfig, localize

@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, listed
+from gsencoder.data.labels.captions import ViewCaption
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.data.truth.view_captions import ViewCaption
 from gsencoder.evaluate.retrieval import Pooling
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.localize.gaussian_products import GaussianProducts

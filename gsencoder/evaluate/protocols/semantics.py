@@ -14,9 +14,8 @@ import numpy as np
 from jaxtyping import Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.label_sets import vertex_classes
-from gsencoder.data.truth.nearest_vertices import VOTERS, labels_of_vertices
+from gsencoder.data.labels.classes import ClassTable, vertex_classes
+from gsencoder.data.labels.mesh import VOTERS, labels_of_vertices
 from gsencoder.evaluate.class_scores import nearest_class
 from gsencoder.evaluate.labeled_points import LabeledPoints
 from gsencoder.evaluate.scores.semantics import BACKGROUND

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.questions import Question
+from gsencoder.data.labels.questions import Question
 from gsencoder.evaluate.scores.java_metrics import JavaTools
 from gsencoder.evaluate.scores.lemmas import Lemmatize, f_value, wordnet_lemmatizer
 from gsencoder.evaluate.scores.sentences import SentenceScores, Tokens, score_sentences

@@ -18,9 +18,9 @@ from jaxtyping import Float64
 
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.caption_text import wrapped_caption
-from gsencoder.data.truth.entries import Corner
-from gsencoder.data.truth.expressions import Expression
+from gsencoder.data.labels.captions import wrapped_caption
+from gsencoder.data.labels.expressions import Expression
+from gsencoder.data.labels.files import Corner
 from gsencoder.evaluate.scores.box_overlap import box_ious
 from gsencoder.evaluate.scores.java_metrics import JavaTools
 from gsencoder.evaluate.scores.sentences import SentenceScores, score_sentences

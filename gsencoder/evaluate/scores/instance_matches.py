@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.write_truth import IDS_PER_CLASS
+from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.expressions import IDS_PER_CLASS
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth
 
 OVERLAPS = np.append(np.arange(0.5, 0.95, 0.05), 0.25)

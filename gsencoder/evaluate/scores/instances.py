@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.scores.instance_matches import OVERLAPS, SceneMatches
 
 

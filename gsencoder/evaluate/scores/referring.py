@@ -17,7 +17,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.expressions import Expression, described
+from gsencoder.data.labels.expressions import Expression, described
 from gsencoder.evaluate.scores.box_overlap import box_ious
 
 IOUS = (0.25, 0.5)

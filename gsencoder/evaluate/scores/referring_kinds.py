@@ -9,8 +9,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from gsencoder.data.truth.expressions import Expression
-from gsencoder.data.truth.label_sets import ids_of_names, scannet_classes
+from gsencoder.data.labels.classes import ids_of_names, scannet_classes
+from gsencoder.data.labels.expressions import Expression
 
 OTHERS = "others"
 """Class of the objects that are of none of the 17 named ones."""

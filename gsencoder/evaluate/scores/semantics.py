@@ -24,7 +24,7 @@ from jaxtyping import Int64
 
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, listed
-from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.scores.means import mean_of
 
 BACKGROUND = ("wall", "floor", "ceiling")

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import exact_settings
+from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.data.seeding.spacing import unit_of
-from gsencoder.data.truth.scene_labels import with_counted_views
 from gsencoder.evaluate.protocols.localization import score_queries
 from gsencoder.evaluate.protocols.naming import compare_names
 from gsencoder.evaluate.tradeoff.fused_scene import hit_scores, stored_bytes

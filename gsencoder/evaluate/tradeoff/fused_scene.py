@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.data.truth.scene_labels import with_counted_views
 from gsencoder.evaluate.boxes import Hit
 from gsencoder.evaluate.protocols.localization import score_queries
 from gsencoder.evaluate.tradeoff.stage import Inputs, Score

@@ -12,8 +12,8 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Track, untracked
 from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.data.seeding.spacing import unit_of
 from gsencoder.evaluate.tradeoff.encoder import encoder_of
 from gsencoder.evaluate.tradeoff.exponents import Exponent, fit_exponent
 from gsencoder.evaluate.tradeoff.fused_scene import taught_scene

@@ -27,9 +27,9 @@ from gsencoder.core.archive import (
 from gsencoder.core.arrays import rise_within
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import parallel
-from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
-from gsencoder.data.scene_paths import kind_of_path
-from gsencoder.data.splats import FINGERPRINT_DIGITS, fingerprint
+from gsencoder.data.scene_arrays import check_splat, read_scene, read_space, scene_parts, space_parts
+from gsencoder.data.scenes import kind_of_path
+from gsencoder.data.splats.files import FINGERPRINT_DIGITS, fingerprint
 from gsencoder.fusion.store.memory_file import MEMORY_FILE, read_memory, write_memory
 from gsencoder.fusion.store.package import PACKAGE_FILE, load_package
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, QueryMemory, Scene

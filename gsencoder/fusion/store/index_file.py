@@ -7,8 +7,8 @@ import numpy as np
 
 from gsencoder.core.archive import LONGEST_NUMBER, Archive, archive_bytes, shape_only, write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.data.archive_records import read_space, scaled_halves, scene_parts, space_parts
-from gsencoder.data.splats import FINGERPRINT_DIGITS
+from gsencoder.data.scene_arrays import read_space, scaled_halves, scene_parts, space_parts
+from gsencoder.data.splats.files import FINGERPRINT_DIGITS
 from gsencoder.types import GaussianFeatures, Scene
 
 INDEX_FORM = 2

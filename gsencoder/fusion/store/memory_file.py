@@ -9,7 +9,7 @@ import numpy as np
 from gsencoder.core.archive import Archive, write_archive
 from gsencoder.core.arrays import rise_within
 from gsencoder.core.errors import InputError
-from gsencoder.data.archive_records import (
+from gsencoder.data.scene_arrays import (
     bank_parts,
     check_splat,
     read_bank,
@@ -17,7 +17,7 @@ from gsencoder.data.archive_records import (
     scaled_halves,
     space_parts,
 )
-from gsencoder.data.splats import fingerprint
+from gsencoder.data.splats.files import fingerprint
 from gsencoder.types import Gaussians, QueryMemory
 
 MEMORY_FILE = "memory.safetensors"

@@ -26,8 +26,8 @@ from gsencoder.core.archive import (
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file
 from gsencoder.core.settings import MEGABYTE
-from gsencoder.data.archive_records import check_splat, read_scene, read_space, scene_parts, space_parts
-from gsencoder.data.splats import FINGERPRINT_DIGITS, fingerprint, load_splat, save_splat
+from gsencoder.data.scene_arrays import check_splat, read_scene, read_space, scene_parts, space_parts
+from gsencoder.data.splats.files import FINGERPRINT_DIGITS, fingerprint, load_splat, save_splat
 from gsencoder.fusion.store.index_file import INDEX_FORM, read_index, write_index
 from gsencoder.fusion.store.quantize import CompactFeatures, compact, compact_within
 from gsencoder.types import FeatureBasis, GaussianFeatures, Scene

@@ -13,7 +13,7 @@ from typing import Any
 from gsencoder.core.errors import InputError, SceneWarning, WriteError, about
 from gsencoder.core.files import plain, sealed, unsealed, write_bytes, write_json
 from gsencoder.core.process import Clock, Track, untracked
-from gsencoder.data.splats import fingerprint
+from gsencoder.data.splats.files import fingerprint
 from gsencoder.infer.ask.ask import Asker, Prompt, Question, chosen_mark, prompt_messages
 from gsencoder.infer.ask.questions import BatchQuestion, read_answers
 from gsencoder.infer.ask.reply import Reply, ServerError

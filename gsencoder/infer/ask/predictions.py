@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from gsencoder.data.truth.caption_text import wrapped_caption
-from gsencoder.data.truth.entries import box_corners
+from gsencoder.data.labels.captions import wrapped_caption
+from gsencoder.data.labels.files import box_corners
 from gsencoder.infer.ask.prompts import THOUGHT
 from gsencoder.infer.ask.question_sets import Benchmark, SetQuestion
 

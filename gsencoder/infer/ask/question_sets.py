@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed
 from gsencoder.core.files import open_foreign
-from gsencoder.data.truth.entries import Corner, corner_bounds, entries_of, object_of, read_benchmark_json, scene_name
-from gsencoder.data.truth.expressions import Expression, read_scanrefer
-from gsencoder.data.truth.questions import Question as TruthQuestion
-from gsencoder.data.truth.questions import read_questions as read_truth
+from gsencoder.data.labels.expressions import Expression, read_scanrefer
+from gsencoder.data.labels.files import Corner, corner_bounds, entries_of, object_of, read_benchmark_json, scene_name
+from gsencoder.data.labels.questions import Question as TruthQuestion
+from gsencoder.data.labels.questions import read_questions as read_truth
 from gsencoder.infer.ask.ask import Question
 from gsencoder.infer.ask.prompts import Task
 from gsencoder.infer.ask.questions import BatchQuestion

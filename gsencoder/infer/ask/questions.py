@@ -9,7 +9,7 @@ from typing import Any
 
 from gsencoder.core.errors import InputError, about, readable
 from gsencoder.core.files import MODEL_BYTES, check_written, read_foreign
-from gsencoder.data.truth.checked_files import read_checked_text
+from gsencoder.data.labels.files import read_checked_text
 from gsencoder.infer.ask.ask import Question
 from gsencoder.infer.ask.prompts import Task, check_question
 

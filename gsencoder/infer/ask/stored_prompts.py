@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float16
 
-from gsencoder.data.prompt_store import PromptStore, StoredPrompt
+from gsencoder.data.prompts import PromptStore, StoredPrompt
 from gsencoder.infer.ask.ask import Asker, Question
 from gsencoder.infer.ask.prompts import encoded_picture
 from gsencoder.infer.views.selection import ViewSet

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.seeding.spacing import scene_spacing
+from gsencoder.data.seeding.points import scene_spacing
 from gsencoder.infer.localize.boxes import Cluster, boxes_of_word, score_clusters
 from gsencoder.infer.localize.cluster import EPS_SPACINGS, cluster, cluster_by_gaps
 from gsencoder.infer.localize.presence import Evidence, Presence, probability
@@ -24,7 +24,7 @@ from gsencoder.types import GaussianFeatures, Gaussians, Localization, Scene
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocalizeConfig:
     """How words become boxes. Relative lengths are in units of the scene's spacing
-    (`gsencoder.data.seeding.spacing.scene_spacing`)."""
+    (`gsencoder.data.seeding.points.scene_spacing`)."""
 
     mode: Literal["centered", "raw"] = field(
         default="centered", metadata={"help": "cosines after removing each side's mean, or as they are"}

@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int32
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import check_written, read_foreign_text, write_json
-from gsencoder.data.splats import load_property, load_splat, save_splat
+from gsencoder.data.splats.files import load_property, load_splat, save_splat
 from gsencoder.infer.draw.boxes_ply import word_color
 from gsencoder.infer.localize.boxes import box_around
 from gsencoder.infer.select.selection import Selection

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Track, untracked
-from gsencoder.data.seeding.spacing import scene_spacing
+from gsencoder.data.seeding.points import scene_spacing
 from gsencoder.fusion.orbit_views import with_views
 from gsencoder.infer.localize.localize import LocalizeConfig, localize, select_features
 from gsencoder.infer.select.grow import grow

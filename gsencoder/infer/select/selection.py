@@ -13,7 +13,7 @@ from gsencoder.fusion.orbit_views import check_orbits
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SelectConfig:
     """How the Gaussians of a box become those of an object. Lengths are in spacings of the scene
-    (`gsencoder.data.seeding.spacing.scene_spacing`)."""
+    (`gsencoder.data.seeding.points.scene_spacing`)."""
 
     grow: bool = field(
         default=True,

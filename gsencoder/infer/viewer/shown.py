@@ -10,8 +10,8 @@ from jaxtyping import Float32, Int64, UInt8, UInt16
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.data.splat_formats.raw import RawSplat, logits_from_opacities, logs_from_scales
-from gsencoder.data.splat_formats.spz import write_spz
+from gsencoder.data.splats.packed import write_spz
+from gsencoder.data.splats.raw import RawSplat, logits_from_opacities, logs_from_scales
 from gsencoder.infer.draw.pictures import fit_pca_colors, pca_picture
 from gsencoder.infer.localize.localize import select_features
 from gsencoder.types import GaussianFeatures, Gaussians, Scene, SceneObject

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, Integer
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.process import parallel
-from gsencoder.data.seeding.spacing import NEIGHBOR
+from gsencoder.data.seeding.points import NEIGHBOR
 from gsencoder.geometry import covariances
 from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.split_gaussians import patches

@@ -15,7 +15,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files import check_written, plain
 from gsencoder.core.pretrained import load_pretrained
 from gsencoder.core.process import ProcessRank, Track, untracked
-from gsencoder.data.prompt_store import PromptStore
+from gsencoder.data.prompts import PromptStore
 from gsencoder.train.checkpoint import TrainingState
 from gsencoder.train.distributed import check_agreement
 from gsencoder.train.trainer import Trainer

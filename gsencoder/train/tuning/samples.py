@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.prompt_store import PromptStore, StoredPrompt
+from gsencoder.data.prompts import PromptStore, StoredPrompt
 
 IGNORED = -100
 """The label of tokens without a loss."""

@@ -8,8 +8,7 @@ from asked_rooms import KEY, save_room
 from reconstructions import QUICK
 
 from gsencoder.app import cli
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 
 
 @pytest.fixture(scope="module")

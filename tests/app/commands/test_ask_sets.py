@@ -11,10 +11,10 @@ from command_runs import refusal, results_of
 from named_rooms import write_words
 
 from gsencoder.app import cli
+from gsencoder.data.labels.expressions import read_scanrefer
+from gsencoder.data.labels.questions import read_questions
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.synthetic.room import make_room, write_room
-from gsencoder.data.truth.expressions import read_scanrefer
-from gsencoder.data.truth.questions import read_questions
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.answer_sheets import add_expressions, add_pictures, add_questions
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.evaluate.files.answer_predictions import read_answer_predictions

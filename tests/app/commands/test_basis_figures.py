@@ -10,9 +10,8 @@ from text_towers import WORDS, save_graph, save_tokenizer
 from gsencoder.app import cli
 from gsencoder.app.commands.basis_figures import describe_basis
 from gsencoder.data.scenes import load_scene
-from gsencoder.data.splats import save_splat
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.splats.files import save_splat
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.basis_fit import basis_fit
 from gsencoder.fusion.store.folder import load_features
 from gsencoder.fusion.teachers.palette import PaletteConfig, PaletteTeacher

@@ -13,7 +13,7 @@ from viewed_rooms import STUB
 
 from gsencoder.app import cli
 from gsencoder.app.commands import export, repair, view
-from gsencoder.data.splats import save_splat
+from gsencoder.data.splats.files import save_splat
 
 COMMANDS = {
     "view": (["view", "features"], "page.html"),

@@ -7,8 +7,7 @@ from command_runs import refusal
 from named_rooms import write_words
 
 from gsencoder.app.commands import evaluate_sources
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 
 
 @pytest.fixture

@@ -16,9 +16,8 @@ from gsencoder.app import cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.check.findings import Finding
 from gsencoder.data.check.repair_scene import repair_posed
-from gsencoder.data.readers.transforms_json import read_transforms
+from gsencoder.data.readers.transforms_json import read_transforms, transforms_of
 from gsencoder.data.readers.undistort import CameraModel
-from gsencoder.data.readers.write_transforms import transforms_of
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.types import Cameras
 from gsencoder.types.checks import OPENCV_FROM_OPENGL

@@ -10,9 +10,8 @@ from PIL import Image
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
-from gsencoder.data.splats import save_splat
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.splats.files import save_splat
+from gsencoder.data.synthetic import make_room, write_room
 
 pytestmark = pytest.mark.slow
 

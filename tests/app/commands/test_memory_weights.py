@@ -10,8 +10,7 @@ from named_rooms import write_words
 from training_scenes import SMALL
 
 from gsencoder.app import cli
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.store.folder import load_memories
 from gsencoder.fusion.teachers.palette import PaletteConfig, PaletteTeacher
 from gsencoder.models.encoder import GaussianEncoder

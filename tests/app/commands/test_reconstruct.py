@@ -14,7 +14,7 @@ from reconstructions import QUICK, interrupt, never, refusal, summary_of
 from gsencoder.app import cli
 from gsencoder.app.commands import reconstruct as command
 from gsencoder.core.errors import InputError
-from gsencoder.data.splats import load_splat
+from gsencoder.data.splats.files import load_splat
 from gsencoder.reconstruct import run as reconstruct
 from gsencoder.reconstruct.score import split
 

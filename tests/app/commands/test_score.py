@@ -12,8 +12,7 @@ from forked_ranks import RankServer
 from named_rooms import write_words
 
 from gsencoder.app import cli
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.files.instances import write_instance_prediction
 from gsencoder.evaluate.scores.instance_masks import prediction_of_masks
 

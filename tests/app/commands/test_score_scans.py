@@ -9,11 +9,11 @@ from command_runs import refusal, results_of
 from labeled_scans import ROOM_NAMES, group, names_of_room, write_scannet_labels, write_scannet_scan
 
 from gsencoder.app import cli
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.truth.label_sets import ids_of_names, read_label_map
-from gsencoder.data.truth.number_files import read_whole_numbers, write_whole_numbers
-from gsencoder.data.truth.scannet_labels import read_scannet_labels
-from gsencoder.data.truth.write_truth import write_instance_truth, write_semantic_truth
+from gsencoder.data.labels.classes import ids_of_names, read_label_map
+from gsencoder.data.labels.expressions import write_instance_truth, write_semantic_truth
+from gsencoder.data.labels.files import read_whole_numbers, write_whole_numbers
+from gsencoder.data.labels.scans import read_scannet_labels
+from gsencoder.data.synthetic import make_room
 from gsencoder.evaluate.files.instances import write_instance_prediction
 from gsencoder.evaluate.scores.instance_masks import prediction_of_masks
 from gsencoder.text.table import make_text_table, save_text_table

@@ -10,7 +10,7 @@ from command_runs import refusal, results_of
 from selected_rooms import EMBEDDINGS, selected_room, words
 
 from gsencoder.app import cli
-from gsencoder.data.splats import load_splat
+from gsencoder.data.splats.files import load_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
 from gsencoder.infer.select.holes import find_holes

@@ -14,7 +14,7 @@ from tuning_pairs import make_model
 
 from gsencoder.app import cli
 from gsencoder.core.logs import read_log
-from gsencoder.data.prompt_store import PromptStore
+from gsencoder.data.prompts import PromptStore
 
 pytest.importorskip("peft")
 transformers = pytest.importorskip("transformers")

@@ -12,8 +12,8 @@ from gsencoder.app.commands.fuse import load_weights_spaces
 from gsencoder.app.commands.question_scenes import scene_folders
 from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.core.errors import InputError
-from gsencoder.data.scene_paths import find_scenes
-from gsencoder.data.splats import read_raw
+from gsencoder.data.scenes import find_scenes
+from gsencoder.data.splats.files import read_raw
 from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, load_memories
 from gsencoder.fusion.store.memory_file import MEMORY_FILE
 from gsencoder.fusion.store.package import PACKAGE_FILE

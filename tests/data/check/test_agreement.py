@@ -7,26 +7,28 @@ import pytest
 from scipy.spatial.transform import Rotation
 from textured_box import HALF, box_cameras, box_views
 
-from gsencoder.data.check.color_agreement import color_correlations, grey_pictures, view_correlations
-from gsencoder.data.check.depth_agreement import (
+from gsencoder.data.check.agreement import (
     CLIP,
     MIN_SAMPLES,
+    MIN_SHARED,
     SAMPLES,
     DepthViews,
+    _details,
     agreement,
     agreement_map,
+    color_correlations,
     depth_views,
+    fit_registration,
+    grey_pictures,
     on_surface,
     pair_offsets,
     residuals,
     shared_samples,
+    view_correlations,
     world_samples,
 )
-from gsencoder.data.check.pose_readings import other_orders
-from gsencoder.data.check.readings import _best_factor, other_readings
-from gsencoder.data.check.registration_fit import MIN_SHARED, _details, fit_registration
-from gsencoder.data.check.scene_check import _needed, check_depth, check_scene
-from gsencoder.data.check.stray_views import fit_pose, surface_normals, view_spreads
+from gsencoder.data.check.findings import _best_factor, other_orders, other_readings
+from gsencoder.data.check.scene_check import _needed, check_depth, check_scene, fit_pose, surface_normals, view_spreads
 from gsencoder.types import Views
 from gsencoder.types.checks import invert_rigid, transform
 

@@ -21,8 +21,8 @@ from gsencoder.data.check.epipolar import (
     mean_error,
     near_pairs,
 )
-from gsencoder.data.check.pose_readings import other_poses
-from gsencoder.data.seeding.feature_matches import PairMatches, epipolar_distances, fundamental_matrix
+from gsencoder.data.check.findings import other_poses
+from gsencoder.data.seeding.matches import PairMatches, epipolar_distances, fundamental_matrix
 from gsencoder.types import Cameras
 
 NAMES = tuple(f"{view}.png" for view in range(6))

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.check.agreement import RegistrationFit
 from gsencoder.data.check.findings import Finding
-from gsencoder.data.check.registration_fit import RegistrationFit
 from gsencoder.data.check.repair_scene import focal_times, repair_posed
 from gsencoder.data.readers.posed import PosedImage, PosedImages
-from gsencoder.data.readers.transforms_json import read_transforms
+from gsencoder.data.readers.transforms_json import DISTORTION, read_transforms, transforms_of
 from gsencoder.data.readers.undistort import CameraModel
-from gsencoder.data.readers.write_transforms import DISTORTION, transforms_of
 from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 
 PINHOLE = CameraModel(model="PINHOLE", width=64, height=48, params=(50.0, 51.0, 32.0, 24.0))

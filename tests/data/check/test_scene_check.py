@@ -11,7 +11,7 @@ from splats import front_camera
 from textured_box import box_cameras, box_views, look
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.data.check.depth_agreement import agreement_map, depth_views, residuals
+from gsencoder.data.check.agreement import agreement_map, depth_views, residuals
 from gsencoder.data.check.epipolar import FEATURES, check_matches, consistent_matches, judge_matches
 from gsencoder.data.check.scene_check import (
     DepthCheck,
@@ -25,7 +25,7 @@ from gsencoder.data.check.scene_check import (
     wrong_size,
 )
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.data.seeding.feature_matches import PairMatches, match_photographs
+from gsencoder.data.seeding.matches import PairMatches, match_photographs
 from gsencoder.types import Cameras, Scene, Views
 from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 

@@ -11,13 +11,13 @@ from PIL import Image
 
 from gsencoder.app.cli import main
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.write_transforms import transforms_of
-from gsencoder.data.scene_facts import scene_facts
+from gsencoder.data.facts import scene_facts
+from gsencoder.data.readers.transforms_json import transforms_of
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.seeding.seed import choose_source, seed
-from gsencoder.data.splat_formats.raw import opacities_from_logits
-from gsencoder.data.splat_formats.repair import inspect_splat
-from gsencoder.data.splats import load_splat, read_raw
+from gsencoder.data.splats.files import load_splat, read_raw
+from gsencoder.data.splats.raw import opacities_from_logits
+from gsencoder.data.splats.repair import inspect_splat
 
 MASK = np.full((120, 160), 255, np.uint8)
 MASK[60:, 80:] = 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsencoder.data.readers.registration import register_depth
+from gsencoder.data.readers.depth_images import register_depth
 
 
 def test_registered_depth_follows_a_turned_and_shifted_sensor_pixel_by_pixel() -> None:

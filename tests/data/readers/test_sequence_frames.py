@@ -11,10 +11,18 @@ from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.posed import MAX_COORDINATE, choose_origin, inside, number, rigid_pose
-from gsencoder.data.readers.replica import DEFAULT_PARAMETERS, read_replica
+from gsencoder.data.readers.rgbd import (
+    DEFAULT_PARAMETERS,
+    KINECTS,
+    interpolate_pose,
+    is_seven_scenes,
+    is_tum,
+    read_replica,
+    read_seven_scenes,
+    read_trajectory,
+    read_tum,
+)
 from gsencoder.data.readers.scannetpp import device_folder, read_scannetpp
-from gsencoder.data.readers.seven_scenes import is_seven_scenes, read_seven_scenes
-from gsencoder.data.readers.tum import KINECTS, interpolate_pose, is_tum, read_trajectory, read_tum
 from gsencoder.types.checks import invert_rigid
 
 

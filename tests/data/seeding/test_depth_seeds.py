@@ -8,15 +8,14 @@ from scipy.spatial import cKDTree
 from seed_views import TILTED, K, camera, colors_of, frames, normals_of, plane_depth, rays, same, sphere_depth
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.seeding.depth import depth_samples, surface_pixels
-from gsencoder.data.seeding.flat import flat_gaussians, quats_from_normals
+from gsencoder.data.seeding.depth import LAYER, SurfaceGrid, depth_samples, surface_pixels
+from gsencoder.data.seeding.points import flat_gaussians, quats_from_normals
 from gsencoder.data.seeding.seed import (
     SeedConfig,
     seed,
     seed_from_depth,
 )
-from gsencoder.data.seeding.surface_grid import LAYER, SurfaceGrid
-from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
 
 
@@ -229,7 +228,7 @@ class TestDepth:
             seed_from_depth(views, voxel=0.05)
 
     def test_a_grid_that_has_to_grow_holds_the_sums_of_every_voxel_facing_and_layer(self, rng, monkeypatch):
-        monkeypatch.setattr("gsencoder.data.seeding.surface_grid.MIN_SLOTS", 2)
+        monkeypatch.setattr("gsencoder.data.seeding.depth.MIN_SLOTS", 2)
         points = rng.uniform(-0.25, 0.25, (3000, 3)).astype(np.float32)
         normals = rng.standard_normal((3000, 3)).astype(np.float32)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)

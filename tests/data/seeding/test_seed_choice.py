@@ -15,7 +15,7 @@ from gsencoder.data.seeding.seed import (
     seed,
     seed_from_depth,
 )
-from gsencoder.data.synthetic.room import make_room
+from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
 
 

@@ -9,15 +9,16 @@ from textured_box import box_cameras, box_views
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.data.seeding.feature_matches import fundamental_matrix, match_photographs
 from gsencoder.data.seeding.from_photographs import MIN_COVERAGE, _spread_neighbors
-from gsencoder.data.seeding.triangulate import triangulate
-from gsencoder.data.seeding.view_pairs import (
+from gsencoder.data.seeding.matches import (
     DEPTHS,
     choose_pairs,
     depth_range_of_cameras,
+    fundamental_matrix,
+    match_photographs,
     nearest_distances,
     overlaps,
+    triangulate,
     typical_distance,
 )
 from gsencoder.types import Cameras

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.labels.classes import ClassTable
 
 TABLE = ClassTable(names=("bed", "chair", "wall"), ids=(4, 5, 1), groups={"head": ("chair", "wall"), "tail": ("bed",)})
 

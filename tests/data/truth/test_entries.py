@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.entries import (
+from gsencoder.data.labels.files import (
     annotation_id,
     box_corners,
     corner_bounds,

@@ -8,9 +8,8 @@ import pytest
 from labeled_scans import group, write_scannet_labels
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.truth.expression_boxes import boxes_from_labels, boxes_from_scans
-from gsencoder.data.truth.expressions import Expression
-from gsencoder.data.truth.scannet_labels import read_scannet_labels
+from gsencoder.data.labels.expressions import Expression, boxes_from_labels, boxes_from_scans
+from gsencoder.data.labels.scans import read_scannet_labels
 
 # A quarter turn about z, and a shift: aligned (x, y, z) = (-y + 10, x, z - 1).
 ALIGNMENT = np.array([[0, -1, 0, 10], [1, 0, 0, 0], [0, 0, 1, -1], [0, 0, 0, 1]], np.float64)

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.entries import MAX_TEXT, box_corners, corner_bounds
-from gsencoder.data.truth.expressions import Expression, read_nr3d, read_scanrefer, write_scanrefer
+from gsencoder.data.labels.expressions import Expression, read_nr3d, read_scanrefer, write_scanrefer
+from gsencoder.data.labels.files import MAX_TEXT, box_corners, corner_bounds
 
 NR3D = {
     "assignmentid": "14",

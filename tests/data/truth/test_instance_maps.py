@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from splats import front_camera, random_gaussians
 
-from gsencoder.data.truth.mesh_instances import MeshInstances, draw_instances
-from gsencoder.data.truth.scene_labels import with_counted_views
+from gsencoder.data.labels.mesh import MeshInstances, draw_instances
+from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.types import MeshLabels, Scene, SceneObject, Views
 
 

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.label_sets import (
+from gsencoder.data.labels.classes import (
     COLUMNS,
+    ClassTable,
     ids_of_names,
     read_class_list,
     read_label_map,
     scannet_classes,
     vertex_classes,
 )
-from gsencoder.data.truth.split_files import read_split
-from gsencoder.data.truth.write_truth import instance_truth, write_instance_truth, write_semantic_truth
+from gsencoder.data.labels.expressions import instance_truth, write_instance_truth, write_semantic_truth
+from gsencoder.data.labels.files import read_split
 from gsencoder.types import MeshLabels
 
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.truth.expressions import read_scanrefer, write_scanrefer
-from gsencoder.data.truth.made_expressions import make_expressions
-from gsencoder.data.truth.made_situations import make_situations, side_of
-from gsencoder.data.truth.questions import read_questions
-from gsencoder.data.truth.seen_objects import SeenObject, SeenScene, see_objects
-from gsencoder.data.truth.write_sqa3d import write_sqa3d
+from gsencoder.data.labels.expressions import read_scanrefer, write_scanrefer
+from gsencoder.data.labels.made_expressions import make_expressions
+from gsencoder.data.labels.made_questions import make_situations, side_of
+from gsencoder.data.labels.questions import read_questions, write_sqa3d
+from gsencoder.data.labels.seen_objects import SeenObject, SeenScene, see_objects
+from gsencoder.data.synthetic import make_room
 
 
 @pytest.fixture(scope="module")

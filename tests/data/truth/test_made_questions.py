@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.synthetic.room import color_words, make_room
-from gsencoder.data.truth.color_names import RANGES, color_counts, color_word, inner_pixels
-from gsencoder.data.truth.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
-from gsencoder.data.truth.questions import Question, read_questions, write_scanqa
-from gsencoder.data.truth.seen_objects import SeenObject, SeenScene, see_objects
+from gsencoder.data.labels.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
+from gsencoder.data.labels.names import RANGES, color_counts, color_word, inner_pixels
+from gsencoder.data.labels.questions import Question, read_questions, write_scanqa
+from gsencoder.data.labels.seen_objects import SeenObject, SeenScene, see_objects
+from gsencoder.data.synthetic import color_words, make_room
 from gsencoder.types import Scene
 
 ALL = QuestionsConfig(balance=False, per_kind=100)

@@ -9,10 +9,15 @@ import pytest
 from labeled_scans import group, write_ply, write_scannet_labels, write_scannetpp_labels
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth import segment_files
-from gsencoder.data.truth.mesh_file import read_mesh, read_vertex_labels
-from gsencoder.data.truth.scannet_labels import find_scannet_files, read_axis_alignment, read_scannet_labels
-from gsencoder.data.truth.scannetpp_labels import find_scannetpp_files, read_scannetpp_labels
+from gsencoder.data.labels import scans as segment_files
+from gsencoder.data.labels.mesh import read_mesh, read_vertex_labels
+from gsencoder.data.labels.scans import (
+    find_scannet_files,
+    find_scannetpp_files,
+    read_axis_alignment,
+    read_scannet_labels,
+    read_scannetpp_labels,
+)
 from gsencoder.types import MeshLabels
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [4, 4, 4], [5, 5, 5]], np.float32)

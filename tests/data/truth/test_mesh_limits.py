@@ -8,9 +8,8 @@ import pytest
 from labeled_scans import group, write_ply, write_scannet_labels, write_scannetpp_labels
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.mesh_file import read_mesh
-from gsencoder.data.truth.scannet_labels import read_scannet_labels
-from gsencoder.data.truth.scannetpp_labels import read_scannetpp_labels
+from gsencoder.data.labels.mesh import read_mesh
+from gsencoder.data.labels.scans import read_scannet_labels, read_scannetpp_labels
 
 VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3], [4, 4, 4], [5, 5, 5]], np.float32)
 SEGMENTS = np.array([7, 7, 2, 9, 9, 4])

@@ -5,8 +5,8 @@ import pytest
 from sklearn.neighbors import KNeighborsClassifier
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth import nearest_vertices
-from gsencoder.data.truth.nearest_vertices import labels_of_gaussians, labels_of_vertices, nearest_rows
+from gsencoder.data.labels import mesh as nearest_vertices
+from gsencoder.data.labels.mesh import labels_of_gaussians, labels_of_vertices, nearest_rows
 
 
 def points(rng: np.random.Generator, count: int) -> np.ndarray:

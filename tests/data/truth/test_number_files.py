@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth import number_files
-from gsencoder.data.truth.checked_files import LIST_BYTES, SCENE_BYTES, check_file, read_checked_text
-from gsencoder.data.truth.number_files import mask_bytes, read_mask, read_whole_numbers, write_whole_numbers
+from gsencoder.data.labels import files as number_files
+from gsencoder.data.labels.files import (
+    LIST_BYTES,
+    SCENE_BYTES,
+    check_file,
+    mask_bytes,
+    read_checked_text,
+    read_mask,
+    read_whole_numbers,
+    write_whole_numbers,
+)
 
 
 def written(path: Path, content: bytes) -> Path:

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.questions import Question, read_questions, read_scanqa, read_sqa3d, write_scanqa
+from gsencoder.data.labels.questions import Question, read_questions, read_scanqa, read_sqa3d, write_scanqa
 
 
 def entry(**changes: Any) -> dict[str, Any]:

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from gsencoder.data.truth.english_nouns import alike, is_plural, plural, with_article
-from gsencoder.data.truth.relations import (
+from gsencoder.data.labels.names import alike, is_plural, plural, with_article
+from gsencoder.data.labels.seen_objects import (
+    SeenObject,
     beside,
     clearly_nearer,
     gap,
@@ -18,7 +19,6 @@ from gsencoder.data.truth.relations import (
     stands_on,
     supporter,
 )
-from gsencoder.data.truth.seen_objects import SeenObject
 
 Point = tuple[float, float, float]
 

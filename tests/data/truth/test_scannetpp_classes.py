@@ -7,8 +7,7 @@ import pytest
 from labeled_scans import group, write_scannetpp_labels
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.scannetpp_classes import ids_of_benchmark, read_benchmark_map, read_instance_classes
+from gsencoder.data.labels.classes import ClassTable, ids_of_benchmark, read_benchmark_map, read_instance_classes
 from gsencoder.evaluate.files.class_files import load_classes
 from gsencoder.evaluate.files.scan_truth import classes_of_scan, instances_of_scan
 

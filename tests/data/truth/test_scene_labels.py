@@ -15,11 +15,11 @@ from rgbd_layouts import write_scannet_frames
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.scene_facts import scene_facts
+from gsencoder.data.facts import scene_facts
+from gsencoder.data.labels.mesh import MeshInstances, draw_instances
+from gsencoder.data.labels.scans import find_labels, is_placed, with_counted_views
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.truth.mesh_instances import MeshInstances, draw_instances
-from gsencoder.data.truth.scene_labels import find_labels, is_placed, with_counted_views
+from gsencoder.data.synthetic import make_room
 from gsencoder.evaluate.boxes import queryable_objects
 from gsencoder.types import MeshLabels, Scene
 

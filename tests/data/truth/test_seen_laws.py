@@ -10,13 +10,11 @@ import pytest
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.color_names import RANGES, color_counts, color_word, hsv
-from gsencoder.data.truth.made_expressions import make_expressions
-from gsencoder.data.truth.made_questions import QuestionsConfig, make_questions
-from gsencoder.data.truth.made_situations import make_situations, side_of
-from gsencoder.data.truth.questions import Question, read_questions, read_sqa3d
-from gsencoder.data.truth.seen_objects import COLOR_VIEWS, SeenObject, SeenScene, see_objects
-from gsencoder.data.truth.write_sqa3d import write_sqa3d
+from gsencoder.data.labels.made_expressions import make_expressions
+from gsencoder.data.labels.made_questions import QuestionsConfig, make_questions, make_situations, side_of
+from gsencoder.data.labels.names import RANGES, color_counts, color_word, hsv
+from gsencoder.data.labels.questions import Question, read_questions, read_sqa3d, write_sqa3d
+from gsencoder.data.labels.seen_objects import COLOR_VIEWS, SeenObject, SeenScene, see_objects
 from gsencoder.types import Scene, SceneObject, Views
 
 RED, BLUE, GREEN = (200, 20, 30), (20, 60, 220), (20, 160, 40)

@@ -6,7 +6,7 @@ from pans import HEIGHT, WALL, WIDTH, blurred, looking_at, wallpaper
 from scipy.ndimage import gaussian_filter, zoom
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.video.choose import BLOCK, Course, choose_frames, follow, laplacian_variance, median_motion
+from gsencoder.data.video import BLOCK, Course, choose_frames, follow, laplacian_variance, median_motion
 
 
 @pytest.mark.parametrize(("right", "down"), [(0, 0), (5, 0), (-7, 11), (20, -3), (0, 25)])

@@ -12,9 +12,8 @@ from pans import blurred, looking_at
 from PIL import Image
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.image_file import picture_size
-from gsencoder.data.video.decode import Video, color_picture, is_video
-from gsencoder.data.video.frames import RECORD_FILE, VideoConfig, take_frames
+from gsencoder.data.readers.images import picture_size
+from gsencoder.data.video import RECORD_FILE, Video, VideoConfig, color_picture, is_video, take_frames
 
 av = pytest.importorskip("av")
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.truth.questions import Question
+from gsencoder.data.labels.questions import Question
 from gsencoder.evaluate.files.answer_predictions import read_answer_predictions, write_answer_predictions
 
 SCANQA = (

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.entries import box_corners
+from gsencoder.data.labels.files import box_corners
 from gsencoder.evaluate.files.caption_predictions import (
     read_caption_predictions,
     write_box_captions,

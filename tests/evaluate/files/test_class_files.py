@@ -7,8 +7,8 @@ import pytest
 from labeled_scans import group, write_scannet_labels
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.number_files import write_whole_numbers
+from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.files import write_whole_numbers
 from gsencoder.evaluate.files.class_files import load_classes, write_classes
 from gsencoder.evaluate.files.scan_truth import classes_of_scan, instances_of_scan
 from gsencoder.evaluate.files.scene_folders import scene_files

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.class_table import ClassTable
-from gsencoder.data.truth.number_files import read_mask, read_whole_numbers, write_whole_numbers
+from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.files import read_mask, read_whole_numbers, write_whole_numbers
 from gsencoder.evaluate.files.instances import (
     match_instance_files,
     read_instance_prediction,

@@ -10,7 +10,7 @@ import pytest
 from labeled_scans import group, write_scannet_labels
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.truth.expressions import read_scanrefer, write_scanrefer
+from gsencoder.data.labels.expressions import read_scanrefer, write_scanrefer
 from gsencoder.evaluate.files.recognition import (
     read_recognition_predictions,
     read_recognition_truth,

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.questions import Question
+from gsencoder.data.labels.questions import Question
 from gsencoder.evaluate.scores.answers import (
     clean_answer,
     match_cleaned,

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.caption_text import wrapped_caption
-from gsencoder.data.truth.expressions import Expression
+from gsencoder.data.labels.captions import wrapped_caption
+from gsencoder.data.labels.expressions import Expression
 from gsencoder.evaluate.scores.dense_captions import (
     CaptionedBox,
     CaptionedObject,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
 from gsencoder.evaluate.scores.instance_matches import MAX_TABLE, match_instances
 from gsencoder.evaluate.scores.instances import average_precision, instance_scores

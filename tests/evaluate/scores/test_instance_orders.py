@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from instance_scenes import BED, CHAIR, CLASSES, VERTICES, Mask, aps, masks_of, scored, truth_of
 
-from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.scores.instance_masks import InstanceTruth, prediction_of_masks
 from gsencoder.evaluate.scores.instance_matches import OVERLAPS, match_instances
 from gsencoder.evaluate.scores.instances import InstanceScores, instance_scores

@@ -5,7 +5,7 @@ import math
 import pytest
 from instance_scenes import BED, CHAIR, SOFA, aps, masks_of, scored, truth_of
 
-from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.scores.instance_matches import OVERLAPS, match_instances
 
 

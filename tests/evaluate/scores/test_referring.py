@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.expressions import Expression
+from gsencoder.data.labels.expressions import Expression
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.evaluate.scores.box_overlap import box_ious
 from gsencoder.evaluate.scores.referring import (

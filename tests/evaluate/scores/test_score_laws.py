@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.expressions import Expression
-from gsencoder.data.truth.questions import Question
+from gsencoder.data.labels.expressions import Expression
+from gsencoder.data.labels.questions import Question
 from gsencoder.evaluate.scores.answers import clean_answer, match_cleaned, score_answers
 from gsencoder.evaluate.scores.box_overlap import box_ious
 from gsencoder.evaluate.scores.dense_captions import (

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import accuracy_score, jaccard_score, recall_score
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.truth.class_table import ClassTable
+from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.scores.semantics import LabelCounts, SemanticScores, count_labels, semantic_scores
 
 CLASSES = ClassTable(names=("wall", "bed", "chair", "sofa"), ids=(1, 4, 5, 6))

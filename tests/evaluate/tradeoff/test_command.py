@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from gsencoder.app import cli
-from gsencoder.data.synthetic.room import make_room, write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.text.table import make_text_table, save_text_table
 
 pytestmark = pytest.mark.slow

@@ -10,8 +10,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.data.synthetic.room import make_room
-from gsencoder.data.synthetic.write import write_room
+from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.tradeoff.reconstruction import ReconstructionScene, reconstruction_stage
 from gsencoder.evaluate.tradeoff.stage import Inputs
 from gsencoder.reconstruct.knobs import ReconstructionSettings

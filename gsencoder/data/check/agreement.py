@@ -1,0 +1,507 @@
+"""How well the depth images of posed views agree: each carried into the others, under the poses and intrinsics given.
+
+A view's depth pixels are points in the world. Where such a point projects into another view with depth z, and that
+view's own depth image says d there, r = z / d − 1 is zero up to noise and the size of a pixel, unless something hides
+the point there. Wrong axes, poses, scales and intrinsics spread r.
+
+Whether depth and photographs belong to one camera: the focal length and place of a color camera under which the
+photographs show the same details at the same places.
+
+Pixels whose depth two views agree on are one place. A color camera beside the depth camera sees it at
+f (X + t) / Z + c; with the right f and t both photographs have the same details there.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from gsencoder.data.readers.depth_images import ray_lengths
+from gsencoder.types import Views
+from gsencoder.types.checks import invert_rigid, transform
+from gsencoder.types.scene import pixel_centers, project_points
+
+MAX_SIDE = 320
+"""Longer side in pixels of the depth images that are compared; larger ones are sampled."""
+SAMPLES = 400
+"""Pixels of each view that are carried into the others."""
+TOLERANCE = 0.02
+"""Depths agree within this share."""
+CLIP = 0.05
+"""Residuals beyond this share count as this much, since what is hidden there is further away by any amount."""
+MIN_SAMPLES = 30
+"""Pairs of views that share fewer samples have no offset of their own."""
+EDGE = 0.05
+"""Pixels beside a step of the depth by more than this share are not carried over: a pixel's size decides there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DepthViews:
+    """Depth images of posed views, small, and what their numbers are taken to mean.
+
+    Attributes:
+        depths: as the files say, 0 = none.
+        pixels: samples of each view at pixel centers, (u, v) in its small image.
+        values: the depth there; 0 where a view has fewer samples.
+        cam_from_world: poses of the depth cameras.
+        Ks: intrinsics of the small images.
+        scale: world units for each unit of `depths`.
+    """
+
+    depths: Float32[np.ndarray, "V h w"]
+    pixels: Float64[np.ndarray, "V n 2"]
+    values: Float64[np.ndarray, "V n"]
+    cam_from_world: Float64[np.ndarray, "V 4 4"]
+    Ks: Float64[np.ndarray, "V 3 3"]
+    scale: float = 1.0
+
+    def __len__(self) -> int:
+        return len(self.depths)
+
+    def select(self, rows: Sequence[int]) -> "DepthViews":
+        """Some of the views."""
+        arrays = ("depths", "pixels", "values", "cam_from_world", "Ks")
+        return replace(self, **{name: getattr(self, name)[list(rows)] for name in arrays})
+
+    def with_focal_times(self, factor: float) -> "DepthViews":
+        """The same images by a sensor of another focal length."""
+        Ks = self.Ks.copy()
+        Ks[:, :2, :2] *= factor
+        return replace(self, Ks=Ks)
+
+    def of_rays(self) -> "DepthViews":
+        """The same images if their numbers are lengths of rays: the coordinates z of these."""
+        lengths = np.stack([ray_lengths(K, *self.depths.shape[:0:-1]) for K in self.Ks])
+        columns, rows = np.floor(self.pixels).astype(np.int64).transpose(2, 0, 1)
+        at_samples = lengths[np.arange(len(self))[:, None], rows, columns]
+        return replace(self, depths=(self.depths / lengths).astype(np.float32), values=self.values / at_samples)
+
+
+def depth_views(views: Views, numbers: Int64[np.ndarray, " V"], *, seed: int = 0) -> DepthViews:
+    """Small depth images of some views and samples on their surfaces.
+
+    Args:
+        views: with depth.
+        numbers: their row numbers.
+        seed: of the choice of samples.
+    """
+    assert views.depths is not None
+    rng = np.random.default_rng(seed)
+    cameras = views.cameras.select(numbers)
+    shrink = min(1.0, MAX_SIDE / int(max(cameras.widths[0], cameras.heights[0])))
+    width, height = (max(3, round(shrink * int(size[0]))) for size in (cameras.widths, cameras.heights))
+    maps, pixels, values = [], [], []
+    for view in numbers:
+        full = views.depths[int(view)]
+        rows, columns = (
+            ((np.arange(n) + 0.5) * size / n).astype(np.int64)
+            for n, size in zip((height, width), full.shape, strict=True)
+        )
+        depth = full[rows][:, columns]
+        maps.append(depth)
+        rows, columns = np.nonzero(on_surface(depth))
+        sample = rng.permutation(len(rows))[:SAMPLES]
+        at, value = np.zeros((SAMPLES, 2)), np.zeros(SAMPLES)
+        at[: len(sample)] = np.stack((columns[sample], rows[sample]), axis=1) + 0.5
+        value[: len(sample)] = depth[rows[sample], columns[sample]]
+        pixels.append(at)
+        values.append(value)
+    small = cameras.resized_to(np.full(len(numbers), width, np.int32), np.full(len(numbers), height, np.int32))
+    return DepthViews(
+        depths=np.stack(maps),
+        pixels=np.stack(pixels),
+        values=np.stack(values),
+        cam_from_world=cameras.cam_from_world.astype(np.float64),
+        Ks=small.Ks.astype(np.float64),
+    )
+
+
+def on_surface(depth: Float32[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels with depth whose eight neighbors have nearly the same; none at the border."""
+    use = np.zeros(depth.shape, bool)
+    middle = depth[1:-1, 1:-1]
+    height, width = middle.shape
+    close = middle > 0
+    for down in range(3):
+        for right in range(3):
+            other = depth[down : down + height, right : right + width]
+            close &= (other > 0) & (np.abs(other - middle) <= EDGE * middle)
+    use[1:-1, 1:-1] = close
+    return use
+
+
+def residuals(views: DepthViews) -> Float64[np.ndarray, "V V n"]:
+    """r of the samples of view i (first axis) in view j (second axis); NaN where nothing can be compared, and on the
+    diagonal."""
+    points = world_samples(views)
+    count = len(views)
+    flat, measured = points.reshape(-1, 3), (views.values > 0).reshape(-1)
+    result = np.stack(
+        [_depth_ratio(views, other, flat, measured).reshape(count, -1) - 1 for other in range(count)], axis=1
+    )
+    result[np.arange(count), np.arange(count)] = np.nan
+    return result
+
+
+def agreement_map(views: DepthViews, view: int) -> Float32[np.ndarray, "h w"]:
+    """For each pixel of a small depth image, the share of the views that see its place whose depth agrees within
+    `TOLERANCE`; NaN where it has no depth, or no other view sees the place.
+
+    A view in which something nearer hides the place is not counted.
+    """
+    count, height, width = views.depths.shape
+    here = slice(view, view + 1)
+    pixels = pixel_centers(width, height).reshape(1, -1, 2)
+    points = world_samples(
+        replace(
+            views,
+            depths=views.depths[here],
+            pixels=pixels,
+            values=views.depths[here].reshape(1, -1).astype(np.float64),
+            cam_from_world=views.cam_from_world[here],
+            Ks=views.Ks[here],
+        )
+    )[0]
+    agree, comparisons = np.zeros(len(points)), np.zeros(len(points))
+    measured = views.depths[view].reshape(-1) > 0
+    for other in range(count):
+        if other == view:
+            continue
+        ratio = _depth_ratio(views, other, points, measured)
+        compared = np.isfinite(ratio) & (ratio < 1 + CLIP)
+        comparisons += compared
+        agree += compared & (np.abs(ratio - 1) <= TOLERANCE)
+    share = np.divide(agree, comparisons, out=np.full(len(points), np.nan), where=comparisons > 0)
+    return share.reshape(height, width).astype(np.float32)
+
+
+def _depth_ratio(
+    views: DepthViews, other: int, points: Float64[np.ndarray, "n 3"], valid: Bool[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """The depth of world points in a view, divided by the view's own depth there; NaN where there is none."""
+    height, width = views.depths.shape[1:]
+    local = transform(views.cam_from_world[other], points)
+    pixels = project_points(local, views.Ks[other])
+    with np.errstate(invalid="ignore"):
+        inside = valid & (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
+    columns, rows = np.floor(pixels[inside]).astype(np.int64).T
+    measured = views.depths[other][rows, columns].astype(np.float64) * views.scale
+    ratio = np.full(len(points), np.nan)
+    ratio[inside] = np.divide(local[inside, 2], measured, out=np.full(len(measured), np.nan), where=measured > 0)
+    return ratio
+
+
+def shared_samples(
+    views: DepthViews, least: int
+) -> Iterator[tuple[int, int, Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]]:
+    """The samples of one view on which the depth of another agrees within `TOLERANCE`, for each ordered pair of views
+    that shares at least so many: both rows, and the points in the axes of both cameras."""
+    points = world_samples(views)
+    for view, other in np.ndindex(len(views), len(views)):
+        if view == other:
+            continue
+        ratio = _depth_ratio(views, other, points[view], views.values[view] > 0)
+        same = points[view][np.abs(ratio - 1) <= TOLERANCE]
+        if len(same) >= least:
+            yield view, other, transform(views.cam_from_world[view], same), transform(views.cam_from_world[other], same)
+
+
+def world_samples(views: DepthViews) -> Float64[np.ndarray, "V n 3"]:
+    """Where the samples lie in the world, under what their numbers are taken to mean."""
+    K = views.Ks
+    rays = np.ones((*views.pixels.shape[:2], 3))
+    for axis in range(2):
+        rays[..., axis] = (views.pixels[..., axis] - K[:, axis, 2, None]) / K[:, axis, axis, None]
+    local = rays * (views.scale * views.values)[..., None]
+    world_from_cam = invert_rigid(views.cam_from_world)
+    return np.einsum("vij,vnj->vni", world_from_cam[:, :3, :3], local) + world_from_cam[:, None, :3, 3]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Agreement:
+    """What residuals say.
+
+    Attributes:
+        share: of the samples that another view sees, those whose depth agrees with it within `TOLERANCE`. Samples that
+            lie further away than the other view's surface by more than `CLIP` are hidden there, and do not count.
+        spread: mean of |r|, clipped at `CLIP`.
+        offset: median of r among those within `CLIP`.
+        compared: number of comparisons.
+    """
+
+    share: float
+    spread: float
+    offset: float
+    compared: int
+
+
+def agreement(residual: Float64[np.ndarray, "*n"]) -> Agreement:
+    """Summary of residuals; NaN where nothing was compared."""
+    finite = residual[np.isfinite(residual)]
+    if not len(finite):
+        return Agreement(share=float("nan"), spread=float("nan"), offset=float("nan"), compared=0)
+    size = np.abs(finite)
+    near = finite[size <= CLIP]
+    return Agreement(
+        share=float((size <= TOLERANCE).sum() / max(1, (finite <= CLIP).sum())),
+        spread=float(np.minimum(size, CLIP).mean()),
+        offset=float(np.median(near)) if len(near) else float("nan"),
+        compared=len(finite),
+    )
+
+
+def pair_offsets(residual: Float64[np.ndarray, "V V n"]) -> tuple[float, float]:
+    """The median size of the offset (median r) of pairs of views: of those up to three places apart in the order of the
+    files, and of those at least half the views apart; NaN where there are no such pairs. Poses that drift have a second
+    number well above the first."""
+    count = len(residual)
+    near: list[float] = []
+    far: list[float] = []
+    for view, other in np.ndindex(count, count):
+        distance = abs(view - other)
+        inliers = residual[view, other][np.abs(residual[view, other]) <= CLIP]
+        if len(inliers) >= MIN_SAMPLES and (distance <= 3 or distance >= count / 2):
+            (near if distance <= 3 else far).append(abs(float(np.median(inliers))))
+    return tuple(float(np.median(each)) if each else float("nan") for each in (near, far))  # type: ignore[return-value]
+
+
+def grey_pictures(views: Views, rows: Int64[np.ndarray, " V"], shape: tuple[int, int]) -> Float32[np.ndarray, "V h w"]:
+    """Photographs in grey, 0 to 1, at the size of the small depth images."""
+    from PIL import Image
+
+    assert views.images is not None
+    pictures = []
+    for view in rows:
+        grey = Image.fromarray(views.images[int(view)]).convert("L").resize(shape[::-1], Image.Resampling.BOX)
+        pictures.append(np.asarray(grey, np.float32) / 255)
+    return np.stack(pictures)
+
+
+def color_correlations(
+    views: DepthViews, grey: Float32[np.ndarray, "V h w"], Ks: Float64[np.ndarray, "V 3 3"]
+) -> Float64[np.ndarray, "V V"]:
+    """Correlation of the intensities of one place in view i and view j; NaN where they share too few places.
+
+    A place is shared where the depth of both agrees within `TOLERANCE`.
+
+    Args:
+        views: depth under the reading that fits best.
+        grey: photographs at the size of the depth images.
+        Ks: intrinsics of these photographs.
+    """
+    result = np.full((len(views), len(views)), np.nan)
+    for view, other, here, there in shared_samples(views, MIN_SAMPLES):
+        intensities, in_view = _intensities(grey[view], Ks[view], here)
+        other_intensities, in_other_view = _intensities(grey[other], Ks[other], there)
+        pair = intensities[in_view & in_other_view], other_intensities[in_view & in_other_view]
+        if len(pair[0]) >= MIN_SAMPLES and min(values.std() for values in pair) > 1e-3:
+            result[view, other] = np.corrcoef(*pair)[0, 1]
+    return result
+
+
+def _intensities(
+    grey: Float32[np.ndarray, "h w"], K: Float64[np.ndarray, "3 3"], local: Float64[np.ndarray, "n 3"]
+) -> tuple[Float32[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """The intensity where points in camera axes project, and whether that is in the picture."""
+    height, width = grey.shape
+    pixels = project_points(local, K)
+    in_view = np.asarray((pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1))
+    columns, rows = np.floor(np.where(in_view[:, None], pixels, 0)).astype(np.int64).T
+    return grey[rows, columns], in_view
+
+
+def view_correlations(correlations: Float64[np.ndarray, "V V"]) -> Float64[np.ndarray, " V"]:
+    """The median correlation of each view with the others, in both directions; NaN for a view that shares nothing."""
+    both = np.concatenate((correlations, correlations.T), axis=1)
+    result = np.full(len(both), np.nan)
+    for view, row in enumerate(both):
+        if np.isfinite(row).any():
+            result[view] = np.nanmedian(row)
+    return result
+
+
+PICTURE_SIZE = 640
+"""Longer side in pixels of the photographs that are compared; smaller ones keep theirs."""
+FINE, COARSE = 1.0, 12.0
+"""Details are the difference of two Gaussian blurs of these widths in pixels."""
+MIN_SHARED = 60
+"""Pairs of views that share fewer samples say nothing."""
+MAX_PAIRS = 160
+SMALLEST_DETAIL = 1e-4
+"""Standard deviation of details, of an intensity from 0 to 1, below which a pair of views shows none."""
+FOCAL_FACTORS: tuple[float, ...] = tuple(np.round(np.geomspace(0.8, 1.25, 13), 4).tolist())
+SHIFTS = (-0.02, -0.01, 0.0, 0.01, 0.02)
+"""Shifts that are tried first, as shares of the median depth."""
+REFINEMENTS = 5
+BETTER = 0.1
+"""A registration is named if it raises the correlation of details by this much, and to `LEAST` or more."""
+LEAST = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RegistrationFit:
+    """The color camera that fits best.
+
+    Attributes:
+        focal_factor: its focal length, as a multiple of the stated one.
+        shift: what is added to x and y in the depth camera's axes to have them in its own, world units.
+        stated: mean correlation of details of pairs of views with the stated camera.
+        best: the same with the best one.
+        pairs: pairs of views that were compared.
+    """
+
+    focal_factor: float
+    shift: Float64[np.ndarray, "2"]
+    stated: float
+    best: float
+    pairs: int
+
+    @property
+    def differs(self) -> bool:
+        """Whether the stated camera is wrong."""
+        return self.pairs > 0 and self.best >= LEAST and self.best >= self.stated + BETTER
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Pair:
+    """Places that two views share, in the axes of both depth cameras."""
+
+    views: tuple[int, int]
+    points: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
+
+
+def fit_registration(views: Views, rows: Int64[np.ndarray, " V"], depth: DepthViews) -> RegistrationFit:
+    """The color camera under which photographs show the same details where their depth agrees.
+
+    Args:
+        views: with photographs and depth.
+        rows: the rows of the views that are compared.
+        depth: their depth images, under the reading that fits best.
+    """
+    pairs = _shared_samples(depth)
+    nothing = RegistrationFit(
+        focal_factor=1.0, shift=np.zeros(2), stated=float("nan"), best=float("nan"), pairs=len(pairs)
+    )
+    if not pairs:
+        return nothing
+    samples = [_samples_of_view(pairs, view, views, rows) for view in range(len(rows))]
+    samples = [each for each in samples if len(each.points)]
+
+    def score(factor: float, shift: Float64[np.ndarray, "2"]) -> float:
+        key = (round(factor, 6), *np.round(shift / typical, 6))
+        if key not in scores:
+            scores[key] = _correlation(samples, len(pairs), factor, shift)
+        return scores[key]
+
+    typical = float(np.median(np.concatenate([pair.points[0][:, 2] for pair in pairs])))
+    scores: dict[tuple[float, ...], float] = {}
+    score_as_stated = score(1.0, np.zeros(2))
+    if not np.isfinite(score_as_stated):
+        return nothing
+    best = max(
+        ((factor, np.array((shift * typical, 0.0))) for factor in FOCAL_FACTORS for shift in SHIFTS),
+        key=lambda candidate: score(*candidate),
+    )
+    steps = 1.02, 0.006 * typical
+    for _ in range(REFINEMENTS):
+        for _ in range(2):
+            factor, shift = best
+            around = [(factor * steps[0] ** sign, shift) for sign in (-1, 1)]
+            around += [(factor, shift + sign * steps[1] * axis) for axis in np.eye(2) for sign in (-1, 1)]
+            best = max([best, *around], key=lambda candidate: score(*candidate))
+        steps = steps[0] ** 0.5, steps[1] / 2
+    return RegistrationFit(
+        focal_factor=best[0], shift=best[1], stated=score_as_stated, best=score(*best), pairs=len(pairs)
+    )
+
+
+def _shared_samples(depth: DepthViews) -> list[_Pair]:
+    """The pairs of views with the most samples on which their depth agrees."""
+    pairs = [
+        _Pair(views=(view, other), points=(here, there))
+        for view, other, here, there in shared_samples(depth, MIN_SHARED)
+    ]
+    return sorted(pairs, key=lambda pair: -len(pair.points[0]))[:MAX_PAIRS]
+
+
+class _ViewSamples(NamedTuple):
+    """What the correlation needs to know about one view.
+
+    Attributes:
+        details: of its photograph.
+        K: intrinsics of the photograph at that size.
+        points: places that it shares with others, in the axes of its depth camera, pair by pair.
+        entries: where each of them stands among the places of all pairs, first those of the pairs' first views.
+        pairs: number of the pair of each.
+    """
+
+    details: Float64[np.ndarray, "h w"]
+    K: Float64[np.ndarray, "3 3"]
+    points: Float64[np.ndarray, "n 3"]
+    entries: Int64[np.ndarray, " n"]
+    pairs: Int64[np.ndarray, " n"]
+
+
+def _samples_of_view(pairs: list[_Pair], view: int, views: Views, rows: Int64[np.ndarray, " V"]) -> _ViewSamples:
+    sizes = np.array([len(pair.points[0]) for pair in pairs])
+    starts = np.concatenate(([0], np.cumsum(sizes)))
+    points, entries, numbers = [np.empty((0, 3))], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for number, pair in enumerate(pairs):
+        for side in range(2):
+            if pair.views[side] == view:
+                points.append(pair.points[side])
+                entries.append(side * starts[-1] + np.arange(starts[number], starts[number + 1]))
+                numbers.append(np.full(sizes[number], number))
+    row = int(rows[view])
+    small = views.cameras.select([row]).resized(PICTURE_SIZE, enlarge=False)
+    everything = np.concatenate(points)
+    details = _details(views, row, int(small.widths[0]), int(small.heights[0])) if len(everything) else np.zeros((1, 1))
+    return _ViewSamples(
+        details, small.Ks[0].astype(np.float64), everything, np.concatenate(entries), np.concatenate(numbers)
+    )
+
+
+def _details(views: Views, row: int, width: int, height: int) -> Float64[np.ndarray, "h w"]:
+    from PIL import Image
+    from scipy.ndimage import gaussian_filter
+
+    assert views.images is not None
+    grey = Image.fromarray(views.images[row]).convert("L").resize((width, height), Image.Resampling.BOX)
+    values = np.asarray(grey, np.float64) / 255
+    return np.asarray(gaussian_filter(values, FINE) - gaussian_filter(values, COARSE))
+
+
+def _correlation(positions: list[_ViewSamples], pairs: int, factor: float, shift: Float64[np.ndarray, "2"]) -> float:
+    """Mean correlation of the details of pairs of views with a color camera."""
+    from scipy.ndimage import map_coordinates
+
+    total = sum(len(each.points) for each in positions)
+    values, numbers = np.full(total, np.nan), np.zeros(total, np.int64)
+    for details, K, points, entries, pair in positions:
+        focal = K.copy()
+        focal[0, 0] *= factor
+        focal[1, 1] *= factor
+        shifted_points = points.copy()
+        shifted_points[:, :2] += shift
+        columns, rows = project_points(shifted_points, focal).T - 0.5
+        height, width = details.shape
+        inside = (columns >= 0) & (rows >= 0) & (columns <= width - 1) & (rows <= height - 1)
+        values[entries[inside]] = map_coordinates(details, (rows[inside], columns[inside]), order=1, mode="nearest")
+        numbers[entries] = pair
+    first, second = values.reshape(2, -1)
+    use = np.isfinite(first) & np.isfinite(second)
+    first, second, number = first[use], second[use], numbers[: total // 2][use]
+    count = np.bincount(number, minlength=pairs)
+
+    def mean(products: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " p"]:
+        return np.asarray(np.bincount(number, products, minlength=pairs) / np.maximum(count, 1))
+
+    centered = first - mean(first)[number], second - mean(second)[number]
+    variances = mean(np.square(centered[0])), mean(np.square(centered[1]))
+    clear = (count >= MIN_SHARED // 2) & (np.minimum(*variances) > SMALLEST_DETAIL**2)
+    if clear.sum() < max(1, pairs // 2):
+        return float("nan")
+    correlations = mean(centered[0] * centered[1])[clear] / np.sqrt(variances[0] * variances[1])[clear]
+    return float(correlations.mean())

@@ -1,0 +1,300 @@
+"""Classes of benchmarks: names, ids in files, and groups such as head, common and tail.
+
+Classes of ScanNet's benchmarks, and how raw names of annotations become their ids.
+
+scannet_classes.csv holds the 20 and the 200 classes with ids and names, and of the 200 whether a class is head, common
+or tail, as ScanNet's BenchmarkScripts/ScanNet200/scannet200_constants.py and scannet200_splits.py have them
+(Rozenberszki et al., Language-Grounded Indoor 3D Semantic Segmentation in the Wild, 2022). Ids of the 20 are nyu40id,
+ids of the 200 are id, both columns of scannetv2-labels.combined.tsv, which comes with ScanNet and maps raw names to
+them.
+
+Classes of ScanNet++'s benchmark, in its own files below metadata/semantic_benchmark/.
+
+top100.txt has one class a line, whose ids count the lines from 0; top100_instance.txt has those of them that have
+instances (wall, ceiling and floor have none). map_benchmark.csv leads raw names of annotations to classes: its column
+semantic_map_to has the class of the name in the column class, nothing where the name is a class itself, and None where
+it has none. Its column instance_map_to is not read: the toolkit maps instances by semantic_map_to, too
+(semantic/transforms/mesh.py, MapLabelToIndex), and then keeps those of top100_instance.txt.
+"""
+
+import csv
+import io
+import warnings
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int32, Int64
+
+from gsencoder.core.arrays import first_repeated
+from gsencoder.core.errors import InputError, SceneWarning, about
+from gsencoder.data.labels.files import read_checked_text
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClassTable:
+    """Classes that are scored. Whatever truth has beside them is ignored.
+
+    Attributes:
+        names: of the classes, each once.
+        ids: of the classes in files, each once and 0 or more.
+        groups: names of classes by the name of a group, such as ScanNet200's head, common and tail.
+    """
+
+    names: tuple[str, ...]
+    ids: tuple[int, ...]
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.names or len(self.names) != len(self.ids):
+            raise InputError(
+                f"classes: expected one id for each of one or more names, got {len(self.names)} names and "
+                f"{len(self.ids)} ids"
+            )
+        for kind, values in (("name", self.names), ("id", self.ids)):
+            if repeated := first_repeated(values):
+                raise InputError(f"classes: the {kind} {repeated[0]!r} is there twice")
+        if min(self.ids) < 0:
+            raise InputError(f"classes: expected ids of 0 or more, got {min(self.ids)}")
+        for group, names in self.groups.items():
+            unknown = [name for name in names if name not in self.names]
+            if unknown:
+                raise InputError(f"classes: {unknown[0]!r} of the group {group!r} is no class")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def name_of(self) -> dict[int, str]:
+        """The name of each id."""
+        return dict(zip(self.ids, self.names, strict=True))
+
+    @property
+    def id_of(self) -> dict[str, int]:
+        """The id of each name."""
+        return dict(zip(self.names, self.ids, strict=True))
+
+    def check_instance_ids(self) -> None:
+        """Checks that files of instances can hold all ids: class id · 1000 + number, below 1000 = no instance.
+
+        Raises:
+            InputError: a class has the id 0.
+        """
+        if 0 in self.ids:
+            raise InputError(
+                f"classes: {self.name_of[0]!r} has the id 0, which files of instances cannot hold: a vertex has "
+                "class id · 1000 + number of the instance, and below 1000 it has none; give the class another id, here "
+                "and in the files, or leave it out of classes="
+            )
+
+    def without(self, names: Collection[str]) -> "ClassTable":
+        """The table without some names, of which those that it does not have are passed over."""
+        rows = [row for row, name in enumerate(self.names) if name not in names]
+        return ClassTable(
+            names=tuple(self.names[row] for row in rows),
+            ids=tuple(self.ids[row] for row in rows),
+            groups={
+                group: tuple(name for name in members if name not in names) for group, members in self.groups.items()
+            },
+        )
+
+    def rows(self, ids: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
+        """The row of each id in the table; -1 for ids that it does not have."""
+        order = np.argsort(self.ids)
+        ascending = np.array(self.ids, np.int64)[order]
+        positions = np.minimum(np.searchsorted(ascending, ids), len(ascending) - 1)
+        return np.where(ascending[positions] == ids, order[positions], -1)
+
+
+CLASSES = Path(__file__).parent / "scannet_classes.csv"
+COLUMNS = {"scannet20": "nyu40id", "scannet200": "id"}
+"""The column of the label map that holds the ids of a set."""
+DEFAULT_COLUMN = "id"
+"""That of other classes."""
+MAX_MAP_BYTES = 16 << 20
+MAX_CLASS_LIST_BYTES = 4 << 20
+
+
+@cache
+def scannet_classes(name: str) -> ClassTable:
+    """The classes of scannet20 or scannet200.
+
+    Raises:
+        InputError: another name.
+    """
+    with CLASSES.open(encoding="utf-8", newline="") as stream:
+        rows = [row for row in csv.DictReader(stream) if row["set"] == name]
+    if not rows:
+        raise InputError(f"classes {name[:40]!r}: expected {' or '.join(COLUMNS)}")
+    return ClassTable(
+        ids=tuple(int(row["id"]) for row in rows),
+        names=tuple(row["name"] for row in rows),
+        groups={
+            group: tuple(row["name"] for row in rows if row["group"] == group)
+            for group in dict.fromkeys(row["group"] for row in rows if row["group"])
+        },
+    )
+
+
+def read_class_list(path: Path) -> ClassTable:
+    """The classes of a text file with one name a line, such as ScanNet++'s top100.txt; ids count the lines from 0.
+
+    Raises:
+        InputError: unreadable, too large, empty, or a name is there twice.
+    """
+    lines = [line.strip() for line in read_checked_text(path, max_bytes=MAX_CLASS_LIST_BYTES).splitlines()]
+    names = [line for line in lines if line]
+    if not names:
+        raise InputError(f"{path}: lists no class; expected one name a line")
+    with about(path):
+        return ClassTable(names=tuple(names), ids=tuple(range(len(names))))
+
+
+def read_label_map(path: Path, column: str) -> dict[str, int]:
+    """The ids of raw names in scannetv2-labels.combined.tsv.
+
+    Args:
+        path: of that file, which comes with ScanNet.
+        column: which ids, such as nyu40id or id; see `COLUMNS`.
+
+    Raises:
+        InputError: unreadable, too large, without the columns, an id that is no whole number, or a raw name with two
+            different ids; the line is named.
+    """
+    mapping: dict[str, int] = {}
+    text = read_checked_text(path, max_bytes=MAX_MAP_BYTES)
+    rows = csv.DictReader(io.StringIO(text, newline=""), delimiter="\t")
+    try:
+        missing = [name for name in ("raw_category", column) if name not in (rows.fieldnames or ())]
+        if missing:
+            raise InputError(
+                f"{path}: has no column {missing[0]!r}; expected scannetv2-labels.combined.tsv, with tabs between"
+            )
+        for row in rows:
+            name, word = row["raw_category"], (row[column] or "").strip()
+            if name is None or not word.isascii() or not word.isdigit() or len(word) > 9:
+                raise InputError(f"{path}: line {rows.line_num}: {column} must be a whole number, got {word[:40]!r}")
+            if mapping.setdefault(name, int(word)) != int(word):
+                raise InputError(
+                    f"{path}: line {rows.line_num}: {name[:40]!r} has {column} {word}, and {mapping[name]} before"
+                )
+    except csv.Error as error:
+        raise InputError(f"{path}: not a readable label map ({' '.join(str(error).split())[:120]})") from error
+    if not mapping:
+        raise InputError(f"{path}: maps no name; expected scannetv2-labels.combined.tsv")
+    return mapping
+
+
+def ids_of_names(names: Iterable[str], mapping: Mapping[str, int], classes: ClassTable | None = None) -> dict[str, int]:
+    """The id of each raw name; 0 where the map does not have the name.
+
+    Names are compared as they are written, as ScanNet's scripts do.
+
+    Args:
+        names: raw names of objects.
+        mapping: of `read_label_map`, or `ClassTable.id_of` for names that are those of classes.
+        classes: where given, ids that are not among its own become 0, as in ScanNet200's script; without it they
+            stay, as in the script of the 20 classes, whose evaluation leaves them out.
+
+    Warns:
+        SceneWarning: names that the map does not have; they are counted.
+    """
+    unique = list(dict.fromkeys(names))
+    unknown = [name for name in unique if name not in mapping]
+    if unknown:
+        warnings.warn(
+            f"{len(unknown)} of {len(unique)} names are not in the label map and have no class (first: "
+            f"{unknown[0][:40]!r})",
+            SceneWarning,
+            stacklevel=2,
+        )
+    ids = {name: mapping.get(name, 0) for name in unique}
+    if classes is None:
+        return ids
+    numbers = set(classes.ids)
+    return {name: number if number in numbers else 0 for name, number in ids.items()}
+
+
+def vertex_classes(
+    instances: Int32[np.ndarray, " V"], names: Mapping[int, str], class_of: Mapping[str, int], *, none: int = 0
+) -> Int32[np.ndarray, " V"]:
+    """The class of each vertex: that of its object's name.
+
+    Args:
+        instances: the object of each vertex, 0 = none.
+        names: the name of each object, such as `dict(MeshLabels.objects)`.
+        class_of: id of each name, as `ids_of_names` gives it.
+        none: of vertices without an object or of an object without a name, and of names that `class_of` lacks.
+    """
+    objects, codes = np.unique(instances, return_inverse=True)
+    ids = [class_of.get(names.get(number, ""), none) if number > 0 else none for number in objects.tolist()]
+    return np.array(ids, np.int32)[codes]
+
+
+RAW, TARGET = "class", "semantic_map_to"
+NO_TARGET = "None"
+
+
+def read_instance_classes(path: Path) -> ClassTable:
+    """The classes of a list that have instances, with the ids of the list: those of NAME_instance.txt beside NAME.txt.
+
+    Raises:
+        InputError: a list is wrong, the second one is missing, or it has a name that the first one lacks.
+    """
+    every, beside = read_class_list(path), path.with_name(f"{path.stem}_instance.txt")
+    if not beside.is_file():
+        raise InputError(
+            f"{beside}: no such file; expected the classes of {path.name} that have instances, one a line, as "
+            f"ScanNet++ "
+            "has them"
+        )
+    names = read_class_list(beside).names
+    foreign = [name for name in names if name not in every.names]
+    if foreign:
+        raise InputError(f"{beside}: {foreign[0][:40]!r} is no class of {path.name}")
+    return ClassTable(names=names, ids=tuple(every.id_of[name] for name in names))
+
+
+def read_benchmark_map(path: Path) -> dict[str, str]:
+    """The class of each raw name in map_benchmark.csv; names without a class are left out.
+
+    Of a name that is there several times the last line with a class counts, as in the toolkit.
+
+    Raises:
+        InputError: unreadable, too large, without the columns, or it maps no name.
+    """
+    rows = csv.DictReader(io.StringIO(read_checked_text(path, max_bytes=MAX_MAP_BYTES), newline=""), strict=True)
+    try:
+        lines = list(rows)
+    except csv.Error as error:
+        raise InputError(f"{path}: not a readable CSV file ({' '.join(str(error).split())[:120]})") from error
+    missing = [name for name in (RAW, TARGET) if name not in (rows.fieldnames or ())]
+    if missing:
+        raise InputError(
+            f"{path}: has no column {missing[0]!r}; expected ScanNet++'s map_benchmark.csv, with {RAW} and {TARGET}"
+        )
+    mapping: dict[str, str] = {}
+    for row in lines:
+        raw, target = row[RAW] or "", row[TARGET] or ""
+        if raw and not target:
+            mapping.setdefault(raw, raw)
+        elif raw and target != NO_TARGET:
+            mapping[raw] = target
+    if not mapping:
+        raise InputError(f"{path}: maps no name; expected ScanNet++'s map_benchmark.csv")
+    return mapping
+
+
+def ids_of_benchmark(path: Path, classes: ClassTable) -> dict[str, int]:
+    """The class id of each raw name in map_benchmark.csv that leads to a class of a table.
+
+    Raises:
+        InputError: as `read_benchmark_map`, or no name leads to a class.
+    """
+    id_of = classes.id_of
+    ids = {raw: id_of[target] for raw, target in read_benchmark_map(path).items() if target in id_of}
+    if not ids:
+        raise InputError(f"{path}: no name leads to one of the {len(classes)} classes; compare it with classes=")
+    return ids

@@ -1,0 +1,373 @@
+"""Expressions that refer to one object of a scene: ScanRefer, Nr3D, and Scan2Cap's captions, in their own files.
+
+ScanRefer (Chen et al. 2020): ScanRefer_filtered_{train,val}.json, a list of {scene_id, object_id, object_name, ann_id,
+description, token}. Scan2Cap's benchmark adds to each entry the box of the object as `bbox`, eight corners
+(ScanRefer_filtered_{train,val}_gt_bbox.json). ScanRefer's predictions say unique_multiple (1 if the scene has several
+objects of the class) and others (1 if the class is none of the named ones), and both may stand here as well. Nr3D
+(ReferIt3D, Achlioptas et al. 2020): nr3d.csv.
+
+Boxes of the objects that expressions refer to, from the labels of ScanNet's scans.
+
+ScanRefer's own files have no boxes. Its scripts take that of an object's vertices along the axes of the aligned scan
+(data/scannet/load_scannet_data.py), and so does this module.
+"""
+
+import ast
+import csv
+import io
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int32, Int64
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files import write_json
+from gsencoder.data.labels.classes import vertex_classes
+from gsencoder.data.labels.files import (
+    LIST_BYTES,
+    MAX_TEXT,
+    Corner,
+    Entry,
+    annotation_id,
+    box_corners,
+    corner_bounds,
+    entries_of,
+    flag_value,
+    id_value,
+    object_id,
+    read_benchmark_json,
+    read_checked_text,
+    refuse_repeated,
+    scene_name,
+    shown,
+    text_list,
+    text_value,
+    write_whole_numbers,
+)
+from gsencoder.data.labels.scans import read_scannet_labels
+from gsencoder.types import MeshLabels
+
+SCANREFER = "scene_id, object_id, object_name, ann_id, description and token"
+NR3D_COLUMNS = ("assignmentid", "utterance", "instance_type", "scan_id", "target_id", "tokens")
+"""Columns that Nr3D must have; `stimulus_id`, `mentions_target_class` and `correct_guess` are read if present."""
+PREDICTED = ("answer_top10", "pred_answers_at10", "caption", "aabb", "boxes", "bboxes")
+"""Keys that predictions have and annotations have not."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Expression:
+    """What one annotator wrote of one object.
+
+    Attributes:
+        scene: name of the scene.
+        object_id: `objectId` of ScanNet's aggregation file, from 0.
+        object_name: as the file writes it; ScanRefer has underscores between words.
+        annotation: id of the expression among those of the object.
+        text: what was written.
+        tokens: the words of the text as the data set cuts it, lower case in ScanRefer.
+        aabb: lower and upper corner of the object's box, in the axes of the aligned scan and its unit; None where the
+            file has none.
+        same_class: objects of the target's class in the scene, the target included (Nr3D's stimulus); None where the
+            file does not say. More than two are hard (ReferIt3D).
+        mentions_class: whether the text names the class of the object; None where the file does not say.
+        understood: whether a listener found the object; None where the file does not say.
+        multiple: whether the scene has several objects of its class; None where the file does not say.
+        others: whether its class is none of ScanRefer's named ones; None where the file does not say.
+    """
+
+    scene: str
+    object_id: int
+    object_name: str
+    annotation: str
+    text: str
+    tokens: tuple[str, ...]
+    aabb: tuple[Corner, Corner] | None = None
+    same_class: int | None = None
+    mentions_class: bool | None = None
+    understood: bool | None = None
+    multiple: bool | None = None
+    others: bool | None = None
+
+    @property
+    def key(self) -> tuple[str, int, str]:
+        """Scene, object and annotation, which together belong to one expression only."""
+        return self.scene, self.object_id, self.annotation
+
+
+def read_scanrefer(path: str | Path) -> tuple[Expression, ...]:
+    """Reads ScanRefer's JSON, with or without boxes.
+
+    Raises:
+        InputError: not such a file, two entries with one id, or two boxes or names of one object.
+    """
+    file = Path(path)
+    rows = read_benchmark_json(file)
+    if isinstance(rows, dict):
+        raise InputError(
+            f"{file}: expected a list of expressions with {SCANREFER}, got an object; were predictions and truth "
+            "swapped?"
+        )
+    expressions = tuple(_scanrefer(entry) for entry in entries_of(rows, file, SCANREFER))
+    _refuse_repeated(file, expressions)
+    _check_objects(expressions, file)
+    return expressions
+
+
+def write_scanrefer(path: str | Path, expressions: Sequence[Expression]) -> None:
+    """Writes expressions as ScanRefer's files have them, with boxes, unique_multiple and others where these are known.
+
+    Raises:
+        InputError: two expressions have one id, or the file cannot be written.
+    """
+    _refuse_repeated(Path(path), expressions)
+    rows = [
+        {
+            "scene_id": each.scene,
+            "object_id": str(each.object_id),
+            "object_name": each.object_name,
+            "ann_id": each.annotation,
+            "description": each.text,
+            "token": list(each.tokens),
+        }
+        | ({"bbox": box_corners(*each.aabb)} if each.aabb else {})
+        | ({} if each.multiple is None else {"unique_multiple": int(each.multiple)})
+        | ({} if each.others is None else {"others": int(each.others)})
+        for each in expressions
+    ]
+    write_json(path, rows)
+
+
+def read_nr3d(path: str | Path) -> tuple[Expression, ...]:
+    """Reads Nr3D's CSV.
+
+    Raises:
+        InputError: not such a table, or two rows with one id.
+    """
+    file = Path(path)
+    expressions = tuple(_nr3d(row, where) for row, where in _csv_rows(file, NR3D_COLUMNS))
+    _refuse_repeated(file, expressions)
+    return expressions
+
+
+def described(key: tuple[str, int | str, str]) -> str:
+    """An expression's name in messages, by scene, object and annotation."""
+    return f"sentence {key[2][:40]} about object {key[1]} of {key[0]}"
+
+
+def _scanrefer(row: Entry) -> Expression:
+    entry, where = row
+    if "description" not in entry:
+        swapped = next((key for key in PREDICTED if key in entry), None)
+        hint = f", got {swapped}: these are predictions" if swapped else ""
+        raise InputError(
+            f"{where}: expected an expression with a description{hint}; predictions and truth may be swapped"
+        )
+    box = entry.get("bbox")
+    return Expression(
+        scene=scene_name(entry.get("scene_id"), where),
+        object_id=object_id(entry.get("object_id"), where),
+        object_name=text_value(entry.get("object_name"), where, "object_name"),
+        annotation=annotation_id(entry.get("ann_id"), where),
+        text=text_value(entry["description"], where, "description"),
+        tokens=text_list(entry.get("token"), where, "token", empty=True),
+        aabb=None if box is None else corner_bounds(box, where, "bbox"),
+        multiple=flag_value(entry.get("unique_multiple"), where, "unique_multiple"),
+        others=flag_value(entry.get("others"), where, "others"),
+    )
+
+
+def _nr3d(row: Mapping[str, str], where: str) -> Expression:
+    return Expression(
+        scene=scene_name(row["scan_id"], where),
+        object_id=object_id(row["target_id"], where, "target_id"),
+        object_name=text_value(row["instance_type"], where, "instance_type"),
+        annotation=id_value(row["assignmentid"], where, "assignmentid"),
+        text=text_value(row["utterance"], where, "utterance"),
+        tokens=_literal_tokens(row["tokens"], where),
+        same_class=_stimulus_count(row.get("stimulus_id"), where),
+        mentions_class=_truth_value(row.get("mentions_target_class"), where, "mentions_target_class"),
+        understood=_truth_value(row.get("correct_guess"), where, "correct_guess"),
+    )
+
+
+def _csv_rows(path: Path, columns: Sequence[str]) -> Iterable[tuple[dict[str, str], str]]:
+    reader = csv.reader(io.StringIO(read_checked_text(path, max_bytes=LIST_BYTES), newline=""), strict=True)
+    try:
+        lines = [(line, reader.line_num) for line in reader if line]
+    except csv.Error as error:
+        raise InputError(f"{path}: not a readable CSV file ({' '.join(str(error).split())[:120]})") from error
+    header = lines[0][0] if lines else []
+    missing = [column for column in columns if column not in header]
+    if missing or len(set(header)) < len(header):
+        wrong = f"lacks {', '.join(missing)}" if missing else "has a column twice"
+        raise InputError(f"{path}: expected a CSV with the columns {', '.join(columns)}; its first line {wrong}")
+    for line, number in lines[1:]:
+        if len(line) != len(header):
+            raise InputError(f"{path}: line {number} has {len(line)} cells and the first line {len(header)}")
+        yield dict(zip(header, line, strict=True)), f"{path}: line {number}"
+
+
+def _literal_tokens(text: str, where: str) -> tuple[str, ...]:
+    """A list of words as Python writes it, which is what the file has; nothing is executed."""
+    if len(text) > MAX_TEXT:
+        raise InputError(f"{where}: tokens has {len(text):,} characters, expected at most {MAX_TEXT:,}")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SyntaxWarning)
+            warnings.simplefilter("ignore", DeprecationWarning)
+            value = ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
+        value = None
+    if not isinstance(value, list):
+        raise InputError(f"{where}: tokens must be a list of words such as ['the', 'chair'], got {shown(text)}")
+    return text_list(value, where, "tokens", empty=True)
+
+
+def _stimulus_count(stimulus: str | None, where: str) -> int | None:
+    """Objects of the class, from scene-class-count-target-distractor-distractor."""
+    if stimulus is None:
+        return None
+    parts = stimulus.split("-")
+    if len(parts) < 4 or not parts[2].isdecimal() or len(parts[2]) > 9 or len(parts) != int(parts[2]) + 3:
+        raise InputError(
+            f"{where}: stimulus_id must be scene-class-count-target and count - 1 other objects, got {shown(stimulus)}"
+        )
+    return int(parts[2])
+
+
+def _truth_value(text: str | None, where: str, column: str) -> bool | None:
+    if text is None:
+        return None
+    if text.strip().lower() not in ("true", "false"):
+        raise InputError(f"{where}: {column} must be True or False, got {shown(text)}")
+    return text.strip().lower() == "true"
+
+
+def _refuse_repeated(path: Path, expressions: Sequence[Expression]) -> None:
+    refuse_repeated(path, [each.key for each in expressions], described)
+
+
+def _check_objects(expressions: Sequence[Expression], path: Path) -> None:
+    first: dict[tuple[str, int], int] = {}
+    for index, each in enumerate(expressions):
+        row = first.setdefault((each.scene, each.object_id), index)
+        other = expressions[row]
+        if (other.object_name, other.aabb) != (each.object_name, each.aabb):
+            attribute = "names" if other.object_name != each.object_name else "boxes"
+            raise InputError(
+                f"{path}: entries {row} and {index} give object {each.object_id} of {each.scene} different {attribute}"
+            )
+
+
+def boxes_from_scans(expressions: Sequence[Expression], scans: Path) -> tuple[Expression, ...]:
+    """Gives expressions without a box that of their object; one scan is in memory at a time.
+
+    Args:
+        expressions: of any scenes.
+        scans: folder with a folder of each scene, which has the label files of its scan.
+
+    Returns:
+        The expressions, in order.
+
+    Raises:
+        InputError: a scan is missing or wrong, or has no such object.
+    """
+    lacking: dict[str, list[int]] = {}
+    for row, each in enumerate(expressions):
+        if each.aabb is None:
+            lacking.setdefault(each.scene, []).append(row)
+    result = list(expressions)
+    for scene, rows in lacking.items():
+        labels = read_scannet_labels(scans / scene)
+        if labels.aligned_from_world is None:
+            warnings.warn(
+                f"{scans / scene}: has no axisAlignment (in {scene}.txt), so boxes are in the raw scan's frame",
+                SceneWarning,
+                stacklevel=2,
+            )
+        for row, each in zip(rows, boxes_from_labels([expressions[row] for row in rows], labels), strict=True):
+            result[row] = each
+    return tuple(result)
+
+
+def boxes_from_labels(expressions: Iterable[Expression], labels: MeshLabels) -> tuple[Expression, ...]:
+    """Gives expressions about one scene without a box that of their object in a ScanNet scan.
+
+    An object whose vertices all belong to others has no box.
+
+    Raises:
+        InputError: an object that the labels do not have.
+    """
+    boxes = labels.boxes(aligned=True)
+    ids = {number for number, _ in labels.objects}
+    result = []
+    for each in expressions:
+        # Labels have objectId + 1, so that 0 is none.
+        number = each.object_id + 1
+        if number not in ids:
+            raise InputError(f"{each.scene}: its labels have no object with the objectId {each.object_id}")
+        if each.aabb is None and number in boxes:
+            (x0, y0, z0), (x1, y1, z1) = (corner.tolist() for corner in boxes[number])
+            each = replace(each, aabb=((x0, y0, z0), (x1, y1, z1)))
+        result.append(each)
+    return tuple(result)
+
+
+IDS_PER_CLASS = 1000
+"""A line of the truth of instances holds the class id times this plus the number of the instance."""
+
+
+def instance_truth(
+    instances: Int32[np.ndarray, " V"], names: Mapping[int, str], class_of: Mapping[str, int]
+) -> Int64[np.ndarray, " V"]:
+    """Class id · 1000 + number of the instance, and 0 of vertices without an object.
+
+    The number is the id of the object, as ScanNet's script has it. Where an id is 1000 or more, which would read as
+    another class, objects are numbered from 1 within their class, in the order of their ids: scores are the same. An
+    object without a class has its number alone, which evaluation takes for a region that does not count.
+
+    Args:
+        instances: the object of each vertex, 0 = none.
+        names: the name of each object, such as `dict(MeshLabels.objects)`.
+        class_of: class id of each name, as `ids_of_names` gives it.
+
+    Raises:
+        InputError: a class has 1000 objects or more, which the format cannot hold.
+    """
+    classes = vertex_classes(instances, names, class_of).astype(np.int64)
+    objects, first, codes = np.unique(instances, return_index=True, return_inverse=True)
+    numbers = objects.astype(np.int64)
+    if int(numbers.max(initial=0)) >= IDS_PER_CLASS:
+        classes_of_objects = classes[first]
+        for number in np.unique(classes_of_objects):
+            rows = np.flatnonzero((classes_of_objects == number) & (objects > 0))
+            if len(rows) >= IDS_PER_CLASS and number:
+                name = names[int(objects[rows[0]])]
+                raise InputError(
+                    f"{name[:40]!r}: {len(rows):,} objects are of its class; up to {IDS_PER_CLASS - 1} fit into class "
+                    "id · 1000 + number"
+                )
+            # The numbers of objects without a class mean nothing.
+            numbers[rows] = np.arange(1, len(rows) + 1) if number else 0
+    return classes * IDS_PER_CLASS + numbers[codes]
+
+
+def write_instance_truth(path: Path, labels: MeshLabels, class_of: Mapping[str, int]) -> None:
+    """Writes SCENE.txt of the instance task: `instance_truth`, one a line.
+
+    Raises:
+        InputError: as `instance_truth`, or the file cannot be written.
+    """
+    write_whole_numbers(path, instance_truth(labels.instances, dict(labels.objects), class_of))
+
+
+def write_semantic_truth(path: Path, labels: MeshLabels, class_of: Mapping[str, int]) -> None:
+    """Writes SCENE.txt of the semantic task: the class of each vertex, 0 = none.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    write_whole_numbers(path, vertex_classes(labels.instances, dict(labels.objects), class_of))

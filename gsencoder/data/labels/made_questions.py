@@ -1,0 +1,393 @@
+"""Questions about labeled scenes with their answers, made from the labels by a seed: of the kinds of ScanQA.
+
+A question is made only where people would agree on its answer:
+
+- A thing is asked about if some photograph shows at least `min_pixels` of it, by its name, if no other name of the
+  scene may stand for the same thing (`english_nouns.alike`). "The" thing is the only one of its name in the labels.
+- next_to: the nearest thing beside it, at most 0.5 m away, and nearer than any of another name by 0.1 m and by half
+  (`relations.neighbor`).
+- how_many: every object of the name that any photograph shows is shown well enough; at most ten.
+- color: nearly all pixels of it have one color word in every photograph that shows it well (`color_names`).
+- where: what it stands on, if one thing qualifies and it is in none (`relations.supporter`), or what it is next to.
+- is_there: yes where an object of the name is shown well enough; no for names that no label has, nor any name that may
+  stand for the same thing.
+
+Questions of one who stands in a labeled scene and faces something, made from the labels: SQA3D's task.
+
+- side: "Is the X on my left or on my right?" The answer is the same wherever in the box of the thing one stands at, and
+  whichever corners of the two others one looks at, by 20° at least from straight ahead and from straight behind.
+- nearer: "Which is closer to me, the X or the Y?" The box of one is nearer to that of the thing one stands at, by half
+  and by 0.5 m.
+
+All things have names of their own and are shown well enough; one stands at things of 0.5 m or more.
+"""
+
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float64
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.labels.names import NUMBERS, alike, is_plural, plural, with_article
+from gsencoder.data.labels.questions import Question
+from gsencoder.data.labels.seen_objects import (
+    SeenObject,
+    SeenScene,
+    clearly_nearer,
+    gap,
+    movables,
+    near_things,
+    neighbor,
+    supporter,
+)
+
+Kind = Literal["next_to", "how_many", "color", "where", "is_there"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+ABSENT = (
+    "apple", "backpack", "banana", "bathtub", "bed", "bicycle", "broom", "drill", "drum", "dumbbell", "fireplace",
+    "globe", "guitar", "hammer", "helmet", "keyboard", "ladder", "lemon", "microwave", "orange", "piano", "printer",
+    "refrigerator", "scissors", "skateboard", "sofa", "stroller", "suitcase", "teddy bear", "telephone", "tent",
+    "toaster", "toilet", "treadmill", "tricycle", "trumpet", "umbrella", "violin", "washing machine", "wheelchair",
+)  # fmt: skip
+"""Names that are asked about where a scene does not have them. None is of a thing that others hide in or consist of, as
+forks lie among other utensils without a label of their own."""
+
+Unit = tuple[Question, ...]
+"""Questions that stay together, such as one whose answer is yes and one whose answer is no."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuestionsConfig:
+    """How questions are made."""
+
+    seed: int = field(default=0, metadata={"help": "of the choice among all questions that can be asked"})
+    per_kind: int = field(default=10, metadata={"help": "most questions of a kind about a scene"})
+    min_pixels: int = field(
+        default=200,
+        metadata={"help": "pixels that some photograph shows of an object before anything is asked about it"},
+    )
+    balance: bool = field(
+        default=True, metadata={"help": "as many questions of each kind, as there are of the rarest; false = all"}
+    )
+    absent: tuple[str, ...] = field(
+        default=ABSENT, metadata={"help": "names that are asked about where a scene does not have them"}
+    )
+
+    def __post_init__(self) -> None:
+        for name, least in (("seed", 0), ("per_kind", 2), ("min_pixels", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+        if any(not name.strip() for name in self.absent):
+            raise InputError("absent: expected names, got an empty one")
+
+
+def make_questions(scenes: Iterable[SeenScene], config: QuestionsConfig = QuestionsConfig()) -> tuple[Question, ...]:
+    """Questions about scenes, balanced over kinds, without two of one text in a scene.
+
+    What is asked about a scene depends on the scene, its name and the seed alone; which of it is left out for balance
+    depends on the other scenes. The order of the scenes does not matter.
+
+    Raises:
+        InputError: two scenes of one name, or nothing can be asked.
+    """
+    scenes = sorted(scenes, key=lambda scene: scene.name)
+    if len({scene.name for scene in scenes}) < len(scenes):
+        raise InputError("questions: two scenes have one name")
+    units = {scene.name: scene_units(scene, config) for scene in scenes}
+    questions = balanced(units, config.balance)
+    if not questions:
+        raise InputError(
+            f"questions: nothing can be asked about {len(scenes)} scenes: no named object is shown by "
+            f"{config.min_pixels} pixels and is clear"
+        )
+    return questions
+
+
+def scene_rng(seed: int, scene: str, part: int) -> np.random.Generator:
+    """Random numbers of a scene, the same whichever other scenes there are."""
+    return np.random.default_rng([seed, zlib.crc32(scene.encode()), part])
+
+
+def scene_units(scene: SeenScene, config: QuestionsConfig) -> dict[Kind, Sequence[Unit]]:
+    """What is asked about a scene: of each kind at most `per_kind` questions, and, of how_many and color, not more than
+    half of them, rounded up, with one answer."""
+    units: dict[Kind, Sequence[Unit]] = {}
+    for number, (kind, questions) in enumerate(_candidates(scene, config.absent).items()):
+        rng = scene_rng(config.seed, scene.name, number)
+        shuffled = [questions[row] for row in rng.permutation(len(questions))]
+        units[kind] = _paired(shuffled, config.per_kind) if kind == "is_there" else _varied(shuffled, config.per_kind)
+    return units
+
+
+def balanced(units: Mapping[str, Mapping[Kind, Sequence[Unit]]], equal: bool) -> tuple[Question, ...]:
+    """Questions with their ids, kind by kind, scene by scene.
+
+    Args:
+        units: of each scene.
+        equal: as many of each kind as of the rarest that there is at all, or one more where a pair is not to be torn
+            apart; they are taken from all scenes in turn.
+    """
+    by_kind: dict[Kind, list[tuple[int, str, Unit]]] = {
+        kind: sorted(
+            ((row, name, unit) for name, kinds in units.items() for row, unit in enumerate(kinds[kind])),
+            key=lambda entry: entry[:2],
+        )
+        for kind in KINDS
+    }
+    counts = [sum(len(unit) for _, _, unit in ranked) for ranked in by_kind.values() if ranked]
+    most = min(counts, default=0)
+    numbered: list[Question] = []
+    for kind, ranked in by_kind.items():
+        selected = ranked[: -(-most // len(ranked[0][2]))] if equal and ranked else ranked
+        numbers: dict[str, int] = {}
+        for _, name, unit in sorted(selected, key=lambda entry: (entry[1], entry[0])):
+            for question in unit:
+                numbers[name] = numbers.get(name, -1) + 1
+                numbered.append(replace(question, id=f"{name}-{kind}-{numbers[name]}"))
+    return tuple(numbered)
+
+
+def kind_of(question: Question) -> Kind | None:
+    """The kind of a question that was made here; None of another one."""
+    parts = question.id.rsplit("-", 2)
+    return next((kind for kind in KINDS if len(parts) == 3 and parts[1] == kind), None)
+
+
+def clear_names(scene: SeenScene) -> tuple[str, ...]:
+    """Names all of whose objects are shown well enough, and beside which no name is that may mean the same."""
+    there = {scene_object.name for scene_object in scene.objects if scene_object.name and scene_object.pixels}
+    return tuple(name for name in scene.names() if not any(alike(name, other) for other in there))
+
+
+def _candidates(scene: SeenScene, absent: Sequence[str]) -> dict[Kind, list[Question]]:
+    """All that can be asked, kind by kind, sorted by name."""
+    near = near_things(movables(scene.objects))
+    clear = clear_names(scene)
+    single = [scene_object for scene_object in map(scene.unique, clear) if scene_object is not None]
+    return {
+        "next_to": [
+            question
+            for scene_object in single
+            if (beside := neighbor(scene_object, near[scene_object.id])) is not None and scene.shown(beside)
+            for question in [
+                _question(
+                    scene, f"What is next to the {scene_object.name}?", [str(beside.name)], [scene_object, beside]
+                )
+            ]
+        ],
+        "how_many": [
+            _question(
+                scene, f"How many {plural(name)} are there in the room?", [str(len(same)), NUMBERS[len(same)]], same
+            )
+            for name in clear
+            if not is_plural(name) and len(same := scene.named(name)) < len(NUMBERS)
+        ],
+        "color": [
+            _question(
+                scene, f"What color {_be(scene_object)} the {scene_object.name}?", [scene_object.color], [scene_object]
+            )
+            for scene_object in single
+            if scene_object.color is not None
+        ],
+        "where": [
+            question
+            for scene_object in single
+            if (question := _where(scene, scene_object, near[scene_object.id])) is not None
+        ],
+        "is_there": [
+            *(_question(scene, _there(name), ["yes"], list(scene.named(name))) for name in clear),
+            *(_question(scene, _there(name), ["no"], []) for name in absent_names(scene, absent)),
+        ],
+    }
+
+
+def absent_names(scene: SeenScene, names: Sequence[str]) -> list[str]:
+    """The names that no label of a scene has, nor any name that may stand for the same thing."""
+    there = {scene_object.name for scene_object in scene.objects if scene_object.name}
+    return sorted({name for name in names if name not in there and not any(alike(name, other) for other in there)})
+
+
+def _where(scene: SeenScene, scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> Question | None:
+    """Where a thing is: on what, and beside what, as far as this is clear; the first of both is what must be seen."""
+    on, beside = supporter(scene_object, scene_objects), neighbor(scene_object, scene_objects)
+    answers: list[str] = []
+    objects: list[SeenObject] = []
+    for word, other in (("on", on), ("next to", beside)):
+        if other is not None and scene.shown(other):
+            answers.append(f"{word} the {other.name}")
+            objects = objects or [scene_object, other]
+    return (
+        _question(scene, f"Where {_be(scene_object)} the {scene_object.name}?", answers, objects) if answers else None
+    )
+
+
+def _there(name: str) -> str:
+    return f"Are there any {name} in the room?" if is_plural(name) else f"Is there {with_article(name)} in the room?"
+
+
+def _be(scene_object: SeenObject) -> str:
+    return "are" if scene_object.name and is_plural(scene_object.name) else "is"
+
+
+def _question(scene: SeenScene, text: str, answers: Sequence[str], objects: Sequence[SeenObject]) -> Question:
+    return Question(
+        dataset="scanqa",
+        id="",
+        scene=scene.name,
+        text=text,
+        answers=tuple(answers),
+        object_ids=tuple(scene_object.id for scene_object in objects),
+        object_names=tuple(scene_object.name or "" for scene_object in objects),
+    )
+
+
+def _varied(questions: Sequence[Question], count: int) -> list[Unit]:
+    """The first so many questions, of which no answer has more than half, rounded up."""
+    most = -(-count // 2)
+    counts: dict[str, int] = {}
+    selected: list[Unit] = []
+    for question in questions:
+        answer = question.answers[0]
+        if counts.get(answer, 0) < most and len(selected) < count:
+            counts[answer] = counts.get(answer, 0) + 1
+            selected.append((question,))
+    return selected
+
+
+def _paired(questions: Sequence[Question], count: int) -> Sequence[Unit]:
+    """Pairs of a question to be answered with yes and one with no."""
+    yes, no = ([each for each in questions if each.answers == (answer,)] for answer in ("yes", "no"))
+    return [*zip(yes, no, strict=False)][: count // 2]
+
+
+PART = 200
+SMALLEST_PLACE = 0.5
+"""Meters across the box of what one stands at."""
+CLEAR_ANGLE = np.radians(20)
+CLEAR_DISTANCE = 0.5
+MAX_TRIPLES = 50_000
+"""Triples of things that are tried: all of 36 things, a random choice of more."""
+
+
+def make_situations(scenes: Iterable[SeenScene], *, seed: int = 0, per_kind: int = 10) -> tuple[Question, ...]:
+    """Questions of both kinds, at most `per_kind` of each a scene, as many to be answered with left as with right.
+
+    Raises:
+        InputError: a number out of range, or two scenes of one name.
+    """
+    if per_kind < 2:
+        raise InputError(f"situations: expected per_kind from 2, got {per_kind}")
+    ordered = sorted(scenes, key=lambda scene: scene.name)
+    if len({scene.name for scene in ordered}) < len(ordered):
+        raise InputError("situations: two scenes have one name")
+    situations = [each for scene in ordered for each in _of_scene(scene, seed, per_kind)]
+    return tuple(situations)
+
+
+def _of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
+    rng = scene_rng(seed, scene.name, PART)
+    scene_objects = movables(scene.objects)
+    single = [
+        scene_object
+        for scene_object in map(scene.unique, clear_names(scene))
+        if scene_object is not None and scene_object in scene_objects
+    ]
+    landmarks = [
+        scene_object
+        for scene_object in single
+        if np.linalg.norm(scene_object.aabb_max - scene_object.aabb_min) >= SMALLEST_PLACE
+    ]
+    shuffled = _shuffled_triples(landmarks, single, rng)
+    sides: dict[str, list[Question]] = {"left": [], "right": []}
+    nearer: list[Question] = []
+    pairs: set[tuple[int, int]] = set()
+    for at, facing, other in shuffled:
+        if min(map(len, sides.values())) == per_kind // 2:
+            break
+        side = side_of(at, facing, other)
+        if side is not None and len(sides[side]) < per_kind // 2 and (at.id, other.id) not in pairs:
+            pairs.add((at.id, other.id))
+            text = f"Is the {other.name} on my left or on my right?"
+            sides[side].append(_situation_question(scene, at, facing, [other], text, side))
+    for number, (at, near, other) in enumerate(shuffled):
+        if len(nearer) == per_kind:
+            break
+        first, second = gap(at, near), gap(at, other)
+        if first > second or (at.id, near.id) in pairs:
+            continue
+        if clearly_nearer(first, second) and second - first >= CLEAR_DISTANCE:
+            pairs.add((at.id, near.id))
+            pair = sorted((near, other), key=lambda scene_object: str(scene_object.name))
+            text = f"Which is closer to me, the {pair[0].name} or the {pair[1].name}?"
+            # What one faces must not tell which is the nearer one.
+            facing, aside = (near, other) if number % 2 else (other, near)
+            nearer.append(_situation_question(scene, at, facing, [aside], text, str(near.name)))
+    count = min(map(len, sides.values()))
+    questions = [*sides["left"][:count], *sides["right"][:count], *nearer]
+    kinds = ["side"] * (2 * count) + ["nearer"] * len(nearer)
+    return [
+        replace(each, id=f"{scene.name}-{kind}-{row}")
+        for row, (kind, each) in enumerate(zip(kinds, questions, strict=True))
+    ]
+
+
+def _shuffled_triples(
+    landmarks: Sequence[SeenObject], single: Sequence[SeenObject], rng: np.random.Generator
+) -> list[tuple[SeenObject, SeenObject, SeenObject]]:
+    """A landmark and two other things, each another one, in random order; of very many a random choice."""
+    count = len(landmarks) * len(single) ** 2
+    if count <= MAX_TRIPLES:
+        triples = [each for each in product(landmarks, single, single) if len({one.id for one in each}) == 3]
+        return [triples[row] for row in rng.permutation(len(triples))]
+    numbers = rng.choice(count, MAX_TRIPLES, replace=False) if count < 2**24 else rng.integers(0, count, MAX_TRIPLES)
+    rows = np.unravel_index(numbers, (len(landmarks), len(single), len(single)))
+    chosen = [(landmarks[at], single[facing], single[other]) for at, facing, other in zip(*rows, strict=True)]
+    return [each for each in chosen if len({one.id for one in each}) == 3]
+
+
+def side_of(at: SeenObject, facing: SeenObject, other: SeenObject) -> str | None:
+    """Whether a thing is on the left or on the right of one who stands at another and faces a third; None where that
+    depends on where exactly, or on which part of it."""
+    origin = _corners(at)[:, None, None]
+    ahead, aside = _corners(facing)[None, :, None] - origin, _corners(other)[None, None] - origin
+    cross = ahead[..., 0] * aside[..., 1] - ahead[..., 1] * aside[..., 0]
+    angles = np.arctan2(cross, (ahead * aside).sum(axis=-1))
+    if (np.linalg.norm(ahead, axis=-1) < 1e-6).any() or (np.linalg.norm(aside, axis=-1) < 1e-6).any():
+        return None
+    # Of directions all around, some corners would be on the other side.
+    for side, turned in (("left", angles), ("right", -angles)):
+        if turned.min() >= CLEAR_ANGLE and turned.max() <= np.pi - CLEAR_ANGLE:
+            return side
+    return None
+
+
+def _corners(scene_object: SeenObject) -> Float64[np.ndarray, "4 2"]:
+    low, high = scene_object.aabb_min[:2], scene_object.aabb_max[:2]
+    return np.array([(low[0], low[1]), (low[0], high[1]), (high[0], low[1]), (high[0], high[1])])
+
+
+def _situation_question(
+    scene: SeenScene, at: SeenObject, facing: SeenObject, others: Sequence[SeenObject], text: str, answer: str
+) -> Question:
+    boxes = [(scene_object.aabb_min, scene_object.aabb_max) for scene_object in scene.objects]
+    middle = (np.min([low for low, _ in boxes], axis=0) + np.max([high for _, high in boxes], axis=0)) / 2
+    position = at.center - middle
+    ahead = facing.center - at.center
+    turn = float(np.arctan2(ahead[1], ahead[0]))
+    objects = [at, facing, *others]
+    return Question(
+        dataset="sqa3d",
+        id="",
+        scene=scene.name,
+        text=text,
+        answers=(answer,),
+        object_ids=tuple(scene_object.id for scene_object in objects),
+        object_names=tuple(str(scene_object.name) for scene_object in objects),
+        situation=f"I am standing at the {at.name} and facing the {facing.name}.",
+        position=(float(position[0]), float(position[1]), 0.0),
+        rotation=(float(np.cos(turn / 2)), 0.0, 0.0, float(np.sin(turn / 2))),
+    )

@@ -1,0 +1,317 @@
+"""Questions about scenes: ScanQA and SQA3D in their own files.
+
+ScanQA (Azuma et al. 2022): ScanQA_v1.0_{train,val,test_w_obj,test_wo_obj}.json, a list of {scene_id, question_id,
+question, answers, object_ids, object_names}; the test sets have no answers. SQA3D (Ma et al. 2023): a file of
+questions, v1_balanced_questions_SPLIT_scannetv2.json, and one of annotations,
+v1_balanced_sqa_annotations_SPLIT_scannetv2.json.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from gsencoder.core.errors import InputError
+from gsencoder.core.files import write_json
+from gsencoder.data.labels.expressions import PREDICTED
+from gsencoder.data.labels.files import (
+    Corner,
+    Entry,
+    entries_of,
+    id_value,
+    number,
+    object_id,
+    object_of,
+    read_benchmark_json,
+    refuse_repeated,
+    scene_name,
+    shown,
+    text_list,
+    text_value,
+)
+
+SCANQA, SQA3D = "scene_id, question_id, question and answers", "scene_id, question_id, situation and question"
+SITUATED = "sqa_annotations"
+"""What the name of SQA3D's file of annotations has where that of the questions has `questions`."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Question:
+    """A question about a scene.
+
+    Attributes:
+        dataset: whose files it comes from.
+        id: of the file; numbers are written in decimal.
+        scene: name of the scene.
+        text: the question.
+        answers: right ones; none in a test set.
+        object_ids: the `objectId`s of ScanNet's aggregation file that the question is about; none where unknown.
+        object_names: their names.
+        situation: where the one who asks stands, in words (SQA3D).
+        position: the same in the axes of the scan, in metres from the center of its mesh's box; z is 0 (SQA3D).
+        rotation: the quaternion of the situation as wxyz, a turn about z (SQA3D).
+    """
+
+    dataset: Literal["scanqa", "sqa3d"]
+    id: str
+    scene: str
+    text: str
+    answers: tuple[str, ...] = ()
+    object_ids: tuple[int, ...] = ()
+    object_names: tuple[str, ...] = ()
+    situation: str | None = None
+    position: Corner | None = None
+    rotation: tuple[float, float, float, float] | None = None
+
+    @property
+    def situated_text(self) -> str:
+        """What is asked of a model: the situation, where there is one, and then the question."""
+        return f"{self.situation} {self.text}" if self.situation else self.text
+
+
+def read_questions(path: str | Path, *, answered: bool = True) -> tuple[Question, ...]:
+    """Reads ScanQA's file or SQA3D's file of questions, by what is in it.
+
+    Args:
+        path: the file; SQA3D's annotations lie beside it.
+        answered: whether answers are needed; without, SQA3D's annotations are not read.
+
+    Raises:
+        InputError: neither of both, doubled ids, or questions without answers where answers are needed.
+    """
+    file = Path(path)
+    content = read_benchmark_json(file)
+    if isinstance(content, list):
+        return _scanqa(content, file, answered)
+    if isinstance(content, dict) and "questions" in content:
+        return _sqa3d(content, file, None, answered)
+    hint = "; these are SQA3D's annotations: give the file of questions beside them"
+    raise InputError(
+        f"{file}: expected ScanQA's list of questions or SQA3D's object with questions, got {shown(content)}"
+        + (hint if isinstance(content, dict) and "annotations" in content else "")
+    )
+
+
+def read_scanqa(path: str | Path, *, answered: bool = True) -> tuple[Question, ...]:
+    """Reads a file of ScanQA.
+
+    Args:
+        path: the file.
+        answered: whether every question must have answers.
+
+    Raises:
+        InputError: not such a file, doubled ids, or questions without answers.
+    """
+    return _scanqa(read_benchmark_json(Path(path)), Path(path), answered)
+
+
+def read_sqa3d(
+    questions: str | Path, annotations: str | Path | None = None, *, answered: bool = True
+) -> tuple[Question, ...]:
+    """Reads SQA3D's questions and their answers.
+
+    Args:
+        questions: the file of questions.
+        annotations: the file of answers; None = the one beside it whose name has `sqa_annotations` for `questions`.
+        answered: whether answers are read.
+
+    Raises:
+        InputError: not such files, doubled ids, or annotations that do not belong to the questions.
+    """
+    file = Path(questions)
+    content = read_benchmark_json(file)
+    if not isinstance(content, dict) or "questions" not in content:
+        raise InputError(f"{file}: expected SQA3D's object with questions, got {shown(content)}")
+    return _sqa3d(content, file, None if annotations is None else Path(annotations), answered)
+
+
+def write_scanqa(path: str | Path, questions: Sequence[Question]) -> None:
+    """Writes questions as ScanQA's files have them.
+
+    Raises:
+        InputError: two questions have one id, or the file cannot be written.
+    """
+    _refuse_repeated(Path(path), [each.id for each in questions])
+    rows = [
+        {
+            "scene_id": each.scene,
+            "question_id": each.id,
+            "question": each.text,
+            "answers": list(each.answers),
+            "object_ids": list(each.object_ids),
+            "object_names": list(each.object_names),
+        }
+        for each in questions
+    ]
+    write_json(path, [{k: v for k, v in row.items() if k != "answers" or v} for row in rows])
+
+
+def _scanqa(rows: Any, path: Path, answered: bool) -> tuple[Question, ...]:
+    questions = []
+    for entry, where in entries_of(rows, path, SCANQA):
+        swapped = next((key for key in PREDICTED if key in entry), None)
+        if swapped:
+            raise InputError(f"{where}: expected a question, got {swapped}: these are predictions; were both swapped?")
+        questions.append(
+            Question(
+                dataset="scanqa",
+                id=id_value(entry.get("question_id"), where, "question_id"),
+                scene=scene_name(entry.get("scene_id"), where),
+                text=text_value(entry.get("question"), where, "question"),
+                answers=text_list(entry["answers"], where, "answers", empty=True) if "answers" in entry else (),
+                object_ids=_object_ids(entry.get("object_ids", []), where),
+                object_names=text_list(entry.get("object_names", []), where, "object_names"),
+            )
+        )
+    _refuse_repeated(path, [each.id for each in questions])
+    if answered:
+        _check_answered(questions, path)
+    return tuple(questions)
+
+
+def _sqa3d(content: Mapping[str, Any], path: Path, annotations: Path | None, answered: bool) -> tuple[Question, ...]:
+    questions = [
+        Question(
+            dataset="sqa3d",
+            id=id_value(entry.get("question_id"), where, "question_id"),
+            scene=scene_name(entry.get("scene_id"), where),
+            text=text_value(entry.get("question"), where, "question"),
+            situation=text_value(entry.get("situation"), where, "situation"),
+        )
+        for entry, where in entries_of(content["questions"], path, SQA3D, key="questions")
+    ]
+    _refuse_repeated(path, [each.id for each in questions])
+    if not answered:
+        return tuple(questions)
+    return _with_annotations(questions, path, annotations or _annotations_beside(path))
+
+
+def _annotations_beside(path: Path) -> Path:
+    beside = path.with_name(path.name.replace("questions", SITUATED))
+    if beside == path or not beside.is_file():
+        raise InputError(
+            f"{path}: no answers beside it; expected a file called like it, with {SITUATED} for questions "
+            f"({beside.name if beside != path else 'v1_balanced_sqa_annotations_test_scannetv2.json'})"
+        )
+    return beside
+
+
+def _with_annotations(questions: Sequence[Question], path: Path, annotations: Path) -> tuple[Question, ...]:
+    content = read_benchmark_json(annotations)
+    if not isinstance(content, dict) or "annotations" not in content:
+        raise InputError(f"{annotations}: expected SQA3D's object with a list of annotations, got {shown(content)}")
+    rows = entries_of(content["annotations"], annotations, "question_id and answers", key="annotations")
+    ids = [id_value(entry.get("question_id"), where, "question_id") for entry, where in rows]
+    _refuse_repeated(annotations, ids)
+    row_of = dict(zip(ids, rows, strict=True))
+    missing = [each.id for each in questions if each.id not in row_of]
+    extra = set(ids) - {each.id for each in questions}
+    if missing or extra:
+        name = missing[0] if missing else min(extra)
+        raise InputError(
+            f"{annotations}: belongs to other questions than {path}: {len(missing)} of these have no annotation and "
+            f"{len(extra)} annotations no question, such as {name[:60]}"
+        )
+    return tuple(_annotated(each, row_of[each.id]) for each in questions)
+
+
+def _annotated(question: Question, row: Entry) -> Question:
+    entry, where = row
+    if scene_name(entry.get("scene_id"), where) != question.scene:
+        raise InputError(
+            f"{where}: question {question.id} is about {question.scene}, and its annotation about "
+            f"{entry['scene_id'][:60]}"
+        )
+    rows = entry.get("answers")
+    if not isinstance(rows, list) or not rows:
+        raise InputError(f"{where}: answers must be a list of objects with an answer, got {shown(rows)}")
+    answers = [
+        text_value(object_of(row, where, "an answer").get("answer"), where, "answer", empty=True) for row in rows
+    ]
+    position = object_of(entry.get("position"), where, "x, y and z as its position")
+    rotation = object_of(entry.get("rotation"), where, "_x, _y, _z and _w as its rotation")
+    x, y, z = (number(position.get(axis), where, f"position.{axis}") for axis in "xyz")
+    qw, qx, qy, qz = (number(rotation.get(f"_{axis}"), where, f"rotation._{axis}") for axis in "wxyz")
+    return Question(
+        dataset="sqa3d",
+        id=question.id,
+        scene=question.scene,
+        text=question.text,
+        situation=question.situation,
+        answers=tuple(answers),
+        position=(x, y, z),
+        rotation=(qw, qx, qy, qz),
+    )
+
+
+def _object_ids(value: Any, where: str) -> tuple[int, ...]:
+    if not isinstance(value, list):
+        raise InputError(f"{where}: object_ids must be a list of whole numbers, got {shown(value)}")
+    return tuple(object_id(each, where, f"object_ids[{index}]") for index, each in enumerate(value))
+
+
+def _refuse_repeated(path: Path, ids: Sequence[str]) -> None:
+    refuse_repeated(path, ids, lambda each: each[:60], what="question_id")
+
+
+def _check_answered(questions: Sequence[Question], path: Path) -> None:
+    silent = [each.id for each in questions if not each.answers]
+    if silent:
+        raise InputError(
+            f"{path}: {len(silent):,} of {len(questions):,} questions have no answers, such as {silent[0][:60]}; "
+            "expected answers, which ScanQA's test sets do not have"
+        )
+
+
+def write_sqa3d(path: str | Path, questions: Sequence[Question]) -> Path:
+    """Writes situated questions as SQA3D's two files have them.
+
+    Args:
+        path: of the file of questions, whose name must have "questions" in it.
+        questions: with situation, position and rotation.
+
+    Returns:
+        The file of annotations beside it, where `read_questions` looks for it.
+
+    Raises:
+        InputError: another name, a question without a situation, or a file cannot be written.
+    """
+    file = Path(path)
+    annotations = file.with_name(file.name.replace("questions", SITUATED))
+    if annotations == file:
+        raise InputError(f"{file}: expected a name with questions in it")
+    rows, answers = [], []
+    for each in questions:
+        if each.situation is None or each.position is None or each.rotation is None:
+            raise InputError(f"{file}: question {each.id[:60]} has no situation")
+        w, x, y, z = each.rotation
+        rows.append(
+            {
+                "scene_id": each.scene,
+                "situation": each.situation,
+                "alternative_situation": [],
+                "question": each.text,
+                "question_id": each.id,
+            }
+        )
+        answers.append(
+            {
+                "scene_id": each.scene,
+                "question_type": "N/A",
+                "answer_type": "other",
+                "question_id": each.id,
+                "answers": [
+                    {"answer": answer, "answer_confidence": "yes", "answer_id": number}
+                    for number, answer in enumerate(each.answers, start=1)
+                ],
+                "rotation": {"_x": x, "_y": y, "_z": z, "_w": w},
+                "position": _axes(each.position),
+            }
+        )
+    write_json(file, {"task_type": "Situated question answering", "questions": rows})
+    write_json(annotations, {"annotations": answers})
+    return annotations
+
+
+def _axes(position: Corner) -> dict[str, float]:
+    return dict(zip("xyz", position, strict=True))

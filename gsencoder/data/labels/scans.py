@@ -1,0 +1,587 @@
+"""Labels of scans from the files of ScanNet and ScanNet++.
+
+Labels of a ScanNet scan from its own files.
+
+A scan ID has ID_vh_clean_2.ply (the mesh), ID_vh_clean_2.0.010000.segs.json (a segment for each vertex),
+ID.aggregation.json (objects as groups of segments), and ID.txt, whose line `axisAlignment` turns the world of the poses
+and of the mesh into the frame in which ScanNet's benchmarks of boxes (ScanRefer and its kin) are stated. Ids are
+objectId + 1, as in ScanNet's own scripts, so that 0 can mean no object; ScanRefer's object_id is objectId.
+
+Reference: Dai et al., ScanNet, 2017; ScanNet's BenchmarkScripts/3d_helpers/export_train_mesh_for_evaluation.py.
+
+Labels of a ScanNet++ scene from its own files: scans/ with mesh_aligned_0.05.ply, segments.json and
+segments_anno.json.
+
+The world is that of the laser scan, which is also the frame of the poses and of the boxes: there is no alignment to
+apply. Ids are the objectIds of the annotation. Objects overlap: a vertex can belong to several, of which ScanNet++'s
+toolkit (semantic/transforms/mesh.py) keeps the smallest.
+
+Reference: Yeshwanth et al., ScanNet++, 2023.
+
+The two JSON files of an annotated scan, which ScanNet and ScanNet++ write alike.
+
+One gives each vertex of the mesh the number of its segment (`segIndices`), the other lists objects as groups of
+segments (`segGroups`: objectId, label, segments).
+"""
+
+import warnings
+from collections.abc import Collection, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from gsencoder.core.arrays import first_repeated
+from gsencoder.core.errors import InputError, SceneWarning, counted
+from gsencoder.data.labels.files import check_file, entries_of, read_checked_text, shown
+from gsencoder.data.labels.mesh import MeshInstances, read_mesh
+from gsencoder.data.readers.label_images import ArchivedLabels, archived_size, label_files, members_by_stem
+from gsencoder.data.readers.posed import rigid_pose
+from gsencoder.data.readers.transforms_json import read_json
+from gsencoder.types import MeshLabels, Scene, SceneObject, Views
+
+MAX_BYTES = 512 << 20
+"""Larger JSON files are refused before they are read: they would take tens of times as much memory."""
+MAX_NAME = 1000
+"""Largest number of characters of a name, as in a text table."""
+MAX_ID = 2**31 - 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SegmentGroup:
+    """One object of an annotation.
+
+    Attributes:
+        id: its objectId, as the file gives it.
+        label: its raw name, as the file gives it.
+        segments: numbers of its segments, ascending and unique.
+    """
+
+    id: int
+    label: str
+    segments: Int64[np.ndarray, " S"]
+
+
+def read_segments(path: Path) -> Int64[np.ndarray, " V"]:
+    """The segment of each vertex.
+
+    Raises:
+        InputError: unreadable, too large, or not a list `segIndices` of whole numbers.
+    """
+    values = _read(path, "segIndices", "the segment of each vertex")
+    numbers = _integers(values, f"{path}: segIndices")
+    if not len(numbers):
+        raise InputError(f"{path}: segIndices is empty; expected the segment of each vertex of the mesh")
+    return numbers
+
+
+def read_groups(path: Path, *, first_id: int) -> tuple[SegmentGroup, ...]:
+    """The objects of an annotation, in the order of the file.
+
+    Args:
+        path: ID.aggregation.json of ScanNet, or segments_anno.json of ScanNet++.
+        first_id: smallest objectId.
+
+    Raises:
+        InputError: unreadable, too large, not a list `segGroups`, a group without objectId, label or segments, or an
+            objectId that is there twice; the group is named.
+    """
+    groups: list[SegmentGroup] = []
+    rows = _read(path, "segGroups", "the objects")
+    for row, where in entries_of(rows, path, "objectId, label and segments", key="segGroups"):
+        number, label = row.get("objectId"), row.get("label")
+        if isinstance(number, bool) or not isinstance(number, int) or not first_id <= number <= MAX_ID:
+            raise InputError(f"{where}: objectId must be a whole number from {first_id}, got {shown(number)}")
+        of_object = f"{where} (objectId {number})"
+        if not isinstance(label, str):
+            raise InputError(f"{of_object}: label must be a name, got {shown(label)}")
+        if len(label) > MAX_NAME:
+            raise InputError(f"{of_object}: label has {len(label):,} characters, expected at most {MAX_NAME:,}")
+        segments = row.get("segments")
+        if not isinstance(segments, list):
+            raise InputError(f"{of_object}: segments must be a list of numbers of segments, got {shown(segments)}")
+        if not segments:
+            raise InputError(f"{of_object}: {label[:40]!r} has no segments; remove it, or get the annotation anew")
+        groups.append(
+            SegmentGroup(id=number, label=label, segments=np.unique(_integers(segments, f"{of_object}: segments")))
+        )
+    if repeated := first_repeated(group.id for group in groups):
+        number, first, second = repeated
+        raise InputError(f"{path}: segGroups[{second}]: objectId {number} is already that of segGroups[{first}]")
+    return tuple(groups)
+
+
+class SegmentVertices:
+    """The vertices of each segment of a mesh."""
+
+    def __init__(self, segments: Int64[np.ndarray, " V"], path: Path) -> None:
+        """Sorts the vertices by segment.
+
+        Args:
+            segments: of each vertex.
+            path: of their file, for messages.
+        """
+        self._order = np.argsort(segments, kind="stable")
+        self._numbers, self._starts = np.unique(segments[self._order], return_index=True)
+        self._ends = np.append(self._starts[1:], len(segments))
+        self._path = path
+
+    def of(self, group: SegmentGroup, path: Path) -> Int64[np.ndarray, " n"]:
+        """The vertices of an object of the annotation at `path`.
+
+        Raises:
+            InputError: it names a segment that no vertex of the mesh belongs to.
+        """
+        rows = np.searchsorted(self._numbers, group.segments)
+        unknown = self._numbers[np.minimum(rows, len(self._numbers) - 1)] != group.segments
+        if unknown.any():
+            raise InputError(
+                f"{path}: objectId {group.id} ({group.label[:40]!r}) names segment {group.segments[unknown][0]}, which "
+                f"no vertex has in {self._path}; expected both of one scan"
+            )
+        return np.concatenate(
+            [self._order[start:end] for start, end in zip(self._starts[rows], self._ends[rows], strict=True)]
+        )
+
+
+def check_counts(segments: Int64[np.ndarray, " V"], vertices: np.ndarray, path: Path, mesh: Path) -> None:
+    """Checks that a file of segments and a mesh have as many vertices.
+
+    Raises:
+        InputError: they have not.
+    """
+    if len(segments) != len(vertices):
+        raise InputError(
+            f"{path}: segIndices has {len(segments):,} entries, but {mesh} has {len(vertices):,} vertices; expected "
+            "the files of one mesh"
+        )
+
+
+def _read(path: Path, key: str, subject: str) -> list[Any]:
+    """The list at a key of the object that a JSON file holds."""
+    check_file(path, max_bytes=MAX_BYTES)
+    data = read_json(path)
+    values = data.get(key) if isinstance(data, dict) else None
+    if not isinstance(values, list):
+        keys = f"an object with {', '.join(map(str, list(data)[:6]))[:80]}" if isinstance(data, dict) else "no object"
+        raise InputError(f"{path}: expected an object with the list {key!r}, {subject}; got {keys}")
+    return values
+
+
+def _integers(values: list[Any], where: str) -> Int64[np.ndarray, " n"]:
+    """A list of whole numbers as an array; the first entry that is none is named."""
+    # JSON's true is not a number here, though Python and numpy would count it as 1.
+    if set(map(type, values)) <= {int}:
+        with suppress(OverflowError):
+            return np.array(values, np.int64)
+    for index, value in enumerate(values):
+        if isinstance(value, bool) or not isinstance(value, int) or not -(2**63) <= value < 2**63:
+            raise InputError(f"{where}[{index}]: expected a whole number, got {shown(value)}")
+    return np.array(values, np.int64)
+
+
+AGGREGATION, SEGMENTS, MESH = ".aggregation.json", "_vh_clean_2.0.010000.segs.json", "_vh_clean_2.ply"
+MAX_META_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanNetFiles:
+    """The label files of one scan.
+
+    Attributes:
+        name: of the scan, such as scene0000_00.
+        aggregation: objects as groups of segments.
+        segments: segment of each vertex.
+        mesh: the vertices.
+        meta: text that may state the alignment of axes, or None.
+    """
+
+    name: str
+    aggregation: Path
+    segments: Path
+    mesh: Path
+    meta: Path | None = None
+
+    @property
+    def missing(self) -> tuple[Path, ...]:
+        """Those of the files that do not exist."""
+        return tuple(path for path in (self.aggregation, self.segments, self.mesh) if not path.is_file())
+
+
+def find_scannet_files(folder: Path) -> ScanNetFiles | None:
+    """The label files of a scan in a folder, or of a scan of the folder's or its parent's name in the parent.
+
+    The second is for frames that were exported to a folder inside the scan's. None where there is no annotation.
+
+    Raises:
+        InputError: the folder holds annotations of several scans, and none has its name.
+    """
+    folder = folder.absolute()
+    # _vh_clean.aggregation.json belongs to the mesh of full resolution, which no benchmark uses.
+    scans = sorted(
+        path.name[: -len(AGGREGATION)]
+        for path in folder.glob(f"*{AGGREGATION}")
+        if path.is_file() and not path.name.endswith(f"_vh_clean{AGGREGATION}")
+    )
+    if folder.name in scans:
+        return _files(folder, folder.name)
+    if len(scans) > 1:
+        raise InputError(
+            f"{folder}: holds annotations of {len(scans)} scans ({', '.join(scans)[:80]}); expected one, or one named "
+            f"{folder.name}{AGGREGATION}"
+        )
+    if scans:
+        return _files(folder, scans[0])
+    for name in (folder.name, folder.parent.name):
+        if name and (folder.parent / f"{name}{AGGREGATION}").is_file():
+            return _files(folder.parent, name)
+    return None
+
+
+def _files(folder: Path, name: str) -> ScanNetFiles:
+    meta = folder / f"{name}.txt"
+    return ScanNetFiles(
+        name=name,
+        aggregation=folder / f"{name}{AGGREGATION}",
+        segments=folder / f"{name}{SEGMENTS}",
+        mesh=folder / f"{name}{MESH}",
+        meta=meta if meta.is_file() else None,
+    )
+
+
+def read_scannet_labels(source: Path | ScanNetFiles) -> MeshLabels:
+    """The labels of a scan.
+
+    A segment that several objects list belongs to the last of them, as ScanNet's script writes one after the other.
+
+    Args:
+        source: folder of the scan, or its files.
+
+    Raises:
+        InputError: a file is missing or wrong; file and entry are named. See `read_groups`, `read_segments`,
+            `read_mesh` and `read_axis_alignment`.
+    """
+    files = source if isinstance(source, ScanNetFiles) else find_scannet_files(source)
+    if files is None:
+        raise InputError(f"{source}: no annotation of ScanNet; expected ID{AGGREGATION}, ID{SEGMENTS} and ID{MESH}")
+    if files.missing:
+        raise InputError(f"{files.missing[0]}: no such file; the labels of {files.name} need it")
+    groups = read_groups(files.aggregation, first_id=0)
+    segments = read_segments(files.segments)
+    vertices, faces = read_mesh(files.mesh)
+    check_counts(segments, vertices, files.segments, files.mesh)
+    rows_of = SegmentVertices(segments, files.segments)
+    instances = np.zeros(len(vertices), np.int32)
+    for group in groups:
+        instances[rows_of.of(group, files.aggregation)] = group.id + 1
+    return MeshLabels(
+        vertices=vertices,
+        instances=instances,
+        objects=tuple((group.id + 1, group.label) for group in groups),
+        faces=faces,
+        aligned_from_world=None if files.meta is None else read_axis_alignment(files.meta),
+    )
+
+
+def read_axis_alignment(path: Path) -> Float64[np.ndarray, "4 4"] | None:
+    """The transform aligned_from_world of a scan's ID.txt (`axisAlignment = ` and 16 numbers, row by row).
+
+    None where the file has no such line, as those of test scans; the world is used as it is then.
+
+    Raises:
+        InputError: unreadable, or a line that is not a rigid transform.
+    """
+    lines = read_checked_text(path, max_bytes=MAX_META_BYTES).splitlines()
+    entries = [words for words in (line.partition("=") for line in lines) if words[0].strip() == "axisAlignment"]
+    if not entries:
+        return None
+    try:
+        values = np.array(entries[-1][2].split(), np.float64)
+    except ValueError:
+        values = np.zeros(0)
+    if len(values) != 16:
+        raise InputError(f"{path}: axisAlignment: expected 16 numbers, got {entries[-1][2].strip()[:60]!r}")
+    rigid_pose(values.reshape(4, 4), f"{path}: axisAlignment")
+    # As it is written, as benchmarks apply it, and not the nearest rotation.
+    return values.reshape(4, 4)
+
+
+ANNOTATION, SEGMENTS_PP, MESH_PP = "segments_anno.json", "segments.json", "mesh_aligned_0.05.ply"
+MAX_OBJECTS_OF_A_VERTEX = 3
+"""Objects after the third that claim a vertex, in the order of the file, are not looked at, as in the toolkit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanNetPPFiles:
+    """The label files of one scene: objects as groups of segments, the segment of each vertex, and the mesh."""
+
+    annotation: Path
+    segments: Path
+    mesh: Path
+
+    @property
+    def missing(self) -> tuple[Path, ...]:
+        """Those of the files that do not exist."""
+        return tuple(path for path in (self.annotation, self.segments, self.mesh) if not path.is_file())
+
+
+def find_scannetpp_files(folder: Path) -> ScanNetPPFiles | None:
+    """The label files of a scene, given itself, its scans/, or its dslr/ or iphone/; None without an annotation."""
+    folder = folder.absolute()
+    homes = [folder / "scans", folder]
+    if folder.name in ("dslr", "iphone"):
+        homes.append(folder.parent / "scans")
+    for home in homes:
+        if (home / ANNOTATION).is_file():
+            return ScanNetPPFiles(annotation=home / ANNOTATION, segments=home / SEGMENTS_PP, mesh=home / MESH_PP)
+    return None
+
+
+def read_scannetpp_labels(source: Path | ScanNetPPFiles, *, names: Collection[str] | None = None) -> MeshLabels:
+    """The labels of a scene.
+
+    A vertex that several objects claim belongs to the one with the fewest vertices, and of equal ones to the first in
+    the file. An object whose vertices all belong to others stays in the list.
+
+    Args:
+        source: folder of the scene, or its files.
+        names: raw names of the objects that are labeled, as benchmarks take those of their classes only, which decides
+            what a vertex with several objects belongs to; None = all. Others are left out.
+
+    Raises:
+        InputError: a file is missing or wrong; file and entry are named. See `read_groups`, `read_segments` and
+            `read_mesh`.
+    """
+    files = source if isinstance(source, ScanNetPPFiles) else find_scannetpp_files(source)
+    if files is None:
+        raise InputError(
+            f"{source}: no annotation of ScanNet++; expected scans/ with {ANNOTATION}, {SEGMENTS_PP}, {MESH_PP}"
+        )
+    if files.missing:
+        raise InputError(f"{files.missing[0]}: no such file; the labels of the scene need it")
+    # Objects count from 1: the toolkit takes 0 for the background.
+    groups = [group for group in read_groups(files.annotation, first_id=1) if names is None or group.label in names]
+    segments = read_segments(files.segments)
+    vertices, faces = read_mesh(files.mesh)
+    check_counts(segments, vertices, files.segments, files.mesh)
+    rows_of = SegmentVertices(segments, files.segments)
+    instances = np.zeros(len(vertices), np.int32)
+    claims = np.zeros(len(vertices), np.int8)
+    smallest = np.full(len(vertices), np.iinfo(np.int64).max)
+    for group in groups:
+        rows = rows_of.of(group, files.annotation)
+        rows = rows[claims[rows] < MAX_OBJECTS_OF_A_VERTEX]
+        claims[rows] += 1
+        count = len(rows)
+        rows = rows[count < smallest[rows]]
+        instances[rows], smallest[rows] = group.id, count
+    return MeshLabels(
+        vertices=vertices,
+        instances=instances,
+        objects=tuple((group.id, group.label) for group in groups),
+        faces=faces,
+    )
+
+
+STRUCTURE = frozenset(
+    """
+    wall; floor; ceiling; door; doorframe; door frame; window; window frame; windowsill; window sill; pillar; column;
+    beam; ledge; stairs; staircase; stair; structure; shower wall; shower floor; closet wall; closet floor;
+    closet ceiling; bathroom wall; bathroom floor; suspended ceiling; roof; skylight; baseboard
+    """.replace("\n", " ")
+    .strip()
+    .split("; ")
+)
+"""Parts of the building, which are not placed."""
+ARCHIVES = ("_2d-instance-filt.zip", "_2d-instance.zip")
+"""Endings of ScanNet's archives of instance maps: 8-bit PNGs with objectId + 1, filtered by depth or not."""
+NAMELESS = frozenset(("object", "objects", "unknown", "unlabeled", "unlabelled", "remove", "split", "misc", "other"))
+"""Names that say nothing: what has one is not placed either."""
+
+
+def find_labels(folder: Path, *, names: Collection[str] | None = None) -> MeshLabels | None:
+    """The labels of a scene's mesh in the files of ScanNet or ScanNet++; None where there is no annotation.
+
+    Args:
+        folder: of the scene (`Scene.folder`).
+        names: of ScanNet++, raw names of the objects that are labeled (`read_scannetpp_labels`); None = all.
+
+    Raises:
+        InputError: a file is missing or wrong.
+    """
+    scannet = find_scannet_files(folder)
+    if scannet is not None:
+        return read_scannet_labels(scannet)
+    scannetpp = find_scannetpp_files(folder)
+    return None if scannetpp is None else read_scannetpp_labels(scannetpp, names=names)
+
+
+def labels_of_layout(folder: Path, layout: str) -> MeshLabels | None:
+    """The labels that lie beside the photographs of a scene, in the world of its poses.
+
+    Args:
+        folder: of the scene.
+        layout: name of its layout; only ScanNet's and ScanNet++'s have labels.
+
+    Raises:
+        InputError: a file of the labels is wrong.
+
+    Warns:
+        SceneWarning: there is an annotation, but not the files that it needs.
+    """
+    if layout == "ScanNet":
+        scannet = find_scannet_files(folder)
+        if scannet is None:
+            return None
+        return None if _warn_of_missing(scannet.missing) else read_scannet_labels(scannet)
+    if layout == "ScanNet++":
+        scannetpp = find_scannetpp_files(folder)
+        if scannetpp is None:
+            return None
+        return None if _warn_of_missing(scannetpp.missing) else read_scannetpp_labels(scannetpp)
+    return None
+
+
+def _warn_of_missing(missing: Sequence[Path]) -> bool:
+    if missing:
+        warnings.warn(
+            f"{missing[0]}: no such file, so that the scene has no objects; its annotation needs it",
+            SceneWarning,
+            stacklevel=4,
+        )
+    return bool(missing)
+
+
+def is_placed(name: str) -> bool:
+    """Whether a raw name is that of a thing that stands, lies or hangs in a room.
+
+    That is every name but those of parts of the building (`STRUCTURE`: wall, floor, ceiling, door, window, column …)
+    and those that say nothing (`NAMELESS`: object, unknown, remove …); capitals do not matter. Benchmarks have no such
+    notion as small objects beside furniture, so that chairs and beds are placed here.
+    """
+    plain = " ".join(name.lower().split())
+    return plain not in STRUCTURE and plain not in NAMELESS and plain != ""
+
+
+def objects_of_labels(labels: MeshLabels) -> tuple[SceneObject, ...]:
+    """The objects of a labeled mesh, with boxes of their vertices along the axes of the world.
+
+    The views that show them are not counted; `with_counted_views` does.
+
+    Args:
+        labels: in the world of the scene's poses.
+
+    Warns:
+        SceneWarning: objects whose vertices all belong to others are left out.
+    """
+    boxes = labels.boxes()
+    if left_out := [name for number, name in labels.objects if number not in boxes]:
+        warnings.warn(
+            f"{len(left_out)} of {len(labels.objects)} labeled objects have no vertex of their own and are left out "
+            f"(first: {left_out[0][:40]!r})",
+            SceneWarning,
+            stacklevel=3,
+        )
+    return tuple(
+        SceneObject(
+            id=number,
+            name=name.strip() or None,
+            aabb_min=boxes[number][0],
+            aabb_max=boxes[number][1],
+            placed=is_placed(name),
+            views=None,
+            max_pixels=None,
+        )
+        for number, name in labels.objects
+        if number in boxes
+    )
+
+
+def with_archived_instances(views: Views, folder: Path) -> Views:
+    """Views of a ScanNet scan with the instance maps of SCAN_2d-instance-filt.zip, or else of SCAN_2d-instance.zip,
+    where one lies beside the annotation and the views have no pictures of instances of their own.
+
+    Args:
+        views: called as their color frames.
+        folder: of the scene.
+
+    Raises:
+        InputError: the archive is damaged.
+
+    Warns:
+        SceneWarning: the archive is not used, since it lacks frames or its pictures have another size.
+    """
+    scan = find_scannet_files(folder)
+    archives = () if scan is None else tuple(scan.aggregation.with_name(f"{scan.name}{end}") for end in ARCHIVES)
+    archive = next((path for path in archives if path.is_file()), None)
+    if archive is None or views.instances is not None or not len(views):
+        return views
+    members = members_by_stem(archive)
+    stems = [PurePosixPath(name).stem for name in views.names]
+    missing = [stem for stem in stems if stem not in members]
+    fault = ""
+    if missing:
+        fault = f"has no picture of {counted(len(missing), 'view')} of {len(stems)} (first: {missing[0]}.png)"
+    else:
+        maps = label_files([members[stem] for stem in stems], views, ArchivedLabels)
+        size, source = archived_size(members[stems[0]]), maps.grids[0].source
+        if size == (source.width, source.height):
+            return replace(views, instances=maps)
+        fault = f"has pictures of {size[0]}×{size[1]} pixels, and photographs have {source.width}×{source.height}"
+    warnings.warn(
+        f"{archive}: {fault}, so that instance maps are drawn from the labeled mesh", SceneWarning, stacklevel=3
+    )
+    return views
+
+
+def with_mesh_instances(views: Views, labels: MeshLabels, origin: Float64[np.ndarray, "3"]) -> Views:
+    """Views with instance maps drawn from a labeled mesh, where they have no pictures of instances of their own.
+
+    Args:
+        views: relative to `origin`.
+        labels: in the world of the views; without faces the views stay as they are.
+        origin: of the scene.
+    """
+    if views.instances is not None or labels.faces is None:
+        return views
+    return replace(views, instances=MeshInstances(labels, views, origin))
+
+
+def with_counted_views(scene: Scene) -> Scene:
+    """A scene whose objects state in how many views they show, and their largest area in one.
+
+    They are counted in the instance maps, inside the masks of the views. A scene whose objects state it stays as it is.
+
+    Raises:
+        InputError: objects that do not state it, and no instance maps to count them in.
+    """
+    if all(each.views is not None and each.max_pixels is not None for each in scene.objects):
+        return scene
+    if scene.views is None or scene.views.instances is None:
+        raise InputError(
+            f"scene {scene.name}: in how many views its objects show is not known, and it has no instance maps to "
+            "count in; expected a mesh with faces beside the annotation, or pictures of instances"
+        )
+    ids = np.array([each.id for each in scene.objects], np.int64)
+    order = np.argsort(ids)
+    view_counts, largest = np.zeros(len(ids), np.int64), np.zeros(len(ids), np.int64)
+    for view in range(len(scene.views)):
+        instances = scene.views.instances[view]
+        if scene.views.masks is not None:
+            instances = instances[scene.views.masks[view]]
+        values, counts = np.unique(instances, return_counts=True)
+        rows = np.minimum(np.searchsorted(ids[order], values), len(ids) - 1)
+        has_row = ids[order][rows] == values
+        rows, counts = order[rows[has_row]], counts[has_row]
+        view_counts[rows] += 1
+        largest[rows] = np.maximum(largest[rows], counts)
+    return replace(
+        scene,
+        objects=tuple(
+            replace(each, views=int(views), max_pixels=int(pixels))
+            for each, views, pixels in zip(scene.objects, view_counts, largest, strict=True)
+        ),
+    )

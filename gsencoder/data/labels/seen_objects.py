@@ -1,0 +1,277 @@
+"""The objects of a labeled scene, and how well its photographs show them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.labels.names import color_word
+from gsencoder.types import Scene
+
+COLOR_VIEWS = 4
+"""Photographs that a thing's color is read from: those that show most of it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenObject:
+    """A labeled object.
+
+    Attributes:
+        id: its value in the instance maps.
+        name: in singular, or None.
+        aabb_min: lower corner in world coordinates, meters.
+        aabb_max: upper corner.
+        pixels: its largest area in a photograph; 0 where none shows it.
+        color: its color word, where that is clear.
+    """
+
+    id: int
+    name: str | None
+    aabb_min: Float64[np.ndarray, "3"]
+    aabb_max: Float64[np.ndarray, "3"]
+    pixels: int
+    color: str | None = None
+
+    @property
+    def center(self) -> Float64[np.ndarray, "3"]:
+        return (self.aabb_min + self.aabb_max) / 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SeenScene:
+    """A labeled scene as questions are made from it: in meters, with z up.
+
+    Attributes:
+        name: of the scene.
+        objects: all that its labels list, in the order of their ids.
+        min_pixels: the area, in some photograph, from which an object may be asked about.
+        metres_per_unit: of the scene's files, which boxes were multiplied with.
+    """
+
+    name: str
+    objects: tuple[SeenObject, ...]
+    min_pixels: int
+    metres_per_unit: float = 1.0
+
+    def shown(self, scene_object: SeenObject) -> bool:
+        """Whether some photograph shows a thing well enough to be asked about."""
+        return scene_object.pixels >= self.min_pixels
+
+    def named(self, name: str) -> tuple[SeenObject, ...]:
+        """The objects of a name that any photograph shows. What none shows is outside of the recorded place."""
+        return tuple(scene_object for scene_object in self.objects if scene_object.name == name and scene_object.pixels)
+
+    def names(self) -> tuple[str, ...]:
+        """Names all of whose objects that any photograph shows are shown well enough, sorted.
+
+        Of other names, people would count differently, and not know which one is meant.
+        """
+        names = sorted(
+            {scene_object.name for scene_object in self.objects if scene_object.name and scene_object.pixels}
+        )
+        return tuple(name for name in names if all(map(self.shown, self.named(name))))
+
+    def unique(self, name: str) -> SeenObject | None:
+        """The only object of a name, where it is shown well enough; None where there are several or none."""
+        same = [scene_object for scene_object in self.objects if scene_object.name == name]
+        return same[0] if len(same) == 1 and self.shown(same[0]) else None
+
+
+def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
+    """Counts the pixels of each object in the photographs, and reads the color of those that are shown well.
+
+    Args:
+        scene: with labeled objects, instance maps and photographs, up = z.
+        min_pixels: see `SeenScene`.
+
+    Raises:
+        InputError: something of this is missing, no object is labeled, or the unit of length is unknown.
+    """
+    views = scene.views
+    missing = [
+        part
+        for part, there in (
+            ("labeled objects (objects.json)", bool(scene.objects)),
+            ("instance maps (instance_file_path)", views is not None and views.instances is not None),
+            ("photographs", views is not None and views.images is not None),
+        )
+        if not there
+    ]
+    if missing:
+        raise InputError(f"questions: scene {scene.name} has no {' and no '.join(missing)}; questions need labels")
+    if not any(scene_object.name for scene_object in scene.objects):
+        raise InputError(f"questions: no object of scene {scene.name} has a name")
+    if scene.metres_per_unit is None:
+        raise InputError(f"questions: the unit of scene {scene.name} is unknown; give data.metres_per_unit=")
+    if scene.up is not None and not np.allclose(scene.up, (0, 0, 1), atol=0.02):
+        raise InputError(f"questions: up is {scene.up.round(3).tolist()} in scene {scene.name}; expected z")
+    assert views is not None
+    assert views.instances is not None
+    ids = np.array([scene_object.id for scene_object in scene.objects])
+    largest = int(ids.max()) + 1
+    counts = np.stack(
+        [np.bincount(np.minimum(labels.ravel(), largest), minlength=largest + 1)[ids] for labels in views.instances]
+    )
+    colors = _colors(scene, counts, min_pixels)
+    unit = scene.metres_per_unit
+    scene_objects = [
+        SeenObject(
+            id=scene_object.id,
+            name=scene_object.name,
+            aabb_min=scene_object.aabb_min * unit,
+            aabb_max=scene_object.aabb_max * unit,
+            pixels=int(counts[:, row].max()),
+            color=colors[row],
+        )
+        for row, scene_object in enumerate(scene.objects)
+    ]
+    return SeenScene(
+        name=scene.name,
+        objects=tuple(sorted(scene_objects, key=lambda scene_object: scene_object.id)),
+        min_pixels=min_pixels,
+        metres_per_unit=unit,
+    )
+
+
+def _colors(scene: Scene, counts: Int64[np.ndarray, "V objects"], min_pixels: int) -> list[str | None]:
+    """The color of each named object that the photographs agree on that show most of it, each with enough of it."""
+    views = scene.views
+    assert views is not None
+    assert views.images is not None
+    assert views.instances is not None
+    words: list[set[str | None]] = [set() for _ in scene.objects]
+    best = np.zeros(counts.shape, bool)
+    np.put_along_axis(best, np.argsort(-counts, axis=0, kind="stable")[:COLOR_VIEWS], True, axis=0)
+    best &= (counts >= max(min_pixels, 1)) & np.array([bool(each.name) for each in scene.objects])
+    # Each photograph is decoded once.
+    for view in np.flatnonzero(best.any(axis=1)).tolist():
+        picture, labels = views.images[view], views.instances[view]
+        for row in np.flatnonzero(best[view]):
+            words[row].add(color_word(picture, labels == scene.objects[row].id))
+    return [next(iter(each)) if len(each) == 1 else None for each in words]
+
+
+NEAR = 0.5
+"""Things farther apart than this are not next to each other."""
+MARGIN = 0.1
+"""What is next to a thing is nearer to it than any other kind of thing, by this and by half."""
+TOUCHING = 0.04
+"""A thing stands on another if its lower side is at most so far from the other's upper side, …"""
+ON_SHARE = 0.6
+"""… and this share of its outline lies within the other's."""
+SAME_PLACE = 0.3
+"""Things whose boxes share more than this of the smaller one's volume are in or around each other, not beside."""
+REACH = 1.0
+"""Things farther apart than this, which is beyond what `clearly_nearer` asks of `NEAR`, do not decide any relation."""
+LARGEST = 1.3
+"""The largest of some things is so many times as long, across its box, as any other."""
+
+
+def gap(a: SeenObject, b: SeenObject) -> float:
+    """The distance between two boxes; 0 where they touch or overlap."""
+    apart = np.maximum(np.maximum(a.aabb_min - b.aabb_max, b.aabb_min - a.aabb_max), 0)
+    return float(np.linalg.norm(apart))
+
+
+def stands_on(upper: SeenObject, lower: SeenObject) -> bool:
+    """Whether the lower side of a box lies on the upper side of another."""
+    if abs(upper.aabb_min[2] - lower.aabb_max[2]) > TOUCHING:
+        return False
+    return outline_share(upper, lower) >= ON_SHARE
+
+
+def outline_share(a: SeenObject, b: SeenObject) -> float:
+    """Which share of the outline of a box, seen from above, lies within that of another; 0 for a flat one."""
+    shared = np.clip(np.minimum(a.aabb_max, b.aabb_max) - np.maximum(a.aabb_min, b.aabb_min), 0, None)[:2].prod()
+    area = (a.aabb_max - a.aabb_min)[:2].prod()
+    return float(shared / area) if area > 0 else 0.0
+
+
+def interlocked(a: SeenObject, b: SeenObject) -> bool:
+    """Whether a box is largely inside of another: in it, around it, or in its hollow."""
+    shared = np.clip(np.minimum(a.aabb_max, b.aabb_max) - np.maximum(a.aabb_min, b.aabb_min), 0, None).prod()
+    smaller = min((a.aabb_max - a.aabb_min).prod(), (b.aabb_max - b.aabb_min).prod())
+    return bool(smaller > 0 and shared > SAME_PLACE * smaller)
+
+
+def is_structure(scene_object: SeenObject, others: Float64[np.ndarray, "N 2"]) -> bool:
+    """Whether a thing without a name is part of the building: its box holds half of the centers of all the others."""
+    if scene_object.name is not None or not len(others):
+        return False
+    inside = ((others >= scene_object.aabb_min[:2]) & (others <= scene_object.aabb_max[:2])).all(axis=1)
+    return bool(inside.mean() >= 0.5)
+
+
+def movables(scene_objects: Sequence[SeenObject]) -> tuple[SeenObject, ...]:
+    """All things that are no part of the building."""
+    centers = np.array([each.center[:2] for each in scene_objects]).reshape(-1, 2)
+    return tuple(
+        each for row, each in enumerate(scene_objects) if not is_structure(each, np.delete(centers, row, axis=0))
+    )
+
+
+def near_things(scene_objects: Sequence[SeenObject]) -> dict[int, tuple[SeenObject, ...]]:
+    """For the id of each thing, the things within `REACH` of its box and itself, in order: `neighbor` and `supporter`
+    find the same among them as among all."""
+    lower, upper = (np.array([getattr(each, f"aabb_{end}") for each in scene_objects]) for end in ("min", "max"))
+    near = {}
+    for row, each in enumerate(scene_objects):
+        apart = np.maximum(lower - upper[row], lower[row] - upper).max(axis=1)
+        near[each.id] = tuple(scene_objects[other] for other in np.flatnonzero(apart <= REACH).tolist())
+    return near
+
+
+def beside(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> list[tuple[float, SeenObject]]:
+    """The things that may be beside another, nearest first, with their distances.
+
+    Left out are what it stands on or carries, what it is in or around, and what is wholly above or below it, as a
+    carpet is.
+
+    Args:
+        scene_object: one of `scene_objects`.
+        scene_objects: of `movables`.
+    """
+    others = [
+        (gap(scene_object, other), other)
+        for other in scene_objects
+        if other is not scene_object
+        and not stands_on(scene_object, other)
+        and not stands_on(other, scene_object)
+        and not interlocked(scene_object, other)
+        and min(scene_object.aabb_max[2], other.aabb_max[2]) > max(scene_object.aabb_min[2], other.aabb_min[2])
+    ]
+    return sorted(others, key=lambda pair: (pair[0], pair[1].id))
+
+
+def clearly_nearer(first: float, second: float) -> bool:
+    """Whether one distance is smaller than another by enough for people to agree."""
+    return second >= max(1.5 * first, first + MARGIN)
+
+
+def neighbor(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> SeenObject | None:
+    """What a thing is next to, where people would agree on its kind: the nearest of `beside`, at most 0.5 m away, and
+    nearer than any thing of another name by 0.1 m and by half. None where it has no name or nothing is clear."""
+    ranked = beside(scene_object, scene_objects)
+    if not ranked or ranked[0][1].name is None or ranked[0][1].name == scene_object.name or ranked[0][0] > NEAR:
+        return None
+    first, nearest = ranked[0]
+    second = min((distance for distance, other in ranked if other.name != nearest.name), default=np.inf)
+    return nearest if clearly_nearer(first, second) else None
+
+
+def supporter(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> SeenObject | None:
+    """What a thing stands on, where only one thing qualifies, it has a name, and the thing is in no other's box."""
+    lower = [other for other in scene_objects if other is not scene_object and stands_on(scene_object, other)]
+    inside = [other for other in scene_objects if other is not scene_object and interlocked(scene_object, other)]
+    return lower[0] if len(lower) == 1 and lower[0].name is not None and not inside else None
+
+
+def largest(scene_objects: Sequence[SeenObject]) -> SeenObject | None:
+    """The largest of several things; None where another is nearly as long across its box."""
+    sizes = np.array([np.linalg.norm(scene_object.aabb_max - scene_object.aabb_min) for scene_object in scene_objects])
+    if len(scene_objects) < 2:
+        return None
+    order = np.argsort(-sizes, kind="stable")
+    return scene_objects[order[0]] if sizes[order[0]] >= LARGEST * sizes[order[1]] else None

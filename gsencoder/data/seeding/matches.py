@@ -1,0 +1,415 @@
+"""Features of photographs and their matches: SIFT by pycolmap, in a database of its own.
+
+Points for posed photographs that came without any: SIFT features matched by pycolmap, triangulated with poses held.
+
+Matches are verified by the epipolar lines of the given poses; nothing is estimated but the points.
+"""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8
+
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.process import Track, untracked
+from gsencoder.data.readers.undistort import load_pycolmap
+from gsencoder.types import Cameras, Views
+from gsencoder.types.checks import invert_rigid
+
+
+def picture_name(view: int) -> str:
+    """The name of a view in the database."""
+    return f"{view:06d}.png"
+
+
+def detect_features(
+    pycolmap: Any,
+    database_path: Path,
+    pictures: Path,
+    views: Views,
+    cameras: Cameras,
+    features: int,
+    track: Track,
+) -> None:
+    """Writes the pictures at the size of `cameras`, and their features into a new database."""
+    from PIL import Image
+
+    masks = pictures.with_name("masks")
+    assert views.images is not None
+    for view in track(range(len(views)), "reading photographs"):
+        size = int(cameras.widths[view]), int(cameras.heights[view])
+        Image.fromarray(views.images[view]).resize(size, Image.Resampling.BOX).save(
+            pictures / picture_name(view), compress_level=1
+        )
+        if views.masks is not None:
+            masks.mkdir(exist_ok=True)
+            mask = Image.fromarray(views.masks[view].astype(np.uint8) * 255).resize(size, Image.Resampling.NEAREST)
+            mask.save(masks / f"{picture_name(view)}.png", compress_level=1)
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = max(int(cameras.widths.max()), int(cameras.heights.max()))
+    extraction.use_gpu = False
+    extraction.sift.max_num_features = features
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "PINHOLE"
+    if views.masks is not None:
+        reader.mask_path = masks
+    pycolmap.extract_features(
+        database_path,
+        pictures,
+        image_names=[picture_name(view) for view in range(len(views))],
+        camera_mode=pycolmap.CameraMode.PER_IMAGE,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def match_pairs(pycolmap: Any, database_path: Path, list_path: Path, pairs: Sequence[tuple[int, int]]) -> None:
+    """Writes the nearest features of pairs of views into the database, without any check of their geometry."""
+    lines = [f"{picture_name(first)} {picture_name(second)}\n" for first, second in pairs]
+    list_path.write_text("".join(lines), encoding="utf-8")
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.use_gpu = False
+    matching.skip_geometric_verification = True
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = list_path
+    pycolmap.match_image_pairs(
+        database_path, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
+    )
+
+
+def image_ids(database: Any, count: int) -> list[int]:
+    """The numbers that the database gives to views."""
+    return [database.read_image_with_name(picture_name(view)).image_id for view in range(count)]
+
+
+def fundamental_matrix(cameras: Cameras, first: int, second: int) -> Float64[np.ndarray, "3 3"]:
+    """F with x₂ᵀ F x₁ = 0 for the homogeneous pixels of one point in both views (Hartley and Zisserman, eq. 9.2)."""
+    poses = cameras.cam_from_world.astype(np.float64)
+    relative = poses[second] @ invert_rigid(poses[first])
+    x, y, z = relative[:3, 3]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    inverse = [np.linalg.inv(cameras.Ks[view].astype(np.float64)) for view in (first, second)]
+    return inverse[1].T @ cross @ relative[:3, :3] @ inverse[0]
+
+
+def epipolar_distances(
+    fundamental: Float64[np.ndarray, "3 3"],
+    first_pixels: Float64[np.ndarray, "M 2"],
+    second_pixels: Float64[np.ndarray, "M 2"],
+) -> Float64[np.ndarray, " M"]:
+    """How far pairs of pixels are from showing one point: the larger of the distances in pixels of each from the
+    epipolar line of the other; 0 where there is no such line, as for views from one place."""
+    largest = np.zeros(len(first_pixels))
+    for pixels, other, matrix in (
+        (second_pixels, first_pixels, fundamental),
+        (first_pixels, second_pixels, fundamental.T),
+    ):
+        lines = np.column_stack((other, np.ones(len(other)))) @ matrix.T
+        distance = np.abs(np.einsum("mi,mi->m", lines[:, :2], pixels) + lines[:, 2])
+        length = np.linalg.norm(lines[:, :2], axis=1)
+        largest = np.maximum(largest, np.divide(distance, length, out=np.zeros_like(distance), where=length > 0))
+    return largest
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PairMatches:
+    """Pixels of two views that look alike.
+
+    Attributes:
+        first: row of a view.
+        second: row of another.
+        first_pixels: (u, v) in the first.
+        second_pixels: the same features in the second.
+    """
+
+    first: int
+    second: int
+    first_pixels: Float64[np.ndarray, "M 2"]
+    second_pixels: Float64[np.ndarray, "M 2"]
+
+
+def match_photographs(
+    views: Views, cameras: Cameras, pairs: Sequence[tuple[int, int]], *, features: int, track: Track = untracked
+) -> list[PairMatches]:
+    """Matched features of pairs of photographs, unverified; pairs without any are left out.
+
+    Args:
+        views: with photographs.
+        cameras: of the same views, at the size in which features are detected.
+        pairs: rows of two views each.
+        features: largest number of features of a photograph.
+        track: progress.
+
+    Raises:
+        InputError: pycolmap is missing or refuses the photographs.
+    """
+    pycolmap = load_pycolmap()
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
+    matched = []
+    with TemporaryDirectory(prefix="gsencoder_match_") as name:
+        folder = Path(name)
+        database_path, pictures = folder / "database.db", folder / "images"
+        pictures.mkdir()
+        try:
+            detect_features(pycolmap, database_path, pictures, views, cameras, features, track)
+            match_pairs(pycolmap, database_path, folder / "pairs.txt", pairs)
+        except (RuntimeError, ValueError) as error:
+            message = " ".join(str(error).split())[:160]
+            raise InputError(f"pycolmap cannot match these photographs: {message}") from error
+        with pycolmap.Database.open(database_path) as database:
+            ids = image_ids(database, len(views))
+            keypoints = [database.read_keypoints(number)[:, :2].astype(np.float64) for number in ids]
+            for first, second in pairs:
+                if database.exists_matches(ids[first], ids[second]):
+                    rows = database.read_matches(ids[first], ids[second])
+                    matched.append(
+                        PairMatches(
+                            first=first,
+                            second=second,
+                            first_pixels=keypoints[first][rows[:, 0]],
+                            second_pixels=keypoints[second][rows[:, 1]],
+                        )
+                    )
+    return matched
+
+
+DEPTHS = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Depths of the points that stand for what a view may show, as multiples of the typical distance."""
+RAYS = 5
+"""Rows and columns of the rays on which these points lie."""
+MAX_ANGLE = np.deg2rad(75.0)
+"""Views of a surface from directions that differ more are not matched: their features look different."""
+FORWARD_BASELINES = 10.0
+"""Parallel cameras are taken to look at something this many times as far away as the nearest other camera."""
+
+
+class DepthRange(NamedTuple):
+    """Depths z at which a view may show something, world units."""
+
+    near: float
+    far: float
+
+
+def typical_distance(cameras: Cameras) -> float:
+    """How far away what the cameras look at may be, world units; 1 for one camera and for cameras at one point.
+
+    Cameras around something look at one point, the nearest one to all optical axes, and the result is their median
+    distance from it along the axes. Where the axes run parallel or apart it is ten times the median distance between
+    neighboring cameras.
+    """
+    centers = cameras.centers.astype(np.float64)
+    forward = cameras.cam_from_world[:, 2, :3].astype(np.float64)
+    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
+    normal_matrix = across.sum(axis=0)
+    if len(cameras) > 1 and np.linalg.eigvalsh(normal_matrix)[0] > 1e-3 * len(cameras):
+        point = np.linalg.solve(normal_matrix, np.einsum("vij,vj->i", across, centers))
+        along = np.einsum("vi,vi->v", point - centers, forward)
+        if np.mean(along > 0) > 0.75 and np.median(along) > 0:
+            return float(np.median(along))
+    apart = nearest_distances(centers)
+    return FORWARD_BASELINES * float(np.median(apart)) if len(apart) and np.median(apart) > 0 else 1.0
+
+
+def nearest_distances(centers: Float64[np.ndarray, "V 3"]) -> Float64[np.ndarray, " n"]:
+    """The distance from each center to the nearest one elsewhere; nothing for a center that has none."""
+    from scipy.spatial import cKDTree
+
+    unique = np.unique(centers, axis=0)
+    if len(unique) < 2:
+        return np.empty(0)
+    return np.asarray(cKDTree(unique).query(unique, k=2)[0])[:, 1]
+
+
+def overlaps(cameras: Cameras, distance: float) -> Float64[np.ndarray, "V V"]:
+    """The share of points before view i that view j shows too, from directions up to 75° apart; 0 on the diagonal.
+
+    Args:
+        cameras: of the views.
+        distance: of `typical_distance`.
+    """
+    count = len(cameras)
+    steps = (np.arange(RAYS) + 0.5) / RAYS
+    shares = np.zeros((count, count))
+    centers = cameras.centers.astype(np.float64)
+    for view in range(count):
+        columns, rows = np.meshgrid(steps * cameras.widths[view], steps * cameras.heights[view])
+        rays = cameras.rays(view, np.stack([columns.ravel(), rows.ravel()], axis=1))
+        points = (centers[view] + distance * np.array(DEPTHS)[:, None, None] * rays).reshape(-1, 3)
+        pixels, depths = cameras.project(points)
+        in_view = cameras.in_image(pixels, depths)
+        directions, other_directions = points - centers[view], points - centers[:, None]
+        norms = np.linalg.norm(directions, axis=1) * np.linalg.norm(other_directions, axis=2)
+        in_view &= np.einsum("pi,vpi->vp", directions, other_directions) > np.cos(MAX_ANGLE) * norms
+        shares[view] = in_view.mean(axis=1)
+    np.fill_diagonal(shares, 0)
+    return shares
+
+
+def choose_pairs(cameras: Cameras, count: int) -> list[tuple[int, int]]:
+    """Pairs of views to match: for each view the `count` others that overlap most with it, each pair once, sorted."""
+    shares = overlaps(cameras, typical_distance(cameras))
+    both = shares + shares.T
+    pairs = set()
+    for view in range(len(cameras)):
+        order = np.argsort(-both[view], kind="stable")[:count]
+        pairs |= {(min(view, int(other)), max(view, int(other))) for other in order if both[view, other] > 0}
+    return sorted(pairs)
+
+
+def depth_range_of_cameras(cameras: Cameras) -> DepthRange:
+    """Depths to sweep where nothing is known but the cameras: a fifth to four times the typical distance."""
+    distance = typical_distance(cameras)
+    return DepthRange(distance / 5, 4 * distance)
+
+
+MAX_EPIPOLAR_ERROR = 2.0
+"""Largest distance of a match from the epipolar line, in pixels of the pictures that are matched."""
+MIN_MATCHES = 15
+"""Pairs of views with fewer verified matches are not used."""
+FITTING_SHARE, ENOUGH_MATCHES = 0.1, 100
+"""Of this many matches or more, a smaller share lies on the epipolar lines only where poses are wrong: 0.18 to 0.9 of
+those of eight choices of views, and 0.00 to 0.11 (once 0.20) with other axes, inverse or exchanged poses."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Triangulation:
+    """Points that were triangulated.
+
+    Attributes:
+        points: world units, in the world of the cameras; sorted, so that a rerun gives the same array.
+        colors: RGB.
+        pairs: pairs of views with verified matches.
+        error: mean reprojection error in pixels of the pictures that were matched; NaN without points.
+    """
+
+    points: Float32[np.ndarray, "P 3"]
+    colors: UInt8[np.ndarray, "P 3"]
+    pairs: int
+    error: float
+
+
+def triangulate(
+    views: Views, *, size: int = 1000, features: int = 4096, neighbors: int = 16, track: Track = untracked
+) -> Triangulation:
+    """Points that several photographs show, seen from the given poses.
+
+    Args:
+        views: posed photographs, without distortion; features on masked pixels are not used.
+        size: longer side in pixels at which features are detected; smaller photographs keep theirs.
+        features: largest number of features of a photograph.
+        neighbors: other photographs that each is matched with.
+        track: progress.
+
+    Raises:
+        InputError: no photographs, fewer than two views, or pycolmap is missing or refuses.
+
+    Warns:
+        SceneWarning: hardly a match lies on the epipolar lines of the poses.
+    """
+    if views.images is None or len(views) < 2:
+        raise InputError(f"triangulate: expected two posed photographs or more, got {len(views)}")
+    pycolmap = load_pycolmap()
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
+    cameras = views.cameras.resized(size, enlarge=False)
+    with TemporaryDirectory(prefix="gsencoder_triangulate_") as name:
+        folder = Path(name)
+        database_path, pictures = folder / "database.db", folder / "images"
+        pictures.mkdir()
+        try:
+            detect_features(pycolmap, database_path, pictures, views, cameras, features, track)
+            pairs = choose_pairs(cameras, neighbors)
+            match_pairs(pycolmap, database_path, folder / "pairs.txt", pairs)
+            verified = _verify(pycolmap, database_path, cameras, pairs)
+            if not verified:
+                return _result(None, verified)
+            model = _posed_model(pycolmap, database_path, cameras)
+            options = pycolmap.IncrementalPipelineOptions()
+            options.random_seed = 0
+            options.num_threads = 1
+            model = pycolmap.triangulate_points(model, database_path, pictures, folder, options=options)
+            model.extract_colors_for_all_images(pictures)
+        except (RuntimeError, ValueError) as error:
+            message = " ".join(str(error).split())[:160]
+            raise InputError(f"triangulate: pycolmap cannot use these photographs: {message}") from error
+        return _result(model, verified)
+
+
+def _verify(
+    pycolmap: Any, database_path: Path, cameras: Cameras, pairs: Sequence[tuple[int, int]]
+) -> list[tuple[int, int]]:
+    """Writes the matches that lie on the epipolar lines of the poses; returns the pairs that have enough of them."""
+    verified, total, fitting = [], 0, 0
+    with pycolmap.Database.open(database_path) as database:
+        ids = image_ids(database, len(cameras))
+        keypoints = [database.read_keypoints(number)[:, :2].astype(np.float64) for number in ids]
+        for first, second in pairs:
+            if not database.exists_matches(ids[first], ids[second]):
+                continue
+            matches = database.read_matches(ids[first], ids[second])
+            good = on_epipolar_lines(
+                cameras, first, second, keypoints[first][matches[:, 0]], keypoints[second][matches[:, 1]]
+            )
+            count = int(good.sum())
+            if len(good) >= MIN_MATCHES:
+                total, fitting = total + len(good), fitting + count
+            if count < MIN_MATCHES:
+                continue
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+            geometry.inlier_matches = matches[good]
+            database.write_two_view_geometry(ids[first], ids[second], geometry)
+            verified.append((first, second))
+    if total >= ENOUGH_MATCHES and fitting < FITTING_SHARE * total:
+        warnings.warn(
+            f"the photographs do not seem to fit their poses: of {total:,} matched features {fitting:,} lie on their "
+            "epipolar lines; `gsencoder inspect` says what is wrong, as far as it can be told",
+            SceneWarning,
+            stacklevel=3,
+        )
+    return verified
+
+
+def on_epipolar_lines(
+    cameras: Cameras,
+    first: int,
+    second: int,
+    first_pixels: Float64[np.ndarray, "M 2"],
+    second_pixels: Float64[np.ndarray, "M 2"],
+) -> Bool[np.ndarray, " M"]:
+    """Which pairs of pixels may show one point: each lies near the epipolar line of the other."""
+    fundamental = fundamental_matrix(cameras, first, second)
+    return epipolar_distances(fundamental, first_pixels, second_pixels) <= MAX_EPIPOLAR_ERROR
+
+
+def _posed_model(pycolmap: Any, database_path: Path, cameras: Cameras) -> Any:
+    """A COLMAP model of the cameras, with the numbers that they have in the database, and no points."""
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database_path) as database:
+        for view, number in enumerate(image_ids(database, len(cameras))):
+            image = database.read_image(number)
+            camera = database.read_camera(image.camera_id)
+            K = cameras.Ks[view].astype(np.float64)
+            camera.params = np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+            database.update_camera(camera)
+            pose = cameras.cam_from_world[view, :3].astype(np.float64)
+            model.add_camera_with_trivial_rig(camera)
+            image.points2D = pycolmap.Point2DList(
+                [pycolmap.Point2D(pixel) for pixel in database.read_keypoints(number)[:, :2].astype(np.float64)]
+            )
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+    return model
+
+
+def _result(model: Any, verified: Sequence[tuple[int, int]]) -> Triangulation:
+    points = [] if model is None else list(model.points3D.values())
+    positions = np.array([point.xyz for point in points], np.float32).reshape(-1, 3)
+    colors = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
+    order = np.lexsort(positions.T)
+    error = float(model.compute_mean_reprojection_error()) if len(points) else float("nan")
+    return Triangulation(points=positions[order], colors=colors[order], pairs=len(verified), error=error)

@@ -1,0 +1,504 @@
+"""Splats in .ply files, INRIA's layout and PlayCanvas' compressed one, and in .splat files.
+
+PLY headers, and the INRIA layout of Gaussians in them (the files that most trainers write).
+
+Reference: Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering, 2023 (the layout is its code's).
+
+PlayCanvas' compressed .ply: chunks of 256 Gaussians with their bounds, 16 bytes a Gaussian, SH in bytes.
+
+Reference: the PLAYCANVAS splat-transform and SuperSplat tools. Writing is gsply's; reading is here, because gsply's
+kernels do not check what a damaged file makes them index, and hold opacities to a logit of ±10.
+"""
+
+import re
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from gsencoder.core.errors import InputError, SceneWarning, readable
+from gsencoder.core.files import open_foreign
+from gsencoder.core.process import threads_unchanged
+from gsencoder.data.splats.raw import (
+    SH_COEFFICIENTS,
+    RawSplat,
+    logits_from_opacities,
+    logs_from_scales,
+    opacities_from_logits,
+    quats_from_smallest_three,
+)
+from gsencoder.types import sh_from_colors
+
+MAX_HEADER = 1 << 18
+_BLOCK = 1 << 12  # Rows a block: small enough that its columns are picked from cache.
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float": "f4", "double": "f8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+_REQUIRED = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+             "rot_0", "rot_1", "rot_2", "rot_3")  # fmt: skip
+
+FILTER = "filter_3D"
+"""The property with the width of mip-splatting's smoothing filter, which its files leave to be applied."""
+_COLORS, _NORMALS = ("red", "green", "blue"), ("nx", "ny", "nz")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlyElement:
+    """One element of a header; `dtype` is None where a list property leaves the row size open.
+
+    `triangle` is the type of a row of an element with one list property and nothing else, if the list has three
+    entries: their count `n`, and `v`.
+    """
+
+    name: str
+    count: int
+    dtype: np.dtype | None
+    first_bad: str = ""
+    triangle: np.dtype | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlyHeader:
+    """What a .ply says about itself. `start` is the offset of the data in bytes."""
+
+    encoding: str
+    elements: tuple[PlyElement, ...]
+    start: int
+
+    def element(self, name: str) -> PlyElement | None:
+        """The element called `name`, or None."""
+        return next((element for element in self.elements if element.name == name), None)
+
+
+def read_header(path: Path, stream: BinaryIO) -> PlyHeader:
+    """Parses the header at the start of `stream`; every way to be wrong is an InputError that names the line."""
+    head = stream.read(MAX_HEADER)
+    end = re.search(rb"\nend_header[ \t]*\r?\n", head)
+    if end is None:
+        raise InputError(
+            f"{path}: no 'end_header' line in the first {len(head):,} bytes; the .ply is truncated or damaged"
+        )
+    lines = head[: end.start()].decode("ascii", errors="replace").splitlines()
+    encoding, order = "", "<"
+    elements: list[tuple[str, int, list[tuple[str, str]], str]] = []
+    lists: dict[str, list[tuple[str, str]]] = {}
+    for number, line in enumerate(lines[1:], start=2):
+        words = line.split()
+        match words:
+            case [] | ["comment", *_] | ["obj_info", *_]:
+                continue
+            case ["format", "ascii" | "binary_little_endian" | "binary_big_endian", _] if not encoding:
+                encoding = words[1]
+                order = ">" if encoding == "binary_big_endian" else "<"
+            case ["element", name, digits] if digits.isascii() and digits.isdigit() and len(digits) < 20:
+                elements.append((name, int(digits), [], ""))
+            case ["property", "list", count_kind, entry_kind, name] if elements:
+                elements[-1] = (*elements[-1][:3], name)
+                lists.setdefault(elements[-1][0], []).append((count_kind, entry_kind))
+            case ["property", kind, name] if elements and kind in _TYPES:
+                elements[-1][2].append((name, order + _TYPES[kind]))
+            case _:
+                raise InputError(f"{path}: line {number} of the .ply header cannot be read: {line[:80]!r}")
+    if not encoding:
+        raise InputError(f"{path}: the .ply header has no usable 'format' line")
+    names = [name for name, *_ in elements]
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}: the .ply header repeats an element: {', '.join(names)[:120]}")
+    parsed = []
+    for name, count, fields, list_name in elements:
+        if len({field for field, _ in fields}) != len(fields):
+            raise InputError(f"{path}: the .ply header repeats a property of element {name!r}")
+        dtype = None if list_name else np.dtype(fields)
+        triangle = _triangle_type(lists.get(name, []), order) if not fields else None
+        parsed.append(PlyElement(name=name, count=count, dtype=dtype, first_bad=list_name, triangle=triangle))
+    return PlyHeader(encoding=encoding, elements=tuple(parsed), start=end.end())
+
+
+def _triangle_type(lists: list[tuple[str, str]], order: str) -> np.dtype | None:
+    """The type of a row that is one list of three integers."""
+    kinds = [_TYPES.get(kind, "") for kind in lists[0]] if len(lists) == 1 else []
+    if not kinds or any(kind[:1] not in ("i", "u") for kind in kinds):
+        return None
+    return np.dtype([("n", order + kinds[0]), ("v", order + kinds[1], (3,))])
+
+
+def element_start(path: Path, header: PlyHeader, name: str, size: int) -> int:
+    """Offset in bytes of a binary element, checked against the size of the file before anything is allocated."""
+    offset = header.start
+    for element in header.elements:
+        if element.dtype is None:
+            raise InputError(
+                f"{path}: element {element.name!r} has the list property {element.first_bad!r} before or in {name!r}; "
+                "expected a splat with plain numbers (a mesh .ply is not a splat)"
+            )
+        end = offset + element.count * element.dtype.itemsize
+        if element.name == name:
+            if end > size:
+                raise InputError(
+                    f"{path}: the header claims {element.count:,} rows of {name!r}, {end:,} bytes in all, but has "
+                    f"{size:,} ({end - size:,} missing); it is truncated or its header is wrong"
+                )
+            return offset
+        offset = end
+    raise InputError(f"{path}: the .ply has no element {name!r}; expected a Gaussian splat")
+
+
+def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> RawSplat:
+    """Gaussians from the element `vertex`: any order of properties, any number type; `filter_3D` is applied, with a
+    warning, and others are ignored and listed."""
+    vertex = header.element("vertex")
+    if vertex is None or vertex.dtype is None:
+        raise InputError(f"{path}: the .ply has no element 'vertex' of plain numbers; expected a Gaussian splat")
+    names = vertex.dtype.names or ()
+    missing = [name for name in _REQUIRED if name not in names]
+    if missing == ["scale_2"]:
+        raise InputError(f"{path}: has scale_0 and scale_1 only, a 2D splat (surfels); expected three scales")
+    if missing:
+        raise InputError(
+            f"{path}: the .ply lacks {', '.join(missing)}; expected a Gaussian splat, not a point cloud or mesh"
+        )
+    colors = {name for name in names if re.fullmatch(r"f_rest_\d+", name)}
+    rest = len(colors)
+    if rest not in (0, 9, 24, 45, 72) or any(f"f_rest_{i}" not in names for i in range(rest)):
+        raise InputError(
+            f"{path}: has {rest} f_rest properties; expected f_rest_0 … with 0, 9, 24 or 45 of them (SH 0 to 3)"
+        )
+    per_channel = rest // 3
+    coefficients = min(per_channel + 1, SH_COEFFICIENTS[-1])
+    if coefficients < per_channel + 1:
+        warnings.warn(f"{path}: SH degree 4 was cut to degree 3", SceneWarning, stacklevel=2)
+
+    count = vertex.count
+    if header.encoding == "ascii":
+        rows = _ascii_rows(path, stream, header, vertex, size)
+    else:
+        stream.seek(element_start(path, header, "vertex", size))
+        rows = None
+    means = np.empty((count, 3), np.float64)
+    quats, scales = np.empty((count, 4), np.float32), np.empty((count, 3), np.float32)
+    opacities, sh = np.empty(count, np.float32), np.empty((count, coefficients, 3), np.float32)
+    widths = np.zeros(count, np.float64)
+    normals = [name for name in _NORMALS if name in names]
+    used = {*_REQUIRED, *colors, *normals, FILTER}
+    with np.errstate(over="ignore", invalid="ignore"):
+        for start in range(0, count, _BLOCK):
+            stop = min(start + _BLOCK, count)
+            block = np.fromfile(stream, vertex.dtype, stop - start) if rows is None else rows[start:stop]
+            if len(block) < stop - start:
+                raise InputError(f"{path}: ended while it was read, at row {start + len(block):,} of {count:,}")
+            for axis, name in enumerate("xyz"):
+                means[start:stop, axis] = block[name]
+            for axis in range(4):
+                quats[start:stop, axis] = block[f"rot_{axis}"]
+            for axis in range(3):
+                scales[start:stop, axis] = block[f"scale_{axis}"]
+                sh[start:stop, 0, axis] = block[f"f_dc_{axis}"]
+                for k in range(1, coefficients):
+                    sh[start:stop, k, axis] = block[f"f_rest_{axis * per_channel + k - 1}"]
+            opacities[start:stop] = block["opacity"]
+            if FILTER in names:
+                widths[start:stop] = block[FILTER]
+            # Trainers write normals of zeros.
+            used -= {name for name in normals if block[name].any()}
+    if FILTER in names:
+        if wrong := int((~((widths >= 0) & (widths < np.inf))).sum()):
+            raise InputError(f"{path}: {FILTER} of {wrong:,} rows is no width; expected 0 or more in each row")
+        scales, opacities = _filtered(scales, opacities, widths)
+        warnings.warn(
+            f"{path}: {FILTER} of mip-splatting is applied, which widens Gaussians and makes them fainter",
+            SceneWarning,
+            stacklevel=2,
+        )
+    others = [f"element {element.name}" for element in header.elements if element is not vertex and element.count]
+    return RawSplat(
+        means=means,
+        quats=quats,
+        log_scales=scales,
+        logit_opacities=opacities,
+        sh=sh,
+        format=f"INRIA .ply, {header.encoding}{f', {FILTER} applied' if FILTER in names else ''}",
+        unused=(*(f"property {name}" for name in names if name not in used), *others),
+    )
+
+
+def _filtered(
+    log_scales: Float32[np.ndarray, "N 3"], logits: Float32[np.ndarray, " N"], widths: Float64[np.ndarray, " N"]
+) -> tuple[Float32[np.ndarray, "N 3"], Float32[np.ndarray, " N"]]:
+    """Gaussians convolved with isotropic ones of these widths: scale √(s² + f²), opacity times √(Π s² / Π (s² + f²))
+    (Yu et al., Mip-Splatting, 2024)."""
+    logs = log_scales.astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wider = np.logaddexp(2 * logs, 2 * np.log(widths)[:, None]) / 2
+        opacities = opacities_from_logits(logits) * np.exp((logs - wider).sum(axis=1))
+    return wider.astype(np.float32), logits_from_opacities(opacities)
+
+
+def read_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
+    """Positions of the element `vertex` of a point cloud, and its colors if it has red, green and blue; those that are
+    no integers are taken for shares of 1.
+
+    Raises:
+        InputError: unreadable, not a .ply, truncated, or without x, y and z.
+    """
+    with readable(path), open_foreign(path) as stream:
+        if stream.read(4)[:3] != b"ply":
+            raise InputError(f"{path}: not a .ply file; expected a point cloud")
+        size = stream.seek(0, 2)
+        stream.seek(0)
+        header = read_header(path, stream)
+        points = np.stack([read_property(path, stream, header, size, name) for name in "xyz"], axis=1)
+        vertex = header.element("vertex")
+        assert vertex is not None
+        assert vertex.dtype is not None
+        if not set(_COLORS) <= set(vertex.dtype.names or ()):
+            return points, None
+        scale = 1 if vertex.dtype["red"].kind in "iu" else 255
+        colors = [read_property(path, stream, header, size, name) * scale for name in _COLORS]
+    return points, np.stack(colors, axis=1).round().clip(0, 255).astype(np.uint8)
+
+
+def read_property(path: Path, stream: BinaryIO, header: PlyHeader, size: int, name: str) -> Float64[np.ndarray, " N"]:
+    """One property of the element `vertex`.
+
+    Raises:
+        InputError: there is none of this name, or the file is truncated.
+    """
+    vertex = header.element("vertex")
+    if vertex is None or vertex.dtype is None or name not in (vertex.dtype.names or ()):
+        raise InputError(f"{path}: the .ply has no property {name!r}")
+    if header.encoding == "ascii":
+        return np.asarray(_ascii_rows(path, stream, header, vertex, size)[name], np.float64)
+    stream.seek(element_start(path, header, "vertex", size))
+    values = np.empty(vertex.count, np.float64)
+    for start in range(0, vertex.count, _BLOCK):
+        stop = min(start + _BLOCK, vertex.count)
+        block = np.fromfile(stream, vertex.dtype, stop - start)
+        if len(block) < stop - start:
+            raise InputError(f"{path}: ended while it was read, at row {start + len(block):,} of {vertex.count:,}")
+        values[start:stop] = block[name]
+    return values
+
+
+def _ascii_rows(path: Path, stream: BinaryIO, header: PlyHeader, vertex: PlyElement, size: int) -> np.ndarray:
+    assert vertex.dtype is not None
+    names = vertex.dtype.names or ()
+    skipped = 0
+    for element in header.elements:
+        if element is vertex:
+            break
+        skipped += element.count
+    # A row has at least one digit and one separator a value.
+    if skipped + vertex.count * len(names) * 2 > size - header.start + 1:
+        raise InputError(
+            f"{path}: the header claims {vertex.count:,} rows of {len(names)} numbers, more than {size:,} bytes hold; "
+            "it is truncated or its header is wrong"
+        )
+    stream.seek(header.start)
+    lines = islice(stream, skipped, skipped + vertex.count)
+    if vertex.count == 0:
+        return np.empty(0, vertex.dtype)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # "input contained no data" becomes the count's error below.
+            table = np.loadtxt(lines, dtype=np.float64, comments=None, ndmin=2, encoding="latin-1")
+    except ValueError as error:
+        raise InputError(f"{path}: a row of the ascii .ply cannot be read: {str(error)[:120]}") from error
+    if table.shape != (vertex.count, len(names)):
+        actual = f"{table.shape[0]:,} rows of {table.shape[1]} numbers"
+        raise InputError(
+            f"{path}: expected {vertex.count:,} rows of {len(names)} numbers, got {actual}; the file is truncated"
+        )
+    # Columns get names again; numbers stay float64, so that text with many digits keeps them.
+    return table.view(np.dtype([(name, np.float64) for name in names])).reshape(-1)
+
+
+def inria_row_bytes(sh_degree: int, *, double_means: bool) -> int:
+    """Bytes of a row that `write_inria` writes without further properties."""
+    positions, normals, others = 3, 3, 1 + 3 + 4
+    return 4 * (positions * (1 + double_means) + normals + 3 * (sh_degree + 1) ** 2 + others)
+
+
+def write_inria(
+    stream: BinaryIO, raw: RawSplat, *, double_means: bool, further: Mapping[str, Float32[np.ndarray, " N"]]
+) -> None:
+    """Writes binary little-endian rows x y z nx ny nz f_dc f_rest opacity scale rot; normals are 0.
+
+    `double_means` writes x y z as doubles, for scenes far from zero; everything else is float. `further` properties
+    follow.
+    """
+    rest = raw.sh.shape[1] - 1
+    position = "f8" if double_means else "f4"
+    names = [
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * rest)),
+    ]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)), *further]
+    dtype = np.dtype([(name, "<" + (position if name in "xyz" else "f4")) for name in names])
+    words = {"<f8": "double", "<f4": "float"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(raw)}"]
+    lines += [f"property {words[dtype[name].str]} {name}" for name in names]
+    stream.write(("\n".join([*lines, "end_header"]) + "\n").encode("ascii"))
+    for start in range(0, len(raw), _BLOCK):
+        part = slice(start, start + _BLOCK)
+        block = np.zeros(len(raw.means[part]), dtype)
+        for axis, name in enumerate("xyz"):
+            block[name] = raw.means[part, axis]
+        for axis in range(3):
+            block[f"f_dc_{axis}"] = raw.sh[part, 0, axis]
+            block[f"scale_{axis}"] = raw.log_scales[part, axis]
+            for k in range(rest):
+                block[f"f_rest_{axis * rest + k}"] = raw.sh[part, k + 1, axis]
+        for axis in range(4):
+            block[f"rot_{axis}"] = raw.quats[part, axis]
+        block["opacity"] = raw.logit_opacities[part]
+        for name, values in further.items():
+            block[name] = values[part]
+        stream.write(block.tobytes())
+
+
+_CHUNK = 256
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_BOUNDS = tuple(f"{end}_{axis}" for end in ("min", "max") for axis in "xyz")
+_SCALE_BOUNDS = tuple(f"{end}_scale_{axis}" for end in ("min", "max") for axis in "xyz")
+_COLOR_BOUNDS = tuple(f"{end}_{axis}" for end in ("min", "max") for axis in "rgb")
+
+
+def is_compressed(header: PlyHeader) -> bool:
+    """True for a .ply that packs its Gaussians."""
+    vertex = header.element("vertex")
+    return vertex is not None and vertex.dtype is not None and "packed_position" in (vertex.dtype.names or ())
+
+
+def read_compressed(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> RawSplat:
+    """Unpacks 11-10-11 bits of position and scale, 2-10-10-10 of rotation, 8-8-8-8 of color, 8 a SH coefficient."""
+    chunk, vertex, rest = header.element("chunk"), header.element("vertex"), header.element("sh")
+    if header.encoding == "ascii" or chunk is None or vertex is None:
+        raise InputError(f"{path}: a packed .ply needs binary data with the elements 'chunk' and 'vertex'")
+    starts = {part.name: element_start(path, header, part.name, size) for part in (chunk, vertex, rest) if part}
+    assert chunk.dtype is not None
+    assert vertex.dtype is not None
+    chunk_names, count = chunk.dtype.names or (), vertex.count
+    missing = [name for name in _BOUNDS + _SCALE_BOUNDS if name not in chunk_names]
+    missing += [name for name in _PACKED if name not in (vertex.dtype.names or ())]
+    if missing or any(vertex.dtype[name].kind != "u" or vertex.dtype[name].itemsize != 4 for name in _PACKED):
+        raise InputError(f"{path}: the packed .ply lacks {', '.join(missing) or 'uint columns'} in its header")
+    if chunk.count * _CHUNK < count:
+        raise InputError(
+            f"{path}: {chunk.count:,} chunks hold {chunk.count * _CHUNK:,} Gaussians at most, header claims {count:,}"
+        )
+    coefficients = 0
+    if rest is not None:
+        assert rest.dtype is not None
+        names = rest.dtype.names or ()
+        coefficients = len(names) // 3
+        if (
+            len(names) not in (9, 24, 45)
+            or set(names) != {f"f_rest_{i}" for i in range(len(names))}
+            or rest.count != count
+        ):
+            raise InputError(
+                f"{path}: element 'sh' has {rest.count:,} rows of {len(names)}; expected {count:,} of 9, 24 or 45"
+            )
+
+    stream.seek(starts["chunk"])
+    bounds = np.fromfile(stream, chunk.dtype, chunk.count)
+    stream.seek(starts["vertex"])
+    rows = np.fromfile(stream, vertex.dtype, count)
+    if len(bounds) < chunk.count or len(rows) < count:
+        raise InputError(f"{path}: ended while it was read")
+
+    def between(names: tuple[str, ...], shares: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+        low = np.stack([bounds[name] for name in names[:3]], axis=1).astype(np.float64)
+        high = np.stack([bounds[name] for name in names[3:]], axis=1).astype(np.float64)
+        which = np.arange(count) // _CHUNK
+        return low[which] + shares * (high - low)[which]
+
+    rotation = rows["packed_rotation"].astype(np.uint32)
+    thirds = np.stack([rotation >> 20 & 1023, rotation >> 10 & 1023, rotation & 1023], axis=1)
+    color = rows["packed_color"].astype(np.uint32)
+    rgba = np.stack([color >> 24, color >> 16 & 255, color >> 8 & 255, color & 255], axis=1) / 255
+    with np.errstate(over="ignore", invalid="ignore"):
+        means = between(_BOUNDS, _shares(rows["packed_position"]))
+        log_scales = between(_SCALE_BOUNDS, _shares(rows["packed_scale"])).astype(np.float32)
+        # Files before the color bounds were introduced spread colors over 0 to 1.
+        rgb = between(_COLOR_BOUNDS, rgba[:, :3]) if "min_r" in chunk_names else rgba[:, :3]
+        sh = np.empty((count, coefficients + 1, 3), np.float32)
+        sh[:, :1] = sh_from_colors(rgb)
+    if rest is not None and rest.dtype is not None:
+        stream.seek(starts["sh"])
+        packed = np.fromfile(stream, rest.dtype, count)
+        for axis in range(3):
+            for k in range(coefficients):
+                sh[:, k + 1, axis] = (packed[f"f_rest_{axis * coefficients + k}"] + np.float32(0.5)) / 32 - 4
+    return RawSplat(
+        means=means,
+        quats=quats_from_smallest_three(rotation >> 30, (thirds / 1023 - 0.5) * np.sqrt(2)),
+        log_scales=log_scales,
+        logit_opacities=logits_from_opacities(rgba[:, 3]),
+        sh=sh,
+        format="PlayCanvas compressed .ply",
+    )
+
+
+def _shares(packed: np.ndarray) -> Float64[np.ndarray, "N 3"]:
+    values = packed.astype(np.uint32)
+    return np.stack([(values >> 21) / 2047, (values >> 11 & 1023) / 1023, (values & 2047) / 2047], axis=1)
+
+
+def packed_bytes(raw: RawSplat) -> bytes:
+    """The file, with rows in the order given; `morton_order` first makes chunks compact and values precise."""
+    from gsply import compress_to_bytes
+
+    rest = raw.sh[:, 1:] if raw.sh.shape[1] > 1 else None
+    with threads_unchanged():
+        data = compress_to_bytes(
+            raw.means.astype(np.float32), raw.log_scales, raw.quats, raw.logit_opacities, raw.sh[:, 0], rest
+        )
+    return bytes(data)
+
+
+def morton_order(means: Float64[np.ndarray, "N 3"]) -> Int64[np.ndarray, " N"]:
+    """Rows along a Z-order curve of 2²¹ cells an axis over the bounding box."""
+    low = means.min(axis=0)
+    extent = max(float((means.max(axis=0) - low).max()), np.finfo(np.float64).tiny)
+    cells = ((means - low) / extent * (2**21 - 1)).astype(np.uint64)
+    # Each step doubles the gaps between bits, until two empty bits follow each.
+    for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F),
+                        (4, 0x10C30C30C30C30C3), (2, 0x1249249249249249)):  # fmt: skip
+        cells = (cells | cells << np.uint64(shift)) & np.uint64(mask)
+    codes = cells[:, 0] | cells[:, 1] << np.uint64(1) | cells[:, 2] << np.uint64(2)
+    return np.argsort(codes, kind="stable")
+
+
+_ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+
+
+def read_dotsplat(path: Path, stream: BinaryIO, size: int) -> RawSplat:
+    """Colors are SH degree 0; scales are stored as standard deviations; quaternion bytes are 128 + 128·q."""
+    if size % _ROW.itemsize:
+        raise InputError(
+            f"{path}: {size:,} bytes is not a whole number of {_ROW.itemsize}-byte rows; the .splat is truncated"
+        )
+    rows = np.fromfile(stream, _ROW)
+    rgba = rows["rgba"].astype(np.float64) / 255
+    return RawSplat(
+        means=rows["means"].astype(np.float64),
+        quats=((rows["quats"].astype(np.float32) - 128) / 128),
+        log_scales=logs_from_scales(rows["scales"]),
+        logit_opacities=logits_from_opacities(rgba[:, 3]),
+        sh=sh_from_colors(rgba[:, :3]).astype(np.float32),
+        format=".splat",
+    )

@@ -1,0 +1,402 @@
+"""Photographs from videos: which frames to take, how to decode them, and where they are stored."""
+
+import json
+import shutil
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int64, UInt8
+
+from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.files import atomic_file, check_foreign, read_foreign_text, sha256_of
+from gsencoder.core.process import Track, untracked
+
+SIZE = 640
+"""Longer side in pixels of the pictures whose sharpness is measured; motion is measured at half of it."""
+BLOCK = 64
+"""Side in pixels of the blocks whose motion is measured."""
+CONTRAST = 3.0
+"""Blocks whose gray levels, of 255, have a smaller standard deviation show nothing that could be seen moving."""
+CLEAR = 0.1
+"""Height of the peak of a phase correlation, of 1, from which on it is no noise."""
+MOVED = 8.0
+"""Motion in pixels after which a picture is compared with a newer one."""
+EDGE = 0.5
+"""What the sharpness of a frame counts midway between two positions, where that of a frame at one counts 1."""
+
+
+class Course(NamedTuple):
+    """What happens in a video.
+
+    Attributes:
+        positions: how far the picture has moved since the first frame, in widths of the picture; never falls.
+        sharpness: variance of the Laplacian of each frame, comparable between frames that show the same.
+    """
+
+    positions: Float[np.ndarray, " F"]
+    sharpness: Float[np.ndarray, " F"]
+
+
+def follow(pictures: Iterable[UInt8[np.ndarray, "H W"]]) -> Course:
+    """Measures motion and sharpness of all frames.
+
+    Each frame is compared with the newest one from which the picture had moved by some pixels, so that slow motion
+    counts in full, and trembling about one place does not.
+
+    Args:
+        pictures: brightness of each frame, at a longer side of about `SIZE` pixels.
+    """
+    positions: list[float] = []
+    sharpness: list[float] = []
+    reference: Float[np.ndarray, "h w"] | None = None
+    base = 0.0
+    for picture in pictures:
+        full = picture.astype(np.float32)
+        sharpness.append(laplacian_variance(full))
+        half = _halved(full)
+        # A picture of another size cannot be compared; few videos change theirs.
+        if reference is None or reference.shape != half.shape:
+            reference = half
+            positions.append(positions[-1] if positions else 0.0)
+            base = positions[-1]
+            continue
+        motion = median_motion(reference, half)
+        positions.append(max(positions[-1], base + motion / half.shape[1]))
+        if motion >= MOVED:
+            reference, base = half, positions[-1]
+    return Course(np.array(positions, np.float64), np.array(sharpness, np.float64))
+
+
+def laplacian_variance(picture: Float[np.ndarray, "H W"]) -> float:
+    """The usual measure of sharpness: variance of the sum of second differences."""
+    middle = picture[1:-1, 1:-1]
+    return float((picture[:-2, 1:-1] + picture[2:, 1:-1] + picture[1:-1, :-2] + picture[1:-1, 2:] - 4 * middle).var())
+
+
+def median_motion(before: Float[np.ndarray, "H W"], after: Float[np.ndarray, "H W"]) -> float:
+    """Median length in pixels of the motion of blocks, by phase correlation.
+
+    Blocks without contrast count nowhere; where a picture has no others it stands still. A block with contrast whose
+    motion is not clear has moved too far, or became blurred: it counts as half a block, the most that can be measured.
+    """
+    pairs = np.stack((_blocks(before), _blocks(after)))
+    textured = pairs.std(axis=(2, 3)).min(axis=0) >= CONTRAST
+    if not textured.any():
+        return 0.0
+    window = np.hanning(pairs.shape[2])[:, None] * np.hanning(pairs.shape[3])
+    pairs = pairs[:, textured]
+    spectra = np.fft.rfft2((pairs - pairs.mean(axis=(2, 3), keepdims=True)) * window)
+    cross = spectra[1] * spectra[0].conj()
+    surface = np.fft.irfft2(cross / np.maximum(np.abs(cross), 1e-6), s=pairs.shape[2:])
+    flat = surface.reshape(len(surface), -1)
+    peaks = flat.argmax(axis=1)
+    shifts = np.stack(np.unravel_index(peaks, surface.shape[1:]), axis=1).astype(np.float64)
+    sides = np.array(surface.shape[1:])
+    shifts -= sides * (shifts > sides / 2)
+    lengths = np.linalg.norm(shifts, axis=1)
+    lengths[flat[np.arange(len(flat)), peaks] < CLEAR] = BLOCK / 2
+    return float(np.median(lengths))
+
+
+def choose_frames(course: Course, *, motion: float, most: int, least: int) -> Int64[np.ndarray, " n"]:
+    """Indices of the frames to take, rising: of those nearest to each of evenly spaced positions a sharp one.
+
+    Args:
+        course: of the video.
+        motion: wanted distance between two frames in widths of the picture.
+        most: so many frames at most; they stand farther apart where that is too few.
+        least: so many at least, closer together where the picture moves little.
+
+    Raises:
+        InputError: the picture hardly moves.
+    """
+    total = float(course.positions[-1])
+    if total < motion:
+        raise InputError(
+            f"the picture moves by {total:.0%} of its width in {len(course.positions)} frames; a reconstruction needs "
+            "a camera that moves through the scene"
+        )
+    count = min(max(round(total / motion) + 1, least), most, len(course.positions))
+    # Nearest positions of all frames; those of one are a slice, because positions never fall.
+    step = total / max(1, count - 1)
+    nearest = np.floor(course.positions / step + 0.5).astype(np.int64).clip(0, count - 1)
+    away = np.abs(course.positions / step - nearest)
+    worth = course.sharpness * (1 - (1 - EDGE) * (2 * away) ** 2)
+    bounds = np.searchsorted(nearest, np.arange(count + 1))
+    slices = [(first, end) for first, end in pairwise(bounds) if first < end]
+    return np.array([first + worth[first:end].argmax() for first, end in slices], np.int64)
+
+
+def _blocks(picture: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "B h w"]:
+    """Blocks side by side over the whole picture; a picture that is smaller than a block is one."""
+    height, width = (min(BLOCK, side) for side in picture.shape)
+    rows, columns = (side // block for side, block in zip(picture.shape, (height, width), strict=True))
+    cut = picture[: rows * height, : columns * width].reshape(rows, height, columns, width)
+    return cut.swapaxes(1, 2).reshape(-1, height, width)
+
+
+def _halved(picture: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "h w"]:
+    height, width = (side // 2 * 2 for side in picture.shape)
+    halves: np.ndarray = picture[:height, :width].reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
+    return halves
+
+
+TIME_BASE = 1_000_000
+"""Parts of a second in which files state how long they are."""
+SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+
+
+def is_video(path: Path) -> bool:
+    """Whether a path is a file with the suffix of a video."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
+
+
+def refuse_video(path: Path) -> None:
+    """Checks that a path where a scene or a splat is expected is no video.
+
+    Raises:
+        InputError: it is one.
+    """
+    if is_video(path):
+        raise InputError(f"{path}: is a video; gsencoder reconstruct makes a scene of it")
+
+
+def load_av() -> Any:
+    """The module av.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import av
+    except ImportError:
+        raise InputError("video files are decoded by PyAV, which is missing: pip install 'gsencoder[video]'") from None
+    av.logging.set_level(av.logging.PANIC)
+    return av
+
+
+class Video:
+    """A video file that can be decoded from its beginning several times.
+
+    Attributes:
+        path: of the file.
+        pixel_aspect: width of a stored pixel by its height; 1 where the file states none.
+        seconds: duration that the file states; 0 = it states none.
+        decoded: seconds of the video that the last pass decoded.
+        failure: why decoding ended before the end of the file, from the last pass; None = it did not, so far as the
+            decoder says.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Args:
+        path: of the file.
+
+        Raises:
+            InputError: PyAV is missing, the file is no video, or it has no picture.
+        """
+        self.path = path
+        self._av = load_av()
+        with self._open() as container:
+            stream = container.streams.video[0]
+            duration = stream.duration * stream.time_base if stream.duration else (container.duration or 0) / TIME_BASE
+            self.pixel_aspect = float(stream.sample_aspect_ratio or 1)
+        self.seconds, self.decoded = float(duration), 0.0
+        self.failure: str | None = None
+
+    def _open(self) -> Any:
+        try:
+            check_foreign(self.path)
+            container = self._av.open(str(self.path), metadata_errors="replace")
+        except (self._av.FFmpegError, OSError, ValueError) as error:
+            raise InputError(f"{self.path}: not a video that can be decoded ({_reason(error)})") from error
+        if not container.streams.video:
+            kinds = listed(sorted({stream.type for stream in container.streams})) or "nothing"
+            container.close()
+            raise InputError(f"{self.path}: holds no pictures, only {kinds}")
+        return container
+
+    def frames(self) -> Iterator[Any]:
+        """All frames, as PyAV's VideoFrame, in the order in which they are shown. Where decoding fails they end, and
+        `failure` says why.
+
+        Raises:
+            InputError: the file cannot be opened any more, or its first frame cannot be decoded.
+        """
+        self.failure, self.decoded, empty = None, 0.0, True
+        with self._open() as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "AUTO"
+            base = float(stream.time_base or 0)
+            try:
+                for frame in container.decode(stream):
+                    empty = False
+                    self.decoded = max(self.decoded, float(frame.time or 0) - float(stream.start_time or 0) * base)
+                    yield frame
+            except (self._av.FFmpegError, OSError, ValueError) as error:
+                self.failure = _reason(error)
+        if empty:
+            raise InputError(f"{self.path}: no frame can be decoded ({self.failure or 'the video is empty'})")
+
+
+def grey_picture(frame: Any, size: int) -> UInt8[np.ndarray, "H W"]:
+    """Brightness of a frame as stored, not rotated.
+
+    Args:
+        frame: of `Video.frames`.
+        size: its longer side becomes so many pixels at most.
+    """
+    width, height = _fitted(frame.width, frame.height, size)
+    grey: np.ndarray = frame.reformat(width=width, height=height, format="gray").to_ndarray()
+    return grey
+
+
+def color_picture(frame: Any, size: int, pixel_aspect: float = 1.0) -> UInt8[np.ndarray, "H W 3"]:
+    """RGB of a frame as it is meant to be seen: rotated as the file states, with square pixels.
+
+    Args:
+        frame: of `Video.frames`.
+        size: its longer side becomes so many pixels at most.
+        pixel_aspect: width of a stored pixel by its height.
+    """
+    width, height = _fitted(round(frame.width * pixel_aspect), frame.height, size)
+    color: np.ndarray = frame.reformat(width=width, height=height, format="rgb24").to_ndarray()
+    return np.ascontiguousarray(np.rot90(color, round(frame.rotation / 90)))
+
+
+def _fitted(width: int, height: int, size: int) -> tuple[int, int]:
+    scale = min(1.0, size / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def _reason(error: BaseException) -> str:
+    return " ".join(str(getattr(error, "strerror", None) or error).split())[:120]
+
+
+RECORD_FILE = "frames.json"
+FEWEST = 16
+"""So many frames are taken of a video in which the picture moves little."""
+THIN = 0.35
+"""Frames that are farther apart, in widths of the picture, overlap too little to be registered surely."""
+ENOUGH = 0.98
+"""A video of which a smaller share can be decoded, less a second for its last frames, is not whole."""
+QUALITY = 95
+"""Of the JPEG files."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoConfig:
+    """Which frames of a video become photographs."""
+
+    frames: int = field(default=100, metadata={"help": "most frames that are taken of a video"})
+    motion: float = field(
+        default=0.08, metadata={"help": "by what share of its width the picture moves from one frame to the next"}
+    )
+    pixels: int = field(default=1600, metadata={"help": "longer side of the frames in pixels, at most"})
+
+    def __post_init__(self) -> None:
+        if self.frames < 3:
+            raise InputError(f"frames: expected at least 3, got {self.frames}")
+        if not 0.001 <= self.motion <= 1:
+            raise InputError(f"motion: expected a share of the width from 0.001 to 1, got {self.motion}")
+        if not 64 <= self.pixels <= 16384:
+            raise InputError(f"pixels: expected 64 to 16384, got {self.pixels}")
+
+
+def take_frames(
+    path: Path, folder: Path, config: VideoConfig = VideoConfig(), *, track: Track = untracked
+) -> tuple[str, ...]:
+    """Writes the frames of a video that show most: sharp ones, evenly spaced by how far the picture moves.
+
+    The video is decoded twice: small, to measure motion and sharpness of all frames, and large, for those that are
+    taken. A folder that an earlier call completed for the same file and settings is used again.
+
+    Args:
+        path: of the video.
+        folder: is replaced; it receives `frame_000000.jpg` and so on, the number being that of the frame in the video,
+            and a record of what they were made from.
+        config: settings.
+        track: progress of decoding.
+
+    Returns:
+        Names of the files, in the order of the video.
+
+    Raises:
+        InputError: PyAV is missing, no video, or a camera that hardly moves.
+
+    Warns:
+        SceneWarning: the video ends early because it is damaged, or the frames are far apart.
+    """
+    inputs = _inputs(path, config)
+    earlier = _taken(folder, inputs)
+    if earlier is not None:
+        return earlier
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    video = Video(path)
+    course = follow(_small_pictures(video, track))
+    if video.failure is not None or video.decoded < ENOUGH * video.seconds - 1:
+        reason = f" ({video.failure})" if video.failure else ""
+        warnings.warn(
+            f"{path}: is damaged or cut off: {video.decoded:.1f} s of {video.seconds:.1f} s can be decoded{reason}; "
+            "the "
+            "rest is not used",
+            SceneWarning,
+            stacklevel=2,
+        )
+    try:
+        numbers = choose_frames(course, motion=config.motion, most=config.frames, least=min(FEWEST, config.frames))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    apart = float(course.positions[-1]) / max(1, len(numbers) - 1)
+    if apart > THIN:
+        warnings.warn(
+            f"{path}: {len(numbers)} frames are {apart:.0%} of the picture's width apart, and overlap little; "
+            f"video.frames={int(course.positions[-1] / config.motion)} takes them closer together",
+            SceneWarning,
+            stacklevel=2,
+        )
+    names: list[str] = []
+    selected = set(numbers.tolist())
+    for index, frame in track(enumerate(video.frames()), f"taking {len(numbers)} frames"):
+        if index in selected:
+            names.append(f"frame_{index:06d}.jpg")
+            _write(folder / names[-1], color_picture(frame, config.pixels, video.pixel_aspect))
+        if index == numbers[-1]:
+            break
+    digests = {name: sha256_of(folder / name) for name in names}
+    with atomic_file(folder / RECORD_FILE) as stream:
+        stream.write(json.dumps({"asked": inputs, "files": digests}).encode())
+    return tuple(names)
+
+
+def _small_pictures(video: Video, track: Track) -> Iterator[UInt8[np.ndarray, "H W"]]:
+    for frame in track(video.frames(), "looking through the video"):
+        yield grey_picture(frame, SIZE)
+
+
+def _taken(folder: Path, inputs: dict[str, Any]) -> tuple[str, ...] | None:
+    """Names of the frames that an earlier call has written, if they are whole and were asked for as now."""
+    try:
+        record = json.loads(read_foreign_text(folder / RECORD_FILE))
+        files = record["files"]
+        if record["asked"] != inputs or any(sha256_of(folder / name) != digest for name, digest in files.items()):
+            return None
+        return tuple(files)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+
+
+def _inputs(path: Path, config: VideoConfig) -> dict[str, Any]:
+    state = path.stat()
+    return {"video": [path.name, state.st_size, state.st_mtime_ns], "settings": asdict(config)}
+
+
+def _write(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
+    from gsencoder.core.files import write_picture
+
+    write_picture(path, picture, quality=QUALITY, subsampling=0)

@@ -1,1 +1,0 @@
-"""Videos: the frames of a film that structure from motion can use."""
