@@ -56,8 +56,6 @@ from gsencoder.evaluate.scripted_answerer import (
 )
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.store.folder import load_features
-from gsencoder.fusion.teachers.build import build_teacher
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.ask.ask import Asker, Prompt, Question, chosen_mark, prompt_messages
 from gsencoder.infer.ask.batch import targets_to_json
 from gsencoder.infer.ask.predictions import short_answer
@@ -67,6 +65,8 @@ from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.selection import ViewsConfig
 from gsencoder.infer.views.write import views_to_json
 from gsencoder.render import blend
+from gsencoder.teachers.build import build_teacher
+from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.table import load_text_table
 from gsencoder.text.vocabulary import words_of_table
 from gsencoder.types import Scene

@@ -20,8 +20,8 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.fusion.basis import Moments, fit_basis
 from gsencoder.fusion.basis_fit import ProjectionSums
-from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import build_teacher
+from gsencoder.teachers.base import Teacher
+from gsencoder.teachers.build import build_teacher
 
 RANKS = (16, 32, 64, 128, 192, 256, 320, 384)
 

@@ -34,11 +34,10 @@ from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within
 from gsencoder.fusion.feature_error import field_error, judge
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teacher_maps import CachedTeacher, WrappedTeacher
-from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.onnx import OnnxConfig
-from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.teachers.base import Teacher
+from gsencoder.teachers.build import TeacherConfig, build_teacher, words_of
+from gsencoder.teachers.labels import LabelsConfig, PaletteConfig
+from gsencoder.teachers.onnx import OnnxConfig
 from gsencoder.types import FeatureMap, GaussianFeatures, Scene, Views
 
 

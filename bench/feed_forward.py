@@ -24,12 +24,12 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.evaluate.protocols.naming import compare_names, naming_scores
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import build_teacher, words_of
-from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.memory.bank import MapStream, build_bank, memory_of_features
 from gsencoder.memory.index import index_features
+from gsencoder.teachers.base import Teacher
+from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.train.memory import memory_training, train_memory
 from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.train.memory_scene import prepare_memory

@@ -18,8 +18,8 @@ from json_option import add_json_option, write_figures
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teachers.build import build_teacher, words_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
+from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig
 
 

@@ -16,9 +16,9 @@ from radios import small_radio
 from splats import front_camera
 
 from gsencoder.core.device import autocast_dtype
-from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.memory.attention import MemoryAttention, random_projection
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, encoder_inputs
+from gsencoder.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.types import FeatureSpace, MemoryBank, Views
 
 

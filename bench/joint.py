@@ -38,8 +38,6 @@ from gsencoder.app.settings.compose import compose
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.fusion.basis import to_coordinates
-from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.memory.attention import MemoryAttention
 from gsencoder.reconstruct.optimize import Optimizer
 from gsencoder.reconstruct.optimize_config import OptimizeConfig
@@ -49,6 +47,8 @@ from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.render import blend
 from gsencoder.render.images import psnr
 from gsencoder.render.rasterize import RasterConfig, rasterize
+from gsencoder.teachers.base import Teacher
+from gsencoder.teachers.build import build_teacher, words_of
 from gsencoder.train.memory import first_queries, memory_training, train_memory
 from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.train.memory_scene import MemoryScene, prepare_memory

@@ -23,9 +23,9 @@ from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.evaluate.rendered import RenderedTally
-from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import Blend, blend
+from gsencoder.teachers.build import build_teacher, words_of
 from gsencoder.train.memory import memory_training, train_decoder, train_memory, untrained_memory
 from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.train.memory_scene import MemoryScene, prepare_memory

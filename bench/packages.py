@@ -14,9 +14,9 @@ from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
 from gsencoder.evaluate.sources import fusion_source, with_features
 from gsencoder.fusion.store.package import PACKAGE_FILE, open_package, save_package
-from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.teachers.build import TeacherConfig, text_table_of
+from gsencoder.teachers.labels import LabelsConfig
 
 
 def main() -> None:

@@ -29,10 +29,10 @@ from gsencoder.evaluate.protocols.naming import NamingCounts, compare_names, nam
 from gsencoder.evaluate.sources import encoder_source
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teachers.labels import LabelsTeacher
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.teachers.labels import LabelsTeacher
 from gsencoder.text.table import TextTable, load_text_table
 from gsencoder.types import FeatureMap, GaussianFeatures, Scene
 

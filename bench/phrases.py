@@ -26,9 +26,9 @@ from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import seed
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teachers.build import build_teacher
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.teachers.build import build_teacher
+from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
 from gsencoder.types import SceneObject
 

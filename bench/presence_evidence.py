@@ -24,10 +24,10 @@ from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.absent import AbsentProtocol, names_of, words_to_ask
 from gsencoder.evaluate.sources import encoder_source, fusion_source, with_features
-from gsencoder.fusion.teachers.build import words_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.infer.localize.localize import find_candidates
+from gsencoder.teachers.build import words_of
+from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import OnnxTextConfig, TableTextConfig, Words, words_of_table
 from gsencoder.types import GaussianFeatures, Scene
 

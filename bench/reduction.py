@@ -24,7 +24,6 @@ from gsencoder.core.archive import RowFile
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import load_scene
 from gsencoder.fusion.teacher_maps import CachedTeacher
-from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.memory.reduction import (
     CoverReduction,
     Reduction,
@@ -33,6 +32,7 @@ from gsencoder.memory.reduction import (
     reduce_units_as_published,
     unit_rows,
 )
+from gsencoder.teachers.build import build_teacher, words_of
 
 CHUNK = 5000
 

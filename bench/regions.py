@@ -22,9 +22,9 @@ from PIL import Image
 from gsencoder.core.errors import SceneWarning
 from gsencoder.evaluate.protocols.localization import evaluate_localization
 from gsencoder.evaluate.sources import fusion_source, load_scenes
-from gsencoder.fusion.teachers.build import LabelsConfig, words_of
-from gsencoder.fusion.teachers.palette import lab_from_rgb
-from gsencoder.fusion.teachers.regions.config import RegionsConfig
+from gsencoder.teachers.build import LabelsConfig, words_of
+from gsencoder.teachers.labels import lab_from_rgb
+from gsencoder.teachers.masks import RegionsConfig
 from gsencoder.text.models import OnnxTextConfig
 from gsencoder.types import GaussianFeatures, Scene
 

@@ -22,9 +22,8 @@ from gsencoder.core.errors import SceneWarning
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
-from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
 from gsencoder.render import blend
+from gsencoder.teachers.segmenter import OnnxSegmenterOptions, SegmenterConfig, SegmenterTeacher
 from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
 
 MIN_ALPHA = 0.5

@@ -44,14 +44,14 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import is_seen, queryable_objects, score_boxes
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teachers.build import build_teacher, words_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.select.select import select
 from gsencoder.render import Blend, blend
 from gsencoder.render.images import render_image
+from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, Gaussians, Scene, SceneObject, Views
 

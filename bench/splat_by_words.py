@@ -27,9 +27,8 @@ from gsencoder.data.splats.files import load_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.orbit_views import with_views
-from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
-from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
 from gsencoder.infer.draw.pictures import contact_sheet
+from gsencoder.teachers.segmenter import OnnxSegmenterOptions, SegmenterConfig, SegmenterTeacher
 from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
 from gsencoder.types import GaussianFeatures
 

@@ -32,10 +32,10 @@ from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.store.folder import FEATURES_FILE, load_features, save_features, save_memories
 from gsencoder.fusion.store.memory_file import MEMORY_FILE
 from gsencoder.fusion.store.package import PACKAGE_FILE, save_index_package, save_package
-from gsencoder.fusion.teachers.build import build_teacher, words_of
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.memory.bank import BankConfig
 from gsencoder.memory.index import IndexConfig, index_features
+from gsencoder.teachers.build import build_teacher, words_of
 from gsencoder.train.memory import memory_training, train_memory, untrained_memory
 from gsencoder.train.memory_network import MemoryConfig
 from gsencoder.train.memory_scene import prepare_memory

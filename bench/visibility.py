@@ -21,11 +21,11 @@ from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.evaluate.boxes import Hit
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.teachers.build import build_teacher, text_table_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.fusion.visibility import VisibilityConfig
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.teachers.build import build_teacher, text_table_of
+from gsencoder.teachers.labels import LabelsConfig
 
 VISIBILITIES = {
     "none": VisibilityConfig(against=()),

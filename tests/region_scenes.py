@@ -11,9 +11,9 @@ from onnx import TensorProto, helper
 from scene_files import save
 from splats import front_camera, random_gaussians
 
-from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import build_teacher
-from gsencoder.fusion.teachers.regions.config import RegionsConfig
+from gsencoder.teachers.base import Teacher
+from gsencoder.teachers.build import build_teacher
+from gsencoder.teachers.masks import RegionsConfig
 from gsencoder.text.table import TextTable, make_text_table, unit
 from gsencoder.types import Cameras, Scene, SceneObject, Views
 

@@ -5,9 +5,9 @@ from typing import Any
 
 from region_scenes import WIDTH, region_scene
 
-from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import build_teacher
-from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions, RegionsConfig
+from gsencoder.teachers.base import Teacher
+from gsencoder.teachers.build import build_teacher
+from gsencoder.teachers.masks import OnnxRegionOptions, RegionsConfig
 from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureMap
 

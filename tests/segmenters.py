@@ -10,8 +10,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 from splats import front_camera
 
-from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
-from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
+from gsencoder.teachers.segmenter import OnnxSegmenterOptions, SegmenterConfig, SegmenterTeacher
 from gsencoder.text.table import TextTable, make_text_table, unit
 from gsencoder.text.vocabulary import OpenVocabulary
 from gsencoder.types import Views

@@ -9,7 +9,7 @@ import numpy as np
 from splats import front_camera
 from vision_towers import picture
 
-from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
+from gsencoder.teachers.tower import TransformersConfig, TransformersTeacher
 from gsencoder.types import Views
 
 WIDE = picture(30, 60)

@@ -8,9 +8,9 @@ import numpy as np
 
 from gsencoder.core.process import untracked
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.teachers import Teacher
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.transformer import TransformerConfig
+from gsencoder.teachers.base import Teacher
 from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.crops import SamplingConfig
 from gsencoder.train.dataset_space import fit_space

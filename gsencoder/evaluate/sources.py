@@ -14,9 +14,9 @@ from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.heads.apply import head_features
 from gsencoder.fusion.heads.measure import HeadSet, MeasuredHead, measure_heads
 from gsencoder.fusion.heads.radio import Head
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder
+from gsencoder.teachers.build import TeacherConfig, build_teacher
 from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, Scene

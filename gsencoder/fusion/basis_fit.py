@@ -14,7 +14,7 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.teacher_maps import upright
-from gsencoder.fusion.teachers import Teacher
+from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureBasis, FeatureMap, Views
 
 BINS = 1000

@@ -16,7 +16,7 @@ from gsencoder.core.files import atomic_file, read_foreign_text
 from gsencoder.core.settings import first_difference
 from gsencoder.data.splats.files import fingerprint
 from gsencoder.fusion.teacher_maps import CachedTeacher
-from gsencoder.fusion.teachers import Teacher
+from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureBasis, Gaussians, Views
 
 SETTINGS_FILE, SUMS_FILE = "settings.json", "sums.safetensors"

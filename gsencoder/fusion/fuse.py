@@ -29,9 +29,9 @@ from gsencoder.fusion.checkpoint import open_checkpoint
 from gsencoder.fusion.coverage.covering import covering_views
 from gsencoder.fusion.lift import FeatureSums, distinct_rows, view_matrix
 from gsencoder.fusion.teacher_maps import upright
-from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import VisibilityConfig, resolve
 from gsencoder.render import Blend, BlendConfig
+from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Scene, Views
 
 VIEWS_AT_ONCE = 4

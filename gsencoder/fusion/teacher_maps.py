@@ -14,7 +14,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import advised
-from gsencoder.fusion.teachers import Teacher
+from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 from gsencoder.types.orientation import stored_map, upright_views
 

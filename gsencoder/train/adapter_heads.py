@@ -20,9 +20,9 @@ from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import choose_heads, has_head, load_heads, save_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE, check_heads_space
-from gsencoder.fusion.teachers.build import TeacherConfig
-from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpace
+from gsencoder.teachers.build import TeacherConfig
+from gsencoder.teachers.radio import RadioConfig
 from gsencoder.train.losses import AdapterHead
 from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.sampled_maps import OpenScene, sampled_maps

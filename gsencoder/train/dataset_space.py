@@ -13,8 +13,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis, to_coordinates
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.teachers import MissingInput
 from gsencoder.models.output_space import OutputSpace, output_space_parts
+from gsencoder.teachers.base import MissingInput
 from gsencoder.train.distributed import check_agreement, fail_together, value_of_first, values_of_all
 from gsencoder.train.prepare import PrepareConfig
 from gsencoder.train.prepared_dataset import SPACE_FILE, PreparedDataset

@@ -26,9 +26,9 @@ from gsencoder.data.splats.files import fingerprint
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.teacher_maps import CachedTeacher, upright
-from gsencoder.fusion.teachers import Teacher
 from gsencoder.memory.bank import BankConfig, MapStream, RawSample, build_bank, draw_sample
 from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
+from gsencoder.teachers.base import Teacher
 from gsencoder.train.prepare import PrepareConfig, view_rows
 from gsencoder.train.prepared_file import write_prepared
 from gsencoder.train.prepared_scene import PreparedScene

@@ -13,10 +13,10 @@ from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import capped
 from gsencoder.fusion.teacher_maps import upright
-from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import row_mask
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.render import blend
+from gsencoder.teachers.base import Teacher
 from gsencoder.train.prepared_file import Precision, ViewRows, write_prepared
 from gsencoder.types import FeatureMap, Scene
 

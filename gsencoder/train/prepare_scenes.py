@@ -15,9 +15,9 @@ from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.core.settings import TRAINED
 from gsencoder.fusion.heads.radio import Head
-from gsencoder.fusion.teachers import MissingInput, Teacher
-from gsencoder.fusion.teachers.build import TeacherConfig
 from gsencoder.models.output_space import check_distinct
+from gsencoder.teachers.base import MissingInput, Teacher
+from gsencoder.teachers.build import TeacherConfig
 from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
 from gsencoder.train.dataset_space import fit_space

@@ -19,8 +19,8 @@ from gsencoder.core.files import atomic_file, locked, read_foreign, read_foreign
 from gsencoder.core.process import ProcessRank, Track
 from gsencoder.core.settings import first_difference, with_added_options
 from gsencoder.fusion.teacher_maps import CachedTeacher
-from gsencoder.fusion.teachers import Teacher
 from gsencoder.models.output_space import OutputSpace, read_output_space
+from gsencoder.teachers.base import Teacher
 from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets
 from gsencoder.train.distributed import fail_together, summed_array, value_of_first
 from gsencoder.train.prepare import PrepareConfig, prepare_scene

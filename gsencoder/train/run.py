@@ -14,9 +14,9 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import plain
 from gsencoder.core.process import Device, ProcessRank, Track, threads_of_torch, untracked
 from gsencoder.fusion.heads.store import heads_digest
-from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces
+from gsencoder.teachers.build import words_by_teacher
 from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.train.adapter_heads import dataset_heads, render_heads, required_heads, teacher_of_heads

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.fusion.teacher_maps import upright
-from gsencoder.fusion.teachers import MissingInput, Teacher
+from gsencoder.teachers.base import MissingInput, Teacher
 from gsencoder.types import FeatureMap, Scene
 
 OpenScene = Callable[[Path], tuple[Scene, Teacher]]

@@ -14,10 +14,10 @@ from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits, with_views
 from gsencoder.fusion.store.folder import TEACHER_NAME
-from gsencoder.fusion.teachers import MissingInput, Teacher
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, options_of_member
-from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.regions.config import RegionsConfig
+from gsencoder.teachers.base import MissingInput, Teacher
+from gsencoder.teachers.build import TeacherConfig, build_teacher, options_of_member
+from gsencoder.teachers.labels import LabelsConfig
+from gsencoder.teachers.masks import RegionsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.train.prepare import PrepareConfig
 from gsencoder.types import Scene

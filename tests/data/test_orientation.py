@@ -17,12 +17,12 @@ from gsencoder.data.up import up_of_scene
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.store.folder import load_features, save_features
 from gsencoder.fusion.teacher_maps import upright
-from gsencoder.fusion.teachers.palette import PaletteTeacher
-from gsencoder.fusion.teachers.regions.masks import FileMasks
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.pictures import view_pictures
 from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.teachers.labels import PaletteTeacher
+from gsencoder.teachers.masks import FileMasks
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 from gsencoder.types.orientation import INVERSE, TURNS, stored_map, turned, upright_scene, upright_views
 

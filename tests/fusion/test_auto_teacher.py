@@ -9,10 +9,8 @@ from field_scenes import FieldRoom
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.data.scenes import load_scene
-from gsencoder.fusion.teachers.auto import SEGMENTER, SENTENCES, AutoConfig, choose_teacher
-from gsencoder.fusion.teachers.build import TeacherConfig, text_table_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.teachers.build import SEGMENTER, SENTENCES, AutoConfig, TeacherConfig, choose_teacher, text_table_of
+from gsencoder.teachers.labels import LabelsConfig, PaletteConfig
 from gsencoder.text.models import OnnxTextConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene

@@ -9,7 +9,7 @@ from training_scenes import DenseSideTeacher, scene
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.checkpoint import SETTINGS_FILE, SUMS_FILE, FusionCheckpoint
-from gsencoder.fusion.teachers import Teacher
+from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureMap, Views
 
 

@@ -12,8 +12,8 @@ from splats import front_camera
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.synthetic import make_room
-from gsencoder.fusion.teachers.build import build_teacher
-from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
+from gsencoder.teachers.build import build_teacher
+from gsencoder.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.types import Views
 
 transformers = pytest.importorskip("transformers")

@@ -17,8 +17,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.fusion.heads.names import text_kind
 from gsencoder.fusion.heads.of_teacher import heads_of
 from gsencoder.fusion.heads.radio import Head, read_radio_heads
-from gsencoder.fusion.teachers.palette import PaletteConfig
-from gsencoder.fusion.teachers.radio import RadioConfig, RadioTeacher
+from gsencoder.teachers.labels import PaletteConfig
+from gsencoder.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.types import Views
 
 pytest.importorskip("transformers")

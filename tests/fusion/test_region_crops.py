@@ -17,9 +17,9 @@ from vision_towers import JOINT_CHANNELS, save_preprocessing
 from vision_towers import VISION as TOWER_VISION
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.teachers.build import build_teacher, takes_text, words_of
-from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions, RegionsConfig
-from gsencoder.fusion.teachers.regions.crops import TransformersImageTower, square_crop
+from gsencoder.teachers.build import build_teacher, takes_text, words_of
+from gsencoder.teachers.masks import OnnxRegionOptions, RegionsConfig
+from gsencoder.teachers.regions import TransformersImageTower, square_crop
 from gsencoder.text.models import OnnxTextConfig
 
 TEXT = {**SMALL, "vocab_size": 8, "max_position_embeddings": 12, "eos_token_id": 3, "bos_token_id": 2}

@@ -13,10 +13,10 @@ from scene_files import save
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.images import read_integers
-from gsencoder.fusion.teachers import MissingInput
-from gsencoder.fusion.teachers.build import build_teacher
-from gsencoder.fusion.teachers.regions.captions import read_captions
-from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions, RegionsConfig
+from gsencoder.teachers.base import MissingInput
+from gsencoder.teachers.build import build_teacher
+from gsencoder.teachers.captions import read_captions
+from gsencoder.teachers.masks import OnnxRegionOptions, RegionsConfig
 
 
 @pytest.mark.parametrize("rest", ["none", "mean"])

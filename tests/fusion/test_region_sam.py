@@ -16,9 +16,18 @@ from torch.nn.functional import interpolate
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teachers.build import build_teacher
-from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions, RegionsConfig
-from gsencoder.fusion.teachers.regions.sam import Proposal, SamMasks, grid_points, mask_iou, paint, stability, suppress
+from gsencoder.teachers.build import build_teacher
+from gsencoder.teachers.masks import (
+    OnnxRegionOptions,
+    Proposal,
+    RegionsConfig,
+    SamMasks,
+    grid_points,
+    mask_iou,
+    paint,
+    stability,
+    suppress,
+)
 
 SIDE = 64
 POINTS = {"hidden_size": 16, "image_size": SIDE, "mask_input_channels": 4}

@@ -14,11 +14,10 @@ from vision_towers import save_preprocessing, save_vision_tower
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
-from gsencoder.fusion.teachers.radio import RadioTeacher
-from gsencoder.fusion.teachers.regions.build import dense_teacher
-from gsencoder.fusion.teachers.regions.config import OnnxRegionOptions, RegionsConfig
-from gsencoder.fusion.teachers.regions.vectors import MapVectors, region_means
+from gsencoder.teachers.masks import OnnxRegionOptions, RegionsConfig
+from gsencoder.teachers.onnx import OnnxConfig, OnnxTeacher
+from gsencoder.teachers.radio import RadioTeacher
+from gsencoder.teachers.regions import MapVectors, dense_teacher, region_means
 from gsencoder.types import FeatureMap, FeatureSpace
 
 

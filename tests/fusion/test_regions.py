@@ -25,12 +25,11 @@ from text_towers import save_graph, save_tokenizer
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.teachers import MissingInput, Teacher
-from gsencoder.fusion.teachers.build import build_teacher, text_table_of, words_beside, words_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.regions.captions import read_captions
-from gsencoder.fusion.teachers.regions.config import RegionsConfig
-from gsencoder.fusion.teachers.regions.masks import label_paths
+from gsencoder.teachers.base import MissingInput, Teacher
+from gsencoder.teachers.build import build_teacher, text_table_of, words_beside, words_of
+from gsencoder.teachers.captions import read_captions
+from gsencoder.teachers.labels import LabelsConfig
+from gsencoder.teachers.masks import RegionsConfig, label_paths
 from gsencoder.text.models import OnnxTextConfig
 from gsencoder.text.table import REFERENCE_NOUNS, save_text_table
 from gsencoder.text.vocabulary import OpenVocabulary

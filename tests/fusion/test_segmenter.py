@@ -14,9 +14,9 @@ from splats import random_gaussians
 
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.teacher_maps import read_map, write_map
-from gsencoder.fusion.teachers.build import build_teacher, words_beside
-from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.segmenter_classes import synonyms_of_classes
+from gsencoder.teachers.build import build_teacher, words_beside
+from gsencoder.teachers.labels import LabelsConfig
+from gsencoder.teachers.segmenter import synonyms_of_classes
 from gsencoder.text.table import unit
 from gsencoder.text.vocabulary import make_vocabulary
 from gsencoder.types import FeatureMap, Scene, SceneObject, Views

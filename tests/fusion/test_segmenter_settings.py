@@ -11,11 +11,16 @@ from segmenters import PLAIN, save_graph, teacher_of, views_of, words
 from splats import front_camera
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.teachers.build import build_teacher, words_of
-from gsencoder.fusion.teachers.palette import COLOR_NAMES, PaletteConfig
-from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher, softmax
-from gsencoder.fusion.teachers.segmenter_classes import MAX_CLASSES_BYTES, read_classes
-from gsencoder.fusion.teachers.segmenter_onnx import OnnxSegmenterOptions
+from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.labels import COLOR_NAMES, PaletteConfig
+from gsencoder.teachers.segmenter import (
+    MAX_CLASSES_BYTES,
+    OnnxSegmenterOptions,
+    SegmenterConfig,
+    SegmenterTeacher,
+    read_classes,
+    softmax,
+)
 from gsencoder.text.models import OnnxTextConfig
 from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.types import Scene, Views

@@ -12,7 +12,7 @@ from segmenters import NAMES, views_of, words
 from text_towers import save_tokenizer
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.teachers.segmenter import SegmenterConfig, SegmenterTeacher
+from gsencoder.teachers.segmenter import SegmenterConfig, SegmenterTeacher
 
 
 def small_segformer() -> Any:

@@ -9,12 +9,11 @@ from onnx import TensorProto, helper
 from text_towers import save_graph, save_tokenizer
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_of
-from gsencoder.fusion.teachers.onnx import OnnxConfig
-from gsencoder.fusion.teachers.palette import PaletteConfig
-from gsencoder.fusion.teachers.radio import RadioConfig
-from gsencoder.fusion.teachers.segmenter import SegmenterConfig
-from gsencoder.fusion.teachers.segmenter_classes import synonyms_of_classes
+from gsencoder.teachers.build import TeacherConfig, build_teacher, words_of
+from gsencoder.teachers.labels import PaletteConfig
+from gsencoder.teachers.onnx import OnnxConfig
+from gsencoder.teachers.radio import RadioConfig
+from gsencoder.teachers.segmenter import SegmenterConfig, synonyms_of_classes
 from gsencoder.text.models import OnnxTextConfig
 from gsencoder.text.table import REFERENCE_NOUNS
 from gsencoder.types import Scene

@@ -7,10 +7,17 @@ import pytest
 from splats import front_camera
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.teachers.build import build_teacher
-from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
-from gsencoder.fusion.teachers.onnx import OnnxConfig, OnnxTeacher
-from gsencoder.fusion.teachers.palette import _PROTOTYPES, COLOR_NAMES, PaletteConfig, PaletteTeacher, lab_from_rgb
+from gsencoder.teachers.build import build_teacher
+from gsencoder.teachers.labels import (
+    _PROTOTYPES,
+    COLOR_NAMES,
+    LabelsConfig,
+    LabelsTeacher,
+    PaletteConfig,
+    PaletteTeacher,
+    lab_from_rgb,
+)
+from gsencoder.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.text.table import make_text_table
 from gsencoder.types import Scene, SceneObject, Views
 

@@ -11,7 +11,7 @@ from tower_files import WIDE, change_weights, features, rewrite, teacher, views
 from vision_towers import SIDE, picture, save_vision_tower
 
 from gsencoder.core.errors import SceneWarning
-from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
+from gsencoder.teachers.tower import TransformersConfig, TransformersTeacher
 
 pytest.importorskip("transformers")
 

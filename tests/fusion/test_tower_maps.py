@@ -10,9 +10,7 @@ import torch
 from splats import front_camera
 from vision_towers import LAYERS, MAKERS, PATCH, SIDE, picture, processor_of, save_vision_tower, tower_of
 
-from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
-from gsencoder.fusion.teachers.tower_kinds import tower_in
-from gsencoder.fusion.teachers.tower_network import VisionTower
+from gsencoder.teachers.tower import TransformersConfig, TransformersTeacher, VisionTower, tower_in
 from gsencoder.types import FeatureMap, Views
 
 transformers = pytest.importorskip("transformers")

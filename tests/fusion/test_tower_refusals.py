@@ -12,7 +12,7 @@ from tower_files import change_weights, features, rewrite, teacher
 from vision_towers import LAYERS
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.teachers.tower import TransformersConfig, TransformersTeacher
+from gsencoder.teachers.tower import TransformersConfig, TransformersTeacher
 from gsencoder.types import Views
 
 pytest.importorskip("transformers")

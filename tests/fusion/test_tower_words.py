@@ -20,8 +20,8 @@ from gsencoder.app.settings.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.store.folder import load_features
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, text_table_of, words_of
-from gsencoder.fusion.teachers.tower import TransformersConfig
+from gsencoder.teachers.build import TeacherConfig, build_teacher, text_table_of, words_of
+from gsencoder.teachers.tower import TransformersConfig
 from gsencoder.text import vocabulary as open_vocabulary
 from gsencoder.text.models import TransformersTextConfig
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table

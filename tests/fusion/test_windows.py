@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsencoder.fusion.teachers.windows import map_in_windows, window_starts
+from gsencoder.teachers.tower import map_in_windows, window_starts
 
 PATCH = 4
 

@@ -16,10 +16,10 @@ from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import load_heads, save_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE
-from gsencoder.fusion.teachers import MissingInput
-from gsencoder.fusion.teachers.palette import PaletteConfig
-from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpace
+from gsencoder.teachers.base import MissingInput
+from gsencoder.teachers.labels import PaletteConfig
+from gsencoder.teachers.radio import RadioConfig
 from gsencoder.train.adapter_heads import (
     FeatureDecoder,
     dataset_heads,

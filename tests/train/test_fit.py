@@ -19,9 +19,9 @@ from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
 from gsencoder.fusion.heads.radio import Head
 from gsencoder.fusion.heads.store import save_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE
-from gsencoder.fusion.teachers.palette import PaletteConfig
-from gsencoder.fusion.teachers.radio import RadioConfig
 from gsencoder.models.output_space import OutputSpaces
+from gsencoder.teachers.labels import PaletteConfig
+from gsencoder.teachers.radio import RadioConfig
 from gsencoder.train import run
 from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.run import TrainConfig, fit

@@ -12,11 +12,10 @@ from training_scenes import PREPARE, SideTeacher, scene
 
 from gsencoder.core.errors import InputError, SceneWarning, renamed_options
 from gsencoder.core.process import ProcessRank
-from gsencoder.fusion.teachers import MissingInput
-from gsencoder.fusion.teachers.build import words_by_teacher
-from gsencoder.fusion.teachers.labels import LabelsConfig
-from gsencoder.fusion.teachers.onnx import OnnxConfig
-from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.teachers.base import MissingInput
+from gsencoder.teachers.build import words_by_teacher
+from gsencoder.teachers.labels import LabelsConfig, PaletteConfig
+from gsencoder.teachers.onnx import OnnxConfig
 from gsencoder.train import prepare_scenes as module
 from gsencoder.train.prepare_scenes import prepare_scenes
 from gsencoder.train.prepared_dataset import PreparedDataset

@@ -12,7 +12,7 @@ from training_scenes import LOSSES, SHORT, samples, small_encoder
 from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.core.process import ProcessRank
 from gsencoder.core.settings import first_difference
-from gsencoder.fusion.teachers.palette import PaletteConfig
+from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.train.distill import Distillation, encoder_trainer
 from gsencoder.train.run import TrainConfig, resume_settings
 from gsencoder.train.samples import SampleDataset

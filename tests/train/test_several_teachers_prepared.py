@@ -12,9 +12,9 @@ from training_scenes import PREPARE, SideTeacher, prepared, scene, small_encoder
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import untracked
-from gsencoder.fusion.teachers import MissingInput
-from gsencoder.fusion.teachers.palette import PaletteConfig
 from gsencoder.models.output_space import OutputSpaces
+from gsencoder.teachers.base import MissingInput
+from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.train.checkpoint import (
     TRAINING_CHECKPOINT_FILE,
     TrainingState,

@@ -13,7 +13,7 @@ from training_scenes import DenseSideTeacher, SideTeacher, scene
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.basis import Moments
-from gsencoder.fusion.teachers import MissingInput
+from gsencoder.teachers.base import MissingInput
 from gsencoder.train.dataset_space import MOMENTS_FOLDER, fit_space
 from gsencoder.train.prepare import PrepareConfig
 from gsencoder.train.prepared_dataset import SPACE_FILE, PreparedDataset

@@ -20,16 +20,15 @@ from gsencoder.data.synthetic import color_words, make_room, write_room
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
-from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import text_table_of
-from gsencoder.fusion.teachers.labels import LabelsTeacher
-from gsencoder.fusion.teachers.palette import PaletteConfig, PaletteTeacher
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize.localization_json import localization_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.viewer.bundle import load_bundle
 from gsencoder.infer.viewer.file_size import fitting_page
 from gsencoder.infer.viewer.page_scene import FileOptions
+from gsencoder.teachers.base import Teacher
+from gsencoder.teachers.build import text_table_of
+from gsencoder.teachers.labels import LabelsTeacher, PaletteConfig, PaletteTeacher
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.types import Scene, SceneObject
 

@@ -235,7 +235,7 @@ def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Enc
     """
     # Teachers need torch, which encoding with an exported graph does without.
     from gsencoder.fusion.basis_fit import basis_fit
-    from gsencoder.fusion.teachers.build import build_teacher, words_by_teacher
+    from gsencoder.teachers.build import build_teacher, words_by_teacher
     from gsencoder.train.source import SourceConfig
 
     if scene.views is None:

@@ -23,9 +23,9 @@ from gsencoder.evaluate.sources import (
 from gsencoder.fusion.heads.of_teacher import heads_of
 from gsencoder.fusion.heads.store import find_head, load_heads
 from gsencoder.fusion.store.heads_file import heads_beside
-from gsencoder.fusion.teachers.build import words_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.load_encoder import file_of_encoder, load_encoder
+from gsencoder.teachers.build import words_of
+from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig, Words, stating_trained, words_of_table
 from gsencoder.types import Scene
 

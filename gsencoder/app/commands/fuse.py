@@ -34,11 +34,10 @@ from gsencoder.fusion.heads.store import save_heads
 from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits
 from gsencoder.fusion.store.folder import FEATURES_FILE, WORDS_FILE, save_features
 from gsencoder.fusion.store.heads_file import HEADS_FILE
-from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.auto import AutoConfig, choose_teacher
-from gsencoder.fusion.teachers.build import TeacherConfig, build_teacher, words_beside, words_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.models.output_space import OutputSpaces, name_of_space
+from gsencoder.teachers.base import Teacher
+from gsencoder.teachers.build import AutoConfig, TeacherConfig, build_teacher, choose_teacher, words_beside, words_of
+from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene

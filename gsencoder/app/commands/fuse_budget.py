@@ -12,7 +12,7 @@ from gsencoder.core.settings import MEGABYTE
 from gsencoder.fusion.budget.config import BudgetConfig
 from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within, realised_error
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.teachers import Teacher
+from gsencoder.teachers.base import Teacher
 from gsencoder.types import Scene
 
 

@@ -25,12 +25,12 @@ from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
 from gsencoder.fusion.store.folder import file_of_teacher, save_memories
 from gsencoder.fusion.store.memory_file import MEMORY_FILE
 from gsencoder.fusion.store.words import save_tables
-from gsencoder.fusion.teachers.build import build_teacher, words_beside, words_by_teacher
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.memory.bank import BankConfig, RawSample
 from gsencoder.models.output_space import check_distinct, name_of_space
+from gsencoder.teachers.build import build_teacher, words_beside, words_by_teacher
+from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.table import TextTable
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.memory import memory_training, train_memory, untrained_memory

@@ -25,10 +25,10 @@ from gsencoder.fusion.heads.measure import HeadSet
 from gsencoder.fusion.heads.store import save_heads
 from gsencoder.fusion.store.heads_file import HEADS_FILE
 from gsencoder.fusion.store.words import save_tables
-from gsencoder.fusion.teachers.build import words_by_teacher
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
+from gsencoder.teachers.build import words_by_teacher
 from gsencoder.train.adapter_heads import dataset_heads, required_heads, teacher_of_heads
 from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, check_same_teachers
 from gsencoder.train.distributed import cpu_share, fail_together, join_processes

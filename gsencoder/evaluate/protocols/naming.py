@@ -17,8 +17,8 @@ from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.fusion.feature_error import field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.teachers.build import build_teacher
-from gsencoder.fusion.teachers.labels import LabelsConfig, LabelsTeacher
+from gsencoder.teachers.build import build_teacher
+from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, Scene
 

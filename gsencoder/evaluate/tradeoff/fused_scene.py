@@ -16,8 +16,8 @@ from gsencoder.evaluate.tradeoff.stage import Inputs, Score
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.store.folder import save_features
 from gsencoder.fusion.teacher_maps import CachedTeacher
-from gsencoder.fusion.teachers.build import build_teacher, text_table_of
 from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.teachers.build import build_teacher, text_table_of
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene
 

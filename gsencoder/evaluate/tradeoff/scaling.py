@@ -20,10 +20,10 @@ from gsencoder.evaluate.tradeoff.fused_scene import taught_scene
 from gsencoder.evaluate.tradeoff.measure import interleaved, timed_run
 from gsencoder.evaluate.tradeoff.stage import Inputs, StageName
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teachers import Teacher
-from gsencoder.fusion.teachers.build import build_teacher, text_table_of
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.knobs import EncoderSettings
+from gsencoder.teachers.base import Teacher
+from gsencoder.teachers.build import build_teacher, text_table_of
+from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.types import FeatureMap, FeatureSpace, Gaussians, Scene, Views
 from gsencoder.types.orientation import upright_views
 

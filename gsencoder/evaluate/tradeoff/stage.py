@@ -14,11 +14,11 @@ from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.teachers.build import TeacherConfig
-from gsencoder.fusion.teachers.labels import LabelsConfig
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.teachers.build import TeacherConfig
+from gsencoder.teachers.labels import LabelsConfig
 
 StageName = Literal["reconstruction", "fusion", "encoder", "packages", "localization", "views"]
 Cost = Literal["cpu_seconds", "seconds", "mib", "bytes"]

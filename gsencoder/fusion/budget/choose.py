@@ -24,9 +24,9 @@ from gsencoder.fusion.coverage.order import view_order
 from gsencoder.fusion.coverage.sight import LatticeOf, Sight, trace_sight
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.lift import capped, distinct_rows
-from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import resolve
 from gsencoder.render.rays import Lattice, grid_lattice
+from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureMap, Gaussians, Views
 
 FIRST_MAPS, MAPS_SHARE = 4, 8

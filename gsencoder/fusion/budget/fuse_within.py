@@ -19,8 +19,8 @@ from gsencoder.fusion.feature_error import FieldError, judge
 from gsencoder.fusion.fuse import FuseConfig, Fusion, checked_scene, fuse
 from gsencoder.fusion.lift import FeatureSums, view_matrix
 from gsencoder.fusion.teacher_maps import CachedTeacher, WrappedTeacher, upright
-from gsencoder.fusion.teachers import Teacher
 from gsencoder.fusion.visibility import resolve
+from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 
 DEPTH_CACHE_BYTES = 1 << 28

@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from gsencoder.fusion.basis import Moments
 from gsencoder.fusion.budget.model import SampleFeatures
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.teachers import Teacher
+from gsencoder.teachers.base import Teacher
 
 RANKS = (8, 16, 32, 64, 128)
 """Ranks worth trying; 0 stands for all channels."""

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.heads.radio import Head, read_radio_heads
-from gsencoder.fusion.teachers.build import TeacherConfig
-from gsencoder.fusion.teachers.radio import RadioConfig, check_radio, radio_folder
+from gsencoder.teachers.build import TeacherConfig
+from gsencoder.teachers.radio import RadioConfig, check_radio, radio_folder
 
 
 def stored_heads(config: TeacherConfig) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import check_fetched, weight_files
 from gsencoder.fusion.heads.layers import Residual
 from gsencoder.fusion.heads.names import Part, default_part, split_name, text_kind
-from gsencoder.fusion.teachers.radio import ADAPTERS, WHAT
+from gsencoder.teachers.radio import ADAPTERS, WHAT
 
 NORMALIZER = "radio_model.feature_normalizer."
 MODULES: Mapping[Part, str] = {"summary": "head_mlp", "features": "feat_mlp"}

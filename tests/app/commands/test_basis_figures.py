@@ -14,9 +14,9 @@ from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.basis_fit import basis_fit
 from gsencoder.fusion.store.folder import load_features
-from gsencoder.fusion.teachers.palette import PaletteConfig, PaletteTeacher
 from gsencoder.infer.onnx.export import random_cloud
 from gsencoder.models.weights import load_weights
+from gsencoder.teachers.labels import PaletteConfig, PaletteTeacher
 from gsencoder.text.table import REFERENCE_NOUNS
 
 pytestmark = pytest.mark.slow

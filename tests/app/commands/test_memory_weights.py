@@ -12,10 +12,10 @@ from training_scenes import SMALL
 from gsencoder.app import cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.store.folder import load_memories
-from gsencoder.fusion.teachers.palette import PaletteConfig, PaletteTeacher
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import save_weights
+from gsencoder.teachers.labels import PaletteConfig, PaletteTeacher
 
 pytestmark = pytest.mark.slow
 

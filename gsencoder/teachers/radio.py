@@ -8,8 +8,8 @@ import numpy as np
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import digest_files, find_file, load_pretrained, read_config
-from gsencoder.fusion.teachers import MissingInput
-from gsencoder.fusion.teachers.resize import fit_to_patches
+from gsencoder.teachers.base import MissingInput
+from gsencoder.teachers.onnx import fit_to_patches
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 WHAT = "teacher radio"

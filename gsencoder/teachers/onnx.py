@@ -1,18 +1,56 @@
 """The `onnx` teacher: any dense ONNX backbone under onnxruntime, its outputs as they are or as word mixtures."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64, UInt8
+from PIL import Image
 
 from gsencoder.core.archive import read_npz
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import choose_tensors, digest_files, find_file, open_session, run_on_picture
-from gsencoder.fusion.teachers import MissingInput
-from gsencoder.fusion.teachers.resize import fit_to_patches, normalized
+from gsencoder.teachers.base import MissingInput
 from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+
+def patches_of(height: int, width: int, size: int, patch: int) -> tuple[int, int]:
+    """Rows and columns of patches of a picture whose longer side becomes about `size` pixels."""
+    ratio = size / max(height, width)
+    return max(1, round(height * ratio / patch)), max(1, round(width * ratio / patch))
+
+
+def fit_to_patches(
+    image: UInt8[np.ndarray, "H W 3"],
+    size: int,
+    patch: int,
+    resample: Image.Resampling = Image.Resampling.BICUBIC,
+) -> tuple[UInt8[np.ndarray, "h w 3"], Float64[np.ndarray, "2 3"]]:
+    """A picture with sides of whole patches, and the affine from its own pixels to the grid of patches.
+
+    Args:
+        image: any size.
+        size: about what the longer side becomes, pixels.
+        patch: pixels along a patch.
+        resample: the filter.
+    """
+    height, width = image.shape[:2]
+    rows, columns = patches_of(height, width, size, patch)
+    resized = Image.fromarray(image).resize((columns * patch, rows * patch), resample)
+    return np.asarray(resized), np.array([[columns / width, 0, 0], [0, rows / height, 0]])
+
+
+def normalized(
+    image: UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"],
+    scale: float,
+    mean: Sequence[float],
+    std: Sequence[float],
+) -> Float32[np.ndarray, "H W 3"]:
+    """(image / scale − mean) / std, channel by channel."""
+    return (image.astype(np.float32) / np.float32(scale) - np.array(mean, np.float32)) / np.array(std, np.float32)
+
 
 LARGEST_SIDE = 8192
 """Pixels along a resized picture: beyond this the backbone's own maps no longer fit into memory."""
