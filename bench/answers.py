@@ -54,8 +54,8 @@ from gsencoder.evaluate.scripted_answerer import (
     request_pictures,
     serving,
 )
+from gsencoder.fusion.folder import load_features
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.store.folder import load_features
 from gsencoder.infer.ask.ask import Asker, Prompt, Question, chosen_mark, prompt_messages
 from gsencoder.infer.ask.batch import targets_to_json
 from gsencoder.infer.ask.predictions import short_answer

@@ -19,7 +19,7 @@ from gsencoder.app.settings.compose import compose
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.fusion.basis import Moments, fit_basis
-from gsencoder.fusion.basis_fit import ProjectionSums
+from gsencoder.fusion.errors import ProjectionSums
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import build_teacher
 

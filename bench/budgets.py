@@ -29,11 +29,11 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.fusion.budget.config import BudgetConfig, exact_config
-from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within
-from gsencoder.fusion.feature_error import field_error, judge
+from gsencoder.fusion.budget import BudgetFusion, fuse_within
+from gsencoder.fusion.checkpoint import CachedTeacher, WrappedTeacher
+from gsencoder.fusion.cost_model import BudgetConfig, exact_config
+from gsencoder.fusion.errors import field_error, judge
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.teacher_maps import CachedTeacher, WrappedTeacher
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import TeacherConfig, build_teacher, words_of
 from gsencoder.teachers.labels import LabelsConfig, PaletteConfig

@@ -27,7 +27,7 @@ from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.evaluate.boxes import accuracy
 from gsencoder.evaluate.protocols.naming import naming_scores
-from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.encode import chunks as chunks_module
 from gsencoder.infer.encode.chunks import EncodeConfig, cut, scene_regions

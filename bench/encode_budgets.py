@@ -20,7 +20,7 @@ from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.fusion.feature_error import field_error, judge
+from gsencoder.fusion.errors import field_error, judge
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode_budget.config import EncodeBudget
 from gsencoder.infer.encode_budget.encode_within import encode_within

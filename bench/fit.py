@@ -23,8 +23,15 @@ from json_option import add_json_option, write_figures
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.data.splat_frame import SplatFrame, identity_frame, moved, usual_frames
-from gsencoder.fusion.fit import SmallViews, agreement, with_fitting_splat
+from gsencoder.fusion.fit import (
+    SmallViews,
+    SplatFrame,
+    agreement,
+    identity_frame,
+    moved,
+    usual_frames,
+    with_fitting_splat,
+)
 from gsencoder.types import Gaussians, Scene
 
 

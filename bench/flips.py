@@ -20,7 +20,7 @@ import numpy as np
 from json_option import add_json_option, write_figures
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.store.folder import FEATURES_FILE, WORDS_FILE, load_features
+from gsencoder.fusion.folder import FEATURES_FILE, WORDS_FILE, load_features
 from gsencoder.models.weights import WEIGHTS_FILE, load_weights
 from gsencoder.text.table import load_text_table
 

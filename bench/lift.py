@@ -35,9 +35,8 @@ from gsencoder.core.process import memory_growth
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.fusion.basis import Moments, fit_basis, to_coordinates
-from gsencoder.fusion.feature_error import field_error
-from gsencoder.fusion.lift import center_matrix
-from gsencoder.fusion.visibility import VisibilityConfig
+from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.lift import VisibilityConfig, center_matrix
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Views
 

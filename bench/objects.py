@@ -41,7 +41,7 @@ from gsencoder.data.seeding.seed import seed
 from gsencoder.data.splats.files import load_splat
 from gsencoder.data.synthetic import make_room
 from gsencoder.data.up import with_up
-from gsencoder.fusion.orbit_views import with_views
+from gsencoder.fusion.cameras import with_views
 from gsencoder.render import blend
 from gsencoder.render.images import view_colors
 from gsencoder.types import Gaussians, Scene

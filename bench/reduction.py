@@ -23,7 +23,7 @@ from gsencoder.app.settings.compose import compose
 from gsencoder.core.archive import RowFile
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import load_scene
-from gsencoder.fusion.teacher_maps import CachedTeacher
+from gsencoder.fusion.checkpoint import CachedTeacher
 from gsencoder.memory.reduction import (
     CoverReduction,
     Reduction,

@@ -44,7 +44,7 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import is_seen, queryable_objects, score_boxes
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
+from gsencoder.fusion.lift import VisibilityConfig, keep_visible
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.select.select import select

@@ -25,8 +25,8 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.data.splats.files import load_splat
 from gsencoder.data.up import with_up
+from gsencoder.fusion.cameras import with_views
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.orbit_views import with_views
 from gsencoder.infer.draw.pictures import contact_sheet
 from gsencoder.teachers.segmenter import OnnxSegmenterOptions, SegmenterConfig, SegmenterTeacher
 from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of

@@ -27,11 +27,10 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import Hit
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
-from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.folder import FEATURES_FILE, MEMORY_FILE, load_features, save_features, save_memories
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.store.folder import FEATURES_FILE, load_features, save_features, save_memories
-from gsencoder.fusion.store.memory_file import MEMORY_FILE
-from gsencoder.fusion.store.package import PACKAGE_FILE, save_index_package, save_package
+from gsencoder.fusion.package import PACKAGE_FILE, save_index_package, save_package
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.memory.bank import BankConfig
 from gsencoder.memory.index import IndexConfig, index_features

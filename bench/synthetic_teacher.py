@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.visibility import ray_pixels
+from gsencoder.fusion.lift import ray_pixels
 from gsencoder.render.rays import grid_lattice
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 

@@ -19,7 +19,7 @@ import numpy as np
 from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.query_words import queried_scene
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.viewer.bundle import load_bundle
 from gsencoder.infer.viewer.page import served_page

@@ -20,7 +20,7 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.core.errors import SceneWarning
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.views.choose import judge_candidates
 from gsencoder.infer.views.free_space import FreeSpace

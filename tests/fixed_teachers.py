@@ -6,7 +6,7 @@ import numpy as np
 from splats import front_camera, random_gaussians
 
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.visibility import VisibilityConfig
+from gsencoder.fusion.lift import VisibilityConfig
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
 
 SPACE = FeatureSpace(name="s", channels=6)

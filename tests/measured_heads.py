@@ -4,9 +4,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from gsencoder.fusion.heads.layers import Residual
-from gsencoder.fusion.heads.measure import HeadFit, MeasuredHead
-from gsencoder.fusion.heads.radio import Head
+from gsencoder.fusion.adapter_heads import Head, Residual
+from gsencoder.fusion.measured_heads import HeadFit, MeasuredHead
 from gsencoder.types import FeatureSpace
 
 SPACE = FeatureSpace(name="radio", channels=6, teacher="radio", weights="abcd", preprocessing="resized")

@@ -21,21 +21,19 @@ from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 
 from gsencoder.core.archive import open_archive
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.checkpoint import SUMS_FILE, FusionCheckpoint
-from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
-from gsencoder.fusion.heads.radio import Head
-from gsencoder.fusion.heads.store import load_heads, save_heads
-from gsencoder.fusion.store.folder import (
+from gsencoder.fusion.adapter_heads import Head
+from gsencoder.fusion.checkpoint import SUMS_FILE, FusionCheckpoint, read_map, write_map
+from gsencoder.fusion.folder import (
     FEATURES_FILE,
+    MEMORY_FILE,
     SCENE_FILE,
     load_features,
     load_memories,
     save_features,
     save_memories,
 )
-from gsencoder.fusion.store.memory_file import MEMORY_FILE
-from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_index_package, save_package
-from gsencoder.fusion.teacher_maps import read_map, write_map
+from gsencoder.fusion.measured_heads import HeadFit, HeadSet, MeasuredHead, load_heads, save_heads
+from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_package, save_package
 from gsencoder.memory.index import index_features
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights

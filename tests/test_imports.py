@@ -40,7 +40,7 @@ TORCH_FREE = [
     "gsencoder.core.archive",
     "gsencoder.fusion.basis",
     "gsencoder.fusion.checkpoint",
-    "gsencoder.fusion.store.folder",
+    "gsencoder.fusion.folder",
     "gsencoder.memory.reduction",
     "gsencoder.models.grid",
     "gsencoder.infer.encode.chunks",

@@ -13,7 +13,7 @@ from gsencoder.app import cli
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats.files import load_splat
 from gsencoder.evaluate.boxes import aabb_iou
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 
 pytestmark = pytest.mark.slow
 

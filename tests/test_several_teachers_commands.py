@@ -10,7 +10,7 @@ from named_rooms import write_words
 
 from gsencoder.app import cli
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.onnx.export import header_of
 from gsencoder.infer.onnx.header import from_metadata, to_metadata

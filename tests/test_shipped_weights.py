@@ -14,8 +14,8 @@ from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.evaluate.protocols.naming import evaluate_naming, naming_scores
-from gsencoder.fusion.feature_error import field_error
-from gsencoder.fusion.store.words import load_tables
+from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.folder import load_tables
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.localize.localize import localize

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.viewer.bundle import Bundle
 from gsencoder.infer.viewer.search import SceneSearch

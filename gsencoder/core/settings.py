@@ -2,13 +2,13 @@
 
 Knobs: the values of a stage's settings that trade cost for accuracy, and how they are put into its frozen settings.
 
-Each stage that has knobs lists them beside its settings (`gsencoder.fusion.knobs`, `gsencoder.reconstruct.knobs`,
+Each stage that has knobs lists them beside its settings (`gsencoder.fusion.package`, `gsencoder.reconstruct.knobs`,
 `gsencoder.infer.knobs`), so that whoever chooses settings, a sweep or a budget, needs no more than such a list.
 
 Budgets: what the section `budget` of a command may promise, and how promises are checked, ordered and worded.
 
 Each stage with budgets has a frozen dataclass of its promises beside its code (`gsencoder.reconstruct.budget`,
-`gsencoder.fusion.budget.config`, `gsencoder.fusion.store.budget`, `gsencoder.infer.encode_budget.config`,
+`gsencoder.fusion.cost_model`, `gsencoder.fusion.package`, `gsencoder.infer.encode_budget.config`,
 `gsencoder.infer.views.budget`), with those fields of `PROMISES` that mean something there.
 
 Options that were added after settings had been stored in files, each with the value that says what was done before.

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64, Int32, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.mesh import nearest_rows
-from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
+from gsencoder.fusion.lift import VisibilityConfig, keep_visible
 from gsencoder.render import blend
 from gsencoder.types import MeshLabels, Scene
 

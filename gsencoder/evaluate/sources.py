@@ -9,11 +9,10 @@ from gsencoder.core.process import Track, untracked
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.heads.apply import head_features
-from gsencoder.fusion.heads.measure import HeadSet, MeasuredHead, measure_heads
-from gsencoder.fusion.heads.radio import Head
+from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, head_features, measure_heads
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import Encoder
 from gsencoder.teachers.build import TeacherConfig, build_teacher

@@ -23,13 +23,10 @@ from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Clock, Device, Track, ahead, thread_count, timed, untracked
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
-from gsencoder.fusion.basis_fit import ProjectionSums
-from gsencoder.fusion.cell_sample import CellSample
-from gsencoder.fusion.checkpoint import open_checkpoint
-from gsencoder.fusion.coverage.covering import covering_views
-from gsencoder.fusion.lift import FeatureSums, distinct_rows, view_matrix
-from gsencoder.fusion.teacher_maps import upright
-from gsencoder.fusion.visibility import VisibilityConfig, resolve
+from gsencoder.fusion.checkpoint import open_checkpoint, upright
+from gsencoder.fusion.errors import CellSample, ProjectionSums
+from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, distinct_rows, resolve, view_matrix
+from gsencoder.fusion.view_coverage import covering_views
 from gsencoder.render import Blend, BlendConfig
 from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Scene, Views

@@ -15,9 +15,9 @@ from jaxtyping import Float32, Float64, Int32, Int64
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import MEGABYTE
-from gsencoder.fusion.feature_error import row_cosines
-from gsencoder.fusion.store.budget import PackBudget
-from gsencoder.fusion.store.quantize import FIT_SAMPLE, rarity_of
+from gsencoder.fusion.errors import row_cosines
+from gsencoder.fusion.package import PackBudget
+from gsencoder.fusion.quantize import FIT_SAMPLE, rarity_of
 from gsencoder.memory.reduction import BLOCK, CoverReduction, check_threshold, largest_threshold
 from gsencoder.types import GaussianFeatures
 

@@ -43,7 +43,7 @@ class Teacher(Protocol):
     def cheap(self) -> bool: ...
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The features of one view. What calls it (`gsencoder.fusion.teacher_maps.upright`) gives upright views."""
+        """The features of one view. What calls it (`gsencoder.fusion.checkpoint.upright`) gives upright views."""
         ...
 
     def settings(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 WHAT = "teacher radio"
 ADAPTERS = "radio_model.adaptors."
-"""What the keys of adapter heads begin with in the files of weights; `gsencoder.fusion.heads.radio` reads them."""
+"""What the keys of adapter heads begin with in the files of weights; `gsencoder.fusion.adapter_heads` reads them."""
 PICKLED = (".tar", ".pth", ".pt", ".bin", ".ckpt")
 """What names of files end with that are opened by unpickling them."""
 

@@ -14,12 +14,19 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.cell_sample import CellSample
-from gsencoder.fusion.heads.measure import HeadSet, measure_heads
-from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
-from gsencoder.fusion.heads.radio import Head
-from gsencoder.fusion.heads.store import choose_heads, has_head, load_heads, save_heads
-from gsencoder.fusion.store.heads_file import HEADS_FILE, check_heads_space
+from gsencoder.fusion.adapter_heads import Head
+from gsencoder.fusion.errors import CellSample
+from gsencoder.fusion.folder import HEADS_FILE, check_heads_space
+from gsencoder.fusion.measured_heads import (
+    HeadSet,
+    choose_heads,
+    has_head,
+    heads_of,
+    load_heads,
+    measure_heads,
+    save_heads,
+    stored_heads,
+)
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.teachers.build import TeacherConfig
 from gsencoder.teachers.radio import RadioConfig

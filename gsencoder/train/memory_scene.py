@@ -24,8 +24,8 @@ from gsencoder.core.settings import first_difference, with_added_options
 from gsencoder.data.scene_arrays import bank_parts, read_bank
 from gsencoder.data.splats.files import fingerprint
 from gsencoder.fusion.basis import to_coordinates
+from gsencoder.fusion.checkpoint import CachedTeacher, upright
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.teacher_maps import CachedTeacher, upright
 from gsencoder.memory.bank import BankConfig, MapStream, RawSample, build_bank, draw_sample
 from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
 from gsencoder.teachers.base import Teacher

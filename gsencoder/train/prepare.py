@@ -10,10 +10,9 @@ from jaxtyping import Bool, Float32, Int64
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.basis import to_coordinates
+from gsencoder.fusion.checkpoint import upright
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.lift import capped
-from gsencoder.fusion.teacher_maps import upright
-from gsencoder.fusion.visibility import row_mask
+from gsencoder.fusion.lift import capped, row_mask
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.render import blend
 from gsencoder.teachers.base import Teacher

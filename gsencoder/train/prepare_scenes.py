@@ -14,7 +14,7 @@ from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.core.settings import TRAINED
-from gsencoder.fusion.heads.radio import Head
+from gsencoder.fusion.adapter_heads import Head
 from gsencoder.models.output_space import check_distinct
 from gsencoder.teachers.base import MissingInput, Teacher
 from gsencoder.teachers.build import TeacherConfig

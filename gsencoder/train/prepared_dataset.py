@@ -18,7 +18,7 @@ from gsencoder.core.errors import InputError, advised, listed, readable
 from gsencoder.core.files import atomic_file, locked, read_foreign, read_foreign_text
 from gsencoder.core.process import ProcessRank, Track
 from gsencoder.core.settings import first_difference, with_added_options
-from gsencoder.fusion.teacher_maps import CachedTeacher
+from gsencoder.fusion.checkpoint import CachedTeacher
 from gsencoder.models.output_space import OutputSpace, read_output_space
 from gsencoder.teachers.base import Teacher
 from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets

@@ -17,7 +17,7 @@ from gsencoder.core.archive import Archive, MappedArrays, write_archive
 from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
 from gsencoder.data.scene_arrays import camera_arrays
-from gsencoder.fusion.basis_fit import ProjectionSums
+from gsencoder.fusion.errors import ProjectionSums
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import GaussianFeatures, Scene
 

@@ -17,7 +17,7 @@ from jaxtyping import Float, Float16, Float32, Float64, Int8
 from gsencoder.core.archive import MappedArrays, open_archive
 from gsencoder.core.errors import InputError, about, advised
 from gsencoder.data.scene_arrays import read_cameras
-from gsencoder.fusion.basis_fit import BINS, ProjectionSums
+from gsencoder.fusion.errors import BINS, ProjectionSums
 from gsencoder.train.prepared_file import SCALES, Precision, ViewRows, array_types, check_arrays, stored_precision
 from gsencoder.types import Cameras, Gaussians
 

@@ -13,7 +13,7 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import plain
 from gsencoder.core.process import Device, ProcessRank, Track, threads_of_torch, untracked
-from gsencoder.fusion.heads.store import heads_digest
+from gsencoder.fusion.measured_heads import heads_digest
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.teachers.build import words_by_teacher

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.core.arrays import even_indices
-from gsencoder.fusion.teacher_maps import upright
+from gsencoder.fusion.checkpoint import upright
 from gsencoder.teachers.base import MissingInput, Teacher
 from gsencoder.types import FeatureMap, Scene
 

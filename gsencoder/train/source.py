@@ -11,9 +11,9 @@ from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
+from gsencoder.fusion.cameras import CamerasOfSplat, check_orbits, with_views
 from gsencoder.fusion.fit import with_fitting_splat
-from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits, with_views
-from gsencoder.fusion.store.folder import TEACHER_NAME
+from gsencoder.fusion.folder import TEACHER_NAME
 from gsencoder.teachers.base import MissingInput, Teacher
 from gsencoder.teachers.build import TeacherConfig, build_teacher, options_of_member
 from gsencoder.teachers.labels import LabelsConfig

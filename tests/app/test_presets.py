@@ -16,7 +16,7 @@ from gsencoder.app.settings.options import options_by_key
 from gsencoder.app.settings.presets import PRESET_OPTIONS, PRESETS, describe_presets, preset_node, preset_values
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import value_at
-from gsencoder.fusion.budget.config import exact_config
+from gsencoder.fusion.cost_model import exact_config
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode_budget.config import exact_encoding

@@ -17,7 +17,7 @@ from gsencoder.core.settings import (
     with_values,
 )
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.knobs import FUSION_KNOBS, PACKAGE_KNOBS, PackageSettings
+from gsencoder.fusion.package import FUSION_KNOBS, PACKAGE_KNOBS, PackageSettings
 from gsencoder.infer.knobs import ENCODER_KNOBS, LOCALIZATION_KNOBS, VIEWS_KNOBS, EncoderSettings
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.views.selection import ViewsConfig

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from gsencoder.data.enclosure import MIN_GAUSSIANS, Enclosure, enclosure_of
 from gsencoder.data.seeding.points import flat_gaussians
 from gsencoder.data.up import with_up
-from gsencoder.fusion.orbit_views import with_explained_views
+from gsencoder.fusion.cameras import with_explained_views
 from gsencoder.types import Gaussians, Scene
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]

@@ -14,9 +14,9 @@ from gsencoder.core.errors import SceneWarning
 from gsencoder.data.readers.images import picture_info, read_rgba
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import up_of_scene
+from gsencoder.fusion.checkpoint import upright
+from gsencoder.fusion.folder import load_features, save_features
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.store.folder import load_features, save_features
-from gsencoder.fusion.teacher_maps import upright
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.pictures import view_pictures

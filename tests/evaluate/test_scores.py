@@ -10,7 +10,7 @@ from gsencoder.core.files import csv_text
 from gsencoder.core.process import memory_growth
 from gsencoder.evaluate.boxes import Hit, aabb_iou, accuracy, queryable_objects, score_boxes
 from gsencoder.evaluate.protocols.localization import scores, scores_by_name
-from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.errors import field_error
 from gsencoder.types import Box, FeatureBasis, FeatureSpace, GaussianFeatures, Localization, Scene, SceneObject
 
 SPACE = FeatureSpace(name="s", channels=4)

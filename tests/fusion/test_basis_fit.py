@@ -8,7 +8,7 @@ from training_scenes import SPACE, TABLE, DenseSideTeacher, SideTeacher, scene
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.basis import fit_basis, table_basis
-from gsencoder.fusion.basis_fit import ProjectionSums, basis_fit, total_fit
+from gsencoder.fusion.errors import ProjectionSums, basis_fit, total_fit
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 WIDE = FeatureSpace(name="wide", channels=12)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from splats import front_camera, random_gaussians
 
-from gsencoder.fusion.coverage.blocks import BLOCKS, Blocks
-from gsencoder.fusion.coverage.kernels import TILE, near_rays
+from gsencoder.fusion.view_coverage import BLOCKS, TILE, Blocks, near_rays
 from gsencoder.geometry import ALPHA_MIN
 from gsencoder.render.rays import pixel_lattice
 

@@ -10,11 +10,11 @@ from fixed_teachers import SPACE, CodedTeacher, FixedTeacher, make_scene
 from splats import one_gaussian
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.budget.config import BudgetConfig, check_budget, exact_config
-from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within
-from gsencoder.fusion.feature_error import field_error, judge
+from gsencoder.fusion.budget import BudgetFusion, fuse_within
+from gsencoder.fusion.cost_model import BudgetConfig, check_budget, exact_config
+from gsencoder.fusion.errors import field_error, judge
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.visibility import VisibilityConfig
+from gsencoder.fusion.lift import VisibilityConfig
 from gsencoder.types import Cameras, FeatureMap, Scene, Views
 
 BASE = FuseConfig(visibility=VisibilityConfig(against=()))

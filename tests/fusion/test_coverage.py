@@ -6,12 +6,17 @@ import numpy as np
 import pytest
 from fixed_teachers import EXACT, FixedTeacher, make_scene
 
-from gsencoder.fusion.coverage.covering import covering_views
-from gsencoder.fusion.coverage.kernels import count_rays, list_rays, near_rays
-from gsencoder.fusion.coverage.order import view_order
-from gsencoder.fusion.coverage.sight import pixels_of, trace_sight
 from gsencoder.fusion.fuse import chosen_views, fuse
-from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
+from gsencoder.fusion.lift import VisibilityConfig, keep_visible
+from gsencoder.fusion.view_coverage import (
+    count_rays,
+    covering_views,
+    list_rays,
+    near_rays,
+    pixels_of,
+    trace_sight,
+    view_order,
+)
 from gsencoder.render import BlendConfig, blend
 
 OPEN = VisibilityConfig(against=())

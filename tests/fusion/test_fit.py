@@ -13,10 +13,20 @@ from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.splat_frame import DATAPARSER, SplatFrame, identity_frame, moved, stated_frames, usual_frames
 from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.fusion import fit
-from gsencoder.fusion.fit import FITS, SmallViews, agreement, with_fitting_splat
+from gsencoder.fusion.fit import (
+    DATAPARSER,
+    FITS,
+    SmallViews,
+    SplatFrame,
+    agreement,
+    identity_frame,
+    moved,
+    stated_frames,
+    usual_frames,
+    with_fitting_splat,
+)
 from gsencoder.geometry import colors_from_sh
 from gsencoder.types import Gaussians, Scene
 

@@ -12,8 +12,7 @@ from splats import one_gaussian, random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.fuse import FuseConfig, Fusion, chosen_views, fuse
-from gsencoder.fusion.lift import view_matrix
-from gsencoder.fusion.visibility import VisibilityConfig
+from gsencoder.fusion.lift import VisibilityConfig, view_matrix
 from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Gaussians, Scene, Views
 

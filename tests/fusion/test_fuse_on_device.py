@@ -12,7 +12,7 @@ from pretend_device import pretended_device
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
-from gsencoder.fusion.visibility import VisibilityConfig
+from gsencoder.fusion.lift import VisibilityConfig
 from gsencoder.render import BlendConfig
 from gsencoder.types import FeatureMap, Scene, Views
 

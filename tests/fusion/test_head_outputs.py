@@ -11,10 +11,9 @@ from measured_heads import SPACE, measured
 from torch import nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.cell_sample import CellSample
-from gsencoder.fusion.heads.apply import equal_rows, head_features, head_space, head_tokens
-from gsencoder.fusion.heads.measure import measure_heads
-from gsencoder.fusion.heads.radio import Head
+from gsencoder.fusion.adapter_heads import Head
+from gsencoder.fusion.errors import CellSample
+from gsencoder.fusion.measured_heads import equal_rows, head_features, head_space, head_tokens, measure_heads
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
 
 
@@ -113,7 +112,7 @@ def test_features_through_a_head_are_its_outputs_for_the_decoded_vectors(rank: i
 
 
 def test_rows_that_are_equal_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    from gsencoder.fusion.heads import apply
+    from gsencoder.fusion import measured_heads as apply
 
     computed = []
     original = apply.head_outputs

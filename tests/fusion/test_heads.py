@@ -15,10 +15,17 @@ from torch import nn
 
 from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.heads.measure import HeadSet
-from gsencoder.fusion.heads.radio import Head
-from gsencoder.fusion.heads.store import choose_heads, find_head, has_head, heads_digest, load_heads, save_heads
-from gsencoder.fusion.store.heads_file import copy_heads, heads_beside
+from gsencoder.fusion.adapter_heads import Head
+from gsencoder.fusion.folder import copy_heads, heads_beside
+from gsencoder.fusion.measured_heads import (
+    HeadSet,
+    choose_heads,
+    find_head,
+    has_head,
+    heads_digest,
+    load_heads,
+    save_heads,
+)
 
 
 def head_set() -> HeadSet:

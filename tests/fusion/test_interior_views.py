@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.interior_views import _cover, interior_views
-from gsencoder.fusion.orbit_views import check_orbits, with_views
+from gsencoder.fusion.cameras import _cover, check_orbits, interior_views, with_views
 from gsencoder.types import Gaussians, Scene
 
 UP = np.array([0.0, 0.0, 1.0])

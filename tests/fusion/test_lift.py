@@ -6,8 +6,7 @@ import torch
 from splats import front_camera, random_gaussians
 
 from gsencoder.fusion import lift
-from gsencoder.fusion.lift import FeatureSums, capped, center_matrix, view_matrix
-from gsencoder.fusion.visibility import VisibilityConfig, keep_visible
+from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, capped, center_matrix, keep_visible, view_matrix
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import depth_image
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Views

@@ -12,8 +12,7 @@ from splats import random_gaussians
 
 from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.store.folder import SCENE_FILE, load_features, load_memories, save_features, save_memories
-from gsencoder.fusion.store.memory_file import MEMORY_FILE
+from gsencoder.fusion.folder import MEMORY_FILE, SCENE_FILE, load_features, load_memories, save_features, save_memories
 from gsencoder.types import FeatureBasis, FeatureSpace, QueryMemory, Scene
 
 SCENE = Scene(name="room", gaussians=random_gaussians(200))

@@ -11,10 +11,9 @@ from training_scenes import PREPARE, prepared
 from training_scenes import SPACE as SIDES
 from training_scenes import scene as side_scene
 
+from gsencoder.fusion.checkpoint import CachedTeacher, read_map, write_map
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.lift import distinct_rows
-from gsencoder.fusion.teacher_maps import CachedTeacher, read_map, write_map
-from gsencoder.fusion.visibility import VisibilityConfig
+from gsencoder.fusion.lift import VisibilityConfig, distinct_rows
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.train.prepare import _pool_map
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Scene, Views

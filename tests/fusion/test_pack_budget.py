@@ -12,9 +12,9 @@ from feature_fields import make_features
 from splats import front_camera, random_gaussians
 
 from gsencoder.app import cli
-from gsencoder.fusion.feature_error import field_error
-from gsencoder.fusion.store.folder import load_features, save_features
-from gsencoder.fusion.store.package import PACKAGE_FILE
+from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.folder import load_features, save_features
+from gsencoder.fusion.package import PACKAGE_FILE
 from gsencoder.memory import index as index_budget
 from gsencoder.types import GaussianFeatures, Scene, Views
 

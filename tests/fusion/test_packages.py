@@ -20,8 +20,8 @@ from gsencoder.app import cli
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.files import load_splat, save_splat
-from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
-from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, open_package, save_package
+from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, open_package, save_package
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import GaussianFeatures, Scene, Views
 
@@ -247,7 +247,7 @@ def test_a_folder_of_two_kinds_of_features_is_refused(folder: Path, package: Pat
 
 def test_a_package_loads_without_torch(package: Path) -> None:
     program = (
-        "import sys; from pathlib import Path; from gsencoder.fusion.store.folder import load_features; "
+        "import sys; from pathlib import Path; from gsencoder.fusion.folder import load_features; "
         f"load_features(Path({str(package)!r})); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -8,10 +8,9 @@ from feature_fields import make_features
 from sklearn.cluster import KMeans
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.feature_error import field_error
-from gsencoder.fusion.store import quantize as module
-from gsencoder.fusion.store.bit_allocation import BitAllocation
-from gsencoder.fusion.store.quantize import CompactFeatures, compact
+from gsencoder.fusion import quantize as module
+from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.quantize import BitAllocation, CompactFeatures, compact
 
 
 @pytest.mark.parametrize("basis", [True, False])

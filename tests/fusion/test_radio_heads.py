@@ -14,9 +14,8 @@ from splats import front_camera
 from torch.nn import functional
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.heads.names import text_kind
-from gsencoder.fusion.heads.of_teacher import heads_of
-from gsencoder.fusion.heads.radio import Head, read_radio_heads
+from gsencoder.fusion.adapter_heads import Head, read_radio_heads, text_kind
+from gsencoder.fusion.measured_heads import heads_of
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.types import Views

@@ -12,8 +12,8 @@ from onnx import TensorProto
 from segmenters import PLAIN, save_graph, teacher_of, views_of, words
 from splats import random_gaussians
 
+from gsencoder.fusion.checkpoint import read_map, write_map
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.teacher_maps import read_map, write_map
 from gsencoder.teachers.build import build_teacher, words_beside
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.teachers.segmenter import synonyms_of_classes

@@ -11,7 +11,7 @@ from splats import front_camera, random_gaussians
 
 from gsencoder.core.archive import open_archive
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, save_features
+from gsencoder.fusion.folder import FEATURES_FILE, SCENE_FILE, load_features, save_features
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene, Views
 
 SPACE = FeatureSpace(name="s", channels=8, teacher="test", text_encoder="words")

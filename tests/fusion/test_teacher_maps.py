@@ -9,8 +9,8 @@ from archives import flip_bit
 from training_scenes import SPACE, DenseSideTeacher, prepared, scene
 
 from gsencoder.core.errors import InputError
+from gsencoder.fusion.checkpoint import CachedTeacher, read_map, write_map
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.teacher_maps import CachedTeacher, read_map, write_map
 from gsencoder.types import FeatureMap, Views
 
 

@@ -19,7 +19,7 @@ from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.teachers.build import TeacherConfig, build_teacher, text_table_of, words_of
 from gsencoder.teachers.tower import TransformersConfig
 from gsencoder.text import vocabulary as open_vocabulary

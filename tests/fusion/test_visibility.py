@@ -5,7 +5,7 @@ import pytest
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.visibility import VisibilityConfig, keep_visible, row_mask
+from gsencoder.fusion.lift import VisibilityConfig, keep_visible, row_mask
 from gsencoder.render import Blend, BlendConfig, blend
 
 WIDTH, HEIGHT, PATCH, SIDE = 30, 22, 8, 2

@@ -12,8 +12,8 @@ from splats import random_gaussians
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat
-from gsencoder.fusion.feature_error import field_error
-from gsencoder.fusion.store.folder import features_bytes, load_features, save_features
+from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.folder import features_bytes, load_features, save_features
 from gsencoder.infer.encode import chunks
 from gsencoder.infer.encode.chunks import EncodeConfig, cut
 from gsencoder.infer.encode.encode import TorchEncoder

@@ -9,8 +9,8 @@ import pytest
 from splats import random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.feature_error import field_error
-from gsencoder.fusion.store.folder import save_features
+from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.folder import save_features
 from gsencoder.infer.encode.chunks import EncodeConfig, cut
 from gsencoder.infer.encode_budget import encode_within as encode_within_module
 from gsencoder.infer.encode_budget import sample

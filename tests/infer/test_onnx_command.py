@@ -76,7 +76,7 @@ def test_a_word_is_found_in_an_interpreter_that_has_no_torch(folder: Path, tmp_p
         f"splat, weights, out = {str(tmp_path / 'room.ply')!r}, {str(folder / 'encoder.onnx')!r}, {str(tmp_path)!r}\n"
         "assert main(['encode', splat, f'weights={weights}', f'out={out}/features']) == 0\n"
         "from gsencoder import load_splat, localize\n"
-        "from gsencoder.fusion.store.folder import load_features\n"
+        "from gsencoder.fusion.folder import load_features\n"
         "from gsencoder.infer.onnx.runtime import OnnxEncoder\n"
         "scene = load_features(__import__('pathlib').Path(out) / 'features')\n"
         "assert len(localize(scene, ['mugs'], OnnxEncoder(weights).words).boxes) > 0\n"

@@ -13,7 +13,7 @@ from splats import random_gaussians
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.store.folder import save_memories
+from gsencoder.fusion.folder import save_memories
 from gsencoder.memory import onnx as module
 from gsencoder.memory.onnx import export_memory
 from gsencoder.types import FeatureSpace, Scene

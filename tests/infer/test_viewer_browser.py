@@ -16,7 +16,7 @@ from viewed_rooms import HOSTILE, room_scene, save_viewed_room, search_of
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat
-from gsencoder.fusion.store.quantize import compact
+from gsencoder.fusion.quantize import compact
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.infer.localize.threshold import ThresholdConfig

@@ -17,7 +17,7 @@ from viewer_containers import read_container
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat
-from gsencoder.fusion.store.quantize import compact
+from gsencoder.fusion.quantize import compact
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.infer.localize.threshold import ThresholdConfig, threshold

@@ -12,8 +12,8 @@ from splats import random_gaussians
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.files import load_splat, save_splat
-from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
-from gsencoder.fusion.store.package import PACKAGE_FILE, SPLAT_FILE, save_index_package
+from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_package
 from gsencoder.infer.localize.relevancy import relevancy
 from gsencoder.memory import index as index_module
 from gsencoder.memory.index import IndexConfig, index_features

@@ -12,9 +12,8 @@ from symbolic import symbolic_sizes
 from gsencoder.app import cli
 from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.core.archive import open_archive
-from gsencoder.fusion.heads.measure import head_outputs
-from gsencoder.fusion.heads.store import find_head, load_heads
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
+from gsencoder.fusion.measured_heads import find_head, head_outputs, load_heads
 from gsencoder.infer.localize.localize import LocalizeConfig, localize
 from gsencoder.infer.localize.threshold import ThresholdConfig
 from gsencoder.text.models import TransformersTextConfig

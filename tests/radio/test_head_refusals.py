@@ -16,7 +16,7 @@ from radios import change_weights, small_joint_model, small_radio
 
 from gsencoder.app.commands.through_head import words_of_head
 from gsencoder.core.errors import SceneWarning
-from gsencoder.fusion.heads.store import find_head, load_heads, save_heads
+from gsencoder.fusion.measured_heads import find_head, load_heads, save_heads
 from gsencoder.text.models import TransformersTextConfig
 
 pytestmark = pytest.mark.slow

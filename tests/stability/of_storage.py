@@ -10,9 +10,9 @@ from stability.of_features import SPACE, VECTORS, features_of, lengths
 from stability.registry import routine, worst
 
 from gsencoder.core.arrays import round_columns
-from gsencoder.fusion.store.folder import load_features, save_features
-from gsencoder.fusion.store.quantize import compact
-from gsencoder.fusion.teacher_maps import read_map, write_map
+from gsencoder.fusion.checkpoint import read_map, write_map
+from gsencoder.fusion.folder import load_features, save_features
+from gsencoder.fusion.quantize import compact
 from gsencoder.types import FeatureMap, Gaussians, Scene
 
 Wide = oracles.Wide

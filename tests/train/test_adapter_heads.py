@@ -11,11 +11,10 @@ from textured_box import box_cameras
 from torch import nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.cell_sample import CellSample
-from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
-from gsencoder.fusion.heads.radio import Head
-from gsencoder.fusion.heads.store import load_heads, save_heads
-from gsencoder.fusion.store.heads_file import HEADS_FILE
+from gsencoder.fusion.adapter_heads import Head
+from gsencoder.fusion.errors import CellSample
+from gsencoder.fusion.folder import HEADS_FILE
+from gsencoder.fusion.measured_heads import HeadFit, HeadSet, MeasuredHead, load_heads, save_heads
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.teachers.base import MissingInput
 from gsencoder.teachers.labels import PaletteConfig

@@ -15,10 +15,9 @@ from training_scenes import LOSSES, SMALL, SideTeacher, prepared
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import ProcessRank
-from gsencoder.fusion.heads.measure import HeadFit, HeadSet, MeasuredHead
-from gsencoder.fusion.heads.radio import Head
-from gsencoder.fusion.heads.store import save_heads
-from gsencoder.fusion.store.heads_file import HEADS_FILE
+from gsencoder.fusion.adapter_heads import Head
+from gsencoder.fusion.folder import HEADS_FILE
+from gsencoder.fusion.measured_heads import HeadFit, HeadSet, MeasuredHead, save_heads
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.radio import RadioConfig

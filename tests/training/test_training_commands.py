@@ -20,8 +20,8 @@ from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.evaluate.validation import validate_names
-from gsencoder.fusion.feature_error import field_error
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.folder import load_features
 from gsencoder.models.weights import load_weights
 from gsencoder.text.table import load_text_table
 from gsencoder.train import TrainConfig, train

@@ -8,7 +8,7 @@ import { WordTable } from "./words";
 
 const WORD_STEP = 1 / 32767;
 
-/** Coordinates of all Gaussians, zero where never seen; see gsencoder/fusion/store/quantize.py. */
+/** Coordinates of all Gaussians, zero where never seen; see gsencoder/fusion/quantize.py. */
 export function decodeCoordinates(container: Container<FileMeta>): Float32Array {
   const { count, rank } = container.meta;
   const codes = arrayOf(container, "codes", Uint8Array);

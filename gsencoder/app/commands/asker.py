@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 from gsencoder.app.commands.query_words import load_words, queried_scene
 from gsencoder.app.commands.shown_scene import shown_scene
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.fusion.store.words import table_path
+from gsencoder.fusion.folder import table_path
 from gsencoder.infer.ask.ask import AskConfig, Asker
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.localize.localize import LocalizeConfig, select_features

@@ -18,8 +18,8 @@ from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import color_words, make_room, write_room
 from gsencoder.evaluate.boxes import aabb_iou
+from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
 from gsencoder.infer.draw.boxes_ply import write_boxes_ply
 from gsencoder.infer.localize.localization_json import localization_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, localize

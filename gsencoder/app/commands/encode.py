@@ -22,9 +22,15 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
-from gsencoder.fusion.store.folder import FEATURES_FILE, file_of_teacher, save_features
-from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads, heads_beside
-from gsencoder.fusion.store.words import save_tables
+from gsencoder.fusion.folder import (
+    FEATURES_FILE,
+    HEADS_FILE,
+    copy_heads,
+    file_of_teacher,
+    heads_beside,
+    save_features,
+    save_tables,
+)
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode_budget.config import EncodeBudget, check_encode_budget
 from gsencoder.infer.encode_budget.encode_within import BudgetEncoding
@@ -234,7 +240,7 @@ def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Enc
         InputError: the scene has no views, or the teacher is not known or cannot be loaded.
     """
     # Teachers need torch, which encoding with an exported graph does without.
-    from gsencoder.fusion.basis_fit import basis_fit
+    from gsencoder.fusion.errors import basis_fit
     from gsencoder.teachers.build import build_teacher, words_by_teacher
     from gsencoder.train.source import SourceConfig
 

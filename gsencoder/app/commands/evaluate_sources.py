@@ -20,9 +20,8 @@ from gsencoder.evaluate.sources import (
     space_of_words,
     table_beside,
 )
-from gsencoder.fusion.heads.of_teacher import heads_of
-from gsencoder.fusion.heads.store import find_head, load_heads
-from gsencoder.fusion.store.heads_file import heads_beside
+from gsencoder.fusion.folder import heads_beside
+from gsencoder.fusion.measured_heads import find_head, heads_of, load_heads
 from gsencoder.infer.load_encoder import file_of_encoder, load_encoder
 from gsencoder.teachers.build import words_of
 from gsencoder.teachers.labels import LabelsConfig

@@ -9,7 +9,7 @@ import numpy as np
 from gsencoder.app.commands.from_poses import memory_of
 from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.types import GaussianFeatures, QueryMemory, Scene
 

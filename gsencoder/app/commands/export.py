@@ -16,8 +16,7 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
-from gsencoder.fusion.store.folder import load_memories
-from gsencoder.fusion.store.heads_file import copy_heads, heads_beside, heads_of_graph
+from gsencoder.fusion.folder import copy_heads, heads_beside, heads_of_graph, load_memories
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.load_encoder import file_of_encoder
 from gsencoder.infer.onnx.export import (

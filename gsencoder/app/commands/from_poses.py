@@ -11,8 +11,7 @@ from PIL import Image
 
 from gsencoder.core.errors import InputError, listed
 from gsencoder.data.readers.transforms_json import read_cameras
-from gsencoder.fusion.store.folder import load_memories, teachers_in
-from gsencoder.fusion.store.memory_file import MEMORY_FILE
+from gsencoder.fusion.folder import MEMORY_FILE, load_memories, teachers_in
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.text.table import TextEncoder
 from gsencoder.types import Cameras, QueryMemory, Scene

@@ -9,8 +9,8 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.fusion.cameras import INSIDE, CamerasOfSplat, with_explained_views
 from gsencoder.fusion.fit import with_fitting_splat
-from gsencoder.fusion.orbit_views import INSIDE, CamerasOfSplat, with_explained_views
 from gsencoder.render import BlendConfig
 from gsencoder.types import Scene
 

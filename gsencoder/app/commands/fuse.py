@@ -24,16 +24,13 @@ from gsencoder.core.process import Device
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
-from gsencoder.fusion.budget.config import BudgetConfig, check_budget
-from gsencoder.fusion.budget.fuse_within import BudgetFusion
+from gsencoder.fusion.adapter_heads import Head
+from gsencoder.fusion.budget import BudgetFusion
+from gsencoder.fusion.cameras import CamerasOfSplat, check_orbits
+from gsencoder.fusion.cost_model import BudgetConfig, check_budget
+from gsencoder.fusion.folder import FEATURES_FILE, HEADS_FILE, WORDS_FILE, save_features
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
-from gsencoder.fusion.heads.measure import measure_heads
-from gsencoder.fusion.heads.of_teacher import heads_of, stored_heads
-from gsencoder.fusion.heads.radio import Head
-from gsencoder.fusion.heads.store import save_heads
-from gsencoder.fusion.orbit_views import CamerasOfSplat, check_orbits
-from gsencoder.fusion.store.folder import FEATURES_FILE, WORDS_FILE, save_features
-from gsencoder.fusion.store.heads_file import HEADS_FILE
+from gsencoder.fusion.measured_heads import heads_of, measure_heads, save_heads, stored_heads
 from gsencoder.models.output_space import OutputSpaces, name_of_space
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import AutoConfig, TeacherConfig, build_teacher, choose_teacher, words_beside, words_of

@@ -9,8 +9,8 @@ from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.process import Device
 from gsencoder.core.settings import MEGABYTE
-from gsencoder.fusion.budget.config import BudgetConfig
-from gsencoder.fusion.budget.fuse_within import BudgetFusion, fuse_within, realised_error
+from gsencoder.fusion.budget import BudgetFusion, fuse_within, realised_error
+from gsencoder.fusion.cost_model import BudgetConfig
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.teachers.base import Teacher
 from gsencoder.types import Scene

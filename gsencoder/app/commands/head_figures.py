@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gsencoder.fusion.heads.measure import HeadSet
+from gsencoder.fusion.measured_heads import HeadSet
 
 
 def head_figures(heads: HeadSet) -> dict[str, Any]:

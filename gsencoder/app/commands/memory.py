@@ -22,9 +22,7 @@ from gsencoder.core.process import Device, retain_freed_memory
 from gsencoder.data.scenes import find_scenes
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
-from gsencoder.fusion.store.folder import file_of_teacher, save_memories
-from gsencoder.fusion.store.memory_file import MEMORY_FILE
-from gsencoder.fusion.store.words import save_tables
+from gsencoder.fusion.folder import MEMORY_FILE, file_of_teacher, save_memories, save_tables
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.memory.bank import BankConfig, RawSample

@@ -13,20 +13,18 @@ from gsencoder.app.settings.config import CommonConfig
 from gsencoder.core.archive import copy_checked
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.settings import MEGABYTE, check_governed
-from gsencoder.fusion.store.budget import PackBudget
-from gsencoder.fusion.store.folder import WORDS_FILE, load_features
-from gsencoder.fusion.store.heads_file import HEADS_FILE, copy_heads
-from gsencoder.fusion.store.index_file import index_bytes
-from gsencoder.fusion.store.package import (
+from gsencoder.fusion.folder import HEADS_FILE, WORDS_FILE, copy_heads, load_features, table_path
+from gsencoder.fusion.package import (
     PACKAGE_FILE,
     Form,
+    PackBudget,
+    index_bytes,
     save_arrays,
     save_index_package,
     save_package,
     save_package_within,
     save_ply,
 )
-from gsencoder.fusion.store.words import table_path
 from gsencoder.infer.localize.localize import select_features
 from gsencoder.memory.index import IndexConfig, index_features, index_within
 from gsencoder.text.table import load_text_table, save_text_table

@@ -7,8 +7,7 @@ from pathlib import Path
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import find_file
-from gsencoder.fusion.store.folder import WORDS_FILE
-from gsencoder.fusion.store.words import table_path
+from gsencoder.fusion.folder import WORDS_FILE, table_path
 from gsencoder.infer.localize.localize import select_features
 from gsencoder.text.table import TextTable, load_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, stating_trained, vocabulary_of, words_of_table

@@ -7,7 +7,7 @@ from pathlib import Path
 from gsencoder.app.commands.evaluated_features import folder_of
 from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.data.scenes import DistinctPaths, kind_of_path
-from gsencoder.fusion.store.folder import holds_features
+from gsencoder.fusion.folder import holds_features
 from gsencoder.infer.ask.ask import Asker
 from gsencoder.infer.ask.question_sets import SetQuestion, caption_question
 from gsencoder.infer.localize.localize import localize

@@ -17,7 +17,7 @@ from gsencoder.core.files import write_json
 from gsencoder.core.process import import_ahead
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.up import with_up
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize.localization_json import words_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent
 from gsencoder.infer.select.file_names import file_stems

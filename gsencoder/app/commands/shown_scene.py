@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.types import Scene
 

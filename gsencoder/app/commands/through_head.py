@@ -5,12 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.fusion.heads.apply import head_features
-from gsencoder.fusion.heads.measure import HeadSet, MeasuredHead
-from gsencoder.fusion.heads.names import TEXT_KINDS, text_kind
-from gsencoder.fusion.heads.radio import Head
-from gsencoder.fusion.heads.store import find_head, load_heads
-from gsencoder.fusion.store.heads_file import HEADS_FILE
+from gsencoder.fusion.adapter_heads import TEXT_KINDS, Head, text_kind
+from gsencoder.fusion.folder import HEADS_FILE
+from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, find_head, head_features, load_heads
 from gsencoder.infer.localize.localize import select_features
 from gsencoder.text.models import TransformersTower
 from gsencoder.text.table import TextTable, TextTower, load_text_table

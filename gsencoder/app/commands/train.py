@@ -20,11 +20,9 @@ from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory, threads_of_torch
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
-from gsencoder.fusion.basis_fit import total_fit
-from gsencoder.fusion.heads.measure import HeadSet
-from gsencoder.fusion.heads.store import save_heads
-from gsencoder.fusion.store.heads_file import HEADS_FILE
-from gsencoder.fusion.store.words import save_tables
+from gsencoder.fusion.errors import total_fit
+from gsencoder.fusion.folder import HEADS_FILE, save_tables
+from gsencoder.fusion.measured_heads import HeadSet, save_heads
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights

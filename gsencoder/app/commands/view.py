@@ -17,7 +17,7 @@ from gsencoder.core.files import atomic_file
 from gsencoder.core.process import accept_stop
 from gsencoder.data.scenes import DistinctPaths, SceneConfig, load_scene
 from gsencoder.data.up import with_up
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize.localize import LocalizeConfig, select_features
 from gsencoder.infer.viewer.bundle import Bundle, load_bundle
 from gsencoder.infer.viewer.file_size import fitting_page

@@ -15,9 +15,8 @@ from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.fusion.heads.apply import head_space, head_tokens
-from gsencoder.fusion.heads.store import find_head
-from gsencoder.fusion.store.heads_file import check_heads_space
+from gsencoder.fusion.folder import check_heads_space
+from gsencoder.fusion.measured_heads import find_head, head_space, head_tokens
 from gsencoder.infer.draw.pictures import Picture
 from gsencoder.infer.localize.localization_json import box_to_json, words_to_json
 from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, select_features

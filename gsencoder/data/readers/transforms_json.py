@@ -4,7 +4,7 @@
 Values of a frame come before those of the file. Distortion (k1, k2, k3, k4, p1, p2) is OpenCV's, of the perspective
 or, for OPENCV_FISHEYE or `is_fisheye`, of the equidistant model. `ply_file_path` names points of the same world.
 `scale`, `offset` and `aabb_scale` are not used: the world is that of the matrices, and `applied_transform` only says
-which one a splat may be in (`gsencoder.data.splat_frame`). Intrinsics may be of the upright picture where the file is
+which one a splat may be in (`gsencoder.fusion.fit`). Intrinsics may be of the upright picture where the file is
 stored sideways (EXIF); its width and height, which differ, tell.
 
 Beside the keys of those programs these are read: `instance_file_path` (integers, 0 = none) for a frame, and

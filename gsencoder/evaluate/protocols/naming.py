@@ -15,7 +15,7 @@ from jaxtyping import Float32, Int64
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.sources import FeatureSource, with_features
-from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher

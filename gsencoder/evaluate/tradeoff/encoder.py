@@ -17,7 +17,7 @@ from gsencoder.evaluate.protocols.localization import score_queries
 from gsencoder.evaluate.protocols.naming import compare_names
 from gsencoder.evaluate.tradeoff.fused_scene import hit_scores, stored_bytes
 from gsencoder.evaluate.tradeoff.stage import Inputs, Judged, Score, Stage
-from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import TorchEncoder

@@ -13,9 +13,9 @@ from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import Hit
 from gsencoder.evaluate.protocols.localization import score_queries
 from gsencoder.evaluate.tradeoff.stage import Inputs, Score
+from gsencoder.fusion.checkpoint import CachedTeacher
+from gsencoder.fusion.folder import save_features
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.store.folder import save_features
-from gsencoder.fusion.teacher_maps import CachedTeacher
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.teachers.build import build_teacher, text_table_of
 from gsencoder.text.table import TextTable
@@ -90,7 +90,7 @@ def hit_scores(hits: list[Hit]) -> Mapping[str, Score]:
 
 def stored_bytes(scene: Scene, features: GaussianFeatures) -> int:
     """Bytes of the file of features alone, as every command writes it."""
-    from gsencoder.fusion.store.folder import FEATURES_FILE
+    from gsencoder.fusion.folder import FEATURES_FILE
 
     with tempfile.TemporaryDirectory(prefix="gsencoder_stored_") as folder:
         save_features(folder, scene, features)

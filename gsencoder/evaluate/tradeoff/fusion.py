@@ -7,9 +7,9 @@ from pathlib import Path
 from gsencoder.core.settings import exact_settings
 from gsencoder.evaluate.tradeoff.fused_scene import TaughtScene, hit_scores, stored_bytes, taught_scene
 from gsencoder.evaluate.tradeoff.stage import Inputs, Judged, Score, Stage
-from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.knobs import FUSION_KNOBS
+from gsencoder.fusion.package import FUSION_KNOBS
 from gsencoder.types import GaussianFeatures
 
 

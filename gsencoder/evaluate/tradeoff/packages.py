@@ -7,10 +7,11 @@ from pathlib import Path
 
 from gsencoder.evaluate.tradeoff.fused_scene import TaughtScene, hit_scores, taught_scene
 from gsencoder.evaluate.tradeoff.stage import Inputs, Judged, Score, Stage
-from gsencoder.fusion.feature_error import field_error
-from gsencoder.fusion.knobs import PACKAGE_KNOBS, PackageSettings
-from gsencoder.fusion.store.package import (
+from gsencoder.fusion.errors import field_error
+from gsencoder.fusion.package import (
+    PACKAGE_KNOBS,
     SPLAT_FILE,
+    PackageSettings,
     load_package,
     save_arrays,
     save_index_package,

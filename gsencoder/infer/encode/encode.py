@@ -9,7 +9,7 @@ from jaxtyping import Float32
 from gsencoder.core.device import autocast_dtype, choose_device
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Device, Precision, Track, untracked
-from gsencoder.fusion.store.words import load_tables
+from gsencoder.fusion.folder import load_tables
 from gsencoder.infer.encode.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.grid import SceneCurves, cut_scene_curves

@@ -12,8 +12,8 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import MEGABYTE, best_setting, shown_value, within_seconds
-from gsencoder.fusion.feature_error import FieldError, judge
-from gsencoder.fusion.store.folder import features_bytes
+from gsencoder.fusion.errors import FieldError, judge
+from gsencoder.fusion.folder import features_bytes
 from gsencoder.infer.encode.chunks import EncodeConfig, cut, scene_regions
 from gsencoder.infer.encode_budget.config import EncodeBudget, exact_encoding
 from gsencoder.infer.encode_budget.principal_axes import PrincipalAxes, principal_axes

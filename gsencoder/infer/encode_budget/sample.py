@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
 
 from gsencoder.core.process import Precision
-from gsencoder.fusion.feature_error import row_cosines
+from gsencoder.fusion.errors import row_cosines
 from gsencoder.infer.encode.chunks import Chunk, EncodeConfig, cut, scene_regions
 from gsencoder.infer.load_encoder import Encoder
 from gsencoder.types import GaussianFeatures, Gaussians

@@ -13,7 +13,7 @@ import torch
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Stored, Track, untracked
-from gsencoder.fusion.feature_error import field_error
+from gsencoder.fusion.errors import field_error
 from gsencoder.infer.encode.chunks import EncodeConfig
 from gsencoder.infer.encode.encode import TorchEncoder
 from gsencoder.infer.onnx.header import FIELDS, NO_SUM, OUTPUT, SETTINGS, SUM, OnnxHeader, to_metadata, with_sum

@@ -9,7 +9,7 @@ import numpy as np
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Track, untracked
 from gsencoder.data.seeding.points import scene_spacing
-from gsencoder.fusion.orbit_views import with_views
+from gsencoder.fusion.cameras import with_views
 from gsencoder.infer.localize.localize import LocalizeConfig, localize, select_features
 from gsencoder.infer.select.grow import grow
 from gsencoder.infer.select.seeds import box_parts, labels_of_parts, threshold_parts

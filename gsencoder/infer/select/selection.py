@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.orbit_views import check_orbits
+from gsencoder.fusion.cameras import check_orbits
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

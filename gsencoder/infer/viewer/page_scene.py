@@ -10,7 +10,7 @@ from PIL import Image
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.store.quantize import compact
+from gsencoder.fusion.quantize import compact
 from gsencoder.infer.localize import presence
 from gsencoder.infer.localize.relevancy import feature_axes, word_directions
 from gsencoder.infer.viewer.container import Container
@@ -102,7 +102,7 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
     """What a page needs that answers by itself: also quantized features, the vectors of all known words, labels and
     photographs.
 
-    Features are coordinates z of the codes and levels of `gsencoder.fusion.store.quantize`. The relevancy of the word
+    Features are coordinates z of the codes and levels of `gsencoder.fusion.quantize`. The relevancy of the word
     with vector t in `words` is z·t / √(|z|² + floor), since the basis is orthonormal and its mean is what centered
     cosines remove.
 

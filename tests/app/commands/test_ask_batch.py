@@ -13,7 +13,7 @@ from asked_rooms import ORIGIN, ask, save_room
 from chat_server import Handler, answer, serving
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.store.folder import WORDS_FILE, load_features
+from gsencoder.fusion.folder import WORDS_FILE, load_features
 from gsencoder.infer.ask import ask as ask_module
 from gsencoder.infer.ask.ask import MAX_CACHED_PICTURES, Asker, Question
 from gsencoder.infer.ask.questions import read_answers, read_questions

@@ -20,7 +20,7 @@ from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.evaluate.files.answer_predictions import read_answer_predictions
 from gsencoder.evaluate.picture_truth import PictureTruth
 from gsencoder.evaluate.scripted_answerer import AnswerSheet, ScriptedAnswerer, serving
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.infer.ask.questions import read_answers
 from gsencoder.infer.views.photographs import with_photographs
 

@@ -12,8 +12,8 @@ from gsencoder.app.commands.basis_figures import describe_basis
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.basis_fit import basis_fit
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.errors import basis_fit
+from gsencoder.fusion.folder import load_features
 from gsencoder.infer.onnx.export import random_cloud
 from gsencoder.models.weights import load_weights
 from gsencoder.teachers.labels import PaletteConfig, PaletteTeacher

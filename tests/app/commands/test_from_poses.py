@@ -9,7 +9,7 @@ from memory_samples import make_memory
 from splats import front_camera, random_gaussians
 
 from gsencoder.app.commands.from_poses import RequestedCameras, memory_of, search_from_poses
-from gsencoder.fusion.store.folder import load_features, save_features, save_memories
+from gsencoder.fusion.folder import load_features, save_features, save_memories
 from gsencoder.infer.localize.from_pose import FromPoseConfig, from_pose
 from gsencoder.infer.localize.localize import LocalizeConfig
 from gsencoder.infer.localize.threshold import ThresholdConfig

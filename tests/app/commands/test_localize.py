@@ -10,7 +10,7 @@ import pytest
 from gsencoder.app.commands.localize import LocalizeCommandConfig
 from gsencoder.app.commands.query_words import MAX_QUERIES_BYTES, load_words, query_words
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.store.folder import WORDS_FILE
+from gsencoder.fusion.folder import WORDS_FILE
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.text.vocabulary import closed_table
 

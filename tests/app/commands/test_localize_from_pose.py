@@ -11,7 +11,7 @@ from command_runs import refusal, results_of
 from PIL import Image
 
 from gsencoder.app import cli
-from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_memories
+from gsencoder.fusion.folder import WORDS_FILE, load_features, save_memories
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import MemoryBank, QueryMemory
 from gsencoder.types.checks import OPENCV_FROM_OPENGL

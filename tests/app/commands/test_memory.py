@@ -11,7 +11,7 @@ from named_rooms import write_words
 from gsencoder.app import cli
 from gsencoder.core.logs import read_log
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.store.folder import load_features, load_memories
+from gsencoder.fusion.folder import load_features, load_memories
 from gsencoder.train import memory as training
 
 pytestmark = pytest.mark.slow

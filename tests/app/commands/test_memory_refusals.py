@@ -14,7 +14,7 @@ from gsencoder.app.commands.memory import MemoryCommandConfig
 from gsencoder.app.settings.options import options_by_key
 from gsencoder.core.logs import read_log
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.store.folder import save_memories
+from gsencoder.fusion.folder import save_memories
 from gsencoder.train import memory as training
 from gsencoder.train.memory import fingerprint_of, memory_training
 from gsencoder.types import Scene

@@ -11,7 +11,7 @@ from training_scenes import SMALL
 
 from gsencoder.app import cli
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.store.folder import load_memories
+from gsencoder.fusion.folder import load_memories
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import save_weights

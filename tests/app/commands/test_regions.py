@@ -15,7 +15,7 @@ from gsencoder.app.settings.compose import compose
 from gsencoder.core.archive import open_archive
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.store.folder import load_features
+from gsencoder.fusion.folder import load_features
 from gsencoder.teachers.masks import RegionsConfig
 from gsencoder.text.table import load_text_table
 

@@ -12,7 +12,7 @@ from selected_rooms import EMBEDDINGS, selected_room, words
 from gsencoder.app import cli
 from gsencoder.data.splats.files import load_splat
 from gsencoder.data.up import with_up
-from gsencoder.fusion.store.folder import WORDS_FILE, load_features, save_features
+from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.infer.select.holes import find_holes
 from gsencoder.infer.select.labels_file import read_labels
 from gsencoder.infer.select.select import select

@@ -14,9 +14,8 @@ from gsencoder.app.runs.work_folder import WorkFolder
 from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import find_scenes
 from gsencoder.data.splats.files import read_raw
-from gsencoder.fusion.store.folder import FEATURES_FILE, SCENE_FILE, load_features, load_memories
-from gsencoder.fusion.store.memory_file import MEMORY_FILE
-from gsencoder.fusion.store.package import PACKAGE_FILE
+from gsencoder.fusion.folder import FEATURES_FILE, MEMORY_FILE, SCENE_FILE, load_features, load_memories
+from gsencoder.fusion.package import PACKAGE_FILE
 from gsencoder.infer.load_encoder import load_encoder
 from gsencoder.models.weights import WEIGHTS_FILE
 

@@ -7,7 +7,7 @@ So is the smallest one, where Gaussians share the rows of a table (`index_file`)
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Int64
 from gsencoder.core.archive import (
     LONGEST_NUMBER,
     LONGEST_SHARE,
+    Archive,
     MappedArrays,
     archive_bytes,
     open_archive,
@@ -25,12 +26,114 @@ from gsencoder.core.archive import (
 )
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file
-from gsencoder.core.settings import MEGABYTE
-from gsencoder.data.scene_arrays import check_splat, read_scene, read_space, scene_parts, space_parts
+from gsencoder.core.settings import MEGABYTE, Budget, Knob
+from gsencoder.data.scene_arrays import check_splat, read_scene, read_space, scaled_halves, scene_parts, space_parts
 from gsencoder.data.splats.files import FINGERPRINT_DIGITS, fingerprint, load_splat, save_splat
-from gsencoder.fusion.store.index_file import INDEX_FORM, read_index, write_index
-from gsencoder.fusion.store.quantize import CompactFeatures, compact, compact_within
+from gsencoder.fusion.quantize import CompactFeatures, compact, compact_within
 from gsencoder.types import FeatureBasis, GaussianFeatures, Scene
+
+INDEX_FORM = 2
+"""Form of a package, in its header, of an index and a table."""
+
+
+def write_index(path: Path, scene: Scene, features: GaussianFeatures, *, fingerprint: str, error: float) -> None:
+    """Writes an index and its table. Weights are not written: those of Gaussians that were seen are read as 1.
+
+    Args:
+        path: the file.
+        scene: of the features.
+        features: with an index.
+        fingerprint: of the splat beside the file.
+        error: 1 − mean centered cosine with the features that the table was made from.
+
+    Raises:
+        InputError: the table has more rows than two bytes can number, or the disk is full.
+    """
+    assert features.index is not None
+    rows = len(features.features)
+    dtype = _index_dtype(rows)
+    unseen = int(np.iinfo(dtype).max)
+    if rows > unseen:
+        raise InputError(f"{path}: expected a table of up to {unseen:,} rows, got {rows:,}")
+    table, channel_scale = scaled_halves(features.features)
+    arrays, header = _index_contents(
+        scene,
+        features,
+        index=np.where(features.index < 0, unseen, features.index).astype(dtype),
+        table=table,
+        channel_scale=channel_scale,
+        fingerprint=fingerprint,
+        error=error,
+    )
+    write_archive(path, arrays, header)
+
+
+def _index_dtype(rows: int) -> str:
+    """The type of the numbers of a table's rows; its largest value stands for Gaussians that were never seen."""
+    return "uint8" if rows < 256 else "uint16"
+
+
+def _index_contents(
+    scene: Scene,
+    features: GaussianFeatures,
+    *,
+    index: np.ndarray,
+    table: np.ndarray,
+    channel_scale: np.ndarray,
+    fingerprint: str,
+    error: float,
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The arrays and the header of a package; of the features it takes the space, the mean and the basis."""
+    arrays, header = scene_parts(scene)
+    space_arrays, space_header = space_parts(features.space, features.mean, features.basis)
+    arrays |= {**space_arrays, "index": index, "table": table, "channel_scale": channel_scale}
+    return arrays, header | space_header | {"form": INDEX_FORM, "fingerprint": fingerprint, "error": error}
+
+
+def index_bytes(scene: Scene, features: GaussianFeatures, rows: int) -> int:
+    """The size of the file that `write_index` would write, with a table of so many rows.
+
+    Args:
+        scene: of the features.
+        features: without an index.
+        rows: of the table.
+    """
+    columns = features.features.shape[1]
+    arrays, header = _index_contents(
+        scene,
+        features,
+        index=shape_only(_index_dtype(rows), (len(features),)),
+        table=shape_only("float16", (rows, columns)),
+        channel_scale=shape_only("float32", (columns,)),
+        fingerprint="0" * FINGERPRINT_DIGITS,
+        error=LONGEST_NUMBER,
+    )
+    return archive_bytes(arrays, header)
+
+
+def read_index(file: Archive) -> GaussianFeatures:
+    """Reads an index and its table.
+
+    Raises:
+        InputError: damaged, or numbers beyond the table.
+    """
+    space, mean, basis = read_space(file)
+    columns = space.channels if basis is None else basis.rank
+    scale = file.array("channel_scale", "float32", (columns,))
+    table = file.array("table", "float16", ("M", columns)).astype(np.float32) * scale
+    dtype = _index_dtype(len(table))
+    stored = file.array("index", dtype, ("N",))
+    unseen = stored == np.iinfo(dtype).max
+    index = np.where(unseen, -1, stored.astype(np.int32)).astype(np.int32)
+    return GaussianFeatures(
+        features=table,
+        weights=(~unseen).astype(np.float32),
+        mean=mean,
+        space=space,
+        basis=basis,
+        index=index,
+    )
+
 
 Form = Literal["compact", "index", "npz", "safetensors", "ply"]
 SPLAT_FILE, PACKAGE_FILE = "splat.ply", "features.gsf"
@@ -245,3 +348,59 @@ def _plain(features: GaussianFeatures, *, decoded: str) -> dict[str, np.ndarray]
 def _about(features: GaussianFeatures, belongs: str, *, decoded: bool) -> dict[str, Any]:
     kind = "vectors" if decoded or features.basis is None else "coordinates: vector = mean + features @ components"
     return {"space": asdict(features.space), "features": kind, "fingerprint": belongs}
+
+
+FUSION_KNOBS = (
+    Knob(name="view_share", key="view_share", values=(0.17, 0.33, 0.5, 0.67), exact=1.0),
+    Knob(name="views", key="views", values=(4, 8, 16), exact=0),
+    Knob(name="view_choice", key="view_choice", values=("coverage",), needs={"view_share": 0.5}),
+    Knob(name="rays_per_patch", key="blend.rays_per_patch", values=(1, 4, 9, 16, 36), exact=196),
+    Knob(name="min_weight", key="blend.min_weight", values=(1e-4, 1e-3, 1e-2), exact=0.0),
+    Knob(name="stop_transmittance", key="blend.stop_transmittance", values=(1e-3, 1e-2, 0.1), exact=1e-6),
+    Knob(name="tolerance", key="visibility.relative", values=(0.005, 0.01, 0.05, 0.1)),
+    Knob(name="energy", key="energy", values=(0.95, 0.99, 0.995)),
+    Knob(name="table_energy", key="table_energy", values=(0.9, 0.99, 0.999)),
+    Knob(name="max_rank", key="max_rank", values=(8, 16, 32, 64)),
+    Knob(name="basis", key="basis", values=(False,), exact=False),
+)
+"""Knobs of `gsencoder.fusion.fuse.FuseConfig`. A tolerance of visibility has no exact value: a wider one takes in what
+is hidden, and a narrower one leaves out what is seen."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PackageSettings:
+    """How features are packed."""
+
+    form: Form = field(default="compact", metadata={"help": "see `pack form=`"})
+    error: float = field(default=0.01, metadata={"help": "largest mean loss of centered cosine, for form=compact"})
+    threshold: float = field(default=0.9, metadata={"help": "centered cosine that the rows of form=index reach"})
+
+    def __post_init__(self) -> None:
+        if not 0 < self.error < 1:
+            raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
+
+
+PACKAGE_KNOBS = (
+    Knob(name="form", key="form", values=("index", "npz")),
+    Knob(name="error", key="error", values=(0.001, 0.003, 0.03, 0.1), exact=0.001),
+    Knob(name="threshold", key="threshold", values=(0.8, 0.95, 0.98), needs={"form": "index"}),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PackBudget(Budget):
+    """What a package may lose, or how large it may be. Where both are promised and conflict, the error wins.
+
+    With a budget of error the smallest package that keeps it is made; with one of megabytes alone, the most exact one.
+    """
+
+    error: float | None = field(
+        default=None,
+        metadata={
+            "help": "largest mean of 1 − centered cosine to the features that are packed, over Gaussians and over "
+            "kinds of features; without a budget 0.01 for form=compact"
+        },
+    )
+    megabytes: float | None = field(
+        default=None, metadata={"help": "largest size of features.gsf, in units of 1,000,000 bytes"}
+    )

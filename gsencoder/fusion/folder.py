@@ -4,14 +4,18 @@ Features of one teacher are in `features.safetensors`, those of several in a fil
 Memories, which are decoded to features when they are read, are in `memory.safetensors` or `memory.TEACHER.safetensors`.
 Arrays are safetensors files, memory-mapped on load; features are float16 for seen rows only. The folder is all that
 localization needs: no photographs, no teacher.
+
+The file of adapter heads beside features and weights: where it lies, and for which features it is.
+
+Its layers are read by `gsencoder.fusion.measured_heads`, which needs torch.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float16, Float32, Int32
@@ -20,19 +24,107 @@ from gsencoder.core.archive import (
     LONGEST_SHARE,
     Archive,
     archive_bytes,
+    copy_checked,
     open_archive,
     shape_only,
+    verify_archive,
     write_archive,
 )
 from gsencoder.core.arrays import rise_within
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import parallel
-from gsencoder.data.scene_arrays import check_splat, read_scene, read_space, scene_parts, space_parts
+from gsencoder.data.scene_arrays import (
+    bank_parts,
+    check_splat,
+    read_bank,
+    read_scene,
+    read_space,
+    scaled_halves,
+    scene_parts,
+    space_parts,
+)
 from gsencoder.data.scenes import kind_of_path
 from gsencoder.data.splats.files import FINGERPRINT_DIGITS, fingerprint
-from gsencoder.fusion.store.memory_file import MEMORY_FILE, read_memory, write_memory
-from gsencoder.fusion.store.package import PACKAGE_FILE, load_package
+from gsencoder.fusion.package import PACKAGE_FILE, load_package
+from gsencoder.text.table import TextTable, load_text_table, save_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, QueryMemory, Scene
+
+MEMORY_FILE = "memory.safetensors"
+
+
+def write_memory(path: Path, memory: QueryMemory, gaussians: Gaussians, more: Mapping[str, Any] = {}) -> None:
+    """Writes a memory: queries of seen Gaussians and components as float16, each channel divided by its largest
+    magnitude.
+
+    Args:
+        path: the file.
+        memory: to write.
+        gaussians: that the queries belong to.
+        more: further entries of the header, as JSON values.
+
+    Raises:
+        InputError: another number of Gaussians, or the disk is full.
+    """
+    if len(memory) != len(gaussians):
+        raise InputError(f"{path}: {len(memory):,} queries need as many Gaussians, got {len(gaussians):,}")
+    rows, bank = np.flatnonzero(memory.weights > 0), memory.bank
+    arrays, header = space_parts(memory.space, memory.mean, memory.basis)
+    queries, query_scale = scaled_halves(memory.queries[rows])
+    components, component_scale = scaled_halves(bank.components)
+    arrays |= {
+        "rows": rows.astype(np.int32),
+        "queries": queries,
+        "query_scale": query_scale,
+        "weights": memory.weights[rows],
+        "projection": memory.projection,
+        "bank": components,
+        "bank_scale": component_scale,
+    }
+    of_bank, figures = bank_parts(bank)
+    header |= {
+        "fingerprint": fingerprint(gaussians),
+        "scoring": memory.scoring,
+        "temperature": memory.temperature,
+        **figures,
+    }
+    write_archive(path, arrays | of_bank, header | dict(more))
+
+
+def read_memory(file: Archive, gaussians: Gaussians) -> QueryMemory:
+    """Reads a memory.
+
+    Raises:
+        InputError: damaged, or of another splat.
+    """
+    check_splat(file, gaussians, "make the memory of this splat again")
+    space, mean, basis = read_space(file)
+    rows, count = file.array("rows", "int32", ("n",)), len(gaussians)
+    if not rise_within(rows, count):
+        raise InputError(f"expected row numbers that rise from 0 to at most {count - 1}")
+    seen = file.array("weights", "float32", (len(rows),))
+    if (seen <= 0).any():
+        raise InputError("expected weights above 0")
+    projection = file.array("projection", "float32", ("s", space.channels))
+    scale = file.array("query_scale", "float32", (len(projection),))
+    queries, weights = np.zeros((count, len(projection)), np.float32), np.zeros(count, np.float32)
+    queries[rows] = file.array("queries", "float16", (len(rows), len(projection))).astype(np.float32) * scale
+    weights[rows] = seen
+    components = file.array("bank", "float16", ("M", space.channels)).astype(np.float32)
+    bank = read_bank(file, components * file.array("bank_scale", "float32", (space.channels,)), space)
+    scoring = file.value("scoring", str)
+    if scoring not in ("centered", "cosine", "dot"):
+        raise InputError(f"expected scoring centered, cosine or dot in the header, got {scoring[:40]!r}")
+    return QueryMemory(
+        queries=queries,
+        weights=weights,
+        projection=projection,
+        bank=bank,
+        scoring=scoring,
+        temperature=file.value("temperature", float, int),
+        mean=mean,
+        basis=basis,
+    )
+
 
 SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
 BLOCK = 16_384
@@ -308,3 +400,128 @@ def _load_rows(folder: Path, name: str, gaussians: Gaussians) -> GaussianFeature
         weights[rows] = seen
         space, mean, basis = read_space(file)
         return GaussianFeatures(features=values, weights=weights, mean=mean, space=space, basis=basis)
+
+
+def save_tables(
+    folder: Path,
+    tables: Mapping[str, TextTable],
+    teachers: Iterable[str],
+    *,
+    dtype: Literal["float32", "float16"] = "float32",
+) -> None:
+    """Writes text tables beside features or weights.
+
+    Args:
+        folder: an existing folder.
+        tables: by the teacher in whose space they are.
+        teachers: all teachers of the features or the encoder, with tables or not; a single one is not named in files.
+        dtype: of the embeddings.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    single = len(list(teachers)) == 1
+    for teacher, table in tables.items():
+        save_text_table(folder / file_of_teacher(WORDS_FILE, None if single else teacher), table, dtype=dtype)
+
+
+def load_tables(folder: Path, teachers: Iterable[str]) -> dict[str, TextTable]:
+    """The text tables of a folder by teacher; teachers without a file are left out.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    names = list(teachers)
+    paths = {name: folder / file_of_teacher(WORDS_FILE, name if len(names) > 1 else None) for name in names}
+    return {name: load_text_table(path) for name, path in paths.items() if path.is_file()}
+
+
+def table_path(folder: Path, text_encoder: str) -> Path | None:
+    """The file in a folder of features whose words lead into the features of one space; None where there is none.
+
+    Args:
+        folder: of features.
+        text_encoder: of the space of these features.
+
+    Raises:
+        InputError: a file is damaged, or there are files, but of other spaces.
+    """
+    if (folder / WORDS_FILE).is_file():
+        return folder / WORDS_FILE
+    if not text_encoder:
+        return None
+    paths = [folder / file_of_teacher(WORDS_FILE, teacher) for teacher in teachers_in(folder, WORDS_FILE)]
+    encoders = {path: load_text_table(path).space.text_encoder for path in paths}
+    fitting = [path for path, encoder in encoders.items() if encoder == text_encoder]
+    if paths and not fitting:
+        raise InputError(
+            f"{folder}: no {file_of_teacher(WORDS_FILE, 'TEACHER')} holds words of {text_encoder}, which lead into "
+            f"these features (there are words of {', '.join(sorted(set(encoders.values())))}): the file was lost; give "
+            "words= or text=, or name other features with space="
+        )
+    return fitting[0] if fitting else None
+
+
+HEADS_FILE = "heads.safetensors"
+"""The adapter heads that take the features, beside them where there are some."""
+
+
+def heads_beside(weights: Path) -> Path | None:
+    """The file of adapter heads beside the file of an encoder, or None: heads.safetensors in its folder, and for an
+    exported graph `heads_of_graph`."""
+    path = heads_of_graph(weights) if weights.suffix.lower() == ".onnx" else weights.with_name(HEADS_FILE)
+    return path if path.is_file() else None
+
+
+def heads_of_graph(graph: Path) -> Path:
+    """Where the adapter heads of an exported graph lie: FILE.onnx.heads.safetensors."""
+    return graph.with_name(f"{graph.name}.{HEADS_FILE}")
+
+
+def copy_heads(
+    source: Path, target: Path, spaces: Sequence[FeatureSpace], *, left_out: Sequence[FeatureSpace] = ()
+) -> None:
+    """Copies a file of adapter heads beside features or weights; an earlier one is replaced once the copy is whole.
+
+    Args:
+        source: the file.
+        target: its copy.
+        spaces: of the features or the weights, one for each teacher; the heads take features of one of them.
+        left_out: spaces of the other teachers of the source, whose features are not written; heads that take these are
+            not copied.
+
+    Raises:
+        InputError: the file is damaged, or of another backbone; or the target cannot be written.
+    """
+    with open_archive(source) as file:
+        heads = read_heads_space(file)
+        if heads in left_out:
+            return
+        check_heads_space(heads, next((space for space in spaces if space == heads), spaces[0]))
+        file.verify()
+    copy_checked(source, target, verify_archive)
+
+
+def read_heads_space(file: Archive) -> FeatureSpace:
+    """The space of the features that the heads of a file take.
+
+    Raises:
+        InputError: the file does not say.
+    """
+    values = file.value("space", dict)
+    if set(values) != set(FeatureSpace.__dataclass_fields__):
+        raise InputError(f"expected a feature space with {', '.join(FeatureSpace.__dataclass_fields__)}")
+    return FeatureSpace(**values)
+
+
+def check_heads_space(heads: FeatureSpace, features: FeatureSpace) -> None:
+    """Checks that heads take features of a space.
+
+    Raises:
+        InputError: they take features of another backbone; both are named.
+    """
+    if heads != features:
+        raise InputError(
+            f"the heads take features of ({heads.describe()}), and these are of ({features.describe()}); expected "
+            "heads of the same backbone with the same settings"
+        )
