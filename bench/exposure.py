@@ -24,8 +24,8 @@ from gsencoder import load_scene
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.reconstruct import ReconstructConfig, reconstruct
-from gsencoder.reconstruct.budget import BudgetConfig
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
+from gsencoder.reconstruct.optimize import OptimizeConfig
+from gsencoder.reconstruct.plan import BudgetConfig
 from gsencoder.types import Scene
 
 GAIN, BALANCE = 1.4, 0.1

@@ -39,11 +39,8 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.memory.attention import MemoryAttention
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.parameters import camera_of, gaussians_of, parameters_from, rows_in_view
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import RowAdam, camera_of, gaussians_of, parameters_from, rows_in_view
 from gsencoder.render import blend
 from gsencoder.render.images import psnr
 from gsencoder.render.rasterize import RasterConfig, rasterize

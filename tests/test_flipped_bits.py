@@ -37,10 +37,9 @@ from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_packag
 from gsencoder.memory.index import index_features
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights
-from gsencoder.reconstruct.anchor import anchor_at
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct.optimize import anchor_at
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.checkpoint import TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.prepared_dataset import CLASS_BALANCE_FILE, SPACE_FILE

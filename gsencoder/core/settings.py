@@ -7,7 +7,7 @@ Each stage that has knobs lists them beside its settings (`gsencoder.fusion.pack
 
 Budgets: what the section `budget` of a command may promise, and how promises are checked, ordered and worded.
 
-Each stage with budgets has a frozen dataclass of its promises beside its code (`gsencoder.reconstruct.budget`,
+Each stage with budgets has a frozen dataclass of its promises beside its code (`gsencoder.reconstruct.plan`,
 `gsencoder.fusion.cost_model`, `gsencoder.fusion.package`, `gsencoder.infer.encode_budget.config`,
 `gsencoder.infer.views.budget`), with those fields of `PROMISES` that mean something there.
 

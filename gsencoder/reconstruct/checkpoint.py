@@ -15,9 +15,8 @@ from torch import Tensor
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.settings import PROMISES, first_difference, without_removed_options
-from gsencoder.reconstruct.anchor import Anchor
-from gsencoder.reconstruct.parameters import shapes_of
-from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct.optimize import Anchor
+from gsencoder.reconstruct.parameters import RowAdam, shapes_of
 
 CHECKPOINT_FILE = "reconstruction.safetensors"
 IMAGE_SCALE = "image_scale"

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 from gsencoder.core.settings import Knob
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.reconstruct.budget import BudgetConfig
-from gsencoder.reconstruct.config import ReconstructConfig
+from gsencoder.reconstruct.plan import BudgetConfig
+from gsencoder.reconstruct.run import ReconstructConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,34 +1,329 @@
 """Optimization of a splat against photographs: L1 + D-SSIM, a depth loss where depth was measured, pruning, no
-densification."""
+densification.
+"""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
+from dataclasses import dataclass, field, fields
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Float, Float32, Int64
 from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import defer_signals
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
-from gsencoder.reconstruct.anchor import Anchor
 from gsencoder.reconstruct.exposure import ROUNDS, Exposures, apply_colors, compared_pixels, fitted_colors
-from gsencoder.reconstruct.losses import losses_of
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
 from gsencoder.reconstruct.parameters import (
     Parameters,
+    RowAdam,
     camera_of,
     gaussians_of,
     rows_in_view,
     seen_colors,
 )
-from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
-from gsencoder.reconstruct.row_adam import RowAdam
 from gsencoder.render.images import WINDOW as SSIM_WINDOW
+from gsencoder.render.images import ssim
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
-from gsencoder.types import Gaussians
+from gsencoder.types import Cameras, Gaussians
+
+MAX_RATE = 10.0
+"""Largest learning rate. A step of Adam is about as large as the rate, and a step of 1 makes a scale e times larger."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OptimizeConfig:
+    """Settings of the optimization of a splat."""
+
+    steps: int = field(default=1500, metadata={"help": "photographs looked at, one a step"})
+    earlier: tuple[int, ...] = field(
+        default=(),
+        metadata={
+            "help": "numbers of steps that were planned before, each with that of the step until which it was; written "
+            "by budget.seconds, whose splat they reproduce (results.budget in summary.json)"
+        },
+    )
+    sh_degree: int = field(default=2, metadata={"help": "how colors may depend on the direction, 0 to 3"})
+    sh_every: float = field(default=0.2, metadata={"help": "share of the steps after which the degree rises by one"})
+    shrinks: tuple[int, ...] = field(
+        default=(2, 1), metadata={"help": "photographs are made smaller so many times, one stage after the other"}
+    )
+    shares: tuple[float, ...] = field(
+        default=(0.3, 0.7), metadata={"help": "share of the steps of each of these stages"}
+    )
+    ssim_weight: float = field(default=0.2, metadata={"help": "of 1 − SSIM; the rest of 1 is L1's"})
+    depth_weight: float = field(
+        default=0.5, metadata={"help": "of the relative error of depth, where a sensor measured it"}
+    )
+    empty_weight: float = field(
+        default=0.5,
+        metadata={
+            "help": "of the opacity where transparency, or a background of one color, says that nothing is there"
+        },
+    )
+    means_rate: float = field(default=3e-4, metadata={"help": "learning rate of positions, times the scene's size"})
+    means_final: float = field(default=0.01, metadata={"help": "share of that rate which is left at the end"})
+    leash: float = field(
+        default=0.4,
+        metadata={
+            "help": "Gaussians that begin on a measured surface (depth, mesh, tsdf) stay within about so many of their "
+            "first standard deviations of there; 0 = they go where they like"
+        },
+    )
+    scales_rate: float = field(default=2e-2, metadata={"help": "learning rate of the logarithms of scales"})
+    quats_rate: float = field(default=1e-3, metadata={"help": "learning rate of rotations"})
+    opacities_rate: float = field(default=5e-2, metadata={"help": "learning rate of the logits of opacities"})
+    colors_rate: float = field(default=2.5e-3, metadata={"help": "learning rate of colors; a 20th for directions"})
+    exposure: bool = field(
+        default=True,
+        metadata={
+            "help": "fit an affine map of colors to each photograph, for exposure and white balance that differ; "
+            "false = photographs are fitted as they are"
+        },
+    )
+    seed: int = field(default=0, metadata={"help": "of the order in which photographs are looked at"})
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise InputError(f"steps: expected 0 or more, got {self.steps}")
+        ends = (0, *self.earlier[1::2], self.steps)
+        follow = all(until < planned for planned, until in zip(self.earlier[::2], ends[1:], strict=False))
+        if self.earlier and (len(self.earlier) % 2 or not follow or sorted({*ends}) != [*ends]):
+            raise InputError(
+                f"earlier: expected numbers of steps, each with a later step before it, got {self.earlier}"
+            )
+        if not 0 <= self.sh_degree <= 3:
+            raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
+        if len(self.shrinks) != len(self.shares) or not self.shrinks:
+            raise InputError(f"shrinks and shares: expected as many of each, got {self.shrinks} and {self.shares}")
+        if min(self.shrinks) < 1:
+            raise InputError(f"shrinks: expected whole numbers from 1, got {self.shrinks}")
+        if not min(self.shares) >= 0 or not math.isclose(sum(self.shares), 1, abs_tol=1e-6):
+            raise InputError(f"shares: expected numbers that add up to 1, got {self.shares}")
+        if not 0 <= self.ssim_weight <= 1:
+            raise InputError(f"ssim_weight: expected a number from 0 to 1, got {self.ssim_weight}")
+        if not 0 < self.means_final <= 1:
+            raise InputError(f"means_final: expected a share above 0, up to 1, got {self.means_final}")
+        if not 0 <= self.seed < 2**63:
+            raise InputError(f"seed: expected 0 or more, got {self.seed}")
+        limits = {"sh_every": 1.0, "depth_weight": 100.0, "empty_weight": 100.0, "leash": 1e6}
+        limits |= dict.fromkeys((field.name for field in fields(self) if field.name.endswith("_rate")), MAX_RATE)
+        for name, limit in limits.items():
+            if not 0 <= getattr(self, name) <= limit:
+                raise InputError(f"{name}: expected a number from 0 to {limit:g}, got {getattr(self, name)}")
+
+    def _plan_at(self, step: int) -> tuple[int, int, float]:
+        """The number of steps that was planned at a step, when that plan began, and the share of the schedule that was
+        done then."""
+        begun, done = 0, 0.0
+        for planned, until in zip(self.earlier[::2], self.earlier[1::2], strict=True):
+            if step < until:
+                return planned, begun, done
+            done += (1 - done) * (until - begun) / (planned - begun)
+            begun = until
+        return self.steps, begun, done
+
+    def _place_of(self, step: int) -> tuple[float, int]:
+        """Where in the schedule of how many steps a step is: a plan stretches what the one before has left over all of
+        its own steps. It depends on the plans until then alone."""
+        planned, begun, done = self._plan_at(step)
+        return planned * (done + (1 - done) * (step - begun) / (planned - begun)) if begun else float(step), planned
+
+    def completes(self, share: float, step: int) -> bool:
+        """Whether a share of the schedule is done after so many steps, and was not before."""
+        planned, begun, done = self._plan_at(step - 1)
+        reached = round(begun + (share - done) / (1 - done) * (planned - begun))
+        return share > done and step == max(begun + 1, reached)
+
+    def shrink_at(self, step: int) -> int:
+        """Factor by which the photographs of a step are made smaller."""
+        place, steps = self._place_of(step)
+        ends = np.cumsum(self.shares) * steps
+        return self.shrinks[min(int(np.searchsorted(ends, place, side="right")), len(self.shrinks) - 1)]
+
+    def degree_at(self, step: int) -> int:
+        """Degree of the color coefficients that a step uses."""
+        place, steps = self._place_of(step)
+        return min(self.sh_degree, int(place / max(1.0, self.sh_every * steps)))
+
+    def rates_at(self, step: int, extent: float) -> dict[str, float]:
+        """Learning rates of a step; that of the positions falls exponentially."""
+        place, steps = self._place_of(step)
+        return {
+            "means": self.means_rate * extent * self.means_final ** (place / max(1, steps)),
+            "quats": self.quats_rate,
+            "log_scales": self.scales_rate,
+            "logit_opacities": self.opacities_rate,
+            "sh0": self.colors_rate,
+            "shN": self.colors_rate / 20,
+        }
+
+
+def losses_of(
+    raster: Raster, photo: ScaledPhotograph, *, ssim_weight: float, depth_weight: float, empty_weight: float = 0.0
+) -> dict[str, Float[Tensor, ""]]:
+    """(1 − λ)·L1 + λ·(1 − SSIM) over the pixels of the mask, the relative error of depth where it is known, and the
+    opacity where the photograph shows that nothing is there.
+
+    Args:
+        raster: a render of the view.
+        photo: the photograph, with its mask and depth.
+        ssim_weight: λ.
+        depth_weight: of the depth term.
+        empty_weight: of the opacity, which is summed as L1 is, per pixel of the mask.
+
+    Returns:
+        The weighted terms by name; a term of weight 0 is left out, except L1.
+    """
+    image = photo.image.to(raster.rgb.device)
+    rgb = raster.rgb
+    losses = {}
+    if photo.mask is not None:
+        # What is masked is made equal: it gives no gradient, and no edge to windows that reach over it.
+        mask = photo.mask.to(rgb.device)
+        image = torch.where(mask.unsqueeze(-1), image, rgb.detach())
+        share = mask.float().mean().clamp(min=1e-6)
+    else:
+        share = torch.ones((), device=rgb.device)
+    losses["l1"] = (1 - ssim_weight) * (rgb - image).abs().mean() / share
+    if ssim_weight:
+        losses["ssim"] = ssim_weight * (1 - ssim(rgb, image)) / share
+    if empty_weight and photo.empty is not None:
+        # The mask alone would let anything float there: what is masked has no gradient.
+        empty = photo.empty.to(rgb.device)
+        losses["empty"] = empty_weight * torch.where(empty, raster.alpha, 0).mean() / share
+    if depth_weight and photo.depth is not None:
+        depth = photo.depth.to(rgb.device)
+        measured = (depth > 0) & (raster.alpha.detach() > 0.5)
+        if photo.mask is not None:
+            measured &= photo.mask.to(rgb.device)
+        expected = raster.depth / raster.alpha.clamp(min=1e-3)
+        error = ((expected - depth).abs() / depth.clamp(min=1e-6)).clamp(max=1)
+        losses["depth"] = depth_weight * torch.where(measured, error, 0).mean()
+    return losses
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PruneConfig:
+    """What is taken out, and when."""
+
+    at: tuple[float, ...] = field(
+        default=(0.3, 0.6, 0.9), metadata={"help": "shares of the steps after which is pruned"}
+    )
+    opacity: float = field(default=0.005, metadata={"help": "opacities below are taken out"})
+    screen: float = field(
+        default=1.0, metadata={"help": "wider than so many times the picture's longer side in some view"}
+    )
+    contribution: float = field(
+        default=0.1, metadata={"help": "less than so many pixels' worth in every photograph, at its full size"}
+    )
+
+    def __post_init__(self) -> None:
+        if any(not 0 < share <= 1 for share in self.at):
+            raise InputError(f"at: expected shares in (0, 1], got {self.at}")
+        for name in ("opacity", "screen", "contribution"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+
+    def due(self, step: int, schedule: OptimizeConfig) -> bool:
+        """Whether is pruned after `step` steps; small shares are of the first step."""
+        return any(schedule.completes(share, step) for share in self.at)
+
+
+def rows_to_keep(
+    raw: Parameters,
+    cameras: Cameras,
+    views: Iterable[tuple[int, ScaledPhotograph]],
+    config: PruneConfig,
+    raster: RasterConfig,
+    *,
+    most: int | None = None,
+) -> Int64[Tensor, " n"]:
+    """Rows that are opaque enough, of sane size on every screen, and seen somewhere.
+
+    A splat's contribution to a view is its column sum of B. Rendering is linear in the colors, so that is the
+    gradient of the sum of a picture in which every color is 1.
+
+    Args:
+        raw: parameters.
+        cameras: of all views.
+        views: photographs that count, at any size, gone through once.
+        config: settings.
+        raster: accuracy of rendering.
+        most: so many rows are left at most, those that contribute most to some view; None = no limit.
+
+    Raises:
+        InputError: nothing would be left.
+    """
+    means = raw["means"]
+    opacities = raw["logit_opacities"].sigmoid()
+    contributions, max_widths = torch.zeros_like(opacities), torch.zeros_like(opacities)
+    for view, photo in views:
+        pose, _ = camera_of(cameras, view, means.device)
+        K = photo.K.to(means.device)
+        pixels = float(cameras.Ks[view, 0, 0] / photo.K[0, 0]) ** 2
+        rows = rows_in_view(raw, pose, K, photo.width, photo.height, near=raster.near, eps2d=raster.eps2d)
+        if not len(rows):
+            continue
+        ones = torch.ones(len(rows), 3, device=means.device, requires_grad=True)
+        shape = (means[rows], raw["quats"][rows], raw["log_scales"][rows].exp(), opacities[rows])
+        seen = rasterize(*shape, ones, pose, K, photo.width, photo.height, config=raster)
+        (sums,) = torch.autograd.grad(seen.rgb[..., 0].sum(), ones)
+        contributions[rows] = torch.maximum(contributions[rows], pixels * sums[:, 0])
+        max_widths[rows] = torch.maximum(max_widths[rows], seen.radii / max(photo.width, photo.height))
+    rejected = {"opacity": opacities < config.opacity, "contribution": contributions < config.contribution}
+    if config.screen:
+        rejected["screen"] = max_widths > config.screen
+    rows_left = (~torch.stack([*rejected.values()]).any(dim=0)).nonzero().squeeze(1)
+    if not len(rows_left):
+        why = ", ".join(
+            f"{int(rows.sum())} by prune.{name}={getattr(config, name):g}"
+            for name, rows in rejected.items()
+            if rows.any()
+        )
+        raise InputError(f"reconstruct: pruning would leave none of {len(means)} Gaussians ({why}); change these")
+    if most is not None and len(rows_left) > most:
+        by_contribution = contributions[rows_left].argsort(descending=True, stable=True)
+        rows_left = rows_left[by_contribution[:most]].sort().values
+    return rows_left
+
+
+MIN_REACH = 1e-30
+"""Smallest reach in world units: a reach of 0 would divide a learning rate of 0 by 0."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Anchor:
+    """Initial means of Gaussians, and how far each may move from there.
+
+    A step of Adam moves a coordinate by its rate at most, or little more. Pulling back by rate / reach of the way after
+    each step therefore leaves it within about one reach, whatever its gradients say; those that disagree from one
+    photograph to the next move it less. It is AdamW's decay (Loshchilov & Hutter 2019), towards the seed instead of 0.
+
+    Attributes:
+        means: initial centers, world units.
+        reach: distance in world units, above 0.
+    """
+
+    means: Float32[Tensor, "N 3"]
+    reach: Float32[Tensor, " N"]
+
+    def pull(self, means: Float32[Tensor, "N 3"], rows: Int64[Tensor, " n"], rate: float) -> None:
+        """Moves rows of `means` back, in place, after a step at a learning rate in world units."""
+        share = (rate / self.reach[rows]).clamp(max=1).unsqueeze(1)
+        means[rows] = means[rows].lerp(self.means[rows], share)
+
+    def keep(self, rows: Int64[Tensor, " n"]) -> "Anchor":
+        """The anchor of some rows."""
+        return Anchor(means=self.means[rows], reach=self.reach[rows])
+
+
+def anchor_at(raw: Parameters, length: float) -> Anchor:
+    """An anchor at the present means, with a reach of `length` times each Gaussian's largest standard deviation."""
+    return Anchor(means=raw["means"].clone(), reach=(length * raw["log_scales"].amax(dim=1).exp()).clamp(min=MIN_REACH))
 
 
 class PhotographGradients(NamedTuple):

@@ -1,11 +1,11 @@
-"""Reconstruction: posed photographs to Gaussians by seeding, optimization and pruning (SplatDistill, sec. 3.1)."""
+"""Reconstruction: posed photographs to Gaussians by seeding, optimization and pruning (SplatDistill, section 3.1)."""
 
 import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from math import inf
 from pathlib import Path
@@ -17,24 +17,277 @@ import torch
 from jaxtyping import Float32
 
 from gsencoder.core.device import choose_device
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning, advised
+from gsencoder.core.files import plain
+from gsencoder.core.logs import LOG_FILE, Log, read_log
 from gsencoder.core.process import Clock, Device, Track, untracked
+from gsencoder.core.settings import check_governed
 from gsencoder.data.photographs import Photographs
-from gsencoder.reconstruct.anchor import anchor_at
-from gsencoder.reconstruct.budget import steps_for_minutes
+from gsencoder.data.seeding.from_photographs import (
+    MAX_DENSE_SPACING,
+    DenseConfig,
+    DenseSeeds,
+    densify,
+    seeds_of_photographs,
+)
+from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
+from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
-from gsencoder.reconstruct.config import ReconstructConfig, Report
-from gsencoder.reconstruct.expected_time import Costs, Pace, measured_costs
-from gsencoder.reconstruct.exposure_prediction import predict_exposures
-from gsencoder.reconstruct.fit import fit
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.plan import AIMED, PLAN, STEPS, Plan, follow, late_notes, make_plan, refuse_late
-from gsencoder.reconstruct.report import MAX_COMPARISONS, Comparison, LogRow, compare, describe_exposure, describe_plan
-from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.score import MIN_PHOTOGRAPHS, drop_masked_views, split
-from gsencoder.reconstruct.start import initial_gaussians
+from gsencoder.reconstruct.exposure import predict_exposures
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig, anchor_at
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.plan import (
+    AIMED,
+    PLAN,
+    STEPS,
+    BudgetConfig,
+    Costs,
+    Pace,
+    Plan,
+    extended,
+    follow,
+    late_notes,
+    make_plan,
+    measured_costs,
+    refuse_late,
+    steps_for_minutes,
+)
+from gsencoder.reconstruct.score import (
+    MAX_COMPARISONS,
+    MIN_PHOTOGRAPHS,
+    Comparison,
+    LogRow,
+    compare,
+    covisible_pixels,
+    describe,
+    describe_exposure,
+    describe_plan,
+    drop_masked_views,
+    score,
+    split,
+)
+from gsencoder.render.rasterize import RasterConfig
 from gsencoder.types import Gaussians, Scene
+
+START_AGAIN = "give resume=false to begin anew"
+Report = Callable[[str], None]
+"""Receives one line of text for people."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReconstructConfig:
+    """How photographs become Gaussians, and how the result is judged."""
+
+    holdout: int = field(default=8, metadata={"help": "hold out every n-th photograph for validation; 0 = none"})
+    validate_every: int = field(default=500, metadata={"help": "steps between validations; 0 = at the end alone"})
+    checkpoint_every: float = field(default=60.0, metadata={"help": "seconds between checkpoints"})
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    dense: DenseConfig = field(default_factory=DenseConfig)
+    optimize: OptimizeConfig = field(default_factory=OptimizeConfig)
+    budget: BudgetConfig = field(default_factory=BudgetConfig)
+    prune: PruneConfig = field(default_factory=PruneConfig)
+    raster: RasterConfig = field(default_factory=RasterConfig)
+
+    def __post_init__(self) -> None:
+        if self.holdout < 0 or self.holdout == 1:
+            raise InputError(f"holdout: expected 0 (none) or 2 and more, got {self.holdout}")
+        for name in ("validate_every", "checkpoint_every"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if self.budget.error is not None or self.budget.seconds is not None:
+            of_steps = replace(self.budget, megabytes=None)
+            check_governed(of_steps, self.optimize, OptimizeConfig(), ("steps", "earlier"), "optimize")
+        if self.budget.error is not None and not self.holdout:
+            raise InputError(
+                "budget.error: is measured on held-out photographs, and holdout=0 holds out none; leave one of the two "
+                "out"
+            )
+        if self.budget.megabytes is not None and not (self.prune.at and self.optimize.steps):
+            never = "optimize.steps=0" if self.prune.at else "prune.at=[]"
+            raise InputError(
+                f"budget.megabytes: Gaussians that do not fit are taken out as the splat is pruned, and {never} "
+                "never prunes; leave one of the two out"
+            )
+
+    def validates_at(self, step: int, steps: int) -> bool:
+        """Whether is validated after `step` of `steps`."""
+        return step in (0, steps) or bool(self.validate_every and step % self.validate_every == 0)
+
+    def identity(self) -> dict[str, Any]:
+        """The settings that an interrupted run must share with the run that continues it, as JSON values."""
+        names = ("seeds", "dense", "optimize", "budget", "prune", "raster", "holdout")
+        return {name: plain(getattr(self, name)) for name in names}
+
+
+MEASURED_SOURCES = ("depth", "mesh", "tsdf")
+"""Sources of seeds that were measured on surfaces; points of photographs are estimates, and a splat was optimized."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """The first Gaussians.
+
+    Attributes:
+        gaussians: to be optimized.
+        source: splat, depth, points, photographs, mesh or tsdf.
+        dense: what was added to structure-from-motion or triangulated points; None where nothing was.
+        triangulated: number of points that were triangulated, for the source photographs.
+    """
+
+    gaussians: Gaussians
+    source: str
+    dense: DenseSeeds | None = None
+    triangulated: int | None = None
+
+    @property
+    def measured(self) -> bool:
+        """Whether the Gaussians lie on measured surfaces."""
+        return self.source in MEASURED_SOURCES
+
+
+def initial_gaussians(
+    scene: Scene,
+    photographs: Photographs,
+    training: Sequence[int],
+    seeds: SeedConfig = SeedConfig(),
+    dense: DenseConfig = DenseConfig(),
+    *,
+    track: Track = untracked,
+) -> Start:
+    """The first Gaussians of a scene: its own splat, else seeds from what its training views hold.
+
+    Args:
+        scene: with views.
+        photographs: of all its views.
+        training: the views that may be looked at.
+        seeds: which source, and how large the grid is.
+        dense: when points are added to those of structure from motion.
+        track: progress.
+
+    Raises:
+        InputError: there is nothing to begin with.
+    """
+    if scene.gaussians is not None:
+        return Start(gaussians=scene.gaussians, source="splat")
+    assert scene.views is not None
+    views = scene.views.select(training)
+    seen = replace(scene, views=views)
+    source = choose_source(seen, seeds)
+    if source == "photographs":
+        from_photographs = seeds_of_photographs(photographs, views, dense, training=training, track=track)
+        added: DenseSeeds | None = from_photographs.dense
+        triangulated = len(from_photographs.triangulation.points)
+    elif source == "points" and scene.sfm_points is not None and dense.enough > 0:
+        colors = colors_or_grey(scene.sfm_points, scene.sfm_colors)
+        added = densify(photographs, training, scene.sfm_points, colors, dense, track=track)
+        seen, triangulated = replace(seen, sfm_colors=colors), None
+    else:
+        added = triangulated = None
+    if added is None:
+        return Start(gaussians=seed(seen, replace(seeds, source=source), track=track), source=source)
+    gaussians = seed_from_points(added.points, added.colors, views=views, largest_spacing=MAX_DENSE_SPACING)
+    return Start(gaussians=gaussians, source=source, dense=added, triangulated=triangulated)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fitted:
+    """An optimization that came to its end.
+
+    Attributes:
+        rows: of the log, oldest first.
+        plan: as it was extended, or changed by the clock.
+    """
+
+    rows: list[LogRow]
+    plan: Plan
+
+
+def fit(
+    optimizer: Optimizer,
+    state: State,
+    plan: Plan,
+    held_out: Sequence[int],
+    config: ReconstructConfig,
+    work: Path,
+    identity: Mapping[str, Any],
+    track: Track,
+    report: Report,
+    *,
+    pace: Pace | None = None,
+    now: Callable[[], float] = time.monotonic,
+) -> Fitted:
+    """All remaining steps of a plan, which is extended while a promised error is not reached, and changed where a clock
+    sets the pace. Whatever stops the run between two steps leaves a checkpoint."""
+    with advised(START_AGAIN):
+        log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
+        rows = read_rows(work / LOG_FILE)
+    seen = covisible_pixels(optimizer.photographs, held_out, optimizer.training)
+    start, saved_at, saved_step = now() - state.seconds, now(), optimizer.step
+
+    def validate() -> None:
+        due = config.validates_at(optimizer.step, plan.steps)
+        # A continued run may begin at a step whose validation was cut off, or whose row is in the log already.
+        if not held_out or not due or (rows and rows[-1]["step"] == optimizer.step):
+            return
+        scores = {
+            name: value for name, value in score(optimizer, held_out, seen)._asdict().items() if value is not None
+        }
+        row: LogRow = {"seconds": now() - start, "gaussians": len(optimizer.parameters["means"]), **scores}
+        log.add(optimizer.step, row)
+        rows.append({"step": optimizer.step, **row})
+        report(
+            f"step {optimizer.step} of {plan.steps}: {describe(row)}, {row['gaussians']:,} Gaussians, "
+            f"{row['seconds']:.0f} s"
+        )
+
+    def save() -> None:
+        between = State(
+            adam=optimizer.adam,
+            anchor=optimizer.anchor,
+            exposures=None if optimizer.exposures is None else optimizer.exposures.maps,
+            step=optimizer.step,
+            seconds=now() - start,
+            facts={**state.facts, **plan.facts()},
+        )
+        save_state(work / CHECKPOINT_FILE, between, identity)
+
+    try:
+        validate()
+        while True:
+            for _ in track(range(optimizer.step, plan.steps), "optimising"):
+                optimizer.advance()
+                validate()
+                if pace is not None and optimizer.step < plan.steps:
+                    steps = pace.steps(optimizer, config.validates_at, STEPS[-1])
+                    if steps != plan.steps:
+                        plan = replace(plan, steps=steps, earlier=(*plan.earlier, plan.steps, optimizer.step))
+                        break
+                if now() - saved_at >= config.checkpoint_every:
+                    save()
+                    saved_at, saved_step = now(), optimizer.step
+            else:
+                plan = extended(plan, config.budget, rows)
+            if plan.steps == optimizer.step:
+                break
+            follow(optimizer, plan)
+    finally:
+        # Also after the last step: writing the results may be interrupted as well.
+        if optimizer.is_consistent and optimizer.step > saved_step:
+            save()
+    return Fitted(rows=rows, plan=plan)
+
+
+def read_rows(path: Path) -> list[LogRow]:
+    """The rows of a log as numbers.
+
+    Raises:
+        InputError: a cell that is not a number.
+    """
+    try:
+        return [{name: float(cell) for name, cell in row.items()} for row in read_log(path)]
+    except ValueError as error:
+        raise InputError(f"{path}: damaged: {error}") from error
+
 
 TRIAL_SHARE = 1 / 30
 """Of promised seconds that are left, what goes into trials of each kind of work."""

@@ -18,7 +18,7 @@ from gsencoder.app.runs.scene_queue import run_scenes
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.data.scenes import find_scenes, listed_paths
-from gsencoder.reconstruct.open_scene import find_photographed
+from gsencoder.reconstruct.sfm import find_photographed
 
 SETTINGS = {"voxel": 0.02, "paths": ["a"], "out": "somewhere", "quiet": False}
 

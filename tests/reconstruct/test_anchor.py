@@ -9,13 +9,9 @@ from walls import wall_views
 
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.anchor import Anchor, anchor_at
 from gsencoder.reconstruct.checkpoint import State, load_state, save_state
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct.optimize import Anchor, OptimizeConfig, Optimizer, PruneConfig, anchor_at
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
 
 ALL = OptimizeConfig(steps=30, sh_degree=0, shrinks=(2, 1), shares=(0.5, 0.5), means_rate=0.03)
 PRUNED = PruneConfig(at=(0.3,))

@@ -14,7 +14,9 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.settings import PLANNED
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.reconstruct.budget import (
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.plan import (
     LEAST_STEPS,
     PROMISED_STEPS,
     BudgetConfig,
@@ -24,13 +26,7 @@ from gsencoder.reconstruct.budget import (
     steps_for_minutes,
     trial_views,
 )
-from gsencoder.reconstruct.config import ReconstructConfig
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.run import reconstruct
+from gsencoder.reconstruct.run import ReconstructConfig, reconstruct
 from gsencoder.types import Cameras, Scene
 
 CPU, USUAL = torch.device("cpu"), OptimizeConfig()
@@ -148,7 +144,7 @@ def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time(monke
     assert affordable_steps(usual, 0.01) == LEAST_STEPS
     assert affordable_steps(usual, 80.0) == 2 * USUAL.steps
     # Between these, a fifth of the time is left for reading and seeds.
-    monkeypatch.setattr("gsencoder.reconstruct.budget.step_seconds", lambda *_: 1.0)
+    monkeypatch.setattr("gsencoder.reconstruct.plan.step_seconds", lambda *_: 1.0)
     assert affordable_steps(usual, 10.0) == 480
 
 
@@ -159,10 +155,10 @@ def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
     """Also on a machine that would have planned other ones."""
     scene = Scene(name="wall", views=wall_views(6, depth=True), metres_per_unit=1.0)
     config = ReconstructConfig(holdout=0, seeds=SeedConfig(voxel=0.15), budget=BudgetConfig(minutes=0.01))
-    monkeypatch.setattr("gsencoder.reconstruct.budget.LEAST_STEPS", 20)
+    monkeypatch.setattr("gsencoder.reconstruct.plan.LEAST_STEPS", 20)
     with cut_at(7):
         reconstruct(scene, config, work=tmp_path)
-    monkeypatch.setattr("gsencoder.reconstruct.budget.LEAST_STEPS", 900)
+    monkeypatch.setattr("gsencoder.reconstruct.plan.LEAST_STEPS", 900)
     lines: list[str] = []
     result = reconstruct(scene, config, work=tmp_path, report=lines.append)
     assert result.steps == 20

@@ -11,14 +11,12 @@ from reconstructions import cut_at, refusal
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.reconstruct import Reconstruction, expected_time, reconstruct, sfm
+from gsencoder.reconstruct import Reconstruction, reconstruct, sfm
+from gsencoder.reconstruct import plan as expected_time
 from gsencoder.reconstruct import run as running
-from gsencoder.reconstruct.budget import BudgetConfig
-from gsencoder.reconstruct.config import ReconstructConfig
-from gsencoder.reconstruct.expected_time import Costs
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.plan import BudgetConfig, Costs
+from gsencoder.reconstruct.run import ReconstructConfig
 from gsencoder.types import Scene
 
 PROMISED = ReconstructConfig(

@@ -10,14 +10,9 @@ from walls import DEPTH, TILT, cameras, wall_points, wall_views
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.from_photographs import DenseConfig, covered_share, densify, outside_hull
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.losses import losses_of
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.report import describe
-from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.score import score
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig, losses_of
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.score import describe, score
 from gsencoder.render.rasterize import Raster
 from gsencoder.types import Views
 

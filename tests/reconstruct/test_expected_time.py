@@ -10,14 +10,11 @@ from walls import wall_views
 
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct import expected_time
-from gsencoder.reconstruct.config import ReconstructConfig
-from gsencoder.reconstruct.expected_time import Costs, ExpectedSeconds, Pace, measured_costs
-from gsencoder.reconstruct.optimize import Optimizer, PhotographGradients
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct import plan as expected_time
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PhotographGradients, PruneConfig
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.plan import Costs, ExpectedSeconds, Pace, measured_costs
+from gsencoder.reconstruct.run import ReconstructConfig
 from gsencoder.reconstruct.score import Score, score
 from gsencoder.types import Gaussians
 

@@ -21,13 +21,9 @@ from gsencoder.reconstruct.exposure import (
     compared_pixels,
     fitted_colors,
 )
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.report import describe_exposure
-from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.score import score
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.score import describe_exposure, score
 from gsencoder.types import Views
 
 GAINS = np.array([0.7, 1.25, 1.0, 0.9, 1.15, 1.0])

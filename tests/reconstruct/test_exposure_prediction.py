@@ -9,21 +9,19 @@ from walls import cameras, wall_views
 
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.exposure import IDENTITY, Exposures, apply_colors
-from gsencoder.reconstruct.exposure_prediction import (
+from gsencoder.reconstruct.exposure import (
+    IDENTITY,
+    Exposures,
+    apply_colors,
     camera_weights,
     map_error,
     mean_weights,
     order_weights,
     predict_exposures,
 )
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.report import compare
-from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.score import score
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.score import compare, score
 
 COUNT = 25
 HELD_OUT = np.arange(0, COUNT, 8)

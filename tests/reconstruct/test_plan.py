@@ -10,16 +10,19 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.reconstruct import plan as planning
-from gsencoder.reconstruct.budget import BudgetConfig
-from gsencoder.reconstruct.expected_time import Costs
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.plan import PhotographsTooLargeError, Plan, error_of, follow, late_notes, make_plan
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.report import MAX_COMPARISONS
-from gsencoder.reconstruct.row_adam import RowAdam
-from gsencoder.reconstruct.score import split
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.plan import (
+    BudgetConfig,
+    Costs,
+    PhotographsTooLargeError,
+    Plan,
+    error_of,
+    follow,
+    late_notes,
+    make_plan,
+)
+from gsencoder.reconstruct.score import MAX_COMPARISONS, split
 from gsencoder.types import Scene
 
 SEEDS = SeedConfig(voxel=0.15)

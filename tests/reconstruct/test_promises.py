@@ -15,12 +15,10 @@ from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats.files import save_splat
 from gsencoder.reconstruct import Reconstruction, reconstruct
 from gsencoder.reconstruct import plan as planning
-from gsencoder.reconstruct.budget import BudgetConfig
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, PLANNED_DEGREE
-from gsencoder.reconstruct.config import ReconstructConfig
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.plan import error_of
-from gsencoder.reconstruct.prune import PruneConfig
+from gsencoder.reconstruct.optimize import OptimizeConfig, PruneConfig
+from gsencoder.reconstruct.plan import BudgetConfig, error_of
+from gsencoder.reconstruct.run import ReconstructConfig
 from gsencoder.types import Scene
 
 SEEDS = SeedConfig(voxel=0.15)

@@ -9,9 +9,8 @@ from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import ScaledPhotograph
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
+from gsencoder.reconstruct.optimize import OptimizeConfig, PruneConfig, rows_to_keep
 from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.prune import PruneConfig, rows_to_keep
 from gsencoder.render import blend
 from gsencoder.render.rasterize import RasterConfig
 from gsencoder.types import Cameras

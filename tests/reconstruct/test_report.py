@@ -6,12 +6,9 @@ from walls import wall_views
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
 from gsencoder.reconstruct.exposure import IDENTITY
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.report import MATCHED_GAIN, compare, describe, describe_plan
-from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.score import MATCHED_GAIN, compare, describe, describe_plan
 
 ROW = {"step": 5, "psnr": 24.0, "ssim": 0.9, "matched_psnr": 24.0}
 

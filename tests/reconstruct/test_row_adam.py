@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsencoder.reconstruct.row_adam import BETAS, EPS, RowAdam
+from gsencoder.reconstruct.parameters import BETAS, EPS, RowAdam
 
 
 def parameters(rows: int = 50) -> dict[str, torch.Tensor]:

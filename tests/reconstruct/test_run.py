@@ -10,8 +10,8 @@ from reconstructions import cut_at
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct import Reconstruction, reconstruct
-from gsencoder.reconstruct.config import ReconstructConfig
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
+from gsencoder.reconstruct.optimize import OptimizeConfig
+from gsencoder.reconstruct.run import ReconstructConfig
 from gsencoder.types import Scene
 
 QUICK = ReconstructConfig(

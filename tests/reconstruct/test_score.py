@@ -9,11 +9,8 @@ from walls import wall_views
 
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.optimize import Optimizer
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.parameters import parameters_from
-from gsencoder.reconstruct.prune import PruneConfig
-from gsencoder.reconstruct.row_adam import RowAdam
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
 from gsencoder.reconstruct.score import covisible_pixels, score
 from gsencoder.types import Views
 

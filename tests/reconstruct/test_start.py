@@ -12,7 +12,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.from_photographs import DenseConfig
 from gsencoder.data.seeding.seed import SeedConfig, seed_from_depth
-from gsencoder.reconstruct.start import Start, initial_gaussians
+from gsencoder.reconstruct.run import Start, initial_gaussians
 from gsencoder.types import Scene
 
 NEVER = DenseConfig(enough=0.0)

@@ -29,15 +29,11 @@ from gsencoder.data.splats.files import READABLE, save_splat
 from gsencoder.data.video import RECORD_FILE, VideoConfig
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.infer.draw.pictures import contact_sheet
-from gsencoder.reconstruct.budget import choose_scale
 from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, IMAGE_SCALE, image_scale_of
-from gsencoder.reconstruct.config import ReconstructConfig
-from gsencoder.reconstruct.open_scene import FRAMES_FOLDER, OpenedScene, find_photographed, open_scene
-from gsencoder.reconstruct.plan import PhotographsTooLargeError, error_of, refuse_late
-from gsencoder.reconstruct.report import Comparison, LogRow, describe
-from gsencoder.reconstruct.run import Reconstruction, reconstruct
-from gsencoder.reconstruct.score import Score
-from gsencoder.reconstruct.sfm import SfmConfig
+from gsencoder.reconstruct.plan import PhotographsTooLargeError, choose_scale, error_of, refuse_late
+from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
+from gsencoder.reconstruct.score import Comparison, LogRow, Score, describe
+from gsencoder.reconstruct.sfm import FRAMES_FOLDER, OpenedScene, SfmConfig, find_photographed, open_scene
 from gsencoder.types import Scene
 
 PLY_FILE, PICTURES_FILE, MODEL_FOLDER = "splat.ply", "held_out.png", "sparse/0"

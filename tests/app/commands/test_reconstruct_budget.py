@@ -11,10 +11,9 @@ from reconstructions import summary_of
 from gsencoder.app import cli
 from gsencoder.app.commands import reconstruct as command
 from gsencoder.reconstruct import Reconstruction, reconstruct
-from gsencoder.reconstruct.budget import BudgetConfig
-from gsencoder.reconstruct.config import ReconstructConfig
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
-from gsencoder.reconstruct.plan import PhotographsTooLargeError, Plan
+from gsencoder.reconstruct.optimize import OptimizeConfig
+from gsencoder.reconstruct.plan import BudgetConfig, PhotographsTooLargeError, Plan
+from gsencoder.reconstruct.run import ReconstructConfig
 from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow

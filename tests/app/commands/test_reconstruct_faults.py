@@ -12,7 +12,7 @@ from reconstructions import QUICK, interrupt, never, refusal, summary_of
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
-from gsencoder.reconstruct import fit
+from gsencoder.reconstruct import run as fit
 from gsencoder.reconstruct import run as reconstruct
 
 pytestmark = pytest.mark.slow
@@ -107,7 +107,7 @@ def test_photographs_are_placed_whatever_lies_in_folders_beside_them(
         calls.append(pictures)
         raise InputError("stop")
 
-    monkeypatch.setattr("gsencoder.reconstruct.open_scene.register_photographs", remembered)
+    monkeypatch.setattr("gsencoder.reconstruct.sfm.register_photographs", remembered)
     assert "stop" in refusal(capsys, str(folder), f"out={folder / 'result'}", "quiet=true")
     assert calls == [folder]
 

@@ -99,7 +99,7 @@ def test_a_run_that_was_cut_off_takes_up_its_frames_and_poses(
     before = {path.name: path.stat().st_mtime_ns for path in frames.iterdir()}
     assert len(before) > 10
     monkeypatch.setattr(reconstruct.Optimizer, "advance", advance)
-    monkeypatch.setattr("gsencoder.reconstruct.open_scene.register_photographs", None)
+    monkeypatch.setattr("gsencoder.reconstruct.sfm.register_photographs", None)
     assert cli.main(words) == 0
     after = {path.name: path.stat().st_mtime_ns for path in (out / "images").iterdir()}
     # shutil.copytree keeps the times.

@@ -14,7 +14,7 @@ from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.tradeoff.reconstruction import ReconstructionScene, reconstruction_stage
 from gsencoder.evaluate.tradeoff.stage import Inputs
 from gsencoder.reconstruct.knobs import ReconstructionSettings
-from gsencoder.reconstruct.optimize_config import OptimizeConfig
+from gsencoder.reconstruct.optimize import OptimizeConfig
 
 pytestmark = pytest.mark.slow
 
