@@ -15,7 +15,7 @@ SLOW = $(shell grep -rl --include='*.py' '^pytestmark = pytest.mark.slow' tests)
 # Compiling the tests and the package takes ten seconds in each process; the results are cached.
 export PYTHONDONTWRITEBYTECODE :=
 
-VIEWER := gsencoder/infer/viewer/static/viewer.js
+VIEWER := gsencoder/infer/page/static/viewer.js
 VIEWER_SOURCES := $(wildcard viewer/src/* viewer/*.json viewer/*.mjs viewer/*.py)
 
 .PHONY: help setup viewer demo test test-fast stability lint check bench gpu cli docs clean

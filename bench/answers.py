@@ -57,13 +57,12 @@ from gsencoder.evaluate.scripted_answerer import (
 from gsencoder.fusion.folder import load_features
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.ask.ask import Asker, Prompt, Question, chosen_mark, prompt_messages
-from gsencoder.infer.ask.batch import targets_to_json
-from gsencoder.infer.ask.predictions import short_answer
+from gsencoder.infer.ask.batch import short_answer, targets_to_json
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
-from gsencoder.infer.localize.localize import select_features
+from gsencoder.infer.localize import select_features
 from gsencoder.infer.views.photographs import with_photographs
-from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.infer.views.write import views_to_json
+from gsencoder.infer.views.pictures import views_to_json
+from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.render import blend
 from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.labels import LabelsConfig

@@ -29,9 +29,9 @@ from gsencoder.evaluate.boxes import accuracy
 from gsencoder.evaluate.protocols.naming import naming_scores
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.encode import chunks as chunks_module
-from gsencoder.infer.encode.chunks import EncodeConfig, cut, scene_regions
-from gsencoder.infer.encode.encode import encode
+from gsencoder.infer import chunks as chunks_module
+from gsencoder.infer.chunks import EncodeConfig, cut, scene_regions
+from gsencoder.infer.encode import encode
 from gsencoder.models import neighbors
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces

@@ -21,10 +21,9 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.errors import field_error, judge
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode_budget.config import EncodeBudget
-from gsencoder.infer.encode_budget.encode_within import encode_within
-from gsencoder.infer.load_encoder import load_encoder
+from gsencoder.infer.chunks import EncodeBudget, EncodeConfig
+from gsencoder.infer.encode_budget import encode_within
+from gsencoder.infer.load import load_encoder
 
 
 def main() -> None:

@@ -29,8 +29,8 @@ from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.device import autocast_dtype
 from gsencoder.core.process import retain_freed_memory
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode.encode import encode
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import encode
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.neighbors import _append_zero_row, _gather_neighborhoods, _row_blocks
 from gsencoder.models.output_space import OutputSpace, OutputSpaces

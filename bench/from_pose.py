@@ -24,7 +24,7 @@ from json_option import add_json_option, write_figures
 from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import load_scene
 from gsencoder.fusion.folder import WORDS_FILE, load_features
-from gsencoder.infer.localize.from_pose import FeatureField, PosePoint, SeenField
+from gsencoder.infer.from_pose import FeatureField, PosePoint, SeenField
 from gsencoder.render import Blend, blend
 from gsencoder.text.table import TextTable, load_text_table
 from gsencoder.types import Cameras, Scene

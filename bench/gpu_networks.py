@@ -158,7 +158,7 @@ def onnx(setting: Setting) -> Iterator[Row]:
         raise Skipped("no CUDA device")
     if "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
         raise Skipped("package missing: onnxruntime-gpu (this onnxruntime has no CUDAExecutionProvider)")
-    from gsencoder.infer.load_encoder import load_encoder
+    from gsencoder.infer.load import load_encoder
     from gsencoder.infer.onnx.export import export_onnx, lower
     from gsencoder.infer.onnx.runtime import OnnxEncoder, feed_of
 

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from json_option import add_json_option, write_figures
 
-from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.infer.relevancy import relevancy
 from gsencoder.memory.attention import MemoryAttention
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, MemoryBank
 

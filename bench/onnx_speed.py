@@ -27,8 +27,8 @@ def measure(model: str, splat: str) -> dict[str, float]:
     from gsencoder.app.runs.summary import peak_memory_mb
     from gsencoder.core.process import retain_freed_memory
     from gsencoder.data.splats.files import load_splat
-    from gsencoder.infer.encode.chunks import EncodeConfig
-    from gsencoder.infer.load_encoder import load_encoder
+    from gsencoder.infer.chunks import EncodeConfig
+    from gsencoder.infer.load import load_encoder
 
     gaussians = load_splat(splat)
     retain_freed_memory()

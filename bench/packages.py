@@ -14,7 +14,7 @@ from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
 from gsencoder.evaluate.sources import fusion_source, with_features
 from gsencoder.fusion.package import PACKAGE_FILE, open_package, save_package
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.teachers.build import TeacherConfig, text_table_of
 from gsencoder.teachers.labels import LabelsConfig
 

@@ -29,8 +29,8 @@ from gsencoder.evaluate.protocols.naming import NamingCounts, compare_names, nam
 from gsencoder.evaluate.sources import encoder_source
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.encode.encode import TorchEncoder
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.teachers.labels import LabelsTeacher
 from gsencoder.text.table import TextTable, load_text_table

@@ -26,7 +26,7 @@ from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import seed
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of

@@ -4,7 +4,7 @@
 
 Every room is asked words: the names of all objects of the house (`names`), other words for some of them (`others`),
 phrases that describe them (`phrases`, those of `bench/house_phrases.csv`), or a list of names ("mug,banana"). Features
-are fused labels without --weights. Each cluster of a word is a row (`gsencoder.infer.localize.presence`), and is right
+are fused labels without --weights. Each cluster of a word is a row (`gsencoder.infer.presence`), and is right
 if more than half of its Gaussians lie in the box of an object that the word stands for, widened by 3 cm. OUT gets one
 .npy a room, and rooms that it has are not gathered again.
 """
@@ -24,8 +24,8 @@ from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.absent import AbsentProtocol, names_of, words_to_ask
 from gsencoder.evaluate.sources import encoder_source, fusion_source, with_features
-from gsencoder.infer.load_encoder import load_encoder
-from gsencoder.infer.localize.localize import find_candidates
+from gsencoder.infer.load import load_encoder
+from gsencoder.infer.localize import find_candidates
 from gsencoder.teachers.build import words_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import OnnxTextConfig, TableTextConfig, Words, words_of_table

@@ -21,8 +21,8 @@ from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.evaluate.boxes import Hit
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.teachers.onnx import OnnxConfig, OnnxTeacher
 from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene

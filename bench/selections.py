@@ -45,9 +45,9 @@ from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import is_seen, queryable_objects, score_boxes
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.lift import VisibilityConfig, keep_visible
-from gsencoder.infer.load_encoder import load_encoder
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.infer.select.select import select
+from gsencoder.infer.load import load_encoder
+from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.select import select
 from gsencoder.render import Blend, blend
 from gsencoder.render.images import render_image
 from gsencoder.teachers.build import build_teacher, words_of

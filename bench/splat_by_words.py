@@ -27,7 +27,7 @@ from gsencoder.data.splats.files import load_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.cameras import with_views
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.draw.pictures import contact_sheet
+from gsencoder.infer.draw import contact_sheet
 from gsencoder.teachers.segmenter import OnnxSegmenterOptions, SegmenterConfig, SegmenterTeacher
 from gsencoder.text.vocabulary import OnnxTextConfig, vocabulary_of
 from gsencoder.types import GaussianFeatures

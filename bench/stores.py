@@ -31,7 +31,7 @@ from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import FEATURES_FILE, MEMORY_FILE, load_features, save_features, save_memories
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.package import PACKAGE_FILE, save_index_package, save_package
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.memory.bank import BankConfig
 from gsencoder.memory.index import IndexConfig, index_features
 from gsencoder.teachers.build import build_teacher, words_of

@@ -15,7 +15,7 @@ from json_option import add_json_option, write_figures
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.infer.views.tokens import feature_tokens, token_blends
+from gsencoder.infer.views.pictures import feature_tokens, token_blends
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 PASSES = 5

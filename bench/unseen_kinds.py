@@ -43,9 +43,9 @@ from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.boxes import aabb_iou, queryable_objects
 from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error, names_of
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, table_beside, with_features
-from gsencoder.infer.load_encoder import load_encoder
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.infer.load import load_encoder
+from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.teachers.build import text_table_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import Words, stating_trained

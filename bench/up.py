@@ -23,8 +23,8 @@ from gsencoder.data.seeding.seed import seed
 from gsencoder.data.up import up_of_scene, with_up
 from gsencoder.evaluate.boxes import queryable_objects
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.teachers.build import build_teacher, text_table_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.table import TextTable

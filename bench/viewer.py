@@ -20,13 +20,10 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.fusion.folder import load_features
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.viewer.bundle import load_bundle
-from gsencoder.infer.viewer.page import served_page
-from gsencoder.infer.viewer.page_scene import scene_container
-from gsencoder.infer.viewer.search import SceneSearch
-from gsencoder.infer.viewer.server import ViewServer
-from gsencoder.infer.viewer.shown import drawn_scene, rows_of_features
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.page.page import load_bundle, scene_container, served_page
+from gsencoder.infer.page.search import SceneSearch, drawn_scene, rows_of_features
+from gsencoder.infer.page.server import ViewServer
 
 WORDS = ("mug", "chair", "table", "window", "book")
 SCRIPT = """async (words) => {

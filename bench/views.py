@@ -23,12 +23,11 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import queryable_objects
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.localize.localize import localize
+from gsencoder.infer.localize import localize
+from gsencoder.infer.views.candidates import FreeSpace
 from gsencoder.infer.views.choose import choose_views
-from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.scores import score_views
-from gsencoder.infer.views.selection import ViewsConfig, ViewSet
-from gsencoder.infer.views.targets import Target, targets_of
+from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, targets_of
 from gsencoder.render import BlendConfig
 from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.labels import LabelsConfig

@@ -21,13 +21,11 @@ from json_option import add_json_option, write_figures
 from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.core.errors import SceneWarning
 from gsencoder.fusion.folder import load_features
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.infer.views.choose import judge_candidates
-from gsencoder.infer.views.free_space import FreeSpace
-from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.infer.views.shown_error import fewest_views, measured_errors
-from gsencoder.infer.views.targets import targets_of
-from gsencoder.infer.views.utility import CoverageObjective
+from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.views.budget import fewest_views, measured_errors
+from gsencoder.infer.views.candidates import FreeSpace
+from gsencoder.infer.views.choose import CoverageObjective, judge_candidates
+from gsencoder.infer.views.targets import ViewsConfig, targets_of
 from gsencoder.render import BlendConfig
 
 

@@ -22,8 +22,8 @@ from gsencoder.evaluate.boxes import Hit
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import VisibilityConfig
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.teachers.build import build_teacher, text_table_of
 from gsencoder.teachers.labels import LabelsConfig
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.infer.ask.prompts import messages
+from gsencoder.infer.ask.ask import messages
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
 
 KEY = "sk-1234567890"

@@ -29,7 +29,7 @@ from gsencoder.data.scenes import kind_of_path
 from gsencoder.data.splats.files import load_property, load_splat
 from gsencoder.data.splats.ply import read_points
 from gsencoder.evaluate.files.scene_folders import scene_files
-from gsencoder.infer.ask.question_sets import is_question_set
+from gsencoder.infer.ask.questions import is_question_set
 from gsencoder.text.models import _load_tokenizer
 
 READERS: dict[str, Callable[[Path], object]] = {

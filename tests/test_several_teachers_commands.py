@@ -11,9 +11,9 @@ from named_rooms import write_words
 from gsencoder.app import cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features
-from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.onnx.export import header_of
-from gsencoder.infer.onnx.header import from_metadata, to_metadata
+from gsencoder.infer.onnx.runtime import from_metadata, to_metadata
 from gsencoder.models.weights import load_weights
 
 pytestmark = pytest.mark.slow

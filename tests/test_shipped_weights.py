@@ -16,9 +16,9 @@ from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.evaluate.protocols.naming import evaluate_naming, naming_scores
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import load_tables
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode.encode import TorchEncoder
-from gsencoder.infer.localize.localize import localize
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.localize import localize
 from gsencoder.models.weights import SHIPPED_WEIGHTS, load_weights
 from gsencoder.text.vocabulary import words_of_table
 from gsencoder.train.run import CHANGEABLE_ON_RESUME

@@ -11,7 +11,7 @@ from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.onnx.export import random_cloud
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import load_weights
@@ -138,7 +138,7 @@ def as_train_config(config: TrainCommandConfig) -> TrainConfig:
 @pytest.mark.slow
 def test_an_output_space_without_centering_passes_through_an_exported_header(trained: Path) -> None:
     from gsencoder.infer.onnx.export import header_of
-    from gsencoder.infer.onnx.header import from_metadata, to_metadata
+    from gsencoder.infer.onnx.runtime import from_metadata, to_metadata
 
     outputs: OutputSpace = from_metadata(to_metadata(header_of(TorchEncoder(str(trained))))).outputs.select()
     assert (outputs.centered, outputs.scaled) == (False, False)

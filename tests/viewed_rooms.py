@@ -7,10 +7,9 @@ import numpy as np
 
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.viewer.bundle import Bundle
-from gsencoder.infer.viewer.search import SceneSearch
-from gsencoder.infer.viewer.shown import drawn_scene, object_numbers
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.page.page import Bundle
+from gsencoder.infer.page.search import SceneSearch, drawn_scene, object_numbers
 from gsencoder.text.table import TextTable, load_text_table, make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 

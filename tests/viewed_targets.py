@@ -4,8 +4,7 @@ import numpy as np
 from rooms import UP, room
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.infer.views.targets import Target, target_of
+from gsencoder.infer.views.targets import Target, ViewsConfig, target_of
 from gsencoder.types import Cameras, Scene
 
 SHELLS = ViewsConfig(source="shells", candidates=16, count=6, width=160, height=120)

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.viewer.container import MAGIC, Container
+from gsencoder.infer.page.page import MAGIC, Container
 
 
 def read_container(data: bytes) -> Container:

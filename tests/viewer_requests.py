@@ -5,7 +5,7 @@ import json
 import socket
 from typing import Any
 
-from gsencoder.infer.viewer.server import ViewServer
+from gsencoder.infer.page.server import ViewServer
 
 
 class Connection(http.client.HTTPConnection):

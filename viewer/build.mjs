@@ -1,11 +1,11 @@
-// Bundles src/main.ts and its libraries into one script, and copies the style, for gsencoder/infer/viewer/static.
+// Bundles src/main.ts and its libraries into one script, and copies the style, for gsencoder/infer/page/static.
 import { build } from "esbuild";
 import { mkdir, readFile, rename, writeFile } from "node:fs/promises";
 import { dirname, join } from "node:path";
 import { fileURLToPath } from "node:url";
 
 const here = dirname(fileURLToPath(import.meta.url));
-const target = join(here, "..", "gsencoder", "infer", "viewer", "static");
+const target = join(here, "..", "gsencoder", "infer", "page", "static");
 const digest = process.argv[2] ?? "unknown";
 
 const result = await build({

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-STATIC = HERE.parent / "gsencoder" / "infer" / "viewer" / "static"
+STATIC = HERE.parent / "gsencoder" / "infer" / "page" / "static"
 INSTALLED = HERE / "node_modules" / ".package-lock.json"
 
 

@@ -8,7 +8,7 @@ Each stage that has knobs lists them beside its settings (`gsencoder.fusion.pack
 Budgets: what the section `budget` of a command may promise, and how promises are checked, ordered and worded.
 
 Each stage with budgets has a frozen dataclass of its promises beside its code (`gsencoder.reconstruct.plan`,
-`gsencoder.fusion.cost_model`, `gsencoder.fusion.package`, `gsencoder.infer.encode_budget.config`,
+`gsencoder.fusion.cost_model`, `gsencoder.fusion.package`, `gsencoder.infer.chunks`,
 `gsencoder.infer.views.budget`), with those fields of `PROMISES` that mean something there.
 
 Options that were added after settings had been stored in files, each with the value that says what was done before.

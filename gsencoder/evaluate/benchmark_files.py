@@ -36,7 +36,7 @@ from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames
 from gsencoder.evaluate.scores.referring import PredictedBoxes
 from gsencoder.evaluate.scores.referring_kinds import named_classes, with_kinds
 from gsencoder.evaluate.sources import FeatureSource, with_features
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import MeshLabels, Scene
 

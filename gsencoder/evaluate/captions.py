@@ -127,7 +127,7 @@ class FeatureDecoder:
         model: of transformers.
         processor: that belongs to it. A picture is one square: cutting it into parts is switched off.
         side: pixels along the pictures that the tower takes.
-        grid: rows and columns of its patches, for `gsencoder.infer.views.tokens.token_blends`.
+        grid: rows and columns of its patches, for `gsencoder.infer.views.pictures.token_blends`.
     """
 
     def __init__(self, folder: str | Path) -> None:
@@ -166,7 +166,7 @@ class FeatureDecoder:
         """What the model answers to each view, greedily.
 
         Args:
-            tokens: of `gsencoder.infer.views.tokens.feature_tokens` on `grid`, of the layer that the model reads (see
+            tokens: of `gsencoder.infer.views.pictures.feature_tokens` on `grid`, of the layer that the model reads (see
                 `generate_from_features`).
             prompt: what is asked about the view.
             max_tokens: most tokens of an answer.

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.infer.relevancy import relevancy
 from gsencoder.text.table import TextEncoder, check_space
 from gsencoder.types import GaussianFeatures
 

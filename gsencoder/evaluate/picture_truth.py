@@ -69,7 +69,7 @@ class PictureTruth:
         """The pixels of each instance in a picture.
 
         Args:
-            row: of a view, as `gsencoder.infer.views.write.views_to_json` writes it.
+            row: of a view, as `gsencoder.infer.views.pictures.views_to_json` writes it.
         """
         key = (row["kind"], row["frame"], str(row["cam_from_world"]), str(row["K"]), row["width"], row["height"])
         if key not in self._counts:

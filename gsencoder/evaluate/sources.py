@@ -13,8 +13,8 @@ from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, head_features, measure_heads
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.load_encoder import Encoder
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.load import Encoder
 from gsencoder.teachers.build import TeacherConfig, build_teacher
 from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import Words

@@ -15,9 +15,9 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.core.errors import about
 from gsencoder.core.process import Track, untracked
-from gsencoder.infer.draw.pictures import contact_sheet, fit_pca_colors, pca_picture
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode.encode import encode_spaces
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.draw import contact_sheet, fit_pca_colors, pca_picture
+from gsencoder.infer.encode import encode_spaces
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.render import blend

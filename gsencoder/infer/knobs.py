@@ -5,7 +5,7 @@ from typing import Literal
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import Knob
-from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.chunks import EncodeConfig
 
 Graph = Literal["none", "float32", "float16", "int8_weights", "int8_dynamic"]
 
@@ -55,11 +55,11 @@ LOCALIZATION_KNOBS = (
     Knob(name="min_samples", key="min_samples", values=(1, 5, 10)),
     Knob(name="min_share", key="min_share", values=(0.0, 0.2)),
 )
-"""Knobs of `gsencoder.infer.localize.localize.LocalizeConfig`; nothing but labels says which is right."""
+"""Knobs of `gsencoder.infer.localize.LocalizeConfig`; nothing but labels says which is right."""
 
 VIEWS_KNOBS = (
     Knob(name="candidates", key="candidates", values=(8, 16, 64), exact=64),
     Knob(name="count", key="count", values=(2, 4, 6)),
     Knob(name="judged_side", key="judged_side", values=(64, 96, 320), exact=320),
 )
-"""Knobs of `gsencoder.infer.views.selection.ViewsConfig`."""
+"""Knobs of `gsencoder.infer.views.targets.ViewsConfig`."""

@@ -18,8 +18,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.settings import value_at
 from gsencoder.fusion.cost_model import exact_config
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode_budget.config import exact_encoding
+from gsencoder.infer.chunks import EncodeConfig, exact_encoding
 
 
 def composed(*words: str) -> FuseCommandConfig:

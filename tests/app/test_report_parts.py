@@ -13,8 +13,8 @@ from gsencoder.app.reports import demo, parts, results
 from gsencoder.app.reports.demo import TeacherResult
 from gsencoder.app.runs.summary import Summary
 from gsencoder.fusion.fuse import Fusion
-from gsencoder.infer.draw.report import HtmlReport
-from gsencoder.infer.localize.localize import localize
+from gsencoder.infer.localize import localize
+from gsencoder.infer.page.report import HtmlReport
 from gsencoder.types import FeatureBasis, Localization, Scene
 
 SCENE, KINDS = selected_room()

@@ -19,8 +19,8 @@ from gsencoder.core.settings import (
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.package import FUSION_KNOBS, PACKAGE_KNOBS, PackageSettings
 from gsencoder.infer.knobs import ENCODER_KNOBS, LOCALIZATION_KNOBS, VIEWS_KNOBS, EncoderSettings
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.reconstruct.knobs import RECONSTRUCTION_KNOBS, ReconstructionSettings
 
 STAGES = {

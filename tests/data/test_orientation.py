@@ -20,7 +20,7 @@ from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.pictures import view_pictures
-from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.teachers.labels import PaletteTeacher
 from gsencoder.teachers.masks import FileMasks
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views

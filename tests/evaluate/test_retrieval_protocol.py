@@ -15,7 +15,7 @@ from rooms import room
 from gsencoder.app import cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol, score_views
-from gsencoder.infer.localize.relevancy import word_directions
+from gsencoder.infer.relevancy import word_directions
 from gsencoder.memory.attention import render_queries
 from gsencoder.memory.bank import memory_of_features
 from gsencoder.render import blend

@@ -8,7 +8,7 @@ from training_scenes import prepared, small_encoder
 
 from gsencoder.evaluate import validation
 from gsencoder.evaluate.validation import ClassAccuracy, nearest_classes, validate_encoder, validate_names
-from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.train.training_scene import TrainingScene
 from gsencoder.types import GaussianFeatures

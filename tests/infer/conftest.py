@@ -10,7 +10,7 @@ import torch
 from symbolic import symbolic_sizes
 
 from gsencoder.app import cli
-from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.onnx.export import lower
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces

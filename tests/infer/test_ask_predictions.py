@@ -10,8 +10,8 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.captions import wrapped_caption
 from gsencoder.data.labels.files import box_corners
 from gsencoder.infer.ask.ask import Question
-from gsencoder.infer.ask.predictions import answer_text, predictions, short_answer, target_corners
-from gsencoder.infer.ask.question_sets import QuestionSet, caption_question, is_question_set, read_question_set
+from gsencoder.infer.ask.batch import answer_text, predictions, short_answer, target_corners
+from gsencoder.infer.ask.questions import QuestionSet, caption_question, is_question_set, read_question_set
 
 
 def target(low: float) -> dict[str, Any]:

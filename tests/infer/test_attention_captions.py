@@ -7,10 +7,11 @@ import pytest
 from memory_scenes import prepared_wall
 from training_scenes import scene as wall
 
-from gsencoder.infer.draw import attention_pictures as module
-from gsencoder.infer.draw.attention_pictures import attention_picture, attention_pictures
-from gsencoder.infer.draw.strongest_components import (
+from gsencoder.infer import memory_pictures as module
+from gsencoder.infer.memory_pictures import (
     attention_entropy,
+    attention_picture,
+    attention_pictures,
     salient_pixel,
     strongest_components,
 )

@@ -11,7 +11,7 @@ from memory_scenes import prepared_wall
 from training_scenes import scene as wall
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.draw.attention_pictures import (
+from gsencoder.infer.memory_pictures import (
     EMPTY_BAR,
     FULL_BAR,
     GAP,
@@ -20,13 +20,11 @@ from gsencoder.infer.draw.attention_pictures import (
     MARK,
     TILE_SIDE,
     VIEW_SIDE,
+    attention_entropy,
     attention_picture,
     attention_pictures,
     cell_tile,
     mark_pixel,
-)
-from gsencoder.infer.draw.strongest_components import (
-    attention_entropy,
     salient_pixel,
     strongest_components,
 )

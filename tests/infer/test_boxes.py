@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gsencoder.data.seeding.points import scene_spacing
-from gsencoder.infer.localize.boxes import Extents, box_around, oriented_axes, score_clusters
-from gsencoder.infer.localize.cluster import cluster
+from gsencoder.infer.boxes import Extents, box_around, oriented_axes, score_clusters
+from gsencoder.infer.localize import cluster
 from gsencoder.types import Gaussians
 
 
@@ -74,7 +74,7 @@ def two_groups(rng: np.random.Generator) -> np.ndarray:
 def test_two_groups_and_a_floater_are_told_apart_on_the_grid_and_without(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, grid_above: int
 ) -> None:
-    monkeypatch.setattr("gsencoder.infer.localize.cluster.MAX_NEIGHBORS", grid_above)
+    monkeypatch.setattr("gsencoder.infer.localize.MAX_NEIGHBORS", grid_above)
     labels = cluster(two_groups(rng), 0.2, 3)
     assert len(set(labels[:200])) == 1
     assert len(set(labels[200:300])) == 1
@@ -88,7 +88,7 @@ def test_clusters_on_the_grid_are_those_of_dbscan_on_a_surface(
     centers = rng.random((30, 3)) * 4
     points = (centers[rng.integers(0, 30, 6000)] + rng.normal(0, 0.03, (6000, 3))).astype(np.float32)
     exact = cluster(points, 0.08, 3)
-    monkeypatch.setattr("gsencoder.infer.localize.cluster.MAX_NEIGHBORS", 0)
+    monkeypatch.setattr("gsencoder.infer.localize.MAX_NEIGHBORS", 0)
     coarse = cluster(points, 0.08, 3)
     from sklearn.metrics import adjusted_rand_score
 

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from rooms import corner_cameras, room
 
+from gsencoder.infer.views.candidates import closeups
 from gsencoder.infer.views.choose import choose_views
-from gsencoder.infer.views.closeups import closeups
-from gsencoder.infer.views.constants import CONSTANTS
 from gsencoder.infer.views.photographs import photograph_cameras, photograph_of, with_photographs
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
-from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.infer.views.targets import Target, target_of
+from gsencoder.infer.views.targets import CONSTANTS, Target, ViewsConfig, target_of
 from gsencoder.types import Cameras, Scene, Views
 
 pytestmark = pytest.mark.slow

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gsencoder.infer.localize.cluster import cluster, cluster_by_gaps
+from gsencoder.infer.localize import cluster, cluster_by_gaps
 
 VIEWER = Path(__file__).parents[2] / "viewer" / "src"
 SPACING = 0.02

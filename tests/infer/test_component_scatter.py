@@ -8,7 +8,7 @@ from memory_samples import make_memory
 from sklearn.decomposition import PCA
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.draw.component_scatter import (
+from gsencoder.infer.memory_pictures import (
     UMAP_LEAST,
     _title,
     component_scatter,
@@ -126,8 +126,8 @@ def test_umap_is_given_the_directions_that_the_bank_compares_and_its_dots_are_to
         calls.append((vectors, seed))
         return np.stack([np.arange(len(vectors)) >= 50, np.linspace(0, 1, len(vectors))], axis=1).astype(np.float32)
 
-    monkeypatch.setattr("gsencoder.infer.draw.component_scatter.umap_plane", plane)
-    monkeypatch.setattr("gsencoder.infer.draw.component_scatter.check_umap", lambda: None)
+    monkeypatch.setattr("gsencoder.infer.memory_pictures.umap_plane", plane)
+    monkeypatch.setattr("gsencoder.infer.memory_pictures.check_umap", lambda: None)
     picture = component_scatter(replace(bank_of(components), mean=mean), sample_of(raw), umap=True, seed=3)
     ((vectors, seed),) = calls
     local = np.concatenate([raw, components]).astype(np.float64) - mean
@@ -168,7 +168,7 @@ def test_a_name_that_is_longer_than_the_picture_is_cut() -> None:
 
 
 def test_umap_says_what_to_install_where_it_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsencoder.infer.draw.component_scatter.find_spec", lambda name: None)
+    monkeypatch.setattr("gsencoder.infer.memory_pictures.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"umap-learn: pip install 'gsencoder\[umap\]', or give umap=false"):
         component_scatter(bank_of(np.eye(3)), sample_of(np.eye(3)), umap=True)
 

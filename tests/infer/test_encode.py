@@ -11,9 +11,9 @@ from splats import random_gaussians
 from training_scenes import SMALL
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.encode import chunks as chunks_module
-from gsencoder.infer.encode.chunks import EncodeConfig, cut, encode_by_chunks, scene_regions
-from gsencoder.infer.encode.encode import encode
+from gsencoder.infer import chunks as chunks_module
+from gsencoder.infer.chunks import EncodeConfig, cut, encode_by_chunks, scene_regions
+from gsencoder.infer.encode import encode
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.transformer import TransformerConfig

@@ -14,13 +14,11 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import features_bytes, load_features, save_features
-from gsencoder.infer.encode import chunks
-from gsencoder.infer.encode.chunks import EncodeConfig, cut
-from gsencoder.infer.encode.encode import TorchEncoder
-from gsencoder.infer.encode_budget import encode_within as encode_within_module
-from gsencoder.infer.encode_budget.config import EncodeBudget, check_encode_budget, exact_encoding
-from gsencoder.infer.encode_budget.encode_within import BudgetEncoding, all_settings, encode_within
-from gsencoder.infer.encode_budget.principal_axes import principal_axes
+from gsencoder.infer import chunks
+from gsencoder.infer import encode_budget as encode_within_module
+from gsencoder.infer.chunks import EncodeBudget, EncodeConfig, check_encode_budget, cut, exact_encoding
+from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.encode_budget import BudgetEncoding, all_settings, encode_within, principal_axes
 from gsencoder.types import Gaussians, Scene
 
 IN_CHUNKS = EncodeConfig(chunk=700)

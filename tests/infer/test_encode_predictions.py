@@ -11,19 +11,19 @@ from splats import random_gaussians
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import save_features
-from gsencoder.infer.encode.chunks import EncodeConfig, cut
-from gsencoder.infer.encode_budget import encode_within as encode_within_module
-from gsencoder.infer.encode_budget import sample
-from gsencoder.infer.encode_budget.config import EncodeBudget, exact_encoding
-from gsencoder.infer.encode_budget.encode_within import (
+from gsencoder.infer import encode_budget as encode_within_module
+from gsencoder.infer import encode_budget as sample
+from gsencoder.infer.chunks import EncodeBudget, EncodeConfig, cut, exact_encoding
+from gsencoder.infer.encode_budget import (
     DEVIATIONS,
     SAFETY,
+    Part,
     Setting,
     all_settings,
     encode_within,
     realised_error,
+    seen_around,
 )
-from gsencoder.infer.encode_budget.sample import Part, seen_around
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, Scene
 
 IN_CHUNKS = EncodeConfig(chunk=700)

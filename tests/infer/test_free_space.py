@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from rooms import HALF, HEIGHT, STEP, corner_cameras, room, sheet, splat
 
-from gsencoder.infer.views import free_space
-from gsencoder.infer.views.constants import CONSTANTS
-from gsencoder.infer.views.free_space import FreeSpace
+from gsencoder.infer.views import candidates as free_space
+from gsencoder.infer.views.candidates import FreeSpace
+from gsencoder.infer.views.targets import CONSTANTS
 from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians
 

@@ -20,9 +20,8 @@ from scipy.spatial.transform import Rotation
 from splats import front_camera, one_gaussian, random_rotation
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig, PosePoint, from_pose
-from gsencoder.infer.localize.relevancy import relevancy
-from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.infer.from_pose import FeatureField, FromPoseConfig, PosePoint, from_pose
+from gsencoder.infer.relevancy import ThresholdConfig, relevancy
 from gsencoder.render import blend
 from gsencoder.text.table import make_text_table
 from gsencoder.types import Cameras, GaussianFeatures, Gaussians

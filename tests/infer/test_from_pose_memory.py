@@ -5,8 +5,8 @@ import pytest
 from posed_words import CHANNELS, NAMES, SPACE, memory_of, opaque_ball, scene_of, two_kinds, words
 from splats import front_camera, one_gaussian
 
-from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig, from_pose
-from gsencoder.infer.localize.relevancy import word_directions
+from gsencoder.infer.from_pose import FeatureField, FromPoseConfig, from_pose
+from gsencoder.infer.relevancy import word_directions
 from gsencoder.memory.attention import render_features
 from gsencoder.render import blend
 from gsencoder.types import MemoryBank, QueryMemory, Scene

@@ -8,8 +8,7 @@ import torch
 from posed_words import NAMES, opaque_ball, plain_relevancy, scene_of, some_features, two_kinds, words
 from splats import front_camera, one_gaussian
 
-from gsencoder.infer.draw.pose_pictures import pose_picture, view_picture
-from gsencoder.infer.localize.from_pose import MAX_RAYS, FeatureField, FromPoseConfig, from_pose
+from gsencoder.infer.from_pose import MAX_RAYS, FeatureField, FromPoseConfig, from_pose, pose_picture, view_picture
 from gsencoder.render import blend
 
 
@@ -38,8 +37,8 @@ def test_at_a_stride_the_best_of_these_pixels_is_found() -> None:
 
 
 def test_large_views_are_looked_at_in_fewer_pixels_and_drawn_small(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gsencoder.infer.localize.from_pose.MAX_RAYS", 500)
-    monkeypatch.setattr("gsencoder.infer.draw.pose_pictures.MAX_SIDE", 40)
+    monkeypatch.setattr("gsencoder.infer.from_pose.MAX_RAYS", 500)
+    monkeypatch.setattr("gsencoder.infer.from_pose.MAX_SIDE", 40)
     gaussians, features = two_kinds(one_gaussian((-0.7, 0, 2)), one_gaussian((0.7, 0, 2)))
     camera = front_camera()
     width, height = int(camera.widths[0]), int(camera.heights[0])
@@ -56,7 +55,7 @@ def test_large_views_are_looked_at_in_fewer_pixels_and_drawn_small(monkeypatch: 
     assert max(rgb.shape[:2]) == 40
     (relevancy,) = seen.relevancy(NAMES[:1], words())
     small = pose_picture(rgb, seen, point, relevancy)
-    monkeypatch.setattr("gsencoder.infer.draw.pose_pictures.MAX_SIDE", 2000)
+    monkeypatch.setattr("gsencoder.infer.from_pose.MAX_SIDE", 2000)
     large = pose_picture(view_picture(seen), seen, point, relevancy)
     # Both are enlarged to be legible; the ring is in one place.
     assert abs(small.shape[0] / small.shape[1] - large.shape[0] / large.shape[1]) < 0.1

@@ -9,10 +9,8 @@ from memory_samples import make_memory
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig, from_pose
-from gsencoder.infer.localize.gaussian_products import GaussianProducts
-from gsencoder.infer.localize.relevancy import Mode, relevancy, word_directions
-from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.infer.from_pose import FeatureField, FromPoseConfig, from_pose
+from gsencoder.infer.relevancy import GaussianProducts, Mode, ThresholdConfig, relevancy, word_directions
 from gsencoder.memory.attention import render_features
 from gsencoder.render import BlendConfig, blend
 from gsencoder.text.table import TextTable, make_text_table
@@ -114,7 +112,7 @@ def test_cosines_of_gaussians_are_relevancies_also_in_chunks_and_near_the_mean(m
     values[~features.seen] = 0
     features = replace(features, features=values.astype(np.float32))
     expected = relevancy(features, words().encode(NAMES), words().mean)
-    monkeypatch.setattr("gsencoder.infer.localize.gaussian_products.CHUNK_BYTES", 8 * CHANNELS * 42)
+    monkeypatch.setattr("gsencoder.infer.relevancy.CHUNK_BYTES", 8 * CHANNELS * 42)
     directions = word_directions(words().encode(NAMES), words().mean)
     cosines = GaussianProducts(features).cosines(directions)
     near_mean = np.arange(295) // 50 == 4

@@ -12,9 +12,17 @@ from typing import Any
 import pytest
 from chat_server import Handler, answer, completion, events, serving
 
-from gsencoder.infer.ask import http_limits as vlm_http
-from gsencoder.infer.ask.reply import Reply, ServerError
-from gsencoder.infer.ask.server import KEY_VARIABLE, MODEL_VARIABLE, URL_VARIABLE, VlmConfig, VlmServer, request_body
+from gsencoder.infer.ask import server as vlm_http
+from gsencoder.infer.ask.server import (
+    KEY_VARIABLE,
+    MODEL_VARIABLE,
+    URL_VARIABLE,
+    Reply,
+    ServerError,
+    VlmConfig,
+    VlmServer,
+    request_body,
+)
 
 pytest.importorskip("openai")
 

@@ -11,9 +11,16 @@ import pytest
 from chat_server import Handler, completion, events, serving
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.ask.key_filter import KeyFilter
-from gsencoder.infer.ask.reply import Reply
-from gsencoder.infer.ask.server import KEY_VARIABLE, MODEL_VARIABLE, URL_VARIABLE, VlmConfig, VlmServer, request_body
+from gsencoder.infer.ask.server import (
+    KEY_VARIABLE,
+    MODEL_VARIABLE,
+    URL_VARIABLE,
+    KeyFilter,
+    Reply,
+    VlmConfig,
+    VlmServer,
+    request_body,
+)
 
 pytest.importorskip("openai")
 

@@ -6,8 +6,8 @@ import torch
 from rooms import UP, splat
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.draw.boxes_ply import word_color
-from gsencoder.infer.views.marks import draw_marks
+from gsencoder.infer.draw import word_color
+from gsencoder.infer.views.pictures import draw_marks
 from gsencoder.infer.views.targets import Target, target_of
 from gsencoder.render import Blend, blend
 from gsencoder.types import Gaussians

@@ -15,13 +15,20 @@ import pytest
 from splats import random_gaussians
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode.encode import TorchEncoder
-from gsencoder.infer.load_encoder import Encoder, load_encoder
-from gsencoder.infer.onnx.export import TOLERANCE, Cloud, check_parity, lower, random_cloud
-from gsencoder.infer.onnx.header import KEY, SUM, OnnxHeader, from_metadata, to_metadata, with_sum
-from gsencoder.infer.onnx.operators import search
-from gsencoder.infer.onnx.runtime import OnnxEncoder, inputs_of
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.load import Encoder, load_encoder
+from gsencoder.infer.onnx.export import TOLERANCE, Cloud, check_parity, lower, random_cloud, search
+from gsencoder.infer.onnx.runtime import (
+    KEY,
+    SUM,
+    OnnxEncoder,
+    OnnxHeader,
+    from_metadata,
+    inputs_of,
+    to_metadata,
+    with_sum,
+)
 from gsencoder.types import Gaussians
 
 pytestmark = pytest.mark.slow

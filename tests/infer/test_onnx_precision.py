@@ -18,13 +18,20 @@ from gsencoder.app import cli
 from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode.encode import TorchEncoder
-from gsencoder.infer.onnx.export import Cloud, check_cosines, export_onnx, lower, random_cloud
-from gsencoder.infer.onnx.header import from_metadata, to_metadata
-from gsencoder.infer.onnx.operators import OPSET, OURS, in_standard_operators
-from gsencoder.infer.onnx.precision import PRODUCT_LIMIT
-from gsencoder.infer.onnx.runtime import OnnxEncoder
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.onnx.export import (
+    OPSET,
+    OURS,
+    PRODUCT_LIMIT,
+    Cloud,
+    check_cosines,
+    export_onnx,
+    in_standard_operators,
+    lower,
+    random_cloud,
+)
+from gsencoder.infer.onnx.runtime import OnnxEncoder, from_metadata, to_metadata
 from gsencoder.models.neighbors import convolve_reference, neighbor_table
 
 pytestmark = pytest.mark.slow

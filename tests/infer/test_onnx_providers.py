@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.load_encoder import load_encoder
+from gsencoder.infer.load import load_encoder
 from gsencoder.infer.onnx import export
 from gsencoder.infer.onnx.runtime import CPU, CUDA, open_session
 

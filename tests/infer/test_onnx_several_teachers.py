@@ -10,8 +10,8 @@ import torch
 from symbolic import symbolic_sizes
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.onnx import export
 from gsencoder.infer.onnx.export import Cloud, check_cosines, check_parity, export_onnx, lower, random_cloud
 from gsencoder.infer.onnx.runtime import OnnxEncoder

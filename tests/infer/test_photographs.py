@@ -17,8 +17,7 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
-from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.infer.views.targets import target_of
+from gsencoder.infer.views.targets import ViewsConfig, target_of
 from gsencoder.render.images import render_image
 from gsencoder.types import Scene
 

@@ -9,10 +9,9 @@ from rooms import corner_cameras, room
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_picture
-from gsencoder.infer.views import picture_size as module
-from gsencoder.infer.views.budget import ViewsBudget
-from gsencoder.infer.views.picture_size import SizedPictures, pictures_within
-from gsencoder.infer.views.selection import SelectedView, ViewSet
+from gsencoder.infer.views import budget as module
+from gsencoder.infer.views.budget import SizedPictures, ViewsBudget, pictures_within
+from gsencoder.infer.views.targets import SelectedView, ViewSet
 from gsencoder.types import Scene
 
 LEAST, COUNT = 32, 4

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.draw.boxes_ply import box_corners
-from gsencoder.infer.draw.pictures import (
+from gsencoder.infer.draw import (
+    box_corners,
     color_bar,
     contact_sheet,
     depth_picture,

@@ -4,9 +4,17 @@ import numpy as np
 import pytest
 from splats import front_camera, one_gaussian, random_gaussians
 
-from gsencoder.infer.draw.pictures import legible_factor
-from gsencoder.infer.draw.pose_pictures import HIDDEN, VISIBLE, pose_picture, view_picture
-from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig, PosePoint, SeenField
+from gsencoder.infer.draw import legible_factor
+from gsencoder.infer.from_pose import (
+    HIDDEN,
+    VISIBLE,
+    FeatureField,
+    FromPoseConfig,
+    PosePoint,
+    SeenField,
+    pose_picture,
+    view_picture,
+)
 from gsencoder.render.images import render_image
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, Scene
 
@@ -109,7 +117,7 @@ def test_where_nothing_with_features_is_in_view_the_picture_says_so_and_marks_no
 
 def test_a_label_says_where_the_word_is_or_why_it_is_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     written = []
-    monkeypatch.setattr("gsencoder.infer.draw.pose_pictures._write", lambda *arguments: written.append(arguments[2]))
+    monkeypatch.setattr("gsencoder.infer.from_pose._write", lambda *arguments: written.append(arguments[2]))
     seen = seen_from(64, 48)
     for point in (point_at(40.5, 20.5), point_at(40.5, 20.5, visible=False), point_at(np.nan, np.nan, visible=False)):
         drawn(seen, point)

@@ -10,10 +10,9 @@ import pytest
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.localize.boxes import Cluster
-from gsencoder.infer.localize.localization_json import localization_to_json, words_to_json
-from gsencoder.infer.localize.localize import LocalizeConfig, find_candidates, localize, select_features
-from gsencoder.infer.localize.presence import (
+from gsencoder.infer.boxes import Cluster, localization_to_json, words_to_json
+from gsencoder.infer.localize import LocalizeConfig, find_candidates, localize, select_features
+from gsencoder.infer.presence import (
     LEAST_ATTAINABLE,
     SYNONYM,
     TRAINED,
@@ -24,8 +23,7 @@ from gsencoder.infer.localize.presence import (
     Presence,
     probability,
 )
-from gsencoder.infer.localize.relevancy import relevancy
-from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.infer.relevancy import ThresholdConfig, relevancy
 from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, Localization, Scene
 

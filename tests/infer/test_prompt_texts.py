@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.ask.prompts import data_url, number_in, prompt_text
+from gsencoder.infer.ask.ask import data_url, number_in, prompt_text
 from gsencoder.infer.views.pictures import PictureKind
 
 pytest.importorskip("openai")

@@ -10,8 +10,8 @@ import pytest
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.files import box_corners
 from gsencoder.infer.ask.ask import Question
-from gsencoder.infer.ask.predictions import predictions, short_answer
-from gsencoder.infer.ask.question_sets import QuestionSet, is_question_set, read_question_set
+from gsencoder.infer.ask.batch import predictions, short_answer
+from gsencoder.infer.ask.questions import QuestionSet, is_question_set, read_question_set
 
 LOW, HIGH = (0.0, 1.0, 2.0), (1.0, 3.0, 2.5)
 SCANQA = [

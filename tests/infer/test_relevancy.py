@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.localize.relevancy import relevancy
-from gsencoder.infer.localize.threshold import ThresholdConfig, otsu, threshold
+from gsencoder.infer.relevancy import ThresholdConfig, otsu, relevancy, threshold
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 SPACE = FeatureSpace(name="toy", channels=24, text_encoder="toy")
@@ -124,7 +123,7 @@ def test_words_one_by_one_score_as_they_do_together(rng: np.random.Generator) ->
 def test_chunks_do_not_change_scores(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     features, text, mean = in_basis(rng), words(rng), np.zeros(24, np.float32)
     whole = relevancy(features, text, mean)
-    monkeypatch.setattr("gsencoder.infer.localize.relevancy.CHUNK_BYTES", 1000)
+    monkeypatch.setattr("gsencoder.infer.relevancy.CHUNK_BYTES", 1000)
     np.testing.assert_allclose(relevancy(features, text, mean), whole, atol=1e-7)
 
 

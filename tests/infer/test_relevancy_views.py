@@ -10,9 +10,9 @@ from PIL import Image
 from splats import random_gaussians
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.draw.pictures import enlarge, legible_factor
-from gsencoder.infer.draw.relevancy_views import best_views, relevancy_pictures
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.draw import enlarge, legible_factor
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.pictures import best_views, relevancy_pictures
 from gsencoder.render import blend
 from gsencoder.render.images import visible_shares
 from gsencoder.types import Cameras, Gaussians, Localization, Scene, Views
@@ -79,7 +79,7 @@ def test_the_best_views_are_those_of_all_views(monkeypatch: pytest.MonkeyPatch) 
         counted.append(len(gaussians))
         return blend(gaussians, *arguments, **options)
 
-    monkeypatch.setattr("gsencoder.infer.draw.relevancy_views.blend", counting)
+    monkeypatch.setattr("gsencoder.infer.pictures.blend", counting)
     chosen = best_views(splat, cameras, groups, 3)
     for column, views in enumerate(chosen):
         best = np.sort(worth[:, column])[::-1]

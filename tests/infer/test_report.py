@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.draw.report import HtmlReport
+from gsencoder.infer.page.report import HtmlReport
 
 VOID = {"meta", "img", "br"}
 

@@ -9,11 +9,16 @@ import torch
 from selected_rooms import BOOK, MUG, NAMES, circling, permuted, selected_room, with_more, words
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.select.seeds import labels_of_parts, threshold_parts
-from gsencoder.infer.select.select import select
-from gsencoder.infer.select.selection import SelectConfig, Selection
-from gsencoder.infer.select.shares import object_shares
-from gsencoder.infer.select.votes import sampling, votes
+from gsencoder.infer.select import select
+from gsencoder.infer.selection import (
+    SelectConfig,
+    Selection,
+    labels_of_parts,
+    object_shares,
+    sampling,
+    threshold_parts,
+    votes,
+)
 from gsencoder.render import blend
 from gsencoder.types import FeatureBasis, GaussianFeatures, Scene
 

@@ -11,10 +11,9 @@ from selected_rooms import selected_room
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_property, load_splat, save_splat
-from gsencoder.infer.draw.boxes_ply import word_color
-from gsencoder.infer.select.file_names import file_stems
-from gsencoder.infer.select.labels_file import LABELS_JSON, LABELS_PLY, read_labels, write_labels
-from gsencoder.infer.select.selection import Selection
+from gsencoder.infer.draw import word_color
+from gsencoder.infer.select_files import LABELS_JSON, LABELS_PLY, file_stems, read_labels, write_labels
+from gsencoder.infer.selection import Selection
 
 SCENE, KINDS = selected_room()
 LABELS = np.array([1, 2, 0], np.int32)[KINDS]

@@ -7,17 +7,16 @@ import pytest
 from selected_rooms import MUG, SPACE, permuted, selected_room, splat_of, with_more, words
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.select.grow import (
+from gsencoder.infer.select import (
     NO_SHARE,
     Candidates,
     Labels,
     labels_by_features,
     labels_by_pixels,
     labels_of_hidden,
+    select,
 )
-from gsencoder.infer.select.seeds import Parts
-from gsencoder.infer.select.select import select
-from gsencoder.infer.select.selection import SelectConfig, Votes
+from gsencoder.infer.selection import Parts, SelectConfig, Votes
 from gsencoder.types import GaussianFeatures, Gaussians, Scene, Views
 
 USUAL = (1.0, 10.0, 10.0, 10.0, 100.0)

@@ -8,11 +8,10 @@ import pytest
 from selected_rooms import EMBEDDINGS, selected_room, words
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.select import select as module
-from gsencoder.infer.select.seeds import Parts, box_parts, threshold_parts
-from gsencoder.infer.select.select import select
-from gsencoder.infer.select.selection import SelectConfig
+from gsencoder.infer import select as module
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.select import select
+from gsencoder.infer.selection import Parts, SelectConfig, box_parts, threshold_parts
 from gsencoder.types import Box, Localization, Scene
 
 SCENE, KINDS = selected_room()

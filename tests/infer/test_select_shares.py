@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.distance import cdist
 from selected_rooms import SPACE
 
-from gsencoder.infer.select import shares as module
-from gsencoder.infer.select.shares import object_shares
+from gsencoder.infer import selection as module
+from gsencoder.infer.selection import object_shares
 from gsencoder.types import GaussianFeatures
 
 REACH, SPACING = 3.0, 1.1

@@ -10,8 +10,7 @@ from chat_server import Handler, answer, completion, events, serving, silent
 from server_questions import KEY, ask, config
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.ask.reply import ServerError
-from gsencoder.infer.ask.server import request_body
+from gsencoder.infer.ask.server import ServerError, request_body
 
 pytest.importorskip("openai")
 

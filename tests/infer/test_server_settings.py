@@ -10,8 +10,15 @@ from server_questions import KEY, ask, config
 
 from gsencoder.app.settings.config import HIDDEN, settings
 from gsencoder.core.errors import InputError
-from gsencoder.infer.ask.reply import ServerError
-from gsencoder.infer.ask.server import KEY_VARIABLE, MODEL_VARIABLE, URL_VARIABLE, VlmConfig, VlmServer, request_body
+from gsencoder.infer.ask.server import (
+    KEY_VARIABLE,
+    MODEL_VARIABLE,
+    URL_VARIABLE,
+    ServerError,
+    VlmConfig,
+    VlmServer,
+    request_body,
+)
 
 pytest.importorskip("openai")
 

@@ -10,11 +10,16 @@ from viewed_targets import SHELLS, cube_in_room
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.views.budget import ViewsBudget, choose_views_within
+from gsencoder.infer.views.budget import (
+    ViewsBudget,
+    choose_views_within,
+    errors_after,
+    fewest_views,
+    measured_errors,
+    order_by_error,
+)
 from gsencoder.infer.views.scores import ViewScores
-from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.infer.views.shown_error import errors_after, fewest_views, measured_errors, order_by_error
-from gsencoder.infer.views.targets import Target, target_of
+from gsencoder.infer.views.targets import Target, ViewsConfig, target_of
 from gsencoder.render import blend
 from gsencoder.types import Scene, Views
 

@@ -6,9 +6,8 @@ import torch
 from rooms import sheet, splat
 
 from gsencoder.geometry import rotmats_from_quats
-from gsencoder.infer.views.constants import CONSTANTS
-from gsencoder.infer.views.free_space import FreeSpace
-from gsencoder.infer.views.split_gaussians import patches
+from gsencoder.infer.views.candidates import FreeSpace, patches
+from gsencoder.infer.views.targets import CONSTANTS
 from gsencoder.types import Gaussians
 
 

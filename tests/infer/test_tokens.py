@@ -14,7 +14,7 @@ from tiny_vlm import PATCH, SIDE, save_tiny_vlm, tokenizer
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.views.tokens import feature_tokens, token_blends, tower_grid
+from gsencoder.infer.views.pictures import feature_tokens, token_blends, tower_grid
 from gsencoder.types import Cameras, FeatureSpace, GaussianFeatures, Gaussians
 
 

@@ -8,9 +8,8 @@ from rooms import UP, corner_cameras, cube
 from viewed_targets import SHELLS, around, cube_in_room, joined
 
 from gsencoder.data.orbits import looking_cameras
+from gsencoder.infer.views.candidates import FreeSpace, frames_on
 from gsencoder.infer.views.choose import choose_views
-from gsencoder.infer.views.frames import frames_on
-from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.targets import target_of
 
 pytestmark = pytest.mark.slow

@@ -9,11 +9,9 @@ from rooms import corner_cameras, cube, sheet, splat
 from viewed_targets import cube_in_room
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.views.constants import CONSTANTS
+from gsencoder.infer.views.choose import CoverageObjective, view_utility
 from gsencoder.infer.views.scores import coverage, score_views
-from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.infer.views.targets import target_of
-from gsencoder.infer.views.utility import CoverageObjective, view_utility
+from gsencoder.infer.views.targets import CONSTANTS, ViewsConfig, target_of
 
 pytestmark = pytest.mark.slow
 

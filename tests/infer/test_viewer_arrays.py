@@ -14,15 +14,13 @@ from viewer_containers import read_container
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat
-from gsencoder.infer.localize import presence
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.localize.relevancy import feature_axes
-from gsencoder.infer.localize.threshold import ThresholdConfig
-from gsencoder.infer.viewer import search as module
-from gsencoder.infer.viewer.container import Container
-from gsencoder.infer.viewer.page_scene import FileOptions, file_container, jpeg_of, scene_container
-from gsencoder.infer.viewer.search import NO_LABEL, SceneSearch
-from gsencoder.infer.viewer.shown import (
+from gsencoder.infer import presence
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.page import search as module
+from gsencoder.infer.page.page import Container, FileOptions, file_container, jpeg_of, scene_container
+from gsencoder.infer.page.search import (
+    NO_LABEL,
+    SceneSearch,
     drawn_scene,
     object_numbers,
     pca_bytes,
@@ -30,6 +28,7 @@ from gsencoder.infer.viewer.shown import (
     spz_bytes,
     weight_bytes,
 )
+from gsencoder.infer.relevancy import ThresholdConfig, feature_axes
 from gsencoder.text.table import make_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene
 

@@ -17,14 +17,19 @@ from viewed_rooms import HOSTILE, room_scene, save_viewed_room, search_of
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat
 from gsencoder.fusion.quantize import compact
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.infer.localize.relevancy import relevancy
-from gsencoder.infer.localize.threshold import ThresholdConfig
-from gsencoder.infer.viewer.bundle import Bundle, load_bundle
-from gsencoder.infer.viewer.page import file_page, served_page
-from gsencoder.infer.viewer.page_scene import FileOptions, file_container, scene_container
-from gsencoder.infer.viewer.search import SceneSearch
-from gsencoder.infer.viewer.server import ViewServer
+from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.page.page import (
+    Bundle,
+    FileOptions,
+    file_container,
+    file_page,
+    load_bundle,
+    scene_container,
+    served_page,
+)
+from gsencoder.infer.page.search import SceneSearch
+from gsencoder.infer.page.server import ViewServer
+from gsencoder.infer.relevancy import ThresholdConfig, relevancy
 from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow

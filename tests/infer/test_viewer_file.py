@@ -15,13 +15,20 @@ from viewed_rooms import STUB, room_scene, save_viewed_room, search_of
 from viewer_containers import read_container
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.viewer.bundle import SCRIPT, STYLE, Bundle, load_bundle
-from gsencoder.infer.viewer.container import Container
-from gsencoder.infer.viewer.file_size import MadePage, fitting_page
-from gsencoder.infer.viewer.page import file_page, served_page
-from gsencoder.infer.viewer.page_scene import FileOptions
-from gsencoder.infer.viewer.search import SceneSearch
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.page.page import (
+    SCRIPT,
+    STYLE,
+    Bundle,
+    Container,
+    FileOptions,
+    MadePage,
+    file_page,
+    fitting_page,
+    load_bundle,
+    served_page,
+)
+from gsencoder.infer.page.search import SceneSearch
 from gsencoder.types import Scene
 
 OPTIONS = FileOptions(error=0.01, sh_degree=3, photographs=2, photograph_side=64)

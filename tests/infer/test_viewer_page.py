@@ -18,22 +18,32 @@ from viewer_containers import read_container
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat
 from gsencoder.fusion.quantize import compact
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.infer.localize.relevancy import relevancy
-from gsencoder.infer.localize.threshold import ThresholdConfig, threshold
-from gsencoder.infer.viewer.bundle import load_bundle
-from gsencoder.infer.viewer.container import Container
-from gsencoder.infer.viewer.file_size import MadePage, fitting_page
-from gsencoder.infer.viewer.page import file_page, json_in_script, served_page
-from gsencoder.infer.viewer.page_scene import WORD_STEP, FileOptions, file_container, scene_container
-from gsencoder.infer.viewer.search import NO_LABEL, RELEVANCY_STEP, UNSEEN, SceneSearch
-from gsencoder.infer.viewer.shown import (
+from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.page.page import (
+    WORD_STEP,
+    Container,
+    FileOptions,
+    MadePage,
+    file_container,
+    file_page,
+    fitting_page,
+    json_in_script,
+    load_bundle,
+    scene_container,
+    served_page,
+)
+from gsencoder.infer.page.search import (
+    NO_LABEL,
+    RELEVANCY_STEP,
+    UNSEEN,
+    SceneSearch,
     drawn_scene,
     object_numbers,
     rows_of_features,
     spz_bytes,
     weight_bytes,
 )
+from gsencoder.infer.relevancy import ThresholdConfig, relevancy, threshold
 from gsencoder.types import Scene
 
 OPTIONS = FileOptions(error=0.01, sh_degree=3, photographs=2, photograph_side=64)

@@ -16,13 +16,12 @@ from viewed_rooms import STUB, room_scene, save_viewed_room, search_of
 from viewer_containers import read_container
 from viewer_requests import at, call, head, sent
 
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.localize.threshold import ThresholdConfig
-from gsencoder.infer.viewer import server as viewer_server
-from gsencoder.infer.viewer.page import served_page
-from gsencoder.infer.viewer.page_scene import scene_container
-from gsencoder.infer.viewer.search import RELEVANCY_STEP, UNSEEN, SceneSearch
-from gsencoder.infer.viewer.server import MAX_BODY, MAX_ROWS, MAX_WORD, ViewServer
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.page import server as viewer_server
+from gsencoder.infer.page.page import scene_container, served_page
+from gsencoder.infer.page.search import RELEVANCY_STEP, UNSEEN, SceneSearch
+from gsencoder.infer.page.server import MAX_BODY, MAX_ROWS, MAX_WORD, ViewServer
+from gsencoder.infer.relevancy import ThresholdConfig
 
 JSON = {"Content-Type": "application/json"}
 

@@ -19,11 +19,10 @@ from viewer_containers import read_container
 from viewer_requests import at, call, connected, head
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.viewer import server as viewer_server
-from gsencoder.infer.viewer.page import served_page
-from gsencoder.infer.viewer.page_scene import scene_container
-from gsencoder.infer.viewer.search import SceneSearch
-from gsencoder.infer.viewer.server import MAX_BODY, MAX_ROWS, ViewServer
+from gsencoder.infer.page import server as viewer_server
+from gsencoder.infer.page.page import scene_container, served_page
+from gsencoder.infer.page.search import SceneSearch
+from gsencoder.infer.page.server import MAX_BODY, MAX_ROWS, ViewServer
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,10 @@ from viewed_targets import SHELLS, cube_in_room, joined
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.orbits import looking_cameras
+from gsencoder.infer.views.candidates import FreeSpace, shell_cameras, up_of
 from gsencoder.infer.views.choose import choose_views
-from gsencoder.infer.views.free_space import FreeSpace
 from gsencoder.infer.views.pictures import view_pictures, view_sheet
-from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.infer.views.shells import shell_cameras, up_of
-from gsencoder.infer.views.targets import target_of, targets_of
+from gsencoder.infer.views.targets import ViewsConfig, target_of, targets_of
 from gsencoder.types import Box, Gaussians, Localization, Scene
 
 pytestmark = pytest.mark.slow

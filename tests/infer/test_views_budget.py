@@ -15,8 +15,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.infer.views import budget as module
 from gsencoder.infer.views.budget import ViewsBudget, check_views_budget, choose_views_within
 from gsencoder.infer.views.choose import choose_views
-from gsencoder.infer.views.selection import ViewsConfig
-from gsencoder.infer.views.targets import target_of
+from gsencoder.infer.views.targets import ViewsConfig, target_of
 
 pytestmark = pytest.mark.slow
 

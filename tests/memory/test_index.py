@@ -14,7 +14,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_package
-from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.infer.relevancy import relevancy
 from gsencoder.memory import index as index_module
 from gsencoder.memory.index import IndexConfig, index_features
 from gsencoder.memory.reduction import reduce_to_cover

@@ -11,7 +11,7 @@ from archives import header_of, rewrite
 from training_scenes import SMALL
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.encode import TorchEncoder
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import DEFAULT_WEIGHTS, SHIPPED_WEIGHTS, find_weights, load_weights, save_weights

@@ -14,8 +14,8 @@ from gsencoder.app.commands.query_words import queried_scene
 from gsencoder.core.archive import open_archive
 from gsencoder.fusion.folder import load_features
 from gsencoder.fusion.measured_heads import find_head, head_outputs, load_heads
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.text.models import TransformersTextConfig
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.text.vocabulary import vocabulary_of

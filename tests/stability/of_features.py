@@ -10,9 +10,8 @@ from stability.of_rendering import blend_of, weights_of
 from stability.registry import routine, worst
 
 from gsencoder.fusion.basis import Moments, fit_basis, to_coordinates
-from gsencoder.infer.localize.gaussian_products import GaussianProducts
-from gsencoder.infer.localize.pixel_relevancy import BlendedFeatures
-from gsencoder.infer.localize.relevancy import relevancy
+from gsencoder.infer.pictures import BlendedFeatures
+from gsencoder.infer.relevancy import GaussianProducts, relevancy
 from gsencoder.memory.attention import MemoryAttention
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory

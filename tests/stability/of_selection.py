@@ -10,12 +10,11 @@ from stability.of_features import WORDS, features_of, wide_cosines
 from stability.of_network import few
 from stability.registry import routine
 
-from gsencoder.infer.localize import cluster as clusters_module
-from gsencoder.infer.localize.boxes import Cluster, score_clusters
-from gsencoder.infer.localize.cluster import cluster
-from gsencoder.infer.localize.presence import SMALLEST_SPREAD, WITHOUT_RIVALS, Presence, probability
-from gsencoder.infer.localize.relevancy import relevancy
-from gsencoder.infer.localize.threshold import ThresholdConfig, otsu, threshold
+from gsencoder.infer import localize as clusters_module
+from gsencoder.infer.boxes import Cluster, score_clusters
+from gsencoder.infer.localize import cluster
+from gsencoder.infer.presence import SMALLEST_SPREAD, WITHOUT_RIVALS, Presence, probability
+from gsencoder.infer.relevancy import ThresholdConfig, otsu, relevancy, threshold
 
 Wide = oracles.Wide
 

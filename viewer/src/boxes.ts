@@ -1,4 +1,4 @@
-// The smallest box around points that stands upright: gsencoder/infer/localize/boxes.py for a known up.
+// The smallest box around points that stands upright: gsencoder/infer/boxes.py for a known up.
 
 import type { Cluster } from "./clusters";
 import type { FoundBox } from "./types";

@@ -1,11 +1,11 @@
-// Selected Gaussians to clusters: DBSCAN on a grid, scores as in gsencoder/infer/localize/boxes.py.
+// Selected Gaussians to clusters: DBSCAN on a grid, scores as in gsencoder/infer/boxes.py.
 
 import type { LocalizeSettings } from "./types";
 
 /** So many pairs of neighbors are looked at; above, points are clustered by occupied cells of eps / 4. */
 const MAX_PAIRS = 3e7;
 
-/** How clusters are joined: gsencoder/infer/localize/cluster.py says why. */
+/** How clusters are joined: gsencoder/infer/localize.py says why. */
 const EPS_SPACINGS = 1.5;
 const SPARSE = 0.25;
 const GROWTH = Math.SQRT2;

@@ -1,4 +1,4 @@
-// Reads the form in which arrays travel: see gsencoder/infer/viewer/container.py.
+// Reads the form in which arrays travel: see gsencoder/infer/page/page.py.
 
 export type Typed = Uint8Array | Int8Array | Uint16Array | Int16Array | Uint32Array | Int32Array | Float32Array;
 

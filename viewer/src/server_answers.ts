@@ -1,4 +1,4 @@
-// Answers of the server that sent the page; see gsencoder/infer/viewer/server.py.
+// Answers of the server that sent the page; see gsencoder/infer/page/server.py.
 
 import { arrayOf, readContainer, type Container } from "./container";
 import { Scene } from "./scene";

@@ -1,4 +1,4 @@
-// The relevancy from which on Gaussians are taken: gsencoder/infer/localize/threshold.py in JavaScript.
+// The relevancy from which on Gaussians are taken: gsencoder/infer/relevancy.py in JavaScript.
 
 import type { ThresholdSettings } from "./types";
 

@@ -1,4 +1,4 @@
-// What the page knows of a scene; see gsencoder/infer/viewer/page_scene.py.
+// What the page knows of a scene; see gsencoder/infer/page/page.py.
 
 export interface ThresholdSettings {
   kind: "adaptive" | "fixed" | "relative" | "quantile" | "otsu";

@@ -19,15 +19,28 @@ from gsencoder.core.errors import InputError, SceneWarning, counted, listed
 from gsencoder.core.files import write_json
 from gsencoder.core.process import Clock
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.infer.ask.ask import AskConfig, Asker, Question
-from gsencoder.infer.ask.batch import ANSWER, ANSWERS, PROMPT, REQUEST, ask_question, ask_questions, write_answers
-from gsencoder.infer.ask.predictions import predictions
-from gsencoder.infer.ask.prompts import Task, check_question
-from gsencoder.infer.ask.question_sets import QuestionSet, SetQuestion, is_question_set, read_question_set
-from gsencoder.infer.ask.questions import BatchQuestion, read_questions
+from gsencoder.infer.ask.ask import AskConfig, Asker, Question, Task, check_question
+from gsencoder.infer.ask.batch import (
+    ANSWER,
+    ANSWERS,
+    PROMPT,
+    REQUEST,
+    ask_question,
+    ask_questions,
+    predictions,
+    write_answers,
+)
+from gsencoder.infer.ask.questions import (
+    BatchQuestion,
+    QuestionSet,
+    SetQuestion,
+    is_question_set,
+    read_question_set,
+    read_questions,
+)
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 
 PREDICTIONS = "predictions.json"

@@ -9,8 +9,8 @@ from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.folder import table_path
 from gsencoder.infer.ask.ask import AskConfig, Asker
 from gsencoder.infer.ask.server import VlmConfig
-from gsencoder.infer.localize.localize import LocalizeConfig, select_features
-from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.localize import LocalizeConfig, select_features
+from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene
 

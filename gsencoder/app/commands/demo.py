@@ -20,12 +20,10 @@ from gsencoder.data.synthetic import color_words, make_room, write_room
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.infer.draw.boxes_ply import write_boxes_ply
-from gsencoder.infer.localize.localization_json import localization_to_json
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
-from gsencoder.infer.viewer.bundle import load_bundle
-from gsencoder.infer.viewer.file_size import fitting_page
-from gsencoder.infer.viewer.page_scene import FileOptions
+from gsencoder.infer.boxes import localization_to_json
+from gsencoder.infer.draw import write_boxes_ply
+from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.page.page import FileOptions, fitting_page, load_bundle
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import text_table_of
 from gsencoder.teachers.labels import LabelsTeacher, PaletteConfig, PaletteTeacher

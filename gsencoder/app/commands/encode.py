@@ -31,10 +31,9 @@ from gsencoder.fusion.folder import (
     save_features,
     save_tables,
 )
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode_budget.config import EncodeBudget, check_encode_budget
-from gsencoder.infer.encode_budget.encode_within import BudgetEncoding
-from gsencoder.infer.load_encoder import Encoder, file_of_encoder, load_encoder
+from gsencoder.infer.chunks import EncodeBudget, EncodeConfig, check_encode_budget
+from gsencoder.infer.encode_budget import BudgetEncoding
+from gsencoder.infer.load import Encoder, file_of_encoder, load_encoder
 from gsencoder.models.output_space import teacher_of_space
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene
 

@@ -10,10 +10,9 @@ from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.app.settings.config import settings
 from gsencoder.core.settings import MEGABYTE
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode_budget.config import EncodeBudget, exact_encoding
-from gsencoder.infer.encode_budget.encode_within import BudgetEncoding, encode_within, realised_error
-from gsencoder.infer.load_encoder import Encoder
+from gsencoder.infer.chunks import EncodeBudget, EncodeConfig, exact_encoding
+from gsencoder.infer.encode_budget import BudgetEncoding, encode_within, realised_error
+from gsencoder.infer.load import Encoder
 from gsencoder.types import Scene
 
 

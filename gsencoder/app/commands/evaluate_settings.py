@@ -22,8 +22,8 @@ from gsencoder.evaluate.protocols.referring import ReferringProtocol
 from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol
 from gsencoder.evaluate.protocols.semantics import SemanticsProtocol
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.teachers.build import TeacherConfig
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig

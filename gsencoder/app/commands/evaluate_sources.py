@@ -22,7 +22,7 @@ from gsencoder.evaluate.sources import (
 )
 from gsencoder.fusion.folder import heads_beside
 from gsencoder.fusion.measured_heads import find_head, heads_of, load_heads
-from gsencoder.infer.load_encoder import file_of_encoder, load_encoder
+from gsencoder.infer.load import file_of_encoder, load_encoder
 from gsencoder.teachers.build import words_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig, Words, stating_trained, words_of_table

@@ -17,8 +17,8 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.folder import copy_heads, heads_beside, heads_of_graph, load_memories
-from gsencoder.infer.encode.encode import TorchEncoder
-from gsencoder.infer.load_encoder import file_of_encoder
+from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.load import file_of_encoder
 from gsencoder.infer.onnx.export import (
     COSINE,
     TOLERANCE,

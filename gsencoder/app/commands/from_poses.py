@@ -12,7 +12,7 @@ from PIL import Image
 from gsencoder.core.errors import InputError, listed
 from gsencoder.data.readers.transforms_json import read_cameras
 from gsencoder.fusion.folder import MEMORY_FILE, load_memories, teachers_in
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.text.table import TextEncoder
 from gsencoder.types import Cameras, QueryMemory, Scene
 
@@ -103,8 +103,7 @@ def search_from_poses(
         For each camera the points of the words as JSON values, and pictures with their names.
     """
     # Rendering needs torch, which finding boxes does without.
-    from gsencoder.infer.draw.pose_pictures import pose_picture, view_picture
-    from gsencoder.infer.localize.from_pose import FeatureField, FromPoseConfig
+    from gsencoder.infer.from_pose import FeatureField, FromPoseConfig, pose_picture, view_picture
 
     field = FeatureField(scene, memory=memory, config=FromPoseConfig(mode=config.mode, threshold=config.threshold))
     for view, name in enumerate(cameras.views):

@@ -17,7 +17,7 @@ from gsencoder.data.check.findings import Finding
 from gsencoder.data.check.scene_check import DepthCheck
 from gsencoder.data.facts import SceneFacts
 from gsencoder.data.seeding.matches import epipolar_distances, fundamental_matrix
-from gsencoder.infer.draw.pictures import contact_sheet, depth_picture
+from gsencoder.infer.draw import contact_sheet, depth_picture
 from gsencoder.types import Views
 from gsencoder.types.orientation import turned
 

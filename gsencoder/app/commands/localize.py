@@ -25,9 +25,9 @@ from gsencoder.core.files import write_json, write_picture
 from gsencoder.core.process import import_ahead
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.up import with_up
-from gsencoder.infer.draw.boxes_ply import write_boxes_ply
-from gsencoder.infer.localize.localization_json import localization_to_json, words_to_json
-from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize
+from gsencoder.infer.boxes import localization_to_json, words_to_json
+from gsencoder.infer.draw import write_boxes_ply
+from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Localization
 
@@ -77,7 +77,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
     words = query_words(config.query, config.queries)
     if config.pictures:
         # Drawing needs torch, which finding boxes does without; it takes as long to load as they take to find.
-        import_ahead("gsencoder.infer.draw.relevancy_views")
+        import_ahead("gsencoder.infer.pictures")
     with summary.step("load"):
         scene = shown_scene(folder, config.photos, config.data)
         # Features of earlier versions may lie in a scene whose up nobody estimated.
@@ -99,7 +99,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
         write_json(target / "words.json", summary.results["words"])
         write_boxes_ply(target / "boxes.ply", scene, localization)
         if config.pictures and scene.views is not None:
-            from gsencoder.infer.draw.relevancy_views import relevancy_pictures
+            from gsencoder.infer.pictures import relevancy_pictures
 
             with summary.step("pictures"):
                 for name, picture in relevancy_pictures(scene, localization, per_word=config.pictures):

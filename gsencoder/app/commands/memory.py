@@ -23,8 +23,8 @@ from gsencoder.data.scenes import find_scenes
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
 from gsencoder.fusion.folder import MEMORY_FILE, file_of_teacher, save_memories, save_tables
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.load_encoder import load_encoder
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.load import load_encoder
 from gsencoder.memory.bank import BankConfig, RawSample
 from gsencoder.models.output_space import check_distinct, name_of_space
 from gsencoder.teachers.build import build_teacher, words_beside, words_by_teacher
@@ -88,7 +88,7 @@ class MemoryCommandConfig(SourceConfig, CommonConfig):
         if self.umap:
             if not self.pictures:
                 raise InputError("umap: expected pictures=1 or more with umap=true; there is no scatter plot without")
-            from gsencoder.infer.draw.component_scatter import check_umap
+            from gsencoder.infer.memory_pictures import check_umap
 
             check_umap()
         if not self.optimize and self.memory.init == "random":
@@ -234,8 +234,7 @@ def _draw(
     folder: Path, scene: Scene, name: str, memory: QueryMemory, sample: RawSample, config: MemoryCommandConfig
 ) -> None:
     """Writes the pictures of one teacher's memory."""
-    from gsencoder.infer.draw.attention_pictures import attention_pictures
-    from gsencoder.infer.draw.component_scatter import component_scatter
+    from gsencoder.infer.memory_pictures import attention_pictures, component_scatter
 
     scatter = component_scatter(memory.bank, sample, umap=config.umap)
     write_picture(folder / f"components.{name}.png", scatter)

@@ -25,7 +25,7 @@ from gsencoder.fusion.package import (
     save_package_within,
     save_ply,
 )
-from gsencoder.infer.localize.localize import select_features
+from gsencoder.infer.localize import select_features
 from gsencoder.memory.index import IndexConfig, index_features, index_within
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig

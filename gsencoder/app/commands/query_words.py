@@ -8,7 +8,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import find_file
 from gsencoder.fusion.folder import WORDS_FILE, table_path
-from gsencoder.infer.localize.localize import select_features
+from gsencoder.infer.localize import select_features
 from gsencoder.text.table import TextTable, load_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, stating_trained, vocabulary_of, words_of_table
 from gsencoder.types import FeatureSpace, Scene

@@ -9,8 +9,8 @@ from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.data.scenes import DistinctPaths, kind_of_path
 from gsencoder.fusion.folder import holds_features
 from gsencoder.infer.ask.ask import Asker
-from gsencoder.infer.ask.question_sets import SetQuestion, caption_question
-from gsencoder.infer.localize.localize import localize
+from gsencoder.infer.ask.questions import SetQuestion, caption_question
+from gsencoder.infer.localize import localize
 from gsencoder.infer.views.targets import best_boxes
 from gsencoder.text.vocabulary import closed_table
 

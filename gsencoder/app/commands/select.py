@@ -18,12 +18,11 @@ from gsencoder.core.process import import_ahead
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
-from gsencoder.infer.localize.localization_json import words_to_json
-from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent
-from gsencoder.infer.select.file_names import file_stems
-from gsencoder.infer.select.labels_file import LABELS_JSON, LABELS_PLY, labels_to_json, write_labels
-from gsencoder.infer.select.select import select
-from gsencoder.infer.select.selection import SelectConfig, Selection
+from gsencoder.infer.boxes import words_to_json
+from gsencoder.infer.localize import LocalizeConfig, describe_absent
+from gsencoder.infer.select import select
+from gsencoder.infer.select_files import LABELS_JSON, LABELS_PLY, file_stems, labels_to_json, write_labels
+from gsencoder.infer.selection import SelectConfig, Selection
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Scene
 
@@ -155,8 +154,7 @@ def _write(
 def _holes(scene: Scene, selection: Selection, config: SelectConfig, track: Progress) -> dict[str, Any]:
     """The holes of each view that has one, and of all views together, as JSON values."""
     # The matrix of a view needs torch.
-    from gsencoder.infer.select.holes import find_holes
-    from gsencoder.infer.select.votes import sampling
+    from gsencoder.infer.selection import find_holes, sampling
 
     assert scene.gaussians is not None
     assert scene.views is not None

@@ -27,9 +27,9 @@ from gsencoder.evaluate.tradeoff.scaling import ScalingConfig, ScalingResult, sc
 from gsencoder.evaluate.tradeoff.stage import HIGHER_IS_BETTER, Inputs, StageName
 from gsencoder.evaluate.tradeoff.sweep import STAGES, StageResult, SweepConfig, check_sweep, sweep_stage
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.teachers.build import TeacherConfig
 from gsencoder.teachers.labels import LabelsConfig
 

@@ -23,7 +23,7 @@ from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.errors import total_fit
 from gsencoder.fusion.folder import HEADS_FILE, save_tables
 from gsencoder.fusion.measured_heads import HeadSet, save_heads
-from gsencoder.infer.encode.chunks import EncodeConfig
+from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
 from gsencoder.teachers.build import words_by_teacher

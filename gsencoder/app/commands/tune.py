@@ -23,8 +23,8 @@ from gsencoder.data.prompts import PromptStore
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.infer.ask.ask import AskConfig
 from gsencoder.infer.ask.server import VlmConfig
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.train.distributed import fail_together, join_processes
 from gsencoder.train.tuning.run import TuneConfig, open_processor, save_tuned, tune

@@ -20,10 +20,10 @@ from gsencoder.data.labels.questions import read_questions
 from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question
+from gsencoder.infer.ask.batch import store_prompt
 from gsencoder.infer.ask.server import VlmConfig
-from gsencoder.infer.ask.stored_prompts import store_prompt
-from gsencoder.infer.localize.localize import LocalizeConfig, select_features
-from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.localize import LocalizeConfig, select_features
+from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.text.vocabulary import TextConfig
 from gsencoder.train.tuning.samples import TuningPair
 from gsencoder.train.tuning.towers import TowerLayout

@@ -18,14 +18,10 @@ from gsencoder.core.process import accept_stop
 from gsencoder.data.scenes import DistinctPaths, SceneConfig, load_scene
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
-from gsencoder.infer.localize.localize import LocalizeConfig, select_features
-from gsencoder.infer.viewer.bundle import Bundle, load_bundle
-from gsencoder.infer.viewer.file_size import fitting_page
-from gsencoder.infer.viewer.page import served_page
-from gsencoder.infer.viewer.page_scene import FileOptions, scene_container
-from gsencoder.infer.viewer.search import SceneSearch
-from gsencoder.infer.viewer.server import ViewServer
-from gsencoder.infer.viewer.shown import drawn_scene
+from gsencoder.infer.localize import LocalizeConfig, select_features
+from gsencoder.infer.page.page import Bundle, FileOptions, fitting_page, load_bundle, scene_container, served_page
+from gsencoder.infer.page.search import SceneSearch, drawn_scene
+from gsencoder.infer.page.server import ViewServer
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene, SceneObject

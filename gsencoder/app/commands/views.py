@@ -17,16 +17,23 @@ from gsencoder.core.files import write_json
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.folder import check_heads_space
 from gsencoder.fusion.measured_heads import find_head, head_space, head_tokens
-from gsencoder.infer.draw.pictures import Picture
-from gsencoder.infer.localize.localization_json import box_to_json, words_to_json
-from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, select_features
+from gsencoder.infer.boxes import box_to_json, words_to_json
+from gsencoder.infer.draw import Picture
+from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize, select_features
 from gsencoder.infer.views.budget import ViewsBudget, check_views_budget
 from gsencoder.infer.views.choose import choose_views
-from gsencoder.infer.views.pictures import describe_view, view_pictures
-from gsencoder.infer.views.selection import ViewsConfig, ViewSet
-from gsencoder.infer.views.targets import Target, best_boxes, targets_of
-from gsencoder.infer.views.tokens import Fit, feature_tokens, token_blends, tower_grid
-from gsencoder.infer.views.write import SHEET, views_to_json, write_pictures
+from gsencoder.infer.views.pictures import (
+    SHEET,
+    Fit,
+    describe_view,
+    feature_tokens,
+    token_blends,
+    tower_grid,
+    view_pictures,
+    views_to_json,
+    write_pictures,
+)
+from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, best_boxes, targets_of
 from gsencoder.render import BlendConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Box, Scene

@@ -7,11 +7,9 @@ from typing import Protocol, runtime_checkable
 from gsencoder.app.runs.promises import report_choice, report_promises
 from gsencoder.app.runs.summary import Summary
 from gsencoder.core.settings import MEGABYTE
-from gsencoder.infer.draw.pictures import Picture
-from gsencoder.infer.views.budget import BudgetViews, ViewsBudget, choose_views_within
-from gsencoder.infer.views.picture_size import pictures_within
-from gsencoder.infer.views.selection import ViewsConfig, ViewSet
-from gsencoder.infer.views.targets import Target
+from gsencoder.infer.draw import Picture
+from gsencoder.infer.views.budget import BudgetViews, ViewsBudget, choose_views_within, pictures_within
+from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet
 from gsencoder.types import Scene
 
 

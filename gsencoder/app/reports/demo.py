@@ -10,7 +10,7 @@ import numpy as np
 from gsencoder.app.reports.parts import add_features, add_views, add_words
 from gsencoder.app.runs.summary import Summary, peak_memory_mb
 from gsencoder.fusion.fuse import Fusion
-from gsencoder.infer.draw.report import HtmlReport
+from gsencoder.infer.page.report import HtmlReport
 from gsencoder.types import GaussianFeatures, Localization, Scene
 
 TEXTS = {

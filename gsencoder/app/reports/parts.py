@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from gsencoder.core.arrays import even_indices
-from gsencoder.infer.draw.pictures import color_bar, depth_picture, fit_pca_colors, pca_picture
-from gsencoder.infer.draw.relevancy_views import relevancy_pictures
-from gsencoder.infer.draw.report import HtmlReport
+from gsencoder.infer.draw import color_bar, depth_picture, fit_pca_colors, pca_picture
+from gsencoder.infer.page.report import HtmlReport
+from gsencoder.infer.pictures import relevancy_pictures
 from gsencoder.render import blend
 from gsencoder.render.images import depth_image, render_image
 from gsencoder.types import GaussianFeatures, Localization, Scene

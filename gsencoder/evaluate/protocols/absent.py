@@ -22,7 +22,7 @@ from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.boxes import is_seen
 from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures, Scene, SceneObject
 

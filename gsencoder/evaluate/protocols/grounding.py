@@ -19,9 +19,8 @@ from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.grounding import GroundedPair, ground, grounding_scores
 from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features
-from gsencoder.infer.localize.gaussian_products import GaussianProducts
-from gsencoder.infer.localize.pixel_relevancy import pixel_features
-from gsencoder.infer.localize.relevancy import word_directions
+from gsencoder.infer.pictures import pixel_features
+from gsencoder.infer.relevancy import GaussianProducts, word_directions
 from gsencoder.render import blend
 from gsencoder.render.rays import strided_lattice
 from gsencoder.text.table import TextEncoder, check_space

@@ -17,7 +17,7 @@ from gsencoder.evaluate.class_scores import class_cosines
 from gsencoder.evaluate.labeled_points import LabeledPoints
 from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
 from gsencoder.evaluate.scores.instance_matches import MIN_REGION
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures, Scene
 

@@ -17,7 +17,7 @@ from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.boxes import Hit, accuracy, queryable_objects, score_boxes
 from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features
-from gsencoder.infer.localize.localize import LocalizeConfig, localize
+from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, Scene
 

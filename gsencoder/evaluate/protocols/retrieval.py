@@ -17,9 +17,8 @@ from gsencoder.data.labels.captions import ViewCaption
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.retrieval import Pooling
 from gsencoder.evaluate.sources import FeatureSource, with_features
-from gsencoder.infer.localize.gaussian_products import GaussianProducts
-from gsencoder.infer.localize.pixel_relevancy import pixel_features
-from gsencoder.infer.localize.relevancy import Mode, word_directions
+from gsencoder.infer.pictures import pixel_features
+from gsencoder.infer.relevancy import GaussianProducts, Mode, word_directions
 from gsencoder.render import blend
 from gsencoder.text.table import TextEncoder, check_space
 from gsencoder.types import GaussianFeatures, QueryMemory, Scene

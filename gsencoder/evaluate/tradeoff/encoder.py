@@ -19,10 +19,10 @@ from gsencoder.evaluate.tradeoff.fused_scene import hit_scores, stored_bytes
 from gsencoder.evaluate.tradeoff.stage import Inputs, Judged, Score, Stage
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.encode.encode import TorchEncoder
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.knobs import ENCODER_KNOBS, EncoderSettings, Graph
-from gsencoder.infer.load_encoder import Encoder
+from gsencoder.infer.load import Encoder
 from gsencoder.infer.onnx.runtime import OnnxEncoder
 from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher

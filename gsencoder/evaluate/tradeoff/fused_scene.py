@@ -16,7 +16,7 @@ from gsencoder.evaluate.tradeoff.stage import Inputs, Score
 from gsencoder.fusion.checkpoint import CachedTeacher
 from gsencoder.fusion.folder import save_features
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.teachers.build import build_teacher, text_table_of
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures, Scene

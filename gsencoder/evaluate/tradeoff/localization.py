@@ -9,7 +9,7 @@ from gsencoder.evaluate.boxes import Hit
 from gsencoder.evaluate.tradeoff.fused_scene import TaughtScene, hit_scores, taught_scene
 from gsencoder.evaluate.tradeoff.stage import Inputs, Judged, Stage
 from gsencoder.infer.knobs import LOCALIZATION_KNOBS
-from gsencoder.infer.localize.localize import LocalizeConfig
+from gsencoder.infer.localize import LocalizeConfig
 
 
 class LocalizationScene:

@@ -18,7 +18,7 @@ from gsencoder.fusion.package import (
     save_package,
     save_ply,
 )
-from gsencoder.infer.localize.localize import select_features
+from gsencoder.infer.localize import select_features
 from gsencoder.memory.index import IndexConfig, index_features
 from gsencoder.types import GaussianFeatures
 

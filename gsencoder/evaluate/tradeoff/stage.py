@@ -14,9 +14,9 @@ from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.infer.encode.chunks import EncodeConfig
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.teachers.build import TeacherConfig
 from gsencoder.teachers.labels import LabelsConfig
 

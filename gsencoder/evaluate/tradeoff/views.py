@@ -15,14 +15,13 @@ from gsencoder.core.errors import InputError
 from gsencoder.evaluate.boxes import queryable_objects
 from gsencoder.evaluate.tradeoff.fused_scene import TaughtScene, taught_scene
 from gsencoder.evaluate.tradeoff.stage import Inputs, Judged, Score, Stage
-from gsencoder.infer.draw.pictures import Picture
+from gsencoder.infer.draw import Picture
 from gsencoder.infer.knobs import VIEWS_KNOBS
-from gsencoder.infer.localize.localize import localize
+from gsencoder.infer.localize import localize
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.pictures import view_pictures
 from gsencoder.infer.views.scores import score_views
-from gsencoder.infer.views.selection import ViewsConfig, ViewSet
-from gsencoder.infer.views.targets import Target, target_of, targets_of
+from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, target_of, targets_of
 from gsencoder.render import BlendConfig
 
 MAX_OBJECTS = 3

@@ -1,26 +1,266 @@
 """From a question about a scene to the prompt of a VLM: words, targets, views, pictures."""
 
+import base64
+import io
+import re
+import unicodedata
 import warnings
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
+from PIL import Image
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.ask.prompts import Task, messages, number_in, prompt_text
-from gsencoder.infer.ask.question_words import ENGLISH, WordRules, words_in
 from gsencoder.infer.ask.server import VlmConfig
-from gsencoder.infer.draw.pictures import Picture
-from gsencoder.infer.localize.localize import LocalizeConfig, describe_absent, localize, spacing_of
+from gsencoder.infer.draw import Picture
+from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize, spacing_of
+from gsencoder.infer.views.candidates import FreeSpace
 from gsencoder.infer.views.choose import choose_views
-from gsencoder.infer.views.free_space import FreeSpace
-from gsencoder.infer.views.pictures import picture_kinds, view_pictures
-from gsencoder.infer.views.selection import ViewsConfig, ViewSet
-from gsencoder.infer.views.targets import Target, best_boxes, target_of, targets_of
+from gsencoder.infer.views.photographs import resized_picture
+from gsencoder.infer.views.pictures import PictureKind, picture_kinds, view_pictures
+from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, best_boxes, target_of, targets_of
+from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.types import Box, Scene
+
+Task = Literal["answer", "ground", "caption"]
+ImageFormat = Literal["jpeg", "png"]
+
+SETTING = "The pictures show one place from several viewpoints."
+SHOWN_BY = {
+    "photograph": "They are photographs.",
+    "render": "They are rendered from a 3D reconstruction: blurred or black parts were not seen well and mean nothing.",
+    "both": "Some are photographs. The others are rendered from a 3D reconstruction: blurred or black parts of these "
+    "were not seen well and mean nothing.",
+}
+ROLES = {
+    "answer": "Answer the question about the place in a few words. Say 'unknown' if the pictures do not tell.",
+    "ground": "Numbered marks stand on things. Answer with the number of the one that is meant, and nothing else; "
+    "answer 0 if none is.",
+    "caption": "Describe the thing in one or two sentences: what it is, how it looks, and where it stands in relation "
+    "to what is near it.",
+}
+MARKED = "It carries the mark 1 in the pictures."
+PLACED = "It stands in the middle of most of the pictures."
+THOUGHT = re.compile(r"^.*</think>", re.DOTALL)
+NEITHER = re.compile(r"\W*(none|neither|no (mark|number)|not any)\b", re.IGNORECASE)
+ALONE = re.compile(r"(?<![\d.,/-])\d{1,6}(?!\d|[.,/-]\d)")
+CALLED = re.compile(r"(?:\bmark|\bmarked|\bnumber|\bno\.?|#)[\s:#*]*(\d{1,6})(?!\d|[.,/-]\d)", re.IGNORECASE)
+NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+
+
+def prompt_text(
+    task: Task,
+    question: str,
+    names: Sequence[str],
+    *,
+    marks: Collection[int],
+    kinds: Collection[PictureKind],
+    probabilities: Sequence[float] = (),
+    absent: Mapping[str, float] = {},
+) -> str:
+    """What is asked, in words.
+
+    Args:
+        task: see the module.
+        question: the user's; a caption needs none.
+        names: of what was looked for and found, in the order of their marks; empty where a thing has no name.
+        marks: the numbers, from 1, that the pictures carry.
+        kinds: of the pictures.
+        probabilities: that each of the names is right, in their order; empty where nothing says.
+        absent: words that were looked for and not found, and the probability that they are there after all.
+
+    Raises:
+        InputError: no question for a task that needs one; nothing to ground or caption.
+    """
+    question = question.strip()
+    check_question(task, question)
+    if task != "answer" and not names:
+        raise InputError(f"task={task}: nothing was found that could be meant; give query= or aabb=")
+    if task == "ground" and not marks:
+        raise InputError("task=ground: needs marks, and no picture carries one")
+    shown_by = "both" if len(set(kinds)) > 1 else next(iter(kinds))
+    lines = [f"{SETTING} {SHOWN_BY[shown_by]}", ROLES[task]]
+    if task == "caption":
+        if names[0]:
+            lines.append(f"The thing is the {names[0]}.")
+        lines.append(MARKED if 1 in marks else PLACED)
+    elif marks:
+        legend = (f"{number} = {names[number - 1] or 'a thing'}" for number in sorted(marks))
+        lines.append(f"Marks: {'; '.join(legend)}.")
+        if probabilities:
+            sure = (f"mark {number} {probabilities[number - 1]:.2f}" for number in sorted(marks))
+            lines.append(f"Probability that the name is right: {', '.join(sure)}.")
+    if absent:
+        missing = (f"{word} (probability {value:.2f})" for word, value in absent.items())
+        lines.append(f"Looked for and probably absent: {', '.join(missing)}.")
+    if question:
+        lines.append(f"Question: {question}" if task == "answer" else f"Meant is: {question}")
+    return "\n".join(lines)
+
+
+def check_question(task: Task, question: str) -> None:
+    """Complains where a task needs a question and there is none, or one that cannot be sent.
+
+    Raises:
+        InputError: see above.
+    """
+    if not question.strip() and task != "caption":
+        raise InputError("question= is missing: what to ask about the scene")
+    try:
+        question.encode()
+    except UnicodeEncodeError as error:
+        raise InputError(f"question: holds what is no character, at {error.start}") from None
+
+
+def messages(text: str, pictures: Sequence[Picture], *, side: int, kind: ImageFormat) -> list[dict[str, Any]]:
+    """One message of the user: pictures, then words.
+
+    Args:
+        text: of `prompt_text`.
+        pictures: what the model sees, in order.
+        side: longer pictures are made smaller, pixels.
+        kind: how they are written.
+    """
+    parts: list[dict[str, Any]] = [
+        {"type": "image_url", "image_url": {"url": data_url(picture, side=side, kind=kind)}} for picture in pictures
+    ]
+    return [{"role": "user", "content": [*parts, {"type": "text", "text": text}]}]
+
+
+def data_url(picture: Picture, *, side: int, kind: ImageFormat) -> str:
+    """A picture as the protocol carries it."""
+    data = encoded_picture(picture, side=side, kind=kind)
+    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def encoded_picture(picture: Picture, *, side: int, kind: ImageFormat) -> bytes:
+    """A picture as the bytes of a JPEG or PNG file.
+
+    Args:
+        picture: uint8 [H, W, 3].
+        side: a longer picture is made smaller, pixels.
+        kind: of the file.
+    """
+    height, width = picture.shape[:2]
+    if max(width, height) > side:
+        factor = side / max(width, height)
+        picture = resized_picture(picture, (max(1, round(width * factor)), max(1, round(height * factor))))
+    held = io.BytesIO()
+    Image.fromarray(picture).save(held, format=kind, **({"quality": 92} if kind == "jpeg" else {}))
+    return held.getvalue()
+
+
+def number_in(text: str, count: int) -> int | None:
+    """The mark that an answer names, of marks 1 to `count`; 0 for none of them; None where it names no mark or several.
+
+    Numbers that are called marks come before others; what a model thought before it answered is left out.
+    """
+    answer = THOUGHT.sub("", text).strip()
+    if NEITHER.match(answer):
+        return 0
+    for pattern in (CALLED, ALONE):
+        numbers = {number for number in map(int, pattern.findall(answer)) if number <= count}
+        if numbers:
+            return numbers.pop() if len(numbers) == 1 else None
+    word = re.sub(r"\W", "", answer).lower()
+    return NUMBERS.index(word) if word in NUMBERS[: count + 1] else None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WordRules:
+    """Words of a language that tell a name in a question from a verb or a color. Those of English were listed by hand.
+
+    Attributes:
+        pronouns: a name right after one of these is a verb, as in "do you watch".
+        auxiliaries: such a name right before a pronoun is a verb, as in "can you".
+        colors: such a name right before another name is its color, as in "the orange chair".
+    """
+
+    pronouns: frozenset[str] = frozenset({"i", "you", "we", "they", "he", "she", "one", "someone", "anyone"})
+    auxiliaries: frozenset[str] = frozenset({"can"})
+    colors: frozenset[str] = frozenset({"orange", "peach", "plum", "lime", "olive", "rose", "lavender", "chocolate"})
+
+
+ENGLISH = WordRules()
+
+
+@dataclass(frozen=True, slots=True)
+class _Token:
+    """A word, and whether nothing but a blank or a hyphen stands between it and the one before."""
+
+    text: str
+    start: int
+    end: int
+    joined: bool
+
+
+def words_in(text: str, table: TextTable, rules: WordRules = ENGLISH) -> tuple[str, ...]:
+    """The names of a table that a text holds, in its order; of names within names the longest.
+
+    Words of one name stand together: "table, lamp" holds no table lamp. A name may be in its singular or plural.
+
+    Args:
+        text: a question.
+        table: whose names are looked for.
+        rules: which words make a name a verb or a color.
+    """
+    text = unicodedata.normalize("NFKC", text)
+    tokens = _tokens(text)
+    longest = max((len(name.split()) + name.count("-") for name in table.names), default=0)
+    matches: list[tuple[int, int, str]] = []
+    start = 0
+    while start < len(tokens):
+        row, length = _longest_name(text, tokens, start, longest, table)
+        if row is not None and not (length == 1 and _is_verb(tokens, start, rules)):
+            matches.append((start, start + length, table.names[row]))
+        start += length
+    begins = {begin for begin, _, _ in matches}
+    # A color belongs to the name after it.
+    names = [
+        name for _, end, name in matches if not (name.lower() in rules.colors and end in begins and tokens[end].joined)
+    ]
+    return tuple(dict.fromkeys(names))
+
+
+def _longest_name(
+    text: str, tokens: list[_Token], start: int, longest: int, table: TextTable
+) -> tuple[int | None, int]:
+    """The row of the longest name that begins at a token, and of how many tokens it is; None and 1 where none does."""
+    count = 1
+    while count < longest and start + count < len(tokens) and tokens[start + count].joined:
+        count += 1
+    for length in range(count, 0, -1):
+        span = tokens[start : start + length]
+        for name in (text[span[0].start : span[-1].end], " ".join(token.text for token in span)):
+            row = table.find(name)
+            if row is not None:
+                return row, length
+    return None, 1
+
+
+def _is_verb(tokens: list[_Token], position: int, rules: WordRules) -> bool:
+    before = tokens[position - 1].text.lower() if position and tokens[position].joined else ""
+    after = tokens[position + 1].text.lower() if position + 1 < len(tokens) and tokens[position + 1].joined else ""
+    return before in rules.pronouns or (tokens[position].text.lower() in rules.auxiliaries and after in rules.pronouns)
+
+
+def _tokens(text: str) -> list[_Token]:
+    """Words of letters, marks and digits, without the ending of a genitive."""
+    wordly = "".join("w" if unicodedata.category(letter)[0] in "LMN" else letter for letter in text)
+    tokens: list[_Token] = []
+    last = 0
+    for match in re.finditer(r"w+(?:['’]w+)*", wordly):
+        word = re.sub(r"['’]s?$", "", text[match.start() : match.end()], flags=re.IGNORECASE)
+        between = text[last : match.start()]
+        joined = bool(tokens) and (between.isspace() or between in ("-", "\N{HYPHEN}"))
+        tokens.append(_Token(word, match.start(), match.start() + len(word), joined))
+        last = match.end()
+    return tokens
+
 
 MAX_CACHED_PICTURES = 8
 """Sets of pictures that are kept for the next question; each is some megabytes."""

@@ -10,16 +10,24 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float16
+
 from gsencoder.core.errors import InputError, SceneWarning, WriteError, about
 from gsencoder.core.files import plain, sealed, unsealed, write_bytes, write_json
 from gsencoder.core.process import Clock, Track, untracked
+from gsencoder.data.labels.captions import wrapped_caption
+from gsencoder.data.labels.files import box_corners
+from gsencoder.data.prompts import PromptStore, StoredPrompt
 from gsencoder.data.splats.files import fingerprint
-from gsencoder.infer.ask.ask import Asker, Prompt, Question, chosen_mark, prompt_messages
-from gsencoder.infer.ask.questions import BatchQuestion, read_answers
-from gsencoder.infer.ask.reply import Reply, ServerError
-from gsencoder.infer.ask.server import MODEL_VARIABLE, URL_VARIABLE, VlmServer, request_body
-from gsencoder.infer.localize.localization_json import box_to_json
-from gsencoder.infer.views.write import views_to_json, write_pictures
+from gsencoder.infer.ask.ask import THOUGHT, Asker, Prompt, Question, chosen_mark, encoded_picture, prompt_messages
+from gsencoder.infer.ask.questions import BatchQuestion, Benchmark, SetQuestion, read_answers
+from gsencoder.infer.ask.server import MODEL_VARIABLE, URL_VARIABLE, Reply, ServerError, VlmServer, request_body
+from gsencoder.infer.boxes import box_to_json
+from gsencoder.infer.views.pictures import Fit, feature_tokens, token_blends, views_to_json, write_pictures
+from gsencoder.infer.views.targets import ViewSet
+from gsencoder.render import BlendConfig
+from gsencoder.types import GaussianFeatures, Gaussians
 
 ANSWER, ANSWERS, PROMPT, REQUEST = "answer.json", "answers.jsonl", "prompt.txt", "request.json"
 TRANSPORT = ("key", "timeout", "longest", "retries", "stream")
@@ -256,3 +264,133 @@ def _depends_on(asker: Asker, dry_run: bool, made_from: Mapping[str, Any]) -> di
 
 def _line(row: Mapping[str, Any]) -> bytes:
     return json.dumps(plain(row), ensure_ascii=False).encode("utf-8", "backslashreplace") + b"\n"
+
+
+CLASSES = 18
+"""Classes of ScanNet's benchmark, over which `sem_prob` of Scan2Cap's predictions is even: `ask` names none."""
+
+
+def predictions(
+    benchmark: Benchmark,
+    answered: Sequence[tuple[SetQuestion, Mapping[str, Any]]],
+    unanswered: Sequence[SetQuestion] = (),
+) -> Any:
+    """What a benchmark takes.
+
+    - ScanQA: a list of {scene_id, question_id, answer_top10: [the answer], bbox}, the box being that of the best target
+      where there is one.
+    - SQA3D: a list of {scene_id, question_id, situation, question, answer}.
+    - ScanRefer: a list of {scene_id, object_id, ann_id, bbox, bboxes}: the box of the mark that the answer names, and
+      the same before those of the other marks; null and none where it names no mark, and for what is unanswered.
+    - Scan2Cap: for each scene a list of {caption, box, obj_prob, sem_prob}, captions in lower case,
+      between "sos" and "eos".
+
+    Boxes are eight corners. Of an answer the case and a full stop at its end are left out (`short_answer`).
+
+    Args:
+        benchmark: whose form is wanted.
+        answered: questions with the rows of `gsencoder.infer.ask.batch.ask_questions`.
+        unanswered: questions without one; besides ScanRefer's they have no entry.
+    """
+    if benchmark == "scan2cap":
+        captions: dict[str, list[dict[str, Any]]] = {}
+        for question, row in answered:
+            probabilities = {"obj_prob": [0.0, 1.0], "sem_prob": [1 / CLASSES] * CLASSES} | dict(question.keys)
+            entry = {
+                "caption": wrapped_caption(answer_text(row["answer"]).lower()),
+                "box": target_corners(row["targets"][0]),
+                **probabilities,
+            }
+            captions.setdefault(question.scene, []).append(entry)
+        return captions
+    if benchmark == "scanrefer":
+        missing: list[tuple[SetQuestion, Mapping[str, Any]]] = [(question, {}) for question in unanswered]
+        return [{**question.keys, **_referred(row)} for question, row in (*answered, *missing)]
+    if benchmark == "sqa3d":
+        return [{**question.keys, "answer": short_answer(row["answer"])} for question, row in answered]
+    rows = []
+    for question, row in answered:
+        box = {"bbox": target_corners(row["targets"][0])} if row["targets"] else {}
+        rows.append({**question.keys, "answer_top10": [short_answer(row["answer"])], **box})
+    return rows
+
+
+def _referred(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The box that an answer means, and after it the others that it might have meant."""
+    if not row.get("mark"):
+        return {"bbox": None, "bboxes": []}
+    corners = [target_corners(target) for target in row["targets"]]
+    meant = corners.pop(row["mark"] - 1)
+    return {"bbox": meant, "bboxes": [meant, *corners]}
+
+
+def target_corners(target: Mapping[str, Any]) -> list[list[float]]:
+    """The eight corners of a target's axis-aligned box."""
+    low, high = ([float(value) for value in target[name]] for name in ("aabb_min", "aabb_max"))
+    return box_corners((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+
+
+def answer_text(answer: str) -> str:
+    """An answer without what a model thought before it, on one line."""
+    return " ".join(THOUGHT.sub("", answer).split())
+
+
+def short_answer(answer: str) -> str:
+    """An answer as the benchmarks write answers: `answer_text` in lower case and without a full stop at its end."""
+    return answer_text(answer).lower().rstrip(".").strip()
+
+
+def store_prompt(
+    store: PromptStore,
+    key: str,
+    asker: Asker,
+    question: Question,
+    *,
+    features: GaussianFeatures | None = None,
+    grid: tuple[int, int] = (1, 1),
+    fit: Fit = "stretch",
+) -> StoredPrompt:
+    """Writes the prompt that `ask` would send for a question.
+
+    Args:
+        store: to write to.
+        key: states all that the prompt is made from.
+        asker: of the scene.
+        question: about it.
+        features: of the scene's Gaussians; they are rendered in each view as tokens of a vision tower; None = no
+            tokens.
+        grid: rows and columns of the tower's patches.
+        fit: how the tower's preprocessing makes pictures square.
+
+    Raises:
+        InputError: see `Asker.prompt`.
+
+    Warns:
+        SceneWarning: nothing was looked for, or nothing of it was found.
+    """
+    prompt = asker.prompt(question)
+    side, kind = asker.vlm.image_side, asker.vlm.image_format
+    pictures = [encoded_picture(each, side=side, kind=kind) for each in prompt.pictures]
+    if features is None:
+        return store.add(key, prompt.text, pictures)
+    assert asker.scene.gaussians is not None
+    tokens = view_tokens(asker.scene.gaussians, prompt.views, features, grid, fit)
+    return store.add(key, prompt.text, pictures, tokens, features.space.describe())
+
+
+def view_tokens(
+    gaussians: Gaussians, views: ViewSet, features: GaussianFeatures, grid: tuple[int, int], fit: Fit
+) -> Float16[np.ndarray, "V P D"]:
+    """Rendered features of chosen views on the grid of a tower.
+
+    Args:
+        gaussians: of the scene.
+        views: as chosen.
+        features: of the Gaussians.
+        grid: rows and columns.
+        fit: see `gsencoder.infer.views.pictures.tower_grid`.
+    """
+    config = BlendConfig(near=min(BlendConfig().near, views.near))
+    tokens = feature_tokens(token_blends(gaussians, views.cameras, grid, fit=fit, config=config), features)
+    limit = float(np.finfo(np.float16).max)
+    return tokens.clamp(-limit, limit).numpy().astype(np.float16)

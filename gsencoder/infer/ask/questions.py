@@ -1,17 +1,28 @@
 """Files of questions and of answers: JSON lines, one each."""
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from gsencoder.core.errors import InputError, about, readable
-from gsencoder.core.files import MODEL_BYTES, check_written, read_foreign
-from gsencoder.data.labels.files import read_checked_text
-from gsencoder.infer.ask.ask import Question
-from gsencoder.infer.ask.prompts import Task, check_question
+from gsencoder.core.errors import InputError, SceneWarning, about, counted, listed, readable
+from gsencoder.core.files import MODEL_BYTES, check_written, open_foreign, read_foreign
+from gsencoder.data.labels.expressions import Expression, read_scanrefer
+from gsencoder.data.labels.files import (
+    Corner,
+    corner_bounds,
+    entries_of,
+    object_of,
+    read_benchmark_json,
+    read_checked_text,
+    scene_name,
+)
+from gsencoder.data.labels.questions import Question as TruthQuestion
+from gsencoder.data.labels.questions import read_questions as read_truth
+from gsencoder.infer.ask.ask import Question, Task, check_question
 
 MAX_FILE_BYTES = 1 << 26
 """Bytes of a file of questions."""
@@ -122,3 +133,237 @@ def read_answers(path: Path) -> dict[str, dict[str, Any]]:
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: line {number} is no answer; give resume=false to ask anew") from error
     return questions
+
+
+Benchmark = Literal["scanqa", "sqa3d", "scanrefer", "scan2cap"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SetQuestion:
+    """A question of a set.
+
+    Attributes:
+        scene: that it is about.
+        question: with an id that is unique in the set.
+        keys: by which the benchmark's predictions name it, such as question_id.
+    """
+
+    scene: str
+    question: BatchQuestion
+    keys: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuestionSet:
+    """The questions of a benchmark's file.
+
+    Attributes:
+        benchmark: whose form the file and the predictions have.
+        questions: in the order of the file.
+        names: for captions without given boxes, the names of the objects of each scene, whose boxes are localized.
+    """
+
+    benchmark: Benchmark
+    questions: tuple[SetQuestion, ...]
+    names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def of_scene(self, scene: str) -> tuple[SetQuestion, ...]:
+        """The questions about a scene."""
+        return tuple(each for each in self.questions if each.scene == scene)
+
+    def scenes(self) -> dict[str, int]:
+        """The scenes, and how many questions there are about each: with `names` the number of these."""
+        counts: dict[str, int] = {scene: len(names) for scene, names in self.names.items()}
+        for each in self.questions:
+            counts[each.scene] = counts.get(each.scene, 0) + 1
+        return counts
+
+
+def is_question_set(path: Path) -> bool:
+    """Whether a file holds one JSON value, as the benchmarks' do, and not one question a line.
+
+    A file that cannot be read is no set; whoever reads it as lines says what is wrong.
+    """
+    try:
+        with open_foreign(path) as stream:
+            start = stream.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
+            if not start.startswith(b"{"):
+                return start.startswith(b"[")
+            stream.seek(0)
+            content = json.loads(stream.read().decode("utf-8-sig"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return "question" not in content and "query" not in content and "aabb" not in content
+
+
+def read_question_set(path: Path, task: Task = "answer", proposals: str = "") -> QuestionSet:
+    """Reads a benchmark's file, recognized by its content.
+
+    Questions of ScanQA and SQA3D are answered; a situation is said before its question. Descriptions of ScanRefer are
+    grounded or, with `task="caption"`, the objects described are captioned: in the boxes of the file (`bbox`, as
+    Scan2Cap's has them), in those of `proposals`, or in those that are localized. Answers in the file are not read.
+
+    Args:
+        path: of the file.
+        task: "answer" stands for what the benchmark asks.
+        proposals: a file of boxes, {scene: [{"box": eight corners}, …]} as Scan2Cap's predictions have them;
+            "localize" = the boxes of the objects' names; empty = those of the file.
+
+    Raises:
+        InputError: no such file, another task than the benchmark's, or boxes are missing.
+
+    Warns:
+        SceneWarning: scenes without captions, since they have no proposals or no descriptions.
+    """
+    content = read_benchmark_json(path)
+    first = content[0] if isinstance(content, list) and content and isinstance(content[0], dict) else {}
+    if isinstance(content, dict) and "questions" not in content and "annotations" not in content:
+        _refuse_other_object(content, path)
+        _check_task(path, "Scan2Cap's boxes", task, ("answer", "caption"))
+        return QuestionSet(benchmark="scan2cap", questions=_captions(_read_boxes(content, path)))
+    if isinstance(content, list) and not content:
+        raise InputError(f"questions: {path} holds none")
+    if "description" in first:
+        _check_task(path, "ScanRefer's descriptions", task, ("answer", "ground", "caption"))
+        expressions = read_scanrefer(path)
+        return _captioned(expressions, path, proposals) if task == "caption" else _grounded(expressions)
+    questions = read_truth(path, answered=False)
+    benchmark: Benchmark = questions[0].dataset if questions else "scanqa"
+    _check_task(path, "ScanQA's questions" if benchmark == "scanqa" else "SQA3D's questions", task, ("answer",))
+    if proposals:
+        raise InputError("proposals: are for captions; leave it out")
+    return QuestionSet(benchmark=benchmark, questions=tuple(map(_answered, questions)))
+
+
+def caption_question(scene: str, name: str, aabb: tuple[Corner, Corner], keys: Mapping[str, Any]) -> SetQuestion:
+    """The question for a caption of what is in a box.
+
+    Args:
+        scene: of the box.
+        name: of the question, unique in the scene.
+        aabb: lower and upper corner in world coordinates.
+        keys: what the prediction says besides caption and box, such as probabilities.
+    """
+    question = Question(task="caption", aabb=(*aabb[0], *aabb[1]))
+    return SetQuestion(scene=scene, question=BatchQuestion(id=f"{scene}/{name}", question=question), keys=keys)
+
+
+def _refuse_other_object(content: Mapping[str, Any], path: Path) -> None:
+    """Raises an error about an object that cannot be Scan2Cap's boxes by scene."""
+    wrong = next((key for key, rows in content.items() if not _are_boxes(rows)), None)
+    if wrong is not None:
+        raise InputError(
+            f"{path}: expected a list of ScanQA's or ScanRefer's entries, SQA3D's object with questions, or "
+            f"Scan2Cap's {{scene: [{{box}}, …]}}; got an object with {listed([key[:40] for key in content], 4)}, and "
+            f"no "
+            f"list of boxes as {wrong[:40]}"
+        )
+
+
+def _are_boxes(rows: Any) -> bool:
+    return isinstance(rows, list) and all(isinstance(row, dict) and "box" in row for row in rows)
+
+
+def _check_task(path: Path, subject: str, task: Task, allowed: Sequence[str]) -> None:
+    if task not in allowed:
+        raise InputError(f"task={task}: {path} holds {subject}; expected task={' or '.join(allowed)}")
+
+
+def _answered(question: TruthQuestion) -> SetQuestion:
+    keys = {"scene_id": question.scene, "question_id": question.id}
+    if question.situation:
+        keys |= {"situation": question.situation, "question": question.text}
+    return SetQuestion(
+        scene=question.scene,
+        question=BatchQuestion(id=question.id, question=Question(text=question.situated_text)),
+        keys=keys,
+    )
+
+
+def _grounded(expressions: Sequence[Expression]) -> QuestionSet:
+    return QuestionSet(
+        benchmark="scanrefer",
+        questions=tuple(
+            SetQuestion(
+                scene=each.scene,
+                question=BatchQuestion(
+                    id=f"{each.scene}/{each.object_id}/{each.annotation}",
+                    question=Question(text=each.text, task="ground"),
+                ),
+                keys={"scene_id": each.scene, "object_id": str(each.object_id), "ann_id": each.annotation},
+            )
+            for each in expressions
+        ),
+    )
+
+
+def _captioned(expressions: Sequence[Expression], path: Path, proposals: str) -> QuestionSet:
+    if proposals == "localize":
+        names: dict[str, tuple[str, ...]] = {}
+        for each in expressions:
+            name = each.object_name.replace("_", " ")
+            names[each.scene] = tuple(dict.fromkeys((*names.get(each.scene, ()), name)))
+        return QuestionSet(benchmark="scan2cap", questions=(), names=names)
+    if proposals:
+        proposed = read_benchmark_json(Path(proposals))
+        boxes = _read_boxes(object_of(proposed, proposals, "the boxes of each scene"), Path(proposals))
+        scenes = dict.fromkeys(each.scene for each in expressions)
+        chosen = {name: rows for name, rows in boxes.items() if name in scenes}
+        if not chosen:
+            raise InputError(
+                f"proposals: {proposals} has boxes in {listed(sorted(boxes), 3)}, and {path} describes objects of "
+                f"{listed(sorted(scenes), 3)}; expected the same scenes"
+            )
+        _warn_of_others([name for name in scenes if name not in boxes], f"{proposals} has no boxes in")
+        _warn_of_others([name for name in boxes if name not in scenes], f"{path} describes no object of")
+        return QuestionSet(benchmark="scan2cap", questions=_captions(chosen))
+    unboxed = [each for each in expressions if each.aabb is None]
+    if unboxed:
+        raise InputError(
+            f"{path}: {len(unboxed)} of {len(expressions)} descriptions have no bbox to be captioned; give proposals= "
+            "(a file of boxes, or localize)"
+        )
+    objects = {(each.scene, each.object_id): each.aabb for each in expressions}
+    return QuestionSet(
+        benchmark="scan2cap",
+        questions=tuple(
+            caption_question(scene, str(number), aabb, {})
+            for (scene, number), aabb in objects.items()
+            if aabb is not None
+        ),
+    )
+
+
+def _warn_of_others(scenes: Sequence[str], why: str) -> None:
+    """Says which scenes have no captions."""
+    if scenes:
+        warnings.warn(
+            f"proposals: {why} {counted(len(scenes), 'scene')}, of which there are no captions: {listed(scenes)}",
+            SceneWarning,
+            stacklevel=4,
+        )
+
+
+def _read_boxes(
+    content: Mapping[str, Any], path: Path
+) -> dict[str, list[tuple[tuple[Corner, Corner], dict[str, Any]]]]:
+    """The boxes of each scene, and what else a prediction says of them; captions are not looked at."""
+    boxes: dict[str, list[tuple[tuple[Corner, Corner], dict[str, Any]]]] = {}
+    for name, rows in content.items():
+        scene = scene_name(name, str(path))
+        for entry, where in entries_of(rows, path, "a box of eight corners", key=scene):
+            keys = {key: entry[key] for key in ("sem_prob", "obj_prob") if key in entry}
+            boxes.setdefault(scene, []).append((corner_bounds(entry.get("box"), where, "box"), keys))
+    if not boxes:
+        raise InputError(f"{path}: holds no boxes")
+    return boxes
+
+
+def _captions(
+    boxes: Mapping[str, Sequence[tuple[tuple[Corner, Corner], Mapping[str, Any]]]],
+) -> tuple[SetQuestion, ...]:
+    return tuple(
+        caption_question(scene, str(number), aabb, keys)
+        for scene, rows in boxes.items()
+        for number, (aabb, keys) in enumerate(rows)
+    )

@@ -1,21 +1,297 @@
 """A vision-language model behind a server that speaks OpenAI's chat protocol: vLLM, transformers serve, llama.cpp's
-server, a cloud."""
+server, a cloud.
+"""
 
+import importlib
 import itertools
 import os
+import re
 import threading
 import time
 import traceback
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from html.entities import html5
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.ask.http_limits import ReplyGuard
-from gsencoder.infer.ask.key_filter import KeyFilter
-from gsencoder.infer.ask.reply import Heard, Reply, ServerError, cause
+
+LARGEST_REPLY = 1 << 22
+"""Bytes of any reply: error pages and lists of models take at most a megabyte or two. JSON of empty lists takes fifty
+times its bytes when it is parsed, so this is 200 MB of memory at worst."""
+BYTES_PER_TOKEN = 1 << 10
+"""Further bytes for each token of an answer: a streamed token comes in a JSON object of 200 to 500 bytes."""
+
+
+class ReplyGuard:
+    """A response hook of the HTTP client: it runs before the body is read and before a redirect is followed.
+
+    It never raises, as the openai client would send the request again.
+
+    Attributes:
+        fault: why the last response was refused; empty where it was not.
+    """
+
+    def __init__(self, max_tokens: int) -> None:
+        """Args:
+        max_tokens: of an answer.
+        """
+        self.fault = ""
+        self._largest = LARGEST_REPLY + BYTES_PER_TOKEN * max_tokens
+
+    def __call__(self, response: Any) -> None:
+        """Args:
+        response: of httpx, or of httpx2 since openai 3.
+        """
+        self.fault = ""
+        self._check_redirect(response)
+        headers, coding = response.headers, response.headers.get("content-encoding", "identity").strip().lower()
+        length = headers.get("content-length", "")
+        if coding not in ("", "identity"):
+            # The client would unpack it before anybody could count its bytes.
+            self._refuse(response, f"compressed its reply ({coding[:40]}), although it was asked not to")
+            del headers["content-encoding"]
+        elif length.isdecimal() and int(length[:20]) > self._largest:
+            self._refuse(response, self._too_large())
+        response.stream = _stream(response, self._bounded(response, response.stream))
+
+    def _check_redirect(self, response: Any) -> None:
+        """Redirects within the server are followed; others would take question and pictures to whom nobody named."""
+        here, location = response.request.url, response.headers.get("location")
+        if location is None or not 300 <= response.status_code < 400:
+            return
+        try:
+            # Read as the client does, which mends an address without a host in its own way.
+            there = type(here)(location)
+            if there.scheme and not there.host:
+                raise ValueError("an address without a host")
+            there = here.join(there)
+            same = _origin(there) == _origin(here)
+            named = f"{there.scheme}://{there.netloc.decode('ascii', 'replace').rpartition('@')[2]}"
+        except Exception:  # the client has errors of its own for each part of an address
+            same, named = False, "what is no address"
+        if not same:
+            # Without the header nobody follows, and the client reports the status.
+            del response.headers["location"]
+            self._refuse(
+                response,
+                f"redirects to {named[:120]} ({response.status_code}), where nothing is sent; "
+                "give that address as vlm.base_url if you trust it",
+            )
+
+    def _refuse(self, response: Any, fault: str) -> None:
+        self.fault = self.fault or fault
+        # openai's own header: no status of a reply that was refused is a reason to ask again.
+        response.headers["x-should-retry"] = "false"
+
+    def _too_large(self) -> str:
+        return f"sent more than {self._largest:,} bytes, which no answer needs; the rest was not read"
+
+    def _bounded(self, response: Any, body: Iterable[bytes]) -> Iterator[bytes]:
+        """The parts of a body until they are too many; none of a reply that was refused."""
+        size = 0
+        for part in () if self.fault else body:
+            size += len(part)
+            if size > self._largest:
+                self._refuse(response, self._too_large())
+                return
+            yield part
+
+
+def _origin(url: Any) -> tuple[str, str, int | None]:
+    default = {"http": 80, "https": 443}.get(url.scheme)
+    return url.scheme, url.host, url.port or default
+
+
+def _stream(response: Any, parts: Iterator[bytes]) -> Any:
+    """A body of these parts that closes the response's own."""
+    library = importlib.import_module(type(response).__module__.partition(".")[0])
+    close: Callable[[], None] = response.stream.close
+
+    class Bounded(library.SyncByteStream):  # type: ignore[name-defined]
+        def __iter__(self) -> Iterator[bytes]:
+            return parts
+
+        def close(self) -> None:
+            close()
+
+    return Bounded()
+
+
+LEAST_KEY = 6
+"""Shorter keys are placeholders, which servers at home are given; any text may hold their letters."""
+LEAST_PART = 12
+"""Shorter beginnings of a key are no secret, and mostly its maker's name."""
+LONGEST_PART = 256
+"""Longer keys, which are compiled for minutes, are recognized by their beginning; what follows is compared letter by
+letter."""
+REDACTED = "(key)"
+
+
+class KeyFilter:
+    """Removes a key from text, in every spelling that a server gives it when it repeats a request: as it is, quoted for
+    a URL, escaped for HTML, JSON or Python, several of these at once, or cut off in its second half."""
+
+    def __init__(self, key: str) -> None:
+        self._pattern: re.Pattern[str] | None = None
+        self._key, self._rest = key, key[LONGEST_PART:]
+        if len(key) >= LEAST_KEY:
+            spelt = [_spellings(letter) for letter in key[:LONGEST_PART]]
+            least = max(LEAST_PART, (len(spelt) + 1) // 2)
+            self._pattern = re.compile("".join(spelt[:least]) + "".join(f"{each}?" for each in spelt[least:]))
+
+    def clean(self, text: str, longest: int | None = None) -> str:
+        """Text without the key, and only then cut to `longest` characters."""
+        parts, at = [], 0
+        # Of a long key with letters that begin escapes, the letters are not always told apart.
+        text = text.replace(self._key, REDACTED) if self._pattern else text
+        while self._pattern and (match := self._pattern.search(text, at)):
+            parts += [text[at : match.start()], REDACTED]
+            at = match.end()
+            for letter in self._rest:
+                if not (match := _pattern_of(letter).match(text, at)):
+                    break
+                at = match.end()
+        return "".join([*parts, text[at:]])[:longest]
+
+    def is_in(self, text: str) -> bool:
+        """Whether text holds the key."""
+        return self._pattern is not None and self._pattern.search(text) is not None
+
+
+@cache
+def _pattern_of(letter: str) -> re.Pattern[str]:
+    return re.compile(_spellings(letter))
+
+
+@cache
+def _spellings(letter: str) -> str:
+    """A pattern of one character, escaped never, once, or several times; no part of it repeats without end, as time
+    would grow with the square of the text."""
+    code = ord(letter)
+    names = sorted(name for name, value in html5.items() if value == letter and name.endswith(";"))
+    entities = "|".join([f"#0{{0,6}}{code};", f"#[xX]0{{0,6}}(?i:{code:x});", *names])
+    # The letter itself comes last, as it may begin its own escape.
+    return (
+        rf"(?:%(?:25){{0,4}}(?i:{code:02x})|&(?:amp;){{0,4}}(?:{entities})|\\{{1,8}}(?:u00|x)(?i:{code:02x})"
+        rf"|\\{{0,8}}{re.escape(letter)}{'|[+]' if letter == ' ' else ''})"
+    )
+
+
+MAX_TOKENS_COUNT = 1 << 53
+"""Larger counts are no counts, and no number that every reader of JSON knows."""
+
+
+class ServerError(InputError):
+    """A fault of the server that another question would meet as well; any other `InputError` is about the question."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reply:
+    """What a model said.
+
+    Attributes:
+        text: the answer.
+        model: as the server names it.
+        finish: why it ended: "stop", "length" (max_tokens), …
+        tokens: of prompt and answer, where the server counts them.
+        seconds: from the request to the end of the answer.
+    """
+
+    text: str
+    model: str
+    finish: str
+    tokens: dict[str, int]
+    seconds: float
+
+
+@dataclass(slots=True)
+class Heard:
+    """An answer as far as it has come.
+
+    Attributes:
+        text, model, finish, tokens: as in `Reply`.
+        refusal: the model's words where it refuses to answer.
+        thought: whether there was reasoning beside the answer.
+        parts: how many parts have come.
+        unstreamed: whether JSON came in place of the stream that was asked for.
+    """
+
+    text: str = ""
+    model: str = ""
+    finish: str = ""
+    tokens: dict[str, int] | None = None
+    refusal: str = ""
+    thought: bool = False
+    parts: int = 0
+    unstreamed: bool = False
+
+    def hear(self, part: Any) -> None:
+        """Takes up a completion, or a chunk of one.
+
+        Raises:
+            ValueError: the server tells of an error, or it is no part of a completion.
+        """
+        choices = getattr(part, "choices", None)
+        if choices is None:
+            extra = getattr(part, "model_extra", None) or {}
+            # Whole, as half a key could not be recognized; who reports it takes the key out and then cuts it.
+            raise ValueError(str(extra.get("error") or extra.get("message") or extra.get("detail") or part))
+        self.parts += 1
+        self.model = str(getattr(part, "model", "") or self.model)
+        self.tokens = _tokens(getattr(part, "usage", None)) or self.tokens
+        # The last chunk of some servers counts tokens and has no choice.
+        for choice in choices[:1]:
+            message = getattr(choice, "delta", None) or getattr(choice, "message", None)
+            self.text += _words(getattr(message, "content", None))
+            self.refusal += _words(getattr(message, "refusal", None))
+            self.thought |= bool(getattr(message, "reasoning_content", None) or getattr(message, "reasoning", None))
+            self.finish = str(choice.finish_reason or self.finish)
+
+    def wrong(self) -> str | None:
+        """Why this is no answer, of a completion that has ended; None if it is one."""
+        if self.refusal:
+            return f"the model refuses: {self.refusal}"
+        if self.finish == "content_filter":
+            return f"a filter cut the answer off after {len(self.text)} characters"
+        if self.text.strip():
+            return None
+        hints = {
+            "length": f"it {'thought' if self.thought else 'went on'} until vlm.max_tokens; raise it",
+            "tool_calls": "it calls a tool, and none is offered; switch tools off on the server, or take another model",
+        }
+        hint = hints.get(self.finish, "")
+        return f"the answer holds no text (it ended with {self.finish!r})" + (f"; {hint}" if hint else "")
+
+
+def _words(content: Any) -> str:
+    """Text that comes as such, or in parts."""
+    if isinstance(content, list):
+        parts = [each.get("text") if isinstance(each, dict) else getattr(each, "text", None) for each in content]
+        return "".join(part for part in parts if isinstance(part, str))
+    return content if isinstance(content, str) else ""
+
+
+def _tokens(usage: Any) -> dict[str, int]:
+    counts = {"prompt": getattr(usage, "prompt_tokens", None), "answer": getattr(usage, "completion_tokens", None)}
+    return {name: count for name, count in counts.items() if isinstance(count, int) and 0 <= count < MAX_TOKENS_COUNT}
+
+
+def cause(error: BaseException) -> str:
+    """What went wrong at the bottom: a server's message, or that of the first error."""
+    extra = getattr(error, "body", None)
+    for name in ("error", "message", "detail"):
+        extra = extra.get(name, extra) if isinstance(extra, dict) else extra
+    if extra:
+        return " ".join(str(extra).split())
+    deepest = error
+    while deepest.__cause__ is not None or deepest.__context__ is not None:
+        deepest = deepest.__cause__ or deepest.__context__  # type: ignore[assignment]
+    return " ".join(str(deepest).split()) or type(deepest).__name__
+
 
 URL_VARIABLE, KEY_VARIABLE, MODEL_VARIABLE = "OPENAI_BASE_URL", "OPENAI_API_KEY", "GSENCODER_VLM_MODEL"
 MAX_MESSAGE = 300

@@ -1,14 +1,149 @@
 """Targets of a choice of views: the Gaussians of boxes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, Integer
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.views.constants import CONSTANTS
-from gsencoder.types import Box, Gaussians, Localization
+from gsencoder.render import BlendConfig
+from gsencoder.types import Box, Cameras, Gaussians, Localization
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewConstants:
+    """Constants of how candidates are placed, scored and chosen.
+
+    The distances of shell cameras were chosen on the rooms train_000 and train_001 of the house scenes. The other
+    values were set by hand for a reason that stands beside them, and were not varied one by one. What the choice
+    reaches with all of them is measured on eight other rooms (docs/measurements.md, "Views").
+    """
+
+    # Targets (targets.py)
+    point_radius_scales: float = 2.0
+    """Smallest radius of a target, in median scales of its Gaussians: a single Gaussian is as large as it is drawn."""
+
+    # Free space (free_space.py, split_gaussians.py)
+    min_obstacle_opacity: float = 0.3
+    """Gaussians of less opacity are no obstacle."""
+    free_space_cameras: int = 12
+    """Cameras of the scene whose depth maps tell what is empty; at least one for each target."""
+    free_space_side: int = 96
+    """Longer side of these depth maps, pixels."""
+    min_depth_alpha: float = 0.5
+    """Rays of less opacity have met nothing that they could have looked up to."""
+    cell_spacings: float = 2.0
+    """Edge of the cells in which rays are followed, in spacings of the splat: surfaces have no holes in such cells."""
+    spacing_sample: int = 5000
+    """Gaussians by whose neighbors the spacing is estimated."""
+    grid_cells: int = 1 << 20
+    """Cells along each side of the grid: three coordinates fit into 60 bits of an int64."""
+    max_ray_cells: int = 512
+    """Cells through which a ray is followed at most."""
+    clearance_neighbors: int = 8
+    """Patches whose surfaces are compared for the distance to the nearest one."""
+    surface_sigmas: float = 2.0
+    """A Gaussian's surface is so many standard deviations from its center."""
+    max_uncut_edges: float = 2.0
+    """Gaussians of at most so many edges are not cut into patches."""
+    max_patches_per_gaussian: int = 4096
+    """Patches that one Gaussian is cut into at most; a larger one gets larger patches."""
+    max_patches: int = 1 << 21
+    """Patches that a splat is cut into at most, as far as one for each Gaussian allows (memory)."""
+
+    # The scene's own frames, ranked by rays before any render (frames.py)
+    frame_rays: int = 12
+    """Rays from a target to each frame."""
+    frame_batch: int = 32
+    """Frames whose rays are followed together (memory)."""
+    blocked_frame_weight: float = 0.02
+    """Weight of a frame all of whose rays are blocked: rays may err."""
+    spread_frames: int = 4
+    """Half of the frames are spread over the recording; they are taken from so many times as many …"""
+    min_spread_share: float = 0.25
+    """… that show at least this share of what the best frame shows: the best of a film are neighbors."""
+
+    min_frame_depth: float = 1e-9
+    """Depth at which a target around the camera is taken to lie, world units."""
+
+    # Cameras on shells around a target (shells.py)
+    tried_directions: int = 8
+    """Directions tried for each camera: many are blocked, or look at holes where nobody has been …"""
+    min_tried_directions: int = 64
+    """… but never fewer than this."""
+    fill_shares: tuple[float, ...] = (0.30, 0.18, 0.10)
+    """Shares of the picture that the target fills, by turns from direction to direction …"""
+    fill_margin: float = 1.5
+    """… kept by this factor above `ViewsConfig.least_share` and below `most_share`: outlines are counted in cells."""
+    max_fill_share: float = 0.5
+    """A camera comes no nearer than where the target fills this share."""
+    thin_fill_share: float = 0.08
+    """A long and thin target may leave the picture until it fills this share."""
+    framed_share: float = 0.9
+    """A target that fits into the picture stays within this share of its width and height."""
+    clearance_share: float = 0.2
+    """Distance to surfaces, as a share of the distance to the target, or of the target's radius where that is less."""
+    outline_cells: int = 16
+    """Cells along a target's radius in which its outline is counted."""
+    outline_sample: int = 1000
+    """Gaussians of a target that make its outline."""
+    background_radii: float = 1.5
+    """Rays that test what is behind a target pass so many radii beside its center."""
+
+    # Close-ups from photographs (closeups.py)
+    closeup_sample: int = 1000
+    """Gaussians of a target that tell where it is in a frame."""
+    min_closeup_inside: float = 0.5
+    """Share of these that must be in the frame."""
+    min_closeup_width: int = 160
+    """Narrowest window in pixels of the photograph: a smaller one would be enlarged to a blur."""
+    max_closeup_share: float = 0.75
+    """Windows of more than this share of a frame's width or height are left out: the frame itself shows as much."""
+
+    # Scores by small renders (scores.py)
+    score_blend: BlendConfig = field(default_factory=lambda: BlendConfig(stop_transmittance=0.02, min_weight=1e-3))
+    """Accuracy of the small renders: rays end where a fiftieth of their light is left."""
+    context_radii: float = 2.0
+    """A target's context is what lies in the ball of so many times its radius."""
+    coverage_sample: int = 2000
+    """Gaussians of a target, and of its context, on which coverage is computed."""
+    min_weight: float = 0.05
+    """Blending weight from which on a pixel shows a target."""
+    solid_share: float = 0.5
+    """Visibility is counted over pixels at least this opaque by the target alone, as a share of the most opaque one:
+    a thin rim is shared with what is behind it."""
+    frame_margin: float = 0.5
+    """Margin around a target on every side, as a share of its size: for its opacity score, and in close-ups."""
+
+    # Budgets of error and of megabytes (shown_error.py, picture_size.py)
+    window_sigmas: float = 6.0
+    """A Gaussian reaches no farther than so many standard deviations in a picture, and is left out of none by it."""
+    error_safety: float = 1.2
+    """What small renders leave unseen counts so many times …"""
+    unsure_gaussians: float = 2.0
+    """… and so many Gaussians of each target count as unseen on top of it."""
+    least_picture_side: int = 224
+    """Pictures are made no smaller by a budget, longer side, pixels: the input of the smallest common vision towers."""
+
+    # Utility of a view and of a set of views (utility.py, choose.py)
+    half_blur: float = 0.04
+    """Standard deviation of the target's Gaussians, as a share of the picture's longer side, that halves a view's
+    utility."""
+    full_alpha: float = 0.9
+    """Mean opacity around a target from which on it does not lower the utility."""
+    min_best_utility: float = 0.1
+    """Views are compared with the best one of a target, or with this where the best one is worse."""
+    min_relative_gain: float = 0.004
+    """The choice ends when the next view adds less than this share of what the first one added …"""
+    min_gain: float = 1e-4
+    """… or less than a view of this utility by itself: not a pixel of the target."""
+    min_visible: float = 0.1
+    """A warning says which targets no chosen view shows to this share."""
+
+
+CONSTANTS = ViewConstants()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,3 +208,129 @@ def check_targets(targets: Sequence[Target], gaussians: Gaussians) -> None:
     for target in targets:
         if target.rows.min() < 0 or target.rows.max() >= len(gaussians):
             raise InputError(f"views: {target.name!r} has Gaussians beyond the {len(gaussians):,} of the splat")
+
+
+MAX_CANDIDATES = 4096
+MAX_PIXELS = 8192
+MAX_WEIGHT = 1e6
+MAX_FOV = 120.0
+"""Gaussians are projected as if the picture were flat around each; degrees up to which that looks right."""
+JUDGED_SIDES = (40, 1024)
+"""Smaller pictures show small targets too large, because no Gaussian is drawn smaller than a pixel; larger ones cost
+gigabytes and tell no more."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewsConfig:
+    """How views are found and chosen."""
+
+    source: Literal["both", "frames", "shells"] = field(
+        default="both", metadata={"help": "the scene's own cameras, cameras around the targets, or up to half of each"}
+    )
+    method: Literal["greedy", "uniform"] = field(
+        default="greedy", metadata={"help": "the best by what they show, or evenly spread frames (the baseline)"}
+    )
+    count: int = field(default=8, metadata={"help": "views chosen"})
+    candidates: int = field(
+        default=32,
+        metadata={
+            "help": "views judged (at least count, and one for each target); the paper's table has 16, 32 and 64"
+        },
+    )
+    width: int = field(default=640, metadata={"help": "of the pictures around targets, pixels"})
+    height: int = field(default=480, metadata={"help": "of the pictures around targets, pixels"})
+    fov: float = field(default=60.0, metadata={"help": "their horizontal field of view, degrees"})
+    frame_side: int = field(
+        default=1024, metadata={"help": "frames are shown no larger than this, longer side, pixels"}
+    )
+    judged_side: int = field(default=160, metadata={"help": "longer side of the renders that candidates are judged by"})
+    least_share: float = field(default=0.05, metadata={"help": "a target should fill this much of the picture …"})
+    most_share: float = field(default=0.6, metadata={"help": "… and no more than this"})
+    cover_weight: float = field(default=0.3, metadata={"help": "what seeing all of a target is worth"})
+    context_weight: float = field(default=0.1, metadata={"help": "what seeing its surroundings is worth"})
+    spread_weight: float = field(default=0.2, metadata={"help": "what seeing it from many directions is worth"})
+
+    def __post_init__(self) -> None:
+        for name in ("count", "candidates"):
+            if not 1 <= getattr(self, name) <= MAX_CANDIDATES:
+                raise InputError(f"{name}: expected 1 to {MAX_CANDIDATES}, got {getattr(self, name)}")
+        if self.method == "uniform" and self.source == "shells":
+            raise InputError("source: expected frames or both with method=uniform, which spreads frames evenly")
+        for name in ("width", "height", "frame_side"):
+            if not 1 <= getattr(self, name) <= MAX_PIXELS:
+                raise InputError(f"{name}: expected 1 to {MAX_PIXELS} pixels, got {getattr(self, name)}")
+        if not 1 <= self.fov <= MAX_FOV:
+            raise InputError(f"fov: expected 1 to {MAX_FOV:g} degrees, got {self.fov}")
+        if not JUDGED_SIDES[0] <= self.judged_side <= JUDGED_SIDES[1]:
+            raise InputError(
+                f"judged_side: expected {JUDGED_SIDES[0]} to {JUDGED_SIDES[1]} pixels, got {self.judged_side}"
+            )
+        if not 0 < self.least_share < self.most_share < 1:
+            raise InputError(
+                f"least_share, most_share: expected shares that rise between 0 and 1, got {self.least_share}, "
+                f"{self.most_share}"
+            )
+        for name in ("cover_weight", "context_weight", "spread_weight"):
+            if not 0 <= getattr(self, name) <= MAX_WEIGHT:
+                raise InputError(f"{name}: expected 0 to {MAX_WEIGHT:g}, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetScore:
+    """What one view shows of one target; see `ViewScores`.
+
+    Attributes:
+        target: its name.
+        visible, share, inside, alpha, blur: as in `ViewScores`; alpha 1 and blur 0 where a photograph is shown.
+        utility: of the view for this target alone, 0 to 1.
+    """
+
+    target: str
+    visible: float
+    share: float
+    inside: float
+    alpha: float
+    blur: float
+    utility: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SelectedView:
+    """Why a view was chosen.
+
+    Attributes:
+        name: of the frame, "IMG_2.jpg near mug" for a close-up, or "around mug 03".
+        frame: which of the scene's views it is or is cut from; None where it was placed.
+        clearance: world units from the camera to the nearest surface.
+        gain: what it added to the choice, with a budget of error by how much it lowered that; None for uniform frames.
+        covered: how well this view and those before it show the targets' Gaussians, by `coverage`: 1 = each as well
+            as the candidate that shows it best; None where there are no targets.
+        target_scores: one for each target.
+    """
+
+    name: str
+    frame: int | None
+    clearance: float
+    gain: float | None
+    covered: float | None
+    target_scores: tuple[TargetScore, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ViewSet:
+    """Views that were chosen, best first (or in the scene's order where uniform).
+
+    Attributes:
+        cameras: relative to the scene's origin.
+        chosen: why, one for each.
+        judged: how many candidates there were.
+        near: near plane for their renders, world units: scenes of small units are not cut open.
+    """
+
+    cameras: Cameras
+    chosen: tuple[SelectedView, ...]
+    judged: int
+    near: float
+
+    def __len__(self) -> int:
+        return len(self.cameras)

@@ -28,7 +28,7 @@ class TowerLayout:
         model: kind of the model.
         grid: rows and columns of patches.
         channels: of the tower.
-        fit: how pictures become square; see `gsencoder.infer.views.tokens.tower_grid`.
+        fit: how pictures become square; see `gsencoder.infer.views.pictures.tower_grid`.
         layer: of the hidden states; None = the last, after the final norm.
         skipped: tokens before those of patches.
     """

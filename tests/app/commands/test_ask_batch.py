@@ -18,7 +18,7 @@ from gsencoder.infer.ask import ask as ask_module
 from gsencoder.infer.ask.ask import MAX_CACHED_PICTURES, Asker, Question
 from gsencoder.infer.ask.questions import read_answers, read_questions
 from gsencoder.infer.views.pictures import view_pictures
-from gsencoder.infer.views.selection import ViewsConfig
+from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.text.table import load_text_table
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("vlm_environment")]

@@ -6,7 +6,7 @@ import pytest
 
 from gsencoder.app import cli
 from gsencoder.core.errors import InputError
-from gsencoder.infer.viewer.bundle import Bundle
+from gsencoder.infer.page.page import Bundle
 
 SMALL = ("demo", "objects=2", "views=2", "width=64")
 

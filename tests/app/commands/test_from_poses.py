@@ -10,9 +10,9 @@ from splats import front_camera, random_gaussians
 
 from gsencoder.app.commands.from_poses import RequestedCameras, memory_of, search_from_poses
 from gsencoder.fusion.folder import load_features, save_features, save_memories
-from gsencoder.infer.localize.from_pose import FromPoseConfig, from_pose
-from gsencoder.infer.localize.localize import LocalizeConfig
-from gsencoder.infer.localize.threshold import ThresholdConfig
+from gsencoder.infer.from_pose import FromPoseConfig, from_pose
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.text.table import make_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
 

@@ -85,7 +85,7 @@ def test_a_run_whose_pictures_cannot_be_drawn_says_how_to_go_on(
         raise InputError("000.png: cannot be decoded")
 
     words = ["memory", str(room), "teacher=palette", f"out={tmp_path / 'out'}", *QUICK[1:]]
-    monkeypatch.setattr("gsencoder.infer.draw.attention_pictures.attention_picture", damaged)
+    monkeypatch.setattr("gsencoder.infer.memory_pictures.attention_picture", damaged)
     line = refusal(capsys, *words)
     assert line == "error: 000.png: cannot be decoded; give pictures=0 to write the memory without pictures"
     monkeypatch.setattr("gsencoder.train.memory_scene.fuse", damaged)
@@ -99,6 +99,6 @@ def test_options_of_pictures_that_cannot_be_are_refused(
     words = ["memory", str(room), "teacher=palette", f"out={tmp_path / 'out'}"]
     assert "pictures: expected 0 or more, got -1" in refusal(capsys, *words, "pictures=-1")
     assert "umap: expected pictures=1 or more" in refusal(capsys, *words, "umap=true", "pictures=0")
-    monkeypatch.setattr("gsencoder.infer.draw.component_scatter.find_spec", lambda name: None)
+    monkeypatch.setattr("gsencoder.infer.memory_pictures.find_spec", lambda name: None)
     assert "pip install 'gsencoder[umap]'" in refusal(capsys, *words, "umap=true")
     assert not (tmp_path / "out").exists()

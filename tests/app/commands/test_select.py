@@ -12,7 +12,7 @@ from selected_rooms import EMBEDDINGS, SPACE, selected_room, words
 from gsencoder.app import cli
 from gsencoder.data.splats.files import load_splat
 from gsencoder.fusion.folder import WORDS_FILE, save_features, save_memories
-from gsencoder.infer.select.labels_file import read_labels
+from gsencoder.infer.select_files import read_labels
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import MemoryBank, QueryMemory
 

@@ -13,10 +13,9 @@ from gsencoder.app import cli
 from gsencoder.data.splats.files import load_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
-from gsencoder.infer.select.holes import find_holes
-from gsencoder.infer.select.labels_file import read_labels
-from gsencoder.infer.select.select import select
-from gsencoder.infer.select.votes import sampling
+from gsencoder.infer.select import select
+from gsencoder.infer.select_files import read_labels
+from gsencoder.infer.selection import find_holes, sampling
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.types import Scene
 

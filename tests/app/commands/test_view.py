@@ -18,7 +18,7 @@ from viewed_rooms import STUB, save_viewed_room
 
 from gsencoder.app import cli
 from gsencoder.app.commands import view
-from gsencoder.infer.viewer import bundle
+from gsencoder.infer.page import page as bundle
 from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow

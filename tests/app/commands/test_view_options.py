@@ -20,8 +20,7 @@ from gsencoder.app import cli
 from gsencoder.app.commands import view
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.folder import WORDS_FILE, save_features
-from gsencoder.infer.viewer.container import Container
-from gsencoder.infer.viewer.page_scene import jpeg_of
+from gsencoder.infer.page.page import Container, jpeg_of
 from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow

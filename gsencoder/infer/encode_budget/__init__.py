@@ -1,1 +1,0 @@
-"""Budgets of encoding: the cheapest setting that keeps a promise is chosen on parts of the scene."""

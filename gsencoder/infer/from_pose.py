@@ -1,0 +1,369 @@
+"""Words to points from the pose of a camera, as a robot asks for what it sees (M3, sec. 4.4).
+
+The features of the scene are rendered at the pose, the pixel that is most relevant to a word is found, and its depth
+turns it into a position in the world:
+
+    field = FeatureField(scene)              # once for a scene
+    seen = field.at(cameras, view)           # once for a pose
+    seen.find(["yellow bath duck"], words)   # for each question
+
+M3's robot takes the depth from its depth camera; here it is that of the splat.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from PIL import Image, ImageDraw
+
+from gsencoder.core.errors import InputError
+from gsencoder.infer.draw import contact_sheet, enlarge, ink_on, label_font, legible_factor, relevancy_overlay
+from gsencoder.infer.localize import select_features
+from gsencoder.infer.pictures import pixel_features
+from gsencoder.infer.relevancy import GaussianProducts, Mode, ThresholdConfig, threshold, word_directions
+from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.render.images import render_image
+from gsencoder.render.rays import strided_lattice
+from gsencoder.text.table import TextEncoder, check_space
+from gsencoder.types import Cameras, QueryMemory, Scene
+
+MEMORY_STRIDE = 4
+MAX_RAYS = 1 << 21
+"""Pixels that are looked at in a view, at most, unless a stride is asked for; their blend takes about a gigabyte."""
+BLOCK_WORDS = 16
+"""Words that are answered at once."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FromPoseConfig:
+    """How words are found in a view.
+
+    Attributes:
+        mode: cosines after removing each side's mean ("centered"), or as they are ("raw").
+        threshold: relevancy from which on something relevant is visible; it is taken over all Gaussians of the scene,
+            so that a word whose best Gaussians are elsewhere is not visible here.
+        min_alpha: a pixel counts where the Gaussians that have features are at least so opaque: what is fainter is
+            haze, and no surface.
+        stride: every so many pixels are looked at, in both directions; None = all for features, and every fourth for a
+            memory, whose attention takes longer, or fewer in large views, so that there are no more than `MAX_RAYS`.
+        blend: accuracy of the rendering.
+    """
+
+    mode: Mode = "centered"
+    threshold: ThresholdConfig = field(default_factory=ThresholdConfig)
+    min_alpha: float = 0.5
+    stride: int | None = None
+    blend: BlendConfig = field(default_factory=BlendConfig)
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("centered", "raw"):
+            raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
+        if not 0 < self.min_alpha <= 1:
+            raise InputError(f"min_alpha: expected a number in (0, 1], got {self.min_alpha}")
+        if self.stride is not None and self.stride < 1:
+            raise InputError(f"stride: expected at least 1 pixel, got {self.stride}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosePoint:
+    """Where a camera sees what a word says.
+
+    Attributes:
+        query: the word.
+        camera: number of the camera.
+        visible: whether the relevancy of the pixel reaches the threshold. Where it does not, the other values are those
+            of the best pixel there is.
+        threshold: relevancy from which on something relevant is visible; NaN where no Gaussian has a feature.
+        relevancy: centered cosine of the blended feature at the pixel, in [−1, 1]. This and all that follows is NaN
+            where the camera sees no surface with features.
+        alpha: opacity of all Gaussians at the pixel.
+        pixel: (x, y), pixel centers at .5.
+        depth: z in the camera, world units: the median, by blending weight, over those Gaussians of the pixel whose own
+            relevancy reaches the threshold, or over all that have features where none does. The expected depth of a
+            pixel at an edge lies between object and background, where nothing is. The median over all Gaussians may be
+            that of the background: a cosine has no length, so that before a background with about the mean feature
+            a pixel with a small share of the object is as relevant as one that shows nothing else.
+        position: in world coordinates, with the scene's origin added.
+    """
+
+    query: str
+    camera: int
+    visible: bool
+    threshold: float
+    relevancy: float
+    alpha: float
+    pixel: Float64[np.ndarray, "2"]
+    depth: float
+    position: Float64[np.ndarray, "3"]
+
+
+class FeatureField:
+    """The features of a scene, ready to be looked at from any pose."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        space: str | None = None,
+        memory: QueryMemory | None = None,
+        config: FromPoseConfig = FromPoseConfig(),
+    ) -> None:
+        """Args:
+        scene: Gaussians with features.
+        space: name of the feature set; None where the scene has only one.
+        memory: queries of the same Gaussians. The feature of a pixel is then what its blended query attends to, and
+            the features of the scene, if it has any, give only the threshold; they are those of the memory.
+        config: how words are found.
+
+        Raises:
+            InputError: no Gaussians or features, or a memory of other Gaussians or of another space.
+        """
+        if memory is not None and not scene.features:
+            features, gaussians = memory.features(), scene.gaussians
+            if gaussians is None:
+                raise InputError(f"scene {scene.name} has no Gaussians")
+        else:
+            gaussians, features = select_features(scene, space)
+        if memory is not None:
+            check_space(features.space, memory.space)
+            if len(memory) != len(gaussians):
+                raise InputError(f"memory: queries of {len(memory):,} Gaussians, and a scene of {len(gaussians):,}")
+        self.gaussians, self.origin, self.space = gaussians, scene.origin, features.space
+        self.memory, self.config = memory, config
+        self.products = GaussianProducts(features, config.mode)
+
+    def stride_in(self, cameras: Cameras, view: int) -> int:
+        """Every so many pixels of a view are looked at."""
+        if self.config.stride is not None:
+            return self.config.stride
+        stride, (width, height) = (
+            1 if self.memory is None else MEMORY_STRIDE,
+            (cameras.widths[view], cameras.heights[view]),
+        )
+        while math.ceil(width / stride) * math.ceil(height / stride) > MAX_RAYS:
+            stride += 1
+        return stride
+
+    def at(self, cameras: Cameras, view: int = 0, *, b: Blend | None = None) -> "SeenField":
+        """What one camera sees of the field, kept for many words.
+
+        Args:
+            cameras: relative to the scene's origin.
+            view: which camera.
+            b: its blend at the stride of this field, where it has been made already.
+
+        Raises:
+            InputError: no such view, or the blend of other Gaussians or pixels.
+        """
+        if not -len(cameras) <= view < len(cameras):
+            raise InputError(f"view: expected 0 to {len(cameras) - 1}, got {view}")
+        stride = self.stride_in(cameras, view)
+        if b is None:
+            b = blend(self.gaussians, cameras, view, stride=stride, config=self.config.blend)
+        expected = strided_lattice(int(cameras.widths[view]), int(cameras.heights[view]), stride)
+        if b.lattice != expected:
+            raise InputError(
+                f"from_pose: expected a blend of {expected.width}×{expected.height} rays, every {stride} pixels, "
+                f"got {b.lattice.width}×{b.lattice.height} with {b.lattice.side**2} rays each"
+            )
+        return SeenField(self, cameras, view % len(cameras), b)
+
+
+class SeenField:
+    """A feature field as one camera sees it; its geometry is kept and answers any number of words.
+
+    Attributes:
+        field: of the scene.
+        cameras: relative to the scene's origin.
+        view: number of the camera.
+        b: its blend, a row for each pixel that is looked at.
+    """
+
+    def __init__(self, field: FeatureField, cameras: Cameras, view: int, b: Blend) -> None:
+        self.field, self.cameras, self.view, self.b = field, cameras, view, b
+        self._pixels = pixel_features(field.products, b, memory=field.memory, mode=field.config.mode)
+        self._opaque = self._pixels.alpha >= field.config.min_alpha
+
+    def find(self, queries: Sequence[str], text: TextEncoder) -> tuple[PosePoint, ...]:
+        """Where the camera sees each word.
+
+        Args:
+            queries: words that `text` knows.
+            text: turns words into the features' space.
+
+        Returns:
+            One point for each word, in the order asked.
+
+        Raises:
+            InputError: no or unknown words, or words of another space.
+        """
+        points: list[PosePoint] = []
+        for start in range(0, len(directions := self._directions(queries, text)), BLOCK_WORDS):
+            block = directions[start : start + BLOCK_WORDS]
+            of_gaussians = self.field.products.cosines(block)
+            of_pixels = self._pixels.cosines(block)
+            for word, scores, pixels in zip(queries[start : start + BLOCK_WORDS], of_gaussians, of_pixels, strict=True):
+                points.append(self._point(word, scores, pixels))
+        return tuple(points)
+
+    def relevancy(self, queries: Sequence[str], text: TextEncoder) -> Float32[np.ndarray, "Q h w"]:
+        """Relevancy of each word at the pixels that are looked at; NaN where there is no surface with features.
+
+        Arguments and errors are those of `find`.
+        """
+        cosines = np.clip(self._pixels.cosines(self._directions(queries, text)), -1, 1)
+        cosines[:, ~self._opaque] = np.nan
+        return cosines.reshape(len(queries), *self.b.shape)
+
+    def _directions(self, queries: Sequence[str], text: TextEncoder) -> Float64[np.ndarray, "Q D"]:
+        if isinstance(queries, str) or not queries or any(not word.strip() for word in queries):
+            raise InputError(f"from_pose: expected a list of one or more words, got {queries!r}")
+        check_space(self.field.space, text.space)
+        return word_directions(text.encode(list(queries)), text.mean, self.field.config.mode)
+
+    def _point(
+        self, query: str, of_gaussians: Float32[np.ndarray, " N"], of_pixels: Float32[np.ndarray, " P"]
+    ) -> PosePoint:
+        least = threshold(of_gaussians, self.field.config.threshold)
+        if not self._opaque.any():
+            nowhere = np.full(3, math.nan)
+            return PosePoint(
+                query=query, camera=self.view, visible=False, threshold=least, relevancy=math.nan, alpha=math.nan,
+                pixel=nowhere[:2], depth=math.nan, position=nowhere,
+            )  # fmt: skip
+        best = int(np.where(self._opaque, of_pixels, -np.inf).argmax())
+        relevancy = float(np.clip(of_pixels[best], -1, 1))
+        lattice = self.b.lattice
+        row, column = divmod(best, lattice.width)
+        pixel = np.array([lattice.x0 + column * lattice.dx, lattice.y0 + row * lattice.dy])
+        entries = slice(int(self.b.crow[best]), int(self.b.crow[best + 1]))
+        gaussians, weights = self.b.col[entries].numpy(), self.b.weight[entries].numpy().astype(np.float64)
+        entry_relevancy = of_gaussians[gaussians]
+        relevant = entry_relevancy >= least
+        chosen = relevant if relevant.any() else np.isfinite(entry_relevancy)
+        # Entries are in order of depth.
+        total = weights[chosen].cumsum()
+        middle = int(np.searchsorted(total, total[-1] / 2))
+        depth = float(self.b.depths[gaussians[chosen][middle]])
+        position = self.cameras.unproject(pixel[None], np.array([depth]), self.view)[0] + self.field.origin
+        return PosePoint(
+            query=query,
+            camera=self.view,
+            visible=relevancy >= least,
+            threshold=least,
+            relevancy=relevancy,
+            alpha=float(weights.sum()),
+            pixel=pixel,
+            depth=depth,
+            position=position,
+        )
+
+
+def from_pose(
+    scene: Scene,
+    cameras: Cameras,
+    queries: Sequence[str],
+    text: TextEncoder,
+    config: FromPoseConfig = FromPoseConfig(),
+    *,
+    space: str | None = None,
+    memory: QueryMemory | None = None,
+) -> tuple[PosePoint, ...]:
+    """Where each camera sees each word: `FeatureField` for those who ask once.
+
+    Args:
+        scene: Gaussians with features.
+        cameras: one or several, relative to the scene's origin.
+        queries: words that `text` knows.
+        text: turns words into the features' space.
+        config: how words are found.
+        space: name of the feature set; None where the scene has only one.
+        memory: queries of the same Gaussians; see `FeatureField`.
+
+    Returns:
+        A point for each camera and word: all words of the first camera, then those of the next.
+
+    Raises:
+        InputError: no Gaussians or features, no or unknown words, words of another space.
+    """
+    field = FeatureField(scene, space=space, memory=memory, config=config)
+    return tuple(point for view in range(len(cameras)) for point in field.at(cameras, view).find(queries, text))
+
+
+VISIBLE, HIDDEN = (255, 255, 255), (150, 150, 150)
+MAX_SIDE = 2000
+"""Longer side of a picture, at most."""
+
+
+def view_picture(seen: SeenField) -> UInt8[np.ndarray, "H W 3"]:
+    """The view in color, whatever the stride is: in all its pixels, or reduced to a longer side of `MAX_SIDE`."""
+    cameras = seen.cameras.select([seen.view])
+    small = cameras.resized(MAX_SIDE, enlarge=False)
+    same = np.array_equal([small.widths, small.heights], [cameras.widths, cameras.heights])
+    blended = seen.b if same and seen.b.lattice.dx == 1 else None
+    return render_image(seen.field.gaussians, small, 0, blended=blended, config=seen.field.config.blend)
+
+
+def pose_picture(
+    rgb: UInt8[np.ndarray, "H W 3"], seen: SeenField, point: PosePoint, relevancy: Float32[np.ndarray, "h w"]
+) -> UInt8[np.ndarray, "H2 W2 3"]:
+    """A view, and beside it the view with the relevancy of a word over it, the word's pixel in a ring in both; small
+    views are enlarged.
+
+    Args:
+        rgb: of `view_picture`.
+        seen: what the camera sees.
+        point: of the word.
+        relevancy: of the word at the pixels that were looked at; NaN where there is no surface.
+    """
+    lattice, (height, width) = seen.b.lattice, rgb.shape[:2]
+    reduced = np.array([seen.cameras.widths[seen.view] / width, seen.cameras.heights[seen.view] / height])
+    # Each pixel takes the ray of its block; pixels beyond the last block that of the last.
+    columns, rows = (
+        np.minimum(((np.arange(size) + 0.5) * factor / step).astype(np.int64), last - 1)
+        for size, factor, step, last in (
+            (width, reduced[0], lattice.dx, lattice.width),
+            (height, reduced[1], lattice.dy, lattice.height),
+        )
+    )
+    factor = legible_factor(width)
+    heat = relevancy_overlay(rgb, relevancy[rows[:, None], columns])
+    halves = [_marked(half, factor, point, point.pixel / reduced) for half in (rgb, heat)]
+    titles = ("rendered", f"relevancy of {point.query!r}, threshold {point.threshold:.2f}")
+    return contact_sheet(halves, titles, columns=2, width=halves[0].shape[1])
+
+
+def _marked(
+    picture: UInt8[np.ndarray, "H W 3"], factor: int, point: PosePoint, pixel: Float64[np.ndarray, "2"]
+) -> UInt8[np.ndarray, "H2 W2 3"]:
+    """A picture, enlarged, with the pixel of a word in a ring, and the word's relevancy and depth."""
+    image = Image.fromarray(enlarge(picture, factor))
+    draw = ImageDraw.Draw(image)
+    if not np.isfinite(point.pixel).all():
+        _write(draw, image.size, f"{point.query}: nothing with features in view", HIDDEN, None)
+        return np.asarray(image)
+    at = pixel * factor
+    color = VISIBLE if point.visible else HIDDEN
+    for radius, ink, line in ((15, (0, 0, 0), 6), (14, color, 3)):
+        draw.ellipse([*(at - radius), *(at + radius)], outline=ink, width=line)
+    for ink, line in (((0, 0, 0), 4), (color, 2)):
+        for step in ((1, 0), (0, 1)):
+            draw.line([*(at - np.multiply(step, 5)), *(at + np.multiply(step, 5))], fill=ink, width=line)
+    verdict = f"depth {point.depth:.3g}" if point.visible else f"not visible (needs {point.threshold:.2f})"
+    _write(draw, image.size, f"{point.query} {point.relevancy:.2f}, {verdict}", color, at)
+    return np.asarray(image)
+
+
+def _write(
+    draw: ImageDraw.ImageDraw, size: tuple[int, int], text: str, color: tuple[int, int, int], at: np.ndarray | None
+) -> None:
+    """A label in the upper left corner, or in the lower one where the upper one would cover what is marked."""
+    text = "".join(character if character.isprintable() else " " for character in text)
+    font = label_font(18)
+    wide, high = draw.textlength(text, font) + 10, 26
+    covers = at is not None and at[0] < wide + 20 and at[1] < high + 20
+    top = max(size[1] - high, 0) if covers else 0
+    draw.rectangle([0, top, wide, top + high], fill=color)
+    draw.text((5, top + high / 2), text, fill=ink_on(color), font=font, anchor="lm")

@@ -1,0 +1,503 @@
+"""Pictures of what a pixel attends to: the view with the pixel, and the photographs that its components come from."""
+
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int64, UInt8
+from PIL import Image, ImageDraw
+
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.infer.draw import FAINT, INK, PAPER, fit_text, label_font
+from gsencoder.memory.attention import render_queries
+from gsencoder.memory.bank import RawSample
+from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.render.images import RenderedImages, render_image
+from gsencoder.types import Cameras, Gaussians, MemoryBank, QueryMemory, Scene
+from gsencoder.types.features import attention_keys
+
+MIN_ALPHA = 0.5
+"""Opacity, of Gaussians with a query, from which a pixel may be chosen."""
+GRID = 64
+"""Pixels of the longer side among which one is chosen."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PixelAttention:
+    """The strongest components of a pixel, strongest first.
+
+    Attributes:
+        pixel: column and row of the pixel.
+        components: rows of the bank.
+        weights: of these in the attention, in which those of all components sum to 1.
+    """
+
+    pixel: tuple[int, int]
+    components: Int64[np.ndarray, " k"]
+    weights: Float32[np.ndarray, " k"]
+
+
+def strongest_components(
+    memory: QueryMemory,
+    gaussians: Gaussians,
+    cameras: Cameras,
+    view: int,
+    pixel: tuple[int, int],
+    count: int,
+    *,
+    config: BlendConfig = BlendConfig(),
+    blended: Blend | None = None,
+) -> PixelAttention:
+    """The components that a pixel's rendered query gives the largest weights; of equal ones the first.
+
+    Args:
+        memory: of the Gaussians.
+        gaussians: the splat.
+        cameras: in the same world.
+        view: which camera.
+        pixel: its column x and row y.
+        count: at most so many components.
+        config: accuracy of the rendering, where the blend must be made.
+        blended: the view's pixel blend, where it has been made already.
+
+    Raises:
+        InputError: no such pixel, nothing with a query is seen in it, a count below 1, or a memory of other Gaussians.
+    """
+    x, y = pixel
+    width, height = int(cameras.widths[view]), int(cameras.heights[view])
+    if not (0 <= x < width and 0 <= y < height):
+        raise InputError(f"pixel ({x}, {y}): expected a column from 0 to {width - 1} and a row from 0 to {height - 1}")
+    if count < 1:
+        raise InputError(f"count: expected 1 component or more, got {count}")
+    # A camera of this pixel alone would see Gaussians at its rim linearized elsewhere.
+    b = blend(gaussians, cameras, view, config=config) if blended is None else blended
+    queries, alpha = (rows[[y * width + x]] for rows in render_queries(memory, b))
+    if not alpha[0] > 0:
+        raise InputError(
+            f"pixel ({x}, {y}): no Gaussian with a query is seen in this pixel of view {view}; choose a pixel in which "
+            "the rendered view shows something"
+        )
+    weights = memory.attention(queries)[0]
+    order = np.argsort(-weights, kind="stable")[:count]
+    return PixelAttention(pixel=(x, y), components=order, weights=weights[order])
+
+
+def salient_pixel(memory: QueryMemory, b: Blend) -> tuple[int, int] | None:
+    """The pixel whose attention has the lowest entropy, so that few components are most of it: among evenly spaced
+    pixels that are opaque, those of the middle half of the view if any of them is. None where no pixel is opaque.
+
+    Args:
+        memory: of the Gaussians of B.
+        b: of all pixels of the view.
+
+    Raises:
+        InputError: B has other Gaussians.
+    """
+    height, width = b.shape
+    columns, rows = (even_indices(size, max(1, size * GRID // max(height, width))) for size in (width, height))
+    x, y = (each.ravel() for each in np.meshgrid(columns, rows))
+    queries, alpha = render_queries(memory, b)
+    opaque = alpha[y * width + x] >= MIN_ALPHA
+    middle = (abs(2 * x + 1 - width) <= width / 2) & (abs(2 * y + 1 - height) <= height / 2)
+    chosen = opaque & middle if (opaque & middle).any() else opaque
+    if not chosen.any():
+        return None
+    pixels = (y * width + x)[chosen]
+    entropy = attention_entropy(memory.attention(queries[pixels]))
+    best = int(pixels[int(entropy.argmin())])
+    return best % width, best // width
+
+
+def attention_entropy(weights: Float32[np.ndarray, "n M"]) -> Float32[np.ndarray, " n"]:
+    """−Σ w log w of each row of weights that sum to 1, in nats: 0 for one component, log M for M equal ones."""
+    logs = np.log(np.maximum(weights, np.finfo(np.float32).tiny))
+    return np.asarray(-(weights * logs).sum(axis=1), np.float32)
+
+
+MARK, HALO = (255, 214, 0), (0, 0, 0)
+"""The pixel and the cells are marked in one color, with a dark rim."""
+VIEW_SIDE, TILE_SIDE, CLOSE_SIDE = 660, 300, 96
+"""Longer sides of the view and of the tiles, and the side of the close-up in a tile's corner, in pixels."""
+CLOSE_CELLS = 3.0
+"""Cells along the side of a close-up."""
+LEAST_OUTLINE = 7.0
+"""Cells smaller than this many pixels of the picture are outlined as if they were this large."""
+GAP, HEAD, CAPTION, BAR = 18, 74, 54, 8
+LEAST_LEFT, LEAST_RIGHT = 520, 620
+"""Smallest widths of the two parts, which hold their headings."""
+EMPTY_BAR, FULL_BAR = (226, 228, 232), (230, 160, 0)
+
+
+def attention_pictures(
+    memory: QueryMemory, scene: Scene, *, views: int, count: int = 6, config: BlendConfig = BlendConfig()
+) -> Iterator[tuple[int, Image.Image]]:
+    """For evenly spaced views a picture of what their most salient pixel attends to: the pixel whose attention has the
+    lowest entropy.
+
+    Args:
+        memory: of the scene's Gaussians.
+        scene: Gaussians, and the views that the memory was made from.
+        views: so many, or all if there are fewer.
+        count: components that are shown, at most.
+        config: accuracy of the rendering.
+
+    Yields:
+        The number of the view and the picture. A view that shows nothing with a query is left out with a warning.
+
+    Raises:
+        InputError: the scene has no Gaussians or no cameras, or other ones than the memory was made of.
+    """
+    if scene.gaussians is None or scene.views is None:
+        raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")
+    for view in even_indices(len(scene.views), views).tolist():
+        b = blend(scene.gaussians, scene.views.cameras, view, config=config)
+        pixel = salient_pixel(memory, b)
+        if pixel is None:
+            name = scene.views.names[view]
+            warnings.warn(f"pictures: view {name} shows no Gaussian with a query and is not drawn", SceneWarning, 2)
+            continue
+        picture = attention_picture(memory, scene, view, pixel, count=count, config=config, blended=b)
+        yield view, Image.fromarray(picture)
+
+
+def attention_picture(
+    memory: QueryMemory,
+    scene: Scene,
+    view: int,
+    pixel: tuple[int, int],
+    *,
+    count: int = 6,
+    config: BlendConfig = BlendConfig(),
+    blended: Blend | None = None,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """A rendered view with a pixel marked, and for each of the pixel's strongest components the photograph that it
+    comes from, with its cell outlined and enlarged in a corner, its rank, and its weight in the attention.
+
+    Where the scene has no photographs, the views that the components come from are rendered.
+
+    Args:
+        memory: of the scene's Gaussians.
+        scene: Gaussians, and the views that the memory was made from.
+        view: number of the view.
+        pixel: its column x and row y.
+        count: components that are shown, at most.
+        config: accuracy of the rendering.
+        blended: the view's pixel blend, where it has been made already.
+
+    Raises:
+        InputError: the scene has no Gaussians or no cameras, or other ones than the memory was made of; or no such
+            pixel, or nothing with a query is seen in it.
+    """
+    gaussians, views, bank = scene.gaussians, scene.views, memory.bank
+    if gaussians is None or views is None:
+        raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")
+    last = int(bank.sources[:, 0].max())
+    if not 0 <= view < len(views) or last >= len(views):
+        raise InputError(
+            f"pictures: scene {scene.name} has {len(views)} views, and view {view} is asked for and components come "
+            f"from view {last}; expected the views that the memory was made from"
+        )
+    b = blended if blended is not None else blend(gaussians, views.cameras, view, config=config)
+    strongest = strongest_components(memory, gaussians, views.cameras, view, pixel, count, config=config, blended=b)
+    shown = render_image(gaussians, views.cameras, view, blended=b)
+    images = RenderedImages(gaussians, views.cameras, config) if views.images is None else views.images
+    cells, tiles = bank.cells, []
+    for component in strongest.components.tolist():
+        source, row, column = bank.sources[component].tolist()
+        where = f"{views.names[source]}{', rendered' if views.images is None else ''}"
+        tiles.append((cell_tile(images[source], cells[component]), where, f"row {row}, column {column} of its map"))
+    return _sheet(mark_pixel(shown, pixel), views.names[view], strongest, tiles, bank)
+
+
+def fit_in(rgb: UInt8[np.ndarray, "h w 3"], side: int) -> tuple[Image.Image, float]:
+    """A picture enlarged or reduced so that its longer side has so many pixels, and the factor."""
+    factor = side / max(rgb.shape[:2])
+    size = tuple(max(1, round(length * factor)) for length in (rgb.shape[1], rgb.shape[0]))
+    return Image.fromarray(np.ascontiguousarray(rgb)).resize(size, Image.Resampling.BICUBIC), factor
+
+
+def mark_pixel(rgb: UInt8[np.ndarray, "h w 3"], pixel: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+    """A view, its longer side `VIEW_SIDE` pixels, with a ring around a pixel and lines that point at it."""
+    image, factor = fit_in(rgb, VIEW_SIDE)
+    draw = ImageDraw.Draw(image)
+    x, y = ((coordinate + 0.5) * factor for coordinate in pixel)
+    radius, reach = 11, 22
+    for color, width in ((HALO, 7), (MARK, 3)):
+        outer = radius + width / 2
+        draw.ellipse([x - outer, y - outer, x + outer, y + outer], outline=color, width=width)
+        rim = 2 if color == HALO else 0
+        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            start, end = radius, reach + rim
+            draw.line([x + dx * start, y + dy * start, x + dx * end, y + dy * end], fill=color, width=width)
+    return np.asarray(image)
+
+
+def cell_tile(rgb: UInt8[np.ndarray, "h w 3"], cell: Float64[np.ndarray, "4"]) -> UInt8[np.ndarray, "H W 3"]:
+    """A photograph, its longer side `TILE_SIDE` pixels, with a cell outlined; in the corner that is farthest from the
+    cell the cell and what is around it, enlarged.
+
+    Args:
+        rgb: the photograph.
+        cell: left, top, right and bottom edge in its pixels; what is outside the photograph is cut off.
+    """
+    height, width = rgb.shape[:2]
+    left, right = np.clip(cell[[0, 2]], 0, width)
+    top, bottom = np.clip(cell[[1, 3]], 0, height)
+    image, factor = fit_in(rgb, TILE_SIDE)
+    _outline(image, [left * factor, top * factor, right * factor, bottom * factor])
+    middle_x, middle_y = (left + right) / 2, (top + bottom) / 2
+    reach = max(CLOSE_CELLS * max(right - left, bottom - top), 12.0) / 2
+    box = (middle_x - reach, middle_y - reach, middle_x + reach, middle_y + reach)
+    scale = CLOSE_SIDE / (2 * reach)
+    if scale <= 1.5 * factor:
+        # The cell is large enough to be seen as it is.
+        return np.asarray(image)
+    close = Image.fromarray(np.ascontiguousarray(rgb)).transform(
+        (CLOSE_SIDE, CLOSE_SIDE), Image.Transform.EXTENT, box, Image.Resampling.BICUBIC, fillcolor=FAINT
+    )
+    edges = [(edge - start) * scale for edge, start in zip((left, top, right, bottom), box[:2] * 2, strict=True)]
+    _outline(close, edges)
+    framed = Image.new("RGB", (CLOSE_SIDE + 4, CLOSE_SIDE + 4), PAPER)
+    framed.paste(close, (2, 2))
+    at_x = image.width - framed.width if middle_x < width / 2 else 0
+    at_y = image.height - framed.height if middle_y < height / 2 else 0
+    image.paste(framed, (at_x, at_y))
+    return np.asarray(image)
+
+
+def _outline(image: Image.Image, edges: Sequence[float]) -> None:
+    """Outlines a rectangle from outside, so that what is in it stays as it is, but within the picture."""
+    left, top, right, bottom = edges
+    x, y = (left + right) / 2, (top + bottom) / 2
+    half_x, half_y = (max(size, LEAST_OUTLINE) / 2 for size in (right - left, bottom - top))
+    last_x, last_y = image.width - 1, image.height - 1
+    draw = ImageDraw.Draw(image)
+    for color, outside, width in ((HALO, 3, 4), (MARK, 2, 2)):
+        # Where the picture ends, the outline lies in its last pixels.
+        rim = 3 - outside
+        corners = (
+            np.clip(round(x - half_x - outside), rim, last_x),
+            np.clip(round(y - half_y - outside), rim, last_y),
+            np.clip(round(x + half_x + outside), 0, last_x - rim),
+            np.clip(round(y + half_y + outside), 0, last_y - rim),
+        )
+        draw.rectangle([int(corner) for corner in corners], outline=color, width=width)
+
+
+def _sheet(
+    view: UInt8[np.ndarray, "h w 3"],
+    view_name: str,
+    strongest: PixelAttention,
+    tiles: Sequence[tuple[UInt8[np.ndarray, "_h _w 3"], str, str]],
+    bank: MemoryBank,
+) -> UInt8[np.ndarray, "H W 3"]:
+    """The view on the left and the tiles on the right, up to three in a row, with what they are above and below."""
+    columns = min(3, len(tiles))
+    block = max(tile.shape[0] for tile, _, _ in tiles) + BAR + CAPTION
+    rows = -(-len(tiles) // columns)
+    view_width = max(view.shape[1], LEAST_LEFT)
+    left = 3 * GAP + view_width
+    width = left + max(columns * (TILE_SIDE + GAP), LEAST_RIGHT)
+    height = HEAD + max(view.shape[0] + CAPTION, rows * block)
+    sheet = Image.new("RGB", (width, height), PAPER)
+    draw = ImageDraw.Draw(sheet)
+
+    def write(at: tuple[int, int], text: str, room: int, size: int, color: tuple[int, int, int] = INK) -> None:
+        draw.text(at, fit_text(draw, text, room, size), fill=color, font=label_font(size))
+
+    (x, y), total = strongest.pixel, 100 * float(strongest.weights.sum())
+    write((GAP, GAP), "The query that is rendered in the marked pixel …", view_width, 19)
+    write((GAP, GAP + 28), f"memory of {bank.space.name}", view_width, 15, FAINT)
+    sheet.paste(Image.fromarray(view), (GAP, HEAD))
+    write((GAP, HEAD + view.shape[0] + 6), f"column {x}, row {y} of {view_name}", view_width, 15, FAINT)
+    room = width - left - GAP
+    kinds = "component" if len(bank) == 1 else "components"
+    write(
+        (left, GAP), f"… attends most to these {len(tiles)} of {len(bank):,} {kinds}: {total:.1f} % together", room, 19
+    )
+    legend = "outlined: the cell whose feature the component is; enlarged in the corner"
+    write((left, GAP + 28), legend, room, 15, FAINT)
+    for number, (tile, where, cell) in enumerate(tiles):
+        row, column = divmod(number, columns)
+        at_x, at_y = left + column * (TILE_SIDE + GAP), HEAD + row * block
+        sheet.paste(Image.fromarray(tile), (at_x, at_y))
+        below = at_y + tile.shape[0] + 4
+        weight = float(strongest.weights[number])
+        draw.rectangle([at_x, below, at_x + TILE_SIDE - 1, below + BAR - 3], fill=EMPTY_BAR)
+        if (filled := round(weight * TILE_SIDE)) > 0:
+            draw.rectangle([at_x, below, at_x + filled - 1, below + BAR - 3], fill=FULL_BAR)
+        write((at_x, below + BAR), f"{number + 1}.  {100 * weight:.1f} %", TILE_SIDE, 17)
+        draw.text((at_x + TILE_SIDE, below + BAR + 3), cell, fill=FAINT, font=label_font(13), anchor="ra")
+        write((at_x, below + BAR + 24), where, TILE_SIDE, 13, FAINT)
+    return np.asarray(sheet)
+
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+RAW_COLOR, COMPONENT_COLOR = "#5b8db8", "#d62728"
+UMAP_LEAST = 10
+"""Fewer features have no neighborhoods that UMAP could keep."""
+UMAP_NEIGHBORS = 15
+LONGEST_NAME = 60
+
+
+def check_umap() -> None:
+    """Raises:
+    InputError: the package umap-learn is not installed."""
+    if find_spec("umap") is None:
+        raise InputError("umap=true needs the package umap-learn: pip install 'gsencoder[umap]', or give umap=false")
+
+
+def component_scatter(
+    bank: MemoryBank, sample: RawSample, *, umap: bool = False, seed: int = 0
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draws raw features as small blue dots and components as red ones, in the plane of the two directions along which
+    the raw features vary most, and with `umap` beside it by UMAP (McInnes et al. 2018), as the paper does.
+
+    Args:
+        bank: the components.
+        sample: raw features of the same maps.
+        umap: whether to draw a second panel, by the cosines that the bank compares features by.
+        seed: of UMAP.
+
+    Raises:
+        InputError: features of another number of channels, or UMAP is asked for and not installed.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if sample.features.shape[1] != bank.space.channels:
+        raise InputError(
+            f"component_scatter: raw features of {sample.features.shape[1]} channels and components of "
+            f"{bank.space.channels}; expected those of the same teacher"
+        )
+    if umap:
+        check_umap()
+    figure = Figure(figsize=(15 if umap else 8.4, 7.6), dpi=100, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    panels = figure.subplots(1, 2 if umap else 1, squeeze=False)[0]
+    shares = _draw_pca(panels[0], bank, sample.features)
+    if umap:
+        _draw_umap(panels[1], bank, sample.features, seed)
+        panels[0].set_title(f"PCA: {100 * shares.sum():.1f} % of the variance", fontsize=13)
+    figure.suptitle("\n".join(_title(bank, sample)), fontsize=13)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def principal_plane(
+    features: Float32[np.ndarray, "n D"],
+) -> tuple[Float64[np.ndarray, " D"], Float64[np.ndarray, "D 2"], Float64[np.ndarray, "2"]]:
+    """The mean of features, the two orthonormal directions along which they vary most, and the shares of the variance
+    along these.
+
+    The largest entry of a direction is positive. Where features have no variance along a second direction, or none at
+    all, the direction is zero and its share is 0.
+    """
+    channels = features.shape[1]
+    axes, shares = np.zeros((channels, 2)), np.zeros(2)
+    if not len(features):
+        return np.zeros(channels), axes, shares
+    mean = features.mean(axis=0, dtype=np.float64)
+    centered = features - mean
+    # Of features and channels the fewer are compared with each other.
+    wide = len(features) < channels
+    products = centered @ centered.T if wide else centered.T @ centered
+    values, vectors = np.linalg.eigh(products)
+    total = float(np.maximum(values, 0).sum())
+    floor = np.finfo(np.float32).eps ** 2 * max(total, float(np.square(mean).sum()) * len(features))
+    for number in range(min(2, len(values))):
+        value, vector = float(values[-1 - number]), vectors[:, -1 - number]
+        if value <= floor:
+            break
+        axis = centered.T @ vector if wide else vector
+        axis = axis / np.linalg.norm(axis)
+        axes[:, number] = axis * (-1 if axis[np.abs(axis).argmax()] < 0 else 1)
+        shares[number] = value / total
+    return mean, axes, shares
+
+
+def umap_plane(vectors: Float32[np.ndarray, "n D"], seed: int = 0) -> Float32[np.ndarray, "n 2"]:
+    """UMAP's coordinates of vectors; the same for the same seed.
+
+    Args:
+        vectors: `UMAP_LEAST` or more, compared by their distances.
+        seed: of its optimization, which then runs in one thread.
+
+    Raises:
+        InputError: umap-learn is not installed, or there are too few vectors.
+    """
+    check_umap()
+    if len(vectors) < UMAP_LEAST:
+        raise InputError(f"umap: expected {UMAP_LEAST} features or more, got {len(vectors)}")
+    with warnings.catch_warnings():
+        # It warns about its own dependencies and about features far from all others, which are drawn all the same.
+        warnings.simplefilter("ignore")
+        from umap import UMAP
+
+        neighbors = min(UMAP_NEIGHBORS, len(vectors) - 1)
+        # Its own start needs a solver that fails where vectors are few or equal.
+        mean, axes, shares = principal_plane(vectors)
+        start = (vectors - mean) @ axes if shares.all() else "random"
+        reducer = UMAP(n_neighbors=neighbors, init=start, random_state=seed, n_jobs=1)
+        return np.asarray(reducer.fit_transform(vectors), np.float32)
+
+
+def _draw_pca(axes: "Axes", bank: MemoryBank, raw: Float32[np.ndarray, "n D"]) -> Float64[np.ndarray, "2"]:
+    mean, directions, shares = principal_plane(raw)
+    _dots(axes, (raw - mean) @ directions, (bank.components - mean) @ directions)
+    axes.set_xlabel(
+        f"first principal direction of the raw features, {100 * shares[0]:.1f} % of their variance", fontsize=12
+    )
+    axes.set_ylabel(f"second principal direction, {100 * shares[1]:.1f} % of their variance", fontsize=12)
+    return shares
+
+
+def _draw_umap(axes: "Axes", bank: MemoryBank, raw: Float32[np.ndarray, "n D"], seed: int) -> None:
+    axes.set_title("UMAP: close dots have features of a high cosine", fontsize=13)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    both = attention_keys(np.concatenate([raw, bank.components]), bank.mean, "centered")
+    if len(both) < UMAP_LEAST:
+        text = f"UMAP needs {UMAP_LEAST} features or more;\nthere are {len(both)}."
+        axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=12, transform=axes.transAxes)
+        return
+    plane = umap_plane(both, seed)
+    _dots(axes, plane[: len(raw)], plane[len(raw) :])
+
+
+def _dots(axes: "Axes", raw: Float[np.ndarray, "n 2"], components: Float[np.ndarray, "M 2"]) -> None:
+    from matplotlib.collections import PathCollection
+
+    few = len(components) <= 100
+    style: dict[str, Any] = {"linewidths": 0.6 if few else 0.3, "edgecolors": "white"}
+    axes.scatter(
+        raw[:, 0], raw[:, 1], s=5, color=RAW_COLOR, alpha=0.35, linewidths=0, label="raw feature", rasterized=True
+    )
+    axes.scatter(
+        components[:, 0], components[:, 1], s=60 if few else 16, color=COMPONENT_COLOR, label="component", **style
+    )
+    axes.grid(alpha=0.25)
+    axes.set_axisbelow(True)
+    legend = axes.legend(loc="best", fontsize=12, framealpha=0.9)
+    for handle, size in zip(legend.legend_handles, (40, 60), strict=True):
+        assert isinstance(handle, PathCollection)
+        handle.set_alpha(1)
+        handle.set_sizes([size])
+
+
+def _title(bank: MemoryBank, sample: RawSample) -> list[str]:
+    name, drawn = bank.space.name, len(sample.features)
+    shown = "" if drawn == sample.total else f", of which {drawn:,} are drawn"
+    return [
+        name if len(name) <= LONGEST_NAME else name[: LONGEST_NAME - 1] + "…",
+        f"{len(bank):,} {'component' if len(bank) == 1 else 'components'} for {sample.total:,} "
+        f"raw {'feature' if sample.total == 1 else 'features'}{shown}",
+        f"{100 * bank.coverage:.1f} % of the raw features have a component within the threshold, "
+        f"a cosine of {bank.threshold:.3f}",
+    ]

