@@ -21,7 +21,7 @@ from pathlib import Path
 from errors import one_line_errors, positive
 
 from gsencoder.core.errors import listed
-from gsencoder.train.augment import AugmentConfig
+from gsencoder.train.samples import AugmentConfig
 
 GROUPS: dict[str, dict[str, list[str]]] = {
     "recipe": {f"as it is, seed {seed}": [f"train.seed={seed}"] for seed in range(3)},

@@ -18,10 +18,10 @@ from json_option import add_json_option, write_figures
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.core.process import threads_of_torch
-from gsencoder.train.dataset_space import fit_space
 from gsencoder.train.distributed import join_processes, values_of_all
-from gsencoder.train.prepared_dataset import SPACE_FILE, PreparedDataset
-from gsencoder.train.source import SceneReader
+from gsencoder.train.prepare import SPACE_FILE, PreparedDataset
+from gsencoder.train.prepare_scenes import SceneReader
+from gsencoder.train.space import fit_space
 
 
 def main() -> None:

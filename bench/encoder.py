@@ -38,9 +38,8 @@ from gsencoder.models.plan import plan_cloud
 from gsencoder.train import samples
 from gsencoder.train.batch import Batch, join_samples
 from gsencoder.train.distill import Distillation
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.samples import SampleDataset, SampleRecipe
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.samples import SampleDataset, SampleRecipe, TrainingScene
 from gsencoder.types import FeatureSpace, Gaussians
 
 CHANNELS = 64

@@ -30,9 +30,7 @@ from gsencoder.memory.index import index_features
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import build_teacher, words_of
 from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher
-from gsencoder.train.memory import memory_training, train_memory
-from gsencoder.train.memory_network import MemoryConfig
-from gsencoder.train.memory_scene import prepare_memory
+from gsencoder.train.memory import MemoryConfig, memory_training, prepare_memory, train_memory
 from gsencoder.types import FeatureMap, Scene
 
 WIDTHS = (16, 32)

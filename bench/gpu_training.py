@@ -21,7 +21,7 @@ from gsencoder.core.process import Precision
 from gsencoder.models.transformer import DropPath
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.distributed import join_processes
-from gsencoder.train.prepared_dataset import PreparedDataset
+from gsencoder.train.prepare import PreparedDataset
 
 STEPS = 3
 

@@ -15,10 +15,8 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.settings.compose import compose
-from gsencoder.train.class_balance import nearest_codes
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.prepare import PreparedDataset, nearest_codes
+from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe, TrainingScene
 
 
 def cosines(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -46,9 +46,14 @@ from gsencoder.render.images import psnr
 from gsencoder.render.rasterize import RasterConfig, rasterize
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import build_teacher, words_of
-from gsencoder.train.memory import first_queries, memory_training, train_memory
-from gsencoder.train.memory_network import MemoryConfig
-from gsencoder.train.memory_scene import MemoryScene, prepare_memory
+from gsencoder.train.memory import (
+    MemoryConfig,
+    MemoryScene,
+    first_queries,
+    memory_training,
+    prepare_memory,
+    train_memory,
+)
 from gsencoder.types import FeatureMap, Gaussians, QueryMemory, Scene
 
 EPS = 1e-12

@@ -26,9 +26,15 @@ from gsencoder.evaluate.rendered import RenderedTally
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import Blend, blend
 from gsencoder.teachers.build import build_teacher, words_of
-from gsencoder.train.memory import memory_training, train_decoder, train_memory, untrained_memory
-from gsencoder.train.memory_network import MemoryConfig
-from gsencoder.train.memory_scene import MemoryScene, prepare_memory
+from gsencoder.train.memory import (
+    MemoryConfig,
+    MemoryScene,
+    memory_training,
+    prepare_memory,
+    train_decoder,
+    train_memory,
+    untrained_memory,
+)
 from gsencoder.types import FeatureMap
 
 MIN_ALPHA = 0.5

@@ -21,9 +21,8 @@ from gsencoder.core.process import retain_freed_memory
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.batch import Batch, join_samples
 from gsencoder.train.distill import Distillation
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe, TrainingScene
 
 
 class Training:

@@ -35,9 +35,7 @@ from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.memory.bank import BankConfig
 from gsencoder.memory.index import IndexConfig, index_features
 from gsencoder.teachers.build import build_teacher, words_of
-from gsencoder.train.memory import memory_training, train_memory, untrained_memory
-from gsencoder.train.memory_network import MemoryConfig
-from gsencoder.train.memory_scene import prepare_memory
+from gsencoder.train.memory import MemoryConfig, memory_training, prepare_memory, train_memory, untrained_memory
 from gsencoder.types import GaussianFeatures, Scene
 
 Stored = tuple[str, str, int, GaussianFeatures, float]

@@ -8,9 +8,8 @@ import numpy as np
 from training_scenes import SMALL, DenseSideTeacher, SideTeacher, prepared, samples
 
 from gsencoder.train.batch import Batch, join_samples
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe, TrainingScene
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 TALL = FeatureSpace(name="heights", channels=4)

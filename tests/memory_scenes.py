@@ -9,7 +9,7 @@ from training_scenes import scene as wall
 
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import blend
-from gsencoder.train.memory_scene import MemoryScene, prepare_memory
+from gsencoder.train.memory import MemoryScene, prepare_memory
 from gsencoder.train.prepare import PrepareConfig
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 

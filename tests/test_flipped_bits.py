@@ -41,8 +41,8 @@ from gsencoder.reconstruct.checkpoint import State, load_state, save_state
 from gsencoder.reconstruct.optimize import anchor_at
 from gsencoder.reconstruct.parameters import RowAdam, parameters_from
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
-from gsencoder.train.checkpoint import TrainingState, load_checkpoint, save_checkpoint
-from gsencoder.train.prepared_dataset import CLASS_BALANCE_FILE, SPACE_FILE
+from gsencoder.train.loop import TrainingState, load_checkpoint, save_checkpoint
+from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE
 from gsencoder.types import FeatureSpace, Scene, Views
 
 FLIPS = 60

@@ -15,9 +15,9 @@ from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.onnx.export import random_cloud
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import load_weights
-from gsencoder.train.augment import AugmentConfig
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.run import TrainConfig
+from gsencoder.train.samples import AugmentConfig
 
 SMALL_MODEL = (
     "model=tiny",

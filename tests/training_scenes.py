@@ -11,15 +11,12 @@ from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.transformer import TransformerConfig
 from gsencoder.teachers.base import Teacher
-from gsencoder.train.augment import AugmentConfig
-from gsencoder.train.crops import SamplingConfig
-from gsencoder.train.dataset_space import fit_space
+from gsencoder.train.batch import SamplingConfig
+from gsencoder.train.loop import TrainerConfig
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepare import PrepareConfig
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
-from gsencoder.train.trainer_config import TrainerConfig
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.prepare import PrepareConfig, PreparedDataset
+from gsencoder.train.samples import AugmentConfig, SampleDataset, SampleRecipe, TeacherRecipe, TrainingScene
+from gsencoder.train.space import fit_space
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
 
 TABLE = np.array([[0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0]], np.float32)

@@ -8,10 +8,9 @@ from PIL import Image
 from tiny_vlm import SIDE, save_tiny_vlm
 
 from gsencoder.data.prompts import PromptStore
-from gsencoder.train.trainer_config import TrainerConfig
-from gsencoder.train.tuning.run import TuneConfig
-from gsencoder.train.tuning.samples import TuningPair
-from gsencoder.train.tuning.vlm import AdapterConfig
+from gsencoder.train.loop import TrainerConfig
+from gsencoder.train.tune import TuneConfig, TuningPair
+from gsencoder.train.vlm import AdapterConfig
 
 THINGS = ("mug", "chair", "box", "crate", "lamp")
 ANSWERS = ("red", "green", "2", "yes")

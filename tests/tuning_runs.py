@@ -5,8 +5,7 @@ from typing import Any
 
 from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.data.prompts import PromptStore
-from gsencoder.train.tuning.run import open_processor
-from gsencoder.train.tuning.samples import PairSamples, TuningPair, TuningSample
+from gsencoder.train.tune import PairSamples, TuningPair, TuningSample, open_processor
 
 Pairs = tuple[list[TuningPair], PromptStore]
 

@@ -22,11 +22,11 @@ from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.render import blend
 from gsencoder.render.images import render_image
-from gsencoder.train.class_balance import nearest_codes
 from gsencoder.train.distributed import current_process, summed_array
-from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.trainer import ValidationResult
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.loop import ValidationResult
+from gsencoder.train.prepare import nearest_codes
+from gsencoder.train.prepared_file import PreparedScene
+from gsencoder.train.samples import TrainingScene
 
 PICTURED_SCENES = 3
 """Held-out scenes of which a view is drawn at each validation during training."""

@@ -31,8 +31,8 @@ from gsencoder.models.output_space import OutputSpace
 from gsencoder.teachers.build import TeacherConfig
 from gsencoder.teachers.radio import RadioConfig
 from gsencoder.train.losses import AdapterHead
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.sampled_maps import OpenScene, sampled_maps
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.space import OpenScene, sampled_maps
 
 
 class FeatureDecoder(nn.Module):

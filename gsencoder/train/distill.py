@@ -10,10 +10,9 @@ from torch import Tensor, nn
 
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.batch import Batch, TeacherTargets, join_samples
+from gsencoder.train.loop import Trainer, TrainerConfig
 from gsencoder.train.losses import AdapterHead, LossConfig, contrast_loss, field_loss, render_loss
 from gsencoder.train.samples import SampleDataset, TeacherRecipe
-from gsencoder.train.trainer import Trainer
-from gsencoder.train.trainer_config import TrainerConfig
 
 Heads = Sequence[tuple[AdapterHead, nn.Module]]
 """Adapter heads of a teacher, each with a decoder from standard units to its input."""

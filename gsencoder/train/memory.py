@@ -1,28 +1,442 @@
-"""Training of a scene's memory: first queries, the loop, and what comes out (M3 sec. 3.3)."""
+"""Training of a scene's memory: first queries, the loop, and what comes out (M3 sec. 3.3).
 
+The network of a scene's memory, its samples and its loss: principal queries of Gaussians, rendered through B, attend
+to banks (M3 sec. 3.3).
+
+    R̂ = A_gm(B q / alpha),   L = λ_cos · (1 − cos(R̂, R)) + λ_L2 · |R̂ − R|² / C
+
+over rows of B that are drawn at random in each view, and Gaussians, which are rows with one entry, with a weight of
+their own; in standard units about the mean of the space. With the geometry
+frozen this is a regression on sparse rows, without a rasterizer.
+
+Preparation of a scene for the training of its memory: fused features, a bank, and the rows of B of every view.
+
+The files of each teacher are in a folder of their own, and appear when they are complete; an interrupted preparation
+continues with the maps and sums of its fusion.
+"""
+
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float32
-from torch import nn
+from jaxtyping import Float, Float32
+from torch import Tensor, nn
+from torch.utils.data import Dataset
 
-from gsencoder.core.errors import InputError
-from gsencoder.core.files import plain
+from gsencoder.core.archive import open_archive, write_archive
+from gsencoder.core.errors import InputError, advised
+from gsencoder.core.files import plain, read_foreign, write_json
 from gsencoder.core.process import ProcessRank, Track, untracked
+from gsencoder.core.settings import first_difference, with_added_options
+from gsencoder.data.scene_arrays import bank_parts, read_bank
+from gsencoder.data.splats.files import fingerprint
+from gsencoder.fusion.basis import to_coordinates
+from gsencoder.fusion.checkpoint import CachedTeacher, upright
+from gsencoder.fusion.fuse import fuse
 from gsencoder.memory.attention import Decoder, MemoryAttention, make_decoder, random_projection
-from gsencoder.memory.bank import principal_queries
-from gsencoder.train.checkpoint import TrainingState
-from gsencoder.train.memory_network import MemoryConfig, MemoryNetwork, MemoryObjective, ViewSamples, join_views
-from gsencoder.train.memory_scene import MemoryScene
-from gsencoder.train.render_rows import sample_rows
-from gsencoder.train.trainer import Trainer
-from gsencoder.train.trainer_config import CHANGEABLE_ON_RESUME, TrainerConfig
-from gsencoder.types import MemoryBank, QueryMemory
+from gsencoder.memory.bank import BankConfig, MapStream, RawSample, build_bank, draw_sample, principal_queries
+from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
+from gsencoder.teachers.base import Teacher
+from gsencoder.train.batch import RenderRows, gaussian_rows, join_rows, sample_rows
+from gsencoder.train.loop import CHANGEABLE_ON_RESUME, Trainer, TrainerConfig, TrainingState
+from gsencoder.train.prepare import PrepareConfig, view_rows
+from gsencoder.train.prepared_file import PreparedScene, write_prepared
+from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory, Scene
+from gsencoder.types.features import Scoring
+
+BANK_FILE, SCENE_FILE, MAPS_FOLDER = "bank.safetensors", "scene.safetensors", "maps"
+SAMPLE_FILE, SETTINGS_FILE = "sample.safetensors", "made_with.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MemoryScene:
+    """A scene that is prepared for one teacher.
+
+    Attributes:
+        prepared: its Gaussians, fused features, and rows of B.
+        outputs: the units of these features.
+        bank: the components.
+    """
+
+    prepared: PreparedScene
+    outputs: OutputSpace
+    bank: MemoryBank
+
+    @property
+    def values(self) -> Float32[np.ndarray, "M channels"]:
+        """The components in the units of the outputs."""
+        basis = self.outputs.basis
+        rows = self.bank.components if basis is None else to_coordinates(basis, self.bank.components)
+        return self.outputs.standardize(rows)
+
+    def fused_features(self) -> GaussianFeatures:
+        """The fused features, as they were stored."""
+        prepared, outputs = self.prepared, self.outputs
+        rows = np.arange(len(prepared))
+        restored = outputs.restore(prepared.targets(rows))
+        weights = np.array(prepared.weights)
+        restored[weights == 0] = 0
+        return GaussianFeatures(
+            features=restored, weights=weights, mean=outputs.mean, space=outputs.space, basis=outputs.basis
+        )
+
+
+def prepare_memory(
+    scene: Scene,
+    teacher: Teacher,
+    folder: Path,
+    bank: BankConfig = BankConfig(),
+    prepare: PrepareConfig = PrepareConfig(),
+    *,
+    predicted: GaussianFeatures | None = None,
+    sample: int = 0,
+    device: torch.device = torch.device("cpu"),
+    track: Track = untracked,
+) -> MemoryScene:
+    """Prepares a scene for one teacher, or opens what was prepared in this folder before.
+
+    Args:
+        scene: with Gaussians and views.
+        teacher: whose features are remembered.
+        folder: created if it does not exist.
+        bank: how the bank is made.
+        prepare: settings of the fusion and of the rows.
+        predicted: features of the teacher's space that an encoder predicts for the scene; None = they are fused.
+        sample: number of raw features that are stored beside the bank for `open_raw_sample`, or all if there are fewer.
+        device: where B is made and multiplied.
+        track: wraps loops to show progress.
+
+    Raises:
+        InputError: features that are not standardized, a scene that cannot be fused, a bank that cannot be made, or a
+            folder that was prepared with other settings.
+    """
+    if not (prepare.center and prepare.scale):
+        raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
+    if prepare.render_views:
+        raise InputError("prepare.render_views: expected 0: a memory is trained on all views of its scene")
+    if prepare.targets != "float16":
+        raise InputError("prepare.targets: expected float16: the fused features of a memory are read from its targets")
+    if predicted is not None and predicted.space != teacher.space:
+        raise InputError(
+            f"memory: the predicted features are of ({predicted.space.describe()}), and the teacher's of "
+            f"({teacher.space.describe()})"
+        )
+    settings = _preparation_settings(scene, teacher, bank, prepare, predicted)
+    stream = _map_stream(scene, teacher, folder)
+    if (folder / BANK_FILE).is_file():
+        prepared = open_memory_scene(folder, settings)
+        _sample_raw(folder, stream, prepared.outputs.space, sample)
+        return prepared
+    _begin(folder, settings)
+    maps = folder / MAPS_FOLDER
+    work = None if teacher.cheap else maps
+    features = predicted or fuse(scene, teacher, prepare.fusion, work=work, device=device, track=track).features
+    outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
+    source = _source(teacher, folder)
+    maps.mkdir(exist_ok=True)
+    components = build_bank(stream, features.space, features.mean, bank)
+    assert scene.views is not None
+    rows = view_rows(scene, source, outputs, prepare, np.arange(len(scene.views)), device)
+    _sample_raw(folder, stream, features.space, sample)
+    write_prepared(folder / SCENE_FILE, scene, features, outputs, rows)
+    _write_bank(folder / BANK_FILE, components, outputs, settings)
+    return open_memory_scene(folder, settings)
+
+
+def open_memory_scene(folder: Path, settings: Mapping[str, Any] | None = None) -> MemoryScene:
+    """Opens a prepared scene.
+
+    Args:
+        folder: of `prepare_memory`.
+        settings: what the preparation depends on; None = anything.
+
+    Raises:
+        InputError: missing, damaged, or prepared with other settings.
+    """
+    with _advice(folder), open_archive(folder / BANK_FILE) as file:
+        stored = with_added_options(file.value("made_with", dict))
+        if settings is not None and stored != settings:
+            raise InputError(f"was prepared with {first_difference(stored, dict(settings))}")
+        outputs = read_output_space(file)
+        bank = read_bank(file, file.array("bank", "float32", ("M", outputs.space.channels)), outputs.space)
+    return MemoryScene(prepared=PreparedScene(folder / SCENE_FILE), outputs=outputs, bank=bank)
+
+
+def _advice(folder: Path) -> AbstractContextManager[None]:
+    return advised(f"give resume=false, or remove {folder}, to prepare the scene again")
+
+
+def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Writes what a preparation depends on before its first map and its sample, which do not say so themselves.
+
+    Raises:
+        InputError: the folder holds those of other settings, or cannot be used.
+    """
+    path = folder / SETTINGS_FILE
+    with _advice(folder):
+        if not path.is_file():
+            if any((folder / name).exists() for name in (SAMPLE_FILE, MAPS_FOLDER)):
+                raise InputError(f"{folder}: holds parts of a preparation, and not what they were made with")
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise InputError(f"{folder}: cannot be made: {error.strerror or error}") from error
+            write_json(path, settings)
+            return
+        try:
+            stored = with_added_options(json.loads(read_foreign(path)))
+        except (OSError, ValueError, TypeError, RecursionError) as error:
+            raise InputError(f"{path}: cannot be read ({type(error).__name__})") from error
+        if stored != settings:
+            raise InputError(f"{folder}: was begun with {first_difference(stored, settings)}")
+
+
+def open_raw_sample(folder: Path) -> RawSample:
+    """The raw features that were stored beside the bank.
+
+    Raises:
+        InputError: none were, or they are damaged.
+    """
+    with advised(f"remove {folder} to prepare the scene again"), open_archive(folder / SAMPLE_FILE) as file:
+        return RawSample(features=file.array("features", "float32", ("n", "D")), total=file.value("total", int))
+
+
+def _sample_raw(folder: Path, stream: MapStream, space: FeatureSpace, count: int) -> None:
+    """Stores a sample of raw features, unless there is one of this number already."""
+    path = folder / SAMPLE_FILE
+    if not count:
+        return
+    if path.is_file():
+        with open_archive(path) as file:
+            if file.value("limit", int) == count:
+                return
+    sample = draw_sample(stream, space, count)
+    write_archive(path, {"features": sample.features}, {"total": sample.total, "limit": count})
+
+
+def _source(teacher: Teacher, folder: Path) -> Teacher:
+    """The teacher, its maps read from where the fusion has left them unless they are cheap."""
+    teacher = upright(teacher)
+    return teacher if teacher.cheap else CachedTeacher(teacher, folder / MAPS_FOLDER)
+
+
+def _map_stream(scene: Scene, teacher: Teacher, folder: Path) -> MapStream:
+    assert scene.views is not None
+    views, source = scene.views, _source(teacher, folder)
+
+    def stream() -> Iterator[tuple[int, FeatureMap]]:
+        for view in range(len(views)):
+            yield view, source.feature_map(views, view)
+
+    return stream
+
+
+def _write_bank(path: Path, bank: MemoryBank, outputs: OutputSpace, settings: Mapping[str, Any]) -> None:
+    arrays, header = output_space_parts(outputs)
+    of_bank, figures = bank_parts(bank)
+    arrays |= {"bank": bank.components, **of_bank}
+    write_archive(path, arrays, {**header, **figures, "made_with": dict(settings)})
+
+
+def _preparation_settings(
+    scene: Scene, teacher: Teacher, bank: BankConfig, prepare: PrepareConfig, predicted: GaussianFeatures | None
+) -> dict[str, Any]:
+    """What a preparation depends on, as JSON values."""
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    settings = {
+        "gaussians": fingerprint(scene.gaussians)[:16],
+        "views": list(scene.views.names),
+        "teacher": teacher.settings(),
+        "bank": plain(bank),
+        "prepare": plain(prepare),
+        "predicted": None if predicted is None else sha256(predicted.features.tobytes()).hexdigest()[:16],
+    }
+    return dict(json.loads(json.dumps(settings, default=str)))
+
+
+def _spread(features: GaussianFeatures) -> float:
+    """The root mean square distance of seen features from the mean."""
+    seen = np.flatnonzero(features.seen)
+    total = 0.0
+    for start in range(0, len(seen), 1 << 14):
+        rows = features.stored(seen[start : start + (1 << 14)])
+        centered = rows if features.basis is not None else rows - features.mean
+        total += float(np.einsum("nc,nc->", centered, centered, dtype=np.float64))
+    # Equal features have no spread; any unit does for them.
+    return float(np.sqrt(total / len(seen))) or 1.0
+
+
+EPS = 1e-12
+MAX_CHANNELS = 1024
+"""Channels of a query, at most; 16 to 64 are enough for most teachers."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MemoryConfig:
+    """Queries, attention and loss of a memory."""
+
+    channels: int = field(default=16, metadata={"help": "channels s of a Gaussian's query for each teacher"})
+    init: Literal["fused", "random"] = field(
+        default="fused",
+        metadata={
+            "help": "first queries: the principal coordinates of the fused features, with which Gaussians themselves "
+            "keep features; random = as the paper, where only rendered queries do"
+        },
+    )
+    scoring: Scoring = field(
+        default="centered",
+        metadata={
+            "help": "queries and components are compared by the cosine about the mean; cosine = as they are, as M3's "
+            "code does; dot = by products, as its equation"
+        },
+    )
+    temperature: float = field(default=0.05, metadata={"help": "temperature of the attention's softmax"})
+    points: int = field(default=2000, metadata={"help": "rows of B that are drawn in each view of a step"})
+    gaussian_weight: float = field(
+        default=0.3,
+        metadata={
+            "help": "weight of Gaussians that are compared with their fused features, half as many as points; without "
+            "them rendered features come nearer to the teacher's, and those of the Gaussians go their own way; 0 = off"
+        },
+    )
+    min_alpha: float = field(default=0.5, metadata={"help": "smallest opacity of a row"})
+    cosine: float = field(default=1.0, metadata={"help": "weight of 1 − cosine"})
+    l2: float = field(default=1.0, metadata={"help": "weight of the squared distance in standard units"})
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.channels <= MAX_CHANNELS:
+            raise InputError(f"channels: expected 1 to {MAX_CHANNELS:,}, got {self.channels:,}")
+        if self.points < 1:
+            raise InputError(f"points: expected 1 or more, got {self.points}")
+        if not 0 < self.temperature < math.inf:
+            raise InputError(f"temperature: expected a positive number, got {self.temperature}")
+        if not 0 < self.min_alpha <= 1:
+            raise InputError(f"min_alpha: expected a number in (0, 1], got {self.min_alpha}")
+        for name in ("cosine", "l2", "gaussian_weight"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        if not self.cosine + self.l2 > 0:
+            raise InputError("cosine, l2: expected one above 0; there would be no loss")
+
+
+class MemoryBatch(NamedTuple):
+    """Rows of one or more views, for each teacher."""
+
+    names: tuple[str, ...]
+    rows: tuple[RenderRows, ...]
+
+    def to(self, device: torch.device) -> "MemoryBatch":
+        """The batch with its tensors on a device."""
+        rows = tuple(RenderRows(*(part.to(device, non_blocking=True) for part in each)) for each in self.rows)
+        return MemoryBatch(names=self.names, rows=rows)
+
+
+class ViewSamples(Dataset[MemoryBatch]):
+    """Rows of the views of a scene by number of the sample; each epoch goes through the views in a new order."""
+
+    def __init__(self, scenes: Mapping[str, MemoryScene], config: MemoryConfig, seed: int) -> None:
+        self._scenes = {name: scene.prepared for name, scene in scenes.items()}
+        self._config, self._seed = config, seed
+        self._views = next(iter(self._scenes.values())).view_names
+
+    def __getitem__(self, number: int) -> MemoryBatch | InputError:  # type: ignore[override]
+        """Sample `number`, or its error as a value."""
+        epoch, position = divmod(number, len(self._views))
+        view = int(np.random.default_rng([self._seed, 0, epoch]).permutation(len(self._views))[position])
+        try:
+            rows = tuple(self._rows(scene, view, number) for scene in self._scenes.values())
+        except InputError as error:
+            return error
+        return MemoryBatch(names=(self._views[view],), rows=rows)
+
+    def _rows(self, scene: PreparedScene, view: int, number: int) -> RenderRows:
+        config, rng = self._config, np.random.default_rng([self._seed, 1, number])
+        seen = scene.weights > 0
+        rows = sample_rows(scene.view(view), seen, config.min_alpha, config.points, rng)
+        if not config.gaussian_weight:
+            return rows
+        # A Gaussian is a row of B with one entry.
+        of_seen = np.flatnonzero(seen)
+        chosen = np.sort(rng.choice(of_seen, min(len(of_seen), -(-config.points // 2)), replace=False))
+        return join_rows([rows, gaussian_rows(chosen, scene.targets(chosen), config.gaussian_weight)], [0, 0])
+
+
+def join_views(samples: Sequence[MemoryBatch | InputError]) -> MemoryBatch | InputError:
+    """Joins samples to a batch; if one of them is an error, returns the first error instead."""
+    batches = []
+    for sample in samples:
+        if isinstance(sample, InputError):
+            return sample
+        batches.append(sample)
+    shifts = [0] * len(batches)
+    rows = tuple(join_rows(of_teacher, shifts) for of_teacher in zip(*(each.rows for each in batches), strict=True))
+    return MemoryBatch(names=tuple(name for each in batches for name in each.names), rows=rows)
+
+
+class MemoryNetwork(nn.Module):
+    """Queries of Gaussians for each teacher, and what turns rendered queries into its features."""
+
+    def __init__(self, queries: Mapping[str, Float[Tensor, "N s"]], decoders: Mapping[str, nn.Module]) -> None:
+        super().__init__()
+        # Names of modules may hold no dots and are not those of attributes; numbers stand for teachers.
+        self.queries = nn.ParameterList([nn.Parameter(each) for each in queries.values()])
+        self.decoders = nn.ModuleList(decoders.values())
+
+    def forward(self, rows: tuple[RenderRows, ...]) -> tuple[Float[Tensor, "_ _"], ...]:
+        """The features of rows of B for each teacher, in standard units."""
+        features = []
+        for queries, decoder, each in zip(self.queries, self.decoders, rows, strict=True):
+            b = each.blend(len(queries))
+            features.append(decoder(b.render(queries) / b.alpha.clamp(min=EPS)[:, None]))
+        return tuple(features)
+
+
+class MemoryObjective:
+    """The loss of a memory: for each teacher and row w · (λ_cos · (1 − cos) + λ_L2 · |R̂ − R|² / C)."""
+
+    def __init__(self, network: nn.Module, config: MemoryConfig, teachers: Sequence[str]) -> None:
+        self.network, self._config, self._teachers = network, config, tuple(teachers)
+
+    @property
+    def advice(self) -> str:
+        """Settings that leave nothing to compare."""
+        return "memory.min_alpha"
+
+    @property
+    def lambdas(self) -> dict[str, float]:
+        """The weights of the terms that are not 0, by name."""
+        weights = {"cosine": self._config.cosine, "l2": self._config.l2}
+        return {self._term(name, term): value for name in self._teachers for term, value in weights.items() if value}
+
+    def _term(self, teacher: str, term: str) -> str:
+        return term if len(self._teachers) == 1 else f"{teacher}/{term}"
+
+    def divisors(self, batch: MemoryBatch) -> dict[str, float]:
+        """The sum of the weights of the rows, for each term."""
+        sums = {
+            name: float(rows.row_weights.double().sum()) for name, rows in zip(self._teachers, batch.rows, strict=True)
+        }
+        return {self._term(name, term): total for name, total in sums.items() for term in ("cosine", "l2")}
+
+    def __call__(self, batch: MemoryBatch) -> dict[str, Tensor]:
+        """Totals of the terms whose weight is not 0."""
+        terms = {}
+        for name, predicted, rows in zip(self._teachers, self.network(batch.rows), batch.rows, strict=True):
+            predicted, target = predicted.float(), rows.targets
+            products = (predicted * target).sum(dim=1)
+            lengths = torch.sqrt(((predicted * predicted).sum(dim=1) + EPS) * ((target * target).sum(dim=1) + EPS))
+            terms[self._term(name, "cosine")] = ((1 - products / lengths) * rows.row_weights).sum()
+            terms[self._term(name, "l2")] = ((predicted - target).square().mean(dim=1) * rows.row_weights).sum()
+        return {name: terms[name] for name in self.lambdas}
 
 
 def memory_training() -> TrainerConfig:

@@ -1,29 +1,151 @@
 """Preparation of all scenes of a training from disk: reading, seeding and fusing, shared among processes."""
 
 import hashlib
+import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatch
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
 from gsencoder.core.settings import TRAINED
+from gsencoder.data.labels.files import read_split
+from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.seeding.points import unit_of
+from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.adapter_heads import Head
+from gsencoder.fusion.cameras import CamerasOfSplat, check_orbits, with_views
+from gsencoder.fusion.fit import with_fitting_splat
+from gsencoder.fusion.folder import TEACHER_NAME
 from gsencoder.models.output_space import check_distinct
 from gsencoder.teachers.base import MissingInput, Teacher
-from gsencoder.teachers.build import TeacherConfig
-from gsencoder.text.vocabulary import Words, closed_table
+from gsencoder.teachers.build import TeacherConfig, build_teacher, options_of_member
+from gsencoder.teachers.labels import LabelsConfig
+from gsencoder.teachers.masks import RegionsConfig
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
-from gsencoder.train.dataset_space import fit_space
 from gsencoder.train.distributed import check_agreement, fail_together
-from gsencoder.train.prepared_dataset import DATASET_SETTINGS_FILE, PreparedDataset
-from gsencoder.train.source import SceneReader, SourceConfig
+from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PrepareConfig, PreparedDataset
+from gsencoder.train.space import fit_space
+from gsencoder.types import Scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SourceConfig:
+    """The source of a training's targets: settings of reading, seeding, the teacher and preparation."""
+
+    splat: str = field(
+        default="",
+        metadata={
+            "help": "file of the Gaussians of scenes with views, where {scene} stands for the name of its folder; "
+            f"empty = make seeds. {READABLE}"
+        },
+    )
+    orbits: int = field(default=24, metadata={"help": "largest number of cameras placed in a splat without views"})
+    cameras: CamerasOfSplat = field(
+        default="auto",
+        metadata={"help": "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"},
+    )
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    teachers: Mapping[str, TeacherConfig] = field(
+        default_factory=dict,
+        metadata={
+            "help": "several teachers instead of one, by the names that teacher= takes, or NAME:TEACHER; options of "
+            "one of them are teachers.NAME.OPTION",
+            "several": "teacher",
+        },
+    )
+    text: TextConfig = field(default_factory=TableTextConfig)
+    prepare: PrepareConfig = field(default_factory=PrepareConfig)
+
+    def __post_init__(self) -> None:
+        check_orbits(self.orbits)
+        wrong = [name for name in self.teachers if not re.fullmatch(TEACHER_NAME, name)]
+        if wrong:
+            raise InputError(f"teachers: expected names of letters, digits, _ and -, got {wrong[0]!r}")
+        spelled: dict[str, str] = {}
+        for name in self.teachers:
+            other = spelled.setdefault(name.lower(), name)
+            if other != name:
+                raise InputError(
+                    f"teachers: {other} and {name} differ only in case, and their files would overwrite each other "
+                    f"where a file system ignores it; give another name, such as {name}_2"
+                )
+
+    @property
+    def teachers_by_name(self) -> dict[str, TeacherConfig]:
+        """The teachers of the training, one or several."""
+        return dict(self.teachers) or {self.teacher.name: self.teacher}
+
+    def typed_options(self, name: str) -> AbstractContextManager[None]:
+        """Names options of a teacher in errors by the keys that are typed: teachers.NAME.OPTION with `teachers`."""
+        return options_of_member(name, self.teachers[name]) if name in self.teachers else nullcontext()
+
+
+class SceneReader:
+    """Reads scenes and builds teachers for them."""
+
+    def __init__(self, config: SourceConfig, words: Mapping[str, Words], voxel: float) -> None:
+        """Args:
+        config: settings of reading, seeding and the teachers.
+        words: the words of teachers that have any, by teacher.
+        voxel: see `prepare_scenes`.
+        """
+        self.config, self.words, self.voxel = config, words, voxel
+        self._shared: dict[str, Teacher] = {}
+
+    def teacher(self, name: str, scene: Scene) -> Teacher:
+        """The teacher of a scene. Objects and masks belong to a scene; any other teacher is built once for all."""
+        config = self.config.teachers_by_name[name]
+        if isinstance(config, (LabelsConfig, RegionsConfig)):
+            return build_teacher(config, scene, self.words.get(name))
+        if name not in self._shared:
+            self._shared[name] = build_teacher(config, scene, self.words.get(name))
+        return self._shared[name]
+
+    def with_views(self, name: str, path: Path) -> tuple[Scene, Teacher]:
+        """A scene with views, which is enough for maps, and the teacher of this name."""
+        with about(path):
+            scene = self.load(path)
+            return scene, self.teacher(name, scene)
+
+    def weights_of_teachers(self, path: Path) -> dict[str, str]:
+        """The digests of the weights of the teachers that a scene has, by their names."""
+        with about(path):
+            scene, weights = self.load(path), dict[str, str]()
+            for name in self.config.teachers_by_name:
+                try:
+                    with self.config.typed_options(name):
+                        weights[name] = self.teacher(name, scene).space.weights
+                except MissingInput:
+                    continue
+        return weights
+
+    def with_gaussians(self, scene: Scene, path: Path) -> Scene:
+        """A scene that `load` read, with Gaussians, of known unit, named by its path."""
+        scene = with_gaussians(scene, self.config.seeds)
+        return replace(scene, name=path.name, metres_per_unit=unit_of(scene, self.voxel))
+
+    def load(self, path: Path) -> Scene:
+        """A scene with views, as it is on disk; cameras are placed in a splat without any."""
+        config = self.config
+        scene = load_scene(path, splat=config.splat or None, options=config.data)
+        scene = with_fitting_splat(scene, config.splat, config.data)
+        if scene.views is None:
+            scene = with_views(scene, config.orbits, config.prepare.fusion.blend, cameras=config.cameras)
+        return scene
 
 
 def prepare_scenes(
@@ -261,3 +383,60 @@ def _words_digest(words: Words | None) -> str:
         return ""
     table = closed_table(words)
     return hashlib.sha256(repr(table.names).encode() + table.embeddings.tobytes()).hexdigest()[:16]
+
+
+def split_scenes(
+    paths: Sequence[Path], patterns: Sequence[str], split: Path | None = None, holdout_split: Path | None = None
+) -> tuple[list[Path], list[Path]]:
+    """Splits scenes into those to train on and those held out for validation.
+
+    Args:
+        paths: all scenes.
+        patterns: names of scenes to hold out, with * and ? as in file names.
+        split: file of the names of the scenes to train on, one a line, such as scannetv2_train.txt; those that are
+            neither in it nor held out are left out. None = all that are not held out.
+        holdout_split: file of the names of the scenes to hold out, in place of patterns.
+
+    Raises:
+        InputError: a pattern matches no scene, a file names a scene that is not there, or one that the other file
+            names too, all scenes are held out, or two scenes have the same name.
+    """
+    names = [path.name for path in paths]
+    if (repeated := first_repeated(names)) is not None:
+        raise InputError(f"paths: two scenes are called {repeated[0]!r}; prepared scenes need distinct names")
+    for pattern in patterns:
+        if not any(fnmatch(name, pattern) for name in names):
+            raise InputError(
+                f"holdout: no scene is called {pattern!r}; the scenes are {listed(names, 5)}; give names of these, or "
+                "holdout=[] for none (experiments hold out scenes of the data that they are made for)"
+            )
+    trained = _names_of("split", split, names) or tuple(names)
+    held_out = set(_names_of("holdout_split", holdout_split, names))
+    if holdout_split is None:
+        held_out = {name for name in names if any(fnmatch(name, pattern) for pattern in patterns)}
+    elif patterns:
+        raise InputError("holdout: expected holdout= or holdout_split=, got both; leave one out, or give holdout=[]")
+    elif split is not None and (twice := sorted(held_out.intersection(trained))):
+        raise InputError(
+            f"holdout_split={holdout_split}: {len(twice)} of its scenes are in split= too, such as {twice[0]!r}; a "
+            "scene is trained on or held out"
+        )
+    path_of = dict(zip(names, paths, strict=True))
+    training = [path_of[name] for name in trained if name not in held_out]
+    if not training:
+        raise InputError("holdout: matches every scene; at least one must remain for training")
+    return training, [path for path in paths if path.name in held_out]
+
+
+def _names_of(option: str, file: Path | None, scenes: Sequence[str]) -> tuple[str, ...]:
+    """The names in a split file, none without a file; all must be among those given."""
+    if file is None:
+        return ()
+    chosen, possible = read_split(file), frozenset(scenes)
+    missing = [name for name in chosen if name not in possible]
+    if missing:
+        raise InputError(
+            f"{option}={file}: {len(missing)} of its {len(chosen)} scenes are not among those given, such as "
+            f"{missing[0]!r}"
+        )
+    return chosen

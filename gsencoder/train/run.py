@@ -20,20 +20,22 @@ from gsencoder.teachers.build import words_by_teacher
 from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.train.adapter_heads import dataset_heads, render_heads, required_heads, teacher_of_heads
-from gsencoder.train.augment import AugmentConfig
-from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, TrainingState, check_same_teachers
-from gsencoder.train.crops import SamplingConfig
+from gsencoder.train.batch import SamplingConfig
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.distributed import check_agreement, cpu_share, digest_of, fail_together, join_processes
+from gsencoder.train.loop import (
+    CHANGEABLE_ON_RESUME,
+    TRAINING_CHECKPOINT_FILE,
+    TrainerConfig,
+    TrainingState,
+    ValidationResult,
+    check_same_teachers,
+)
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepare_scenes import prepare_scenes
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe
-from gsencoder.train.source import SourceConfig
-from gsencoder.train.trainer import ValidationResult
-from gsencoder.train.trainer_config import CHANGEABLE_ON_RESUME, TrainerConfig
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
+from gsencoder.train.prepared_file import PreparedScene
+from gsencoder.train.samples import AugmentConfig, SampleDataset, SampleRecipe, TeacherRecipe, TrainingScene
 
 SceneValidator = Callable[
     [Sequence[TrainingScene], GaussianEncoder, OutputSpaces, Mapping[str, Float32[np.ndarray, "C channels"]]],

@@ -10,7 +10,7 @@ from gsencoder.evaluate import validation
 from gsencoder.evaluate.validation import ClassAccuracy, nearest_classes, validate_encoder, validate_names
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.models.output_space import OutputSpaces
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.samples import TrainingScene
 from gsencoder.types import GaussianFeatures
 
 

@@ -19,7 +19,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import check_fetched, digest_files
 from gsencoder.data.readers.images import load_npy
 from gsencoder.text.table import load_text_table
-from gsencoder.train.data_workers import lost_workers
+from gsencoder.train.loop import lost_workers
 
 ROWS = np.arange(400_000, dtype=np.float32).reshape(-1, 4)
 TYPES = {"rows": ("float32", 2)}

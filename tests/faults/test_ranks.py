@@ -15,7 +15,7 @@ import torch
 from gsencoder.core.errors import InputError
 from gsencoder.train import distributed, presence
 from gsencoder.train.distill import encoder_trainer
-from gsencoder.train.trainer_config import TrainerConfig
+from gsencoder.train.loop import TrainerConfig
 
 torch.set_num_threads(1)
 rate_at = TrainerConfig.rate_at

@@ -36,8 +36,8 @@ from gsencoder.evaluate.tradeoff.records import IDENTITY_FILE, RECORDS_FILE, Rec
 from gsencoder.fusion.checkpoint import SETTINGS_FILE, FusionCheckpoint
 from gsencoder.infer.ask.batch import ANSWERS, _answered
 from gsencoder.infer.ask.questions import read_answers
-from gsencoder.train.prepared_dataset import DATASET_SETTINGS_FILE, PreparedDataset
-from gsencoder.train.prepared_dataset import SPACE_FILE as DATASET_SPACE_FILE
+from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PreparedDataset
+from gsencoder.train.prepare import SPACE_FILE as DATASET_SPACE_FILE
 
 FLIPS = 60
 SETTINGS = {"fuse": {"views": 3, "rays": 1.5}, "teacher": {"name": "palette"}}

@@ -17,8 +17,7 @@ from gsencoder.infer.memory_pictures import (
 )
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import Blend, BlendConfig, blend
-from gsencoder.train.memory import untrained_memory
-from gsencoder.train.memory_network import MemoryConfig
+from gsencoder.train.memory import MemoryConfig, untrained_memory
 from gsencoder.types import QueryMemory
 
 

@@ -32,8 +32,7 @@ from gsencoder.memory.attention import render_features, render_queries
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import blend
 from gsencoder.render.images import render_image
-from gsencoder.train.memory import untrained_memory
-from gsencoder.train.memory_network import MemoryConfig
+from gsencoder.train.memory import MemoryConfig, untrained_memory
 from gsencoder.types import MemoryBank, QueryMemory, Scene
 
 GREY = np.full((60, 80, 3), 90, np.uint8)

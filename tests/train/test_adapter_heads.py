@@ -28,8 +28,8 @@ from gsencoder.train.adapter_heads import (
     required_heads,
     teacher_of_heads,
 )
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.sampled_maps import sampled_maps, views_of_scenes
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.space import sampled_maps, views_of_scenes
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Views
 
 SPACE = FeatureSpace(name="s", channels=6)

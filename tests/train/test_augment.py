@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from gsencoder.core.errors import InputError
 from gsencoder.geometry import colors_from_sh, covariances
-from gsencoder.train.augment import AugmentConfig, augment, turn
+from gsencoder.train.samples import AugmentConfig, augment, turn
 from gsencoder.types import SH_C0, Gaussians
 
 NOTHING = AugmentConfig(turn=0.0, tilt=0.0, mirror=0.0, scale=0.0, jitter=0.0, drop=0.0, light=0.0, tint=0.0, noise=0.0)

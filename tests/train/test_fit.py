@@ -22,10 +22,10 @@ from gsencoder.models.output_space import OutputSpaces
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.radio import RadioConfig
 from gsencoder.train import run
-from gsencoder.train.prepared_dataset import PreparedDataset
+from gsencoder.train.loop import ValidationResult
+from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.run import TrainConfig, fit
 from gsencoder.train.samples import SampleDataset
-from gsencoder.train.trainer import ValidationResult
 
 Datasets = Mapping[str, PreparedDataset]
 

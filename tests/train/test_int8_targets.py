@@ -14,10 +14,9 @@ from training_scenes import PREPARE, SPACE, DenseSideTeacher, prepared, samples,
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import plain
-from gsencoder.train.memory_scene import BANK_FILE, prepare_memory
-from gsencoder.train.prepare import PrepareConfig, prepare_scene
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.prepared_scene import PreparedScene
+from gsencoder.train.memory import BANK_FILE, prepare_memory
+from gsencoder.train.prepare import PrepareConfig, PreparedDataset, prepare_scene
+from gsencoder.train.prepared_file import PreparedScene
 from gsencoder.types import FeatureMap, Views
 
 HALF_STEP = 0.5 / 127

@@ -9,8 +9,7 @@ from training_scenes import LOSSES, small_encoder
 from gsencoder.train import samples as module
 from gsencoder.train.distill import Distillation
 from gsencoder.train.losses import AdapterHead, render_loss
-from gsencoder.train.samples import SampleDataset
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.samples import SampleDataset, TrainingScene
 
 
 def test_heads_of_a_teacher_are_in_its_render_loss_and_in_no_other_term(datasets: Datasets) -> None:

@@ -15,18 +15,25 @@ from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.memory.attention import make_decoder, render_features
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import blend
-from gsencoder.train.memory import first_queries, memory_training, train_decoder, train_memory, untrained_memory
-from gsencoder.train.memory_network import (
+from gsencoder.train.batch import sample_rows
+from gsencoder.train.memory import (
+    BANK_FILE,
     MemoryBatch,
     MemoryConfig,
     MemoryNetwork,
     MemoryObjective,
+    MemoryScene,
     ViewSamples,
+    first_queries,
     join_views,
+    memory_training,
+    open_memory_scene,
+    prepare_memory,
+    train_decoder,
+    train_memory,
+    untrained_memory,
 )
-from gsencoder.train.memory_scene import BANK_FILE, MemoryScene, open_memory_scene, prepare_memory
 from gsencoder.train.prepare import PrepareConfig
-from gsencoder.train.render_rows import sample_rows
 from gsencoder.types import QueryMemory
 
 SHORT = replace(memory_training(), steps=8, warmup=2, log_every=1, checkpoint_every=0.0)
@@ -131,8 +138,8 @@ from dataclasses import replace
 from pathlib import Path
 from gsencoder.train.distributed import join_processes
 from gsencoder.train.memory import memory_training, train_memory
-from gsencoder.train.memory_network import MemoryConfig
-from gsencoder.train.memory_scene import open_memory_scene
+from gsencoder.train.memory import MemoryConfig
+from gsencoder.train.memory import open_memory_scene
 
 with join_processes("cpu") as (process, device):
     config = replace(memory_training(), steps=6, warmup=2, log_every=1, accumulate={accumulate})

@@ -14,9 +14,14 @@ from gsencoder.evaluate.rendered import RenderedTally
 from gsencoder.memory.attention import render_queries
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import BlendConfig, blend
-from gsencoder.train.memory import memory_training, train_memory, untrained_memory
-from gsencoder.train.memory_network import MemoryConfig
-from gsencoder.train.memory_scene import MemoryScene, prepare_memory
+from gsencoder.train.memory import (
+    MemoryConfig,
+    MemoryScene,
+    memory_training,
+    prepare_memory,
+    train_memory,
+    untrained_memory,
+)
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 
@@ -44,7 +49,7 @@ def test_predicted_features_take_the_place_of_fused_ones(tmp_path: Path, monkeyp
     def fused(*arguments: object, **settings: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("gsencoder.train.memory_scene.fuse", fused)
+    monkeypatch.setattr("gsencoder.train.memory.fuse", fused)
     predicted = predicted_features()
     made = prepared(tmp_path / "made", predicted)
     features = made.fused_features()
@@ -87,7 +92,7 @@ def test_a_preparation_that_was_cut_off_is_not_continued_with_others(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("gsencoder.train.memory_scene.write_prepared", cut_off)
+        patched.setattr("gsencoder.train.memory.write_prepared", cut_off)
         with pytest.raises(KeyboardInterrupt):
             prepared(tmp_path / "made", predicted_features())
     with pytest.raises(InputError, match="was begun with predicted=.*resume=false"):

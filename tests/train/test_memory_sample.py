@@ -9,7 +9,7 @@ from training_scenes import scene as wall
 
 from gsencoder.core.errors import InputError
 from gsencoder.memory.bank import BankConfig, raw_features
-from gsencoder.train.memory_scene import open_raw_sample, prepare_memory
+from gsencoder.train.memory import open_raw_sample, prepare_memory
 
 
 def test_raw_features_are_stored_beside_the_bank_when_they_are_asked_for(
@@ -25,7 +25,7 @@ def test_raw_features_are_stored_beside_the_bank_when_they_are_asked_for(
     def fused_again(*arguments: object, **settings: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("gsencoder.train.memory_scene.fuse", fused_again)
+    monkeypatch.setattr("gsencoder.train.memory.fuse", fused_again)
     rows = np.concatenate([raw_features(view, teacher.feature_map(scene.views, view))[0] for view in range(2)])
     for count in (50, 50, 10_000):
         prepare_memory(scene, teacher, tmp_path / "made", BankConfig(), PREPARE, sample=count)
@@ -44,6 +44,6 @@ def test_an_interrupted_run_keeps_its_sample(tmp_path: Path, monkeypatch: pytest
     def drawn_again(*arguments: object, **settings: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("gsencoder.train.memory_scene.draw_sample", drawn_again)
+    monkeypatch.setattr("gsencoder.train.memory.draw_sample", drawn_again)
     prepare_memory(scene, teacher, tmp_path / "made", BankConfig(), PREPARE, sample=30)
     np.testing.assert_array_equal(open_raw_sample(tmp_path / "made").features, first)

@@ -11,16 +11,20 @@ from training_scenes import scene as wall
 
 from gsencoder.core.errors import InputError
 from gsencoder.memory.bank import BankConfig
-from gsencoder.train.memory import first_queries, memory_training, train_decoder, train_memory
-from gsencoder.train.memory_network import (
+from gsencoder.train.memory import (
     MemoryBatch,
     MemoryConfig,
     MemoryNetwork,
     MemoryObjective,
+    MemoryScene,
     ViewSamples,
+    first_queries,
     join_views,
+    memory_training,
+    prepare_memory,
+    train_decoder,
+    train_memory,
 )
-from gsencoder.train.memory_scene import MemoryScene, prepare_memory
 from gsencoder.types import MemoryBank
 
 STEPS = replace(memory_training(), steps=2, warmup=1, log_every=1, checkpoint_every=0.0)

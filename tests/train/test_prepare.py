@@ -16,11 +16,20 @@ from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import untracked
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.train.class_balance import ClassBalance, cluster_targets, count_targets, nearest_codes
-from gsencoder.train.dataset_space import dataset_space, fit_space
-from gsencoder.train.prepare import PrepareConfig, prepare_scene
-from gsencoder.train.prepared_dataset import CLASS_BALANCE_FILE, DATASET_SETTINGS_FILE, SPACE_FILE, PreparedDataset
-from gsencoder.train.prepared_scene import PreparedScene
+from gsencoder.train.prepare import (
+    CLASS_BALANCE_FILE,
+    DATASET_SETTINGS_FILE,
+    SPACE_FILE,
+    ClassBalance,
+    PrepareConfig,
+    PreparedDataset,
+    cluster_targets,
+    count_targets,
+    nearest_codes,
+    prepare_scene,
+)
+from gsencoder.train.prepared_file import PreparedScene
+from gsencoder.train.space import dataset_space, fit_space
 from gsencoder.types import FeatureMap, FeatureSpace, Views
 
 

@@ -17,9 +17,8 @@ from gsencoder.teachers.build import words_by_teacher
 from gsencoder.teachers.labels import LabelsConfig, PaletteConfig
 from gsencoder.teachers.onnx import OnnxConfig
 from gsencoder.train import prepare_scenes as module
-from gsencoder.train.prepare_scenes import prepare_scenes
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.source import SceneReader, SourceConfig
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepare_scenes import SceneReader, SourceConfig, prepare_scenes
 from gsencoder.types import Scene
 
 LACKING = {"coded": {"wall_1"}, "dense": {"wall_0", "wall_3"}}

@@ -16,16 +16,11 @@ from training_scenes import SMALL, DenseSideTeacher, prepared, samples, small_en
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import BlendConfig, blend
-from gsencoder.train.augment import AugmentConfig
-from gsencoder.train.batch import join_samples
-from gsencoder.train.crops import SamplingConfig, choose_crop
+from gsencoder.train.batch import SamplingConfig, choose_crop, join_samples, restrict_rows
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepared_dataset import PreparedDataset
-from gsencoder.train.prepared_file import ViewRows
-from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.render_rows import restrict_rows
-from gsencoder.train.samples import SampleDataset, StepSampler, make_sample, target_codes
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepared_file import PreparedScene, ViewRows
+from gsencoder.train.samples import AugmentConfig, SampleDataset, StepSampler, TrainingScene, make_sample, target_codes
 from gsencoder.types import Cameras
 
 

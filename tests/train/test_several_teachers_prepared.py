@@ -15,18 +15,18 @@ from gsencoder.core.process import untracked
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.teachers.base import MissingInput
 from gsencoder.teachers.labels import PaletteConfig
-from gsencoder.train.checkpoint import (
+from gsencoder.train.loop import (
     TRAINING_CHECKPOINT_FILE,
     TrainingState,
     check_same_teachers,
     load_checkpoint,
     save_checkpoint,
 )
-from gsencoder.train.dataset_space import dataset_space
+from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
-from gsencoder.train.prepared_dataset import PreparedDataset
 from gsencoder.train.run import TrainConfig, train
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.samples import TrainingScene
+from gsencoder.train.space import dataset_space
 
 
 def test_other_teachers_than_those_of_a_checkpoint_are_refused_before_and_after_preparation(tmp_path: Path) -> None:

@@ -14,11 +14,8 @@ from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.basis import Moments
 from gsencoder.teachers.base import MissingInput
-from gsencoder.train.dataset_space import MOMENTS_FOLDER, fit_space
-from gsencoder.train.prepare import PrepareConfig
-from gsencoder.train.prepared_dataset import SPACE_FILE, PreparedDataset
-from gsencoder.train.sampled_maps import sampled_maps
-from gsencoder.train.shared_moments import sampled_moments
+from gsencoder.train.prepare import SPACE_FILE, PrepareConfig, PreparedDataset
+from gsencoder.train.space import MOMENTS_FOLDER, fit_space, sampled_maps, sampled_moments
 from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 
 CHANNELS = 24

@@ -13,8 +13,8 @@ from gsencoder.core.process import ProcessRank, available_cores, rank_from_envir
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.train.distributed import cpu_share, value_of_first, values_of_all
-from gsencoder.train.prepared_dataset import CLASS_BALANCE_FILE, PreparedDataset
-from gsencoder.train.training_scene import TrainingScene
+from gsencoder.train.prepare import CLASS_BALANCE_FILE, PreparedDataset
+from gsencoder.train.samples import TrainingScene
 
 SCRIPT = """
 import json
@@ -23,7 +23,7 @@ from pathlib import Path
 from test_shared_work import counted, scores_of
 
 from gsencoder.train.distributed import join_processes
-from gsencoder.train.prepared_dataset import PreparedDataset
+from gsencoder.train.prepare import PreparedDataset
 
 if __name__ == "__main__":
     with join_processes("cpu") as (process, _):

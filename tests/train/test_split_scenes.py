@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.train.split_scenes import split_scenes
+from gsencoder.train.prepare_scenes import split_scenes
 
 SCENES = [Path("data") / f"scene{number:04d}_00" for number in range(6)]
 

@@ -14,14 +14,17 @@ from training_scenes import LOSSES, SHORT, samples, small_encoder
 from gsencoder.core.errors import InputError
 from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.core.process import ProcessRank
-from gsencoder.train import data_workers
-from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
-from gsencoder.train.data_workers import automatic_workers
+from gsencoder.train import loop as data_workers
 from gsencoder.train.distill import encoder_trainer
+from gsencoder.train.loop import (
+    TRAINING_CHECKPOINT_FILE,
+    TrainerConfig,
+    ValidationResult,
+    _parameter_groups,
+    automatic_workers,
+)
 from gsencoder.train.losses import LossConfig
-from gsencoder.train.prepared_scene import PreparedScene
-from gsencoder.train.trainer import ValidationResult, _parameter_groups
-from gsencoder.train.trainer_config import TrainerConfig
+from gsencoder.train.prepared_file import PreparedScene
 
 pytestmark = pytest.mark.slow
 

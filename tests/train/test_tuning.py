@@ -14,9 +14,9 @@ from tuning_runs import Pairs, losses, made, sample, samples
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.logs import LOG_FILE, read_log
-from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE
-from gsencoder.train.tuning.run import TuneConfig, Tuned, open_tuned, save_tuned, tune
-from gsencoder.train.tuning.vlm import AdapterConfig, link_served
+from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE
+from gsencoder.train.tune import TuneConfig, Tuned, open_tuned, save_tuned, tune
+from gsencoder.train.vlm import AdapterConfig, link_served
 
 peft = pytest.importorskip("peft")
 transformers = pytest.importorskip("transformers")
@@ -91,7 +91,7 @@ import peft
 import transformers
 from tuning_pairs import SHORT, make_pairs
 from gsencoder.train.distributed import join_processes
-from gsencoder.train.tuning.run import tune
+from gsencoder.train.tune import tune
 
 with join_processes("cpu") as (process, device):
     config = replace(SHORT, train=replace(SHORT.train, steps=5, batch=1, accumulate={accumulate}))

@@ -11,13 +11,25 @@ from torch import nn
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.prompts import StoredPrompt
-from gsencoder.train.trainer_config import TrainerConfig
-from gsencoder.train.tuning import run, vlm
-from gsencoder.train.tuning.network import TERM, AnswerObjective
-from gsencoder.train.tuning.run import TuneConfig, check_pairs, open_processor, pairs_digest, tuning_training
-from gsencoder.train.tuning.samples import IGNORED, TuningBatch, TuningPair, TuningSample, chat, join_pairs
-from gsencoder.train.tuning.towers import SPLIT, TokenHook, TowerLayout, tower_layout
-from gsencoder.train.tuning.vlm import AdapterConfig
+from gsencoder.train import tune as run
+from gsencoder.train import vlm
+from gsencoder.train.loop import TrainerConfig
+from gsencoder.train.tune import (
+    IGNORED,
+    TERM,
+    AnswerObjective,
+    TuneConfig,
+    TuningBatch,
+    TuningPair,
+    TuningSample,
+    chat,
+    check_pairs,
+    join_pairs,
+    open_processor,
+    pairs_digest,
+    tuning_training,
+)
+from gsencoder.train.vlm import SPLIT, AdapterConfig, TokenHook, TowerLayout, tower_layout
 
 
 def made(

@@ -14,8 +14,8 @@ from tuning_pairs import SHORT, make_pairs
 from tuning_runs import Pairs, made, samples
 
 from gsencoder.core.errors import InputError
-from gsencoder.train.tuning.run import tune
-from gsencoder.train.tuning.vlm import load_adapted, load_processor, save_adapters
+from gsencoder.train.tune import tune
+from gsencoder.train.vlm import load_adapted, load_processor, save_adapters
 
 pytest.importorskip("peft")
 pytest.importorskip("transformers")

@@ -9,9 +9,17 @@ import torch
 from tuning_pairs import SHORT, make_pairs
 from tuning_runs import Pairs, sample, samples
 
-from gsencoder.train.tuning.network import TERM, AnswerObjective, TunedVlm
-from gsencoder.train.tuning.samples import IGNORED, TuningBatch, TuningSample, answer_frame, join_pairs
-from gsencoder.train.tuning.vlm import load_adapted, load_processor
+from gsencoder.train.tune import (
+    IGNORED,
+    TERM,
+    AnswerObjective,
+    TunedVlm,
+    TuningBatch,
+    TuningSample,
+    answer_frame,
+    join_pairs,
+)
+from gsencoder.train.vlm import load_adapted, load_processor
 
 pytest.importorskip("peft")
 transformers = pytest.importorskip("transformers")

@@ -12,11 +12,8 @@ from tuning_pairs import SHORT, make_pairs
 from tuning_runs import losses, made, sample, samples
 
 from gsencoder.core.errors import InputError
-from gsencoder.train.tuning.network import TunedVlm
-from gsencoder.train.tuning.run import open_tuned, save_tuned, tune
-from gsencoder.train.tuning.samples import PairSamples
-from gsencoder.train.tuning.towers import TokenHook, tower_layout
-from gsencoder.train.tuning.vlm import load_adapted, load_processor
+from gsencoder.train.tune import PairSamples, TunedVlm, open_tuned, save_tuned, tune
+from gsencoder.train.vlm import TokenHook, load_adapted, load_processor, tower_layout
 
 pytest.importorskip("peft")
 transformers = pytest.importorskip("transformers")

@@ -241,7 +241,7 @@ def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Enc
     # Teachers need torch, which encoding with an exported graph does without.
     from gsencoder.fusion.errors import basis_fit
     from gsencoder.teachers.build import build_teacher, words_by_teacher
-    from gsencoder.train.source import SourceConfig
+    from gsencoder.train.prepare_scenes import SourceConfig
 
     if scene.views is None:
         raise InputError("basis_views: the scene has no views in which the teacher could be run; leave it out")

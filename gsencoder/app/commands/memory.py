@@ -30,13 +30,20 @@ from gsencoder.models.output_space import check_distinct, name_of_space
 from gsencoder.teachers.build import build_teacher, words_beside, words_by_teacher
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.table import TextTable
+from gsencoder.train.batch import sample_rows
 from gsencoder.train.distributed import fail_together, join_processes
-from gsencoder.train.memory import memory_training, train_memory, untrained_memory
-from gsencoder.train.memory_network import MemoryConfig
-from gsencoder.train.memory_scene import MemoryScene, open_memory_scene, open_raw_sample, prepare_memory
-from gsencoder.train.render_rows import sample_rows
-from gsencoder.train.source import SourceConfig
-from gsencoder.train.trainer_config import TrainerConfig
+from gsencoder.train.loop import TrainerConfig
+from gsencoder.train.memory import (
+    MemoryConfig,
+    MemoryScene,
+    memory_training,
+    open_memory_scene,
+    open_raw_sample,
+    prepare_memory,
+    train_memory,
+    untrained_memory,
+)
+from gsencoder.train.prepare_scenes import SourceConfig
 from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
 
 DRAWN_FEATURES = 20_000

@@ -28,12 +28,11 @@ from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
 from gsencoder.teachers.build import words_by_teacher
 from gsencoder.train.adapter_heads import dataset_heads, required_heads, teacher_of_heads
-from gsencoder.train.checkpoint import TRAINING_CHECKPOINT_FILE, check_same_teachers
 from gsencoder.train.distributed import cpu_share, fail_together, join_processes
-from gsencoder.train.prepare_scenes import prepare_scenes
-from gsencoder.train.prepared_scene import PreparedScene
+from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE, check_same_teachers
+from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
+from gsencoder.train.prepared_file import PreparedScene
 from gsencoder.train.run import TrainConfig, Training, fit
-from gsencoder.train.split_scenes import split_scenes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,8 +27,8 @@ from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.train.distributed import fail_together, join_processes
-from gsencoder.train.tuning.run import TuneConfig, open_processor, save_tuned, tune
-from gsencoder.train.tuning.vlm import SERVED_FOLDER, check_peft, check_targets, link_served
+from gsencoder.train.tune import TuneConfig, open_processor, save_tuned, tune
+from gsencoder.train.vlm import SERVED_FOLDER, check_peft, check_targets, link_served
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

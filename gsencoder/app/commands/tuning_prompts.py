@@ -25,8 +25,8 @@ from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.localize import LocalizeConfig, select_features
 from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.text.vocabulary import TextConfig
-from gsencoder.train.tuning.samples import TuningPair
-from gsencoder.train.tuning.towers import TowerLayout
+from gsencoder.train.tune import TuningPair
+from gsencoder.train.vlm import TowerLayout
 from gsencoder.types import GaussianFeatures
 
 

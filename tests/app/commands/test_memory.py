@@ -123,7 +123,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
         raise AssertionError
 
     with monkeypatch.context() as patch:
-        patch.setattr("gsencoder.train.memory_scene.fuse", prepared_again)
+        patch.setattr("gsencoder.train.memory.fuse", prepared_again)
         assert cli.main(words) == 0
     whole = ["memory", str(room), *teachers, f"out={tmp_path / 'whole'}", *QUICK]
     assert cli.main(whole) == 0

@@ -57,7 +57,7 @@ def test_without_pictures_no_raw_features_are_kept_and_nothing_is_drawn(
     def unused(*arguments: object, **settings: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("gsencoder.train.memory_scene.draw_sample", unused)
+    monkeypatch.setattr("gsencoder.train.memory.draw_sample", unused)
     out = tmp_path / "memory"
     assert cli.main(["memory", str(room), "teacher=palette", "pictures=0", f"out={out}", *QUICK]) == 0
     assert pictures_in(out) == {}
@@ -88,7 +88,7 @@ def test_a_run_whose_pictures_cannot_be_drawn_says_how_to_go_on(
     monkeypatch.setattr("gsencoder.infer.memory_pictures.attention_picture", damaged)
     line = refusal(capsys, *words)
     assert line == "error: 000.png: cannot be decoded; give pictures=0 to write the memory without pictures"
-    monkeypatch.setattr("gsencoder.train.memory_scene.fuse", damaged)
+    monkeypatch.setattr("gsencoder.train.memory.fuse", damaged)
     assert cli.main([*words, "pictures=0", "quiet=true"]) == 0
     assert (tmp_path / "out" / "memory.safetensors").is_file()
 

@@ -35,7 +35,7 @@ def test_a_memory_of_predictions_has_their_mean_and_all_gaussians_without_any_fu
     def fused(*arguments: object, **settings: object) -> None:
         raise AssertionError
 
-    monkeypatch.setattr("gsencoder.train.memory_scene.fuse", fused)
+    monkeypatch.setattr("gsencoder.train.memory.fuse", fused)
     words = ["memory", str(room), f"weights={weights}", "optimize=false", "pictures=0", "device=cpu"]
     assert cli.main([*words, "teacher=palette", "quiet=true", f"out={tmp_path / 'memory'}"]) == 0
     (memory,) = load_memories(tmp_path / "memory").values()

@@ -134,7 +134,7 @@ def test_prepared_prompts_serve_the_next_run_and_what_changed_is_prepared_anew(
 def test_an_interrupted_command_goes_on_as_if_nothing_had_happened(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, interrupts: None
 ) -> None:
-    from gsencoder.train.trainer_config import TrainerConfig
+    from gsencoder.train.loop import TrainerConfig
 
     assert cli.main(words(given, tmp_path / "whole", "train.steps=6")) == 0
     rate_at = TrainerConfig.rate_at

@@ -1,1 +1,0 @@
-"""Fine-tuning of vision-language models by low-rank adapters on questions about scenes."""
