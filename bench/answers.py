@@ -40,16 +40,18 @@ from gsencoder.data.labels.questions import Question as TruthQuestion
 from gsencoder.data.labels.seen_objects import see_objects
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.evaluate.answer_sheets import add_expressions, add_questions
 from gsencoder.evaluate.boxes import aabb_iou
-from gsencoder.evaluate.picture_truth import LEAST_WEIGHT, PictureTruth
-from gsencoder.evaluate.scripted_answerer import (
+from gsencoder.evaluate.stand_in_vlm import (
+    LEAST_WEIGHT,
     MIN_PIXELS,
     MODEL,
     AnswerSheet,
     Fact,
+    PictureTruth,
     ScriptedAnswerer,
     SentPicture,
+    add_expressions,
+    add_questions,
     request_digest,
     request_pictures,
     serving,

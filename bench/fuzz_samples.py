@@ -30,17 +30,17 @@ from gsencoder.data.readers.transforms_json import read_cameras, read_objects
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.splats.files import gaussians_from_raw, load_splat, read_raw
 from gsencoder.data.splats.repair import inspect_splat, repair_splat
-from gsencoder.evaluate.files.answer_predictions import read_answer_predictions
-from gsencoder.evaluate.files.instances import read_instance_prediction, read_instance_truth
-from gsencoder.evaluate.files.recognition import (
+from gsencoder.evaluate.benchmarks.answers import read_answer_predictions
+from gsencoder.evaluate.benchmarks.instances import read_instance_prediction, read_instance_truth
+from gsencoder.evaluate.benchmarks.recognition import (
     read_recognition_predictions,
     read_recognition_truth,
 )
-from gsencoder.evaluate.files.referring import (
+from gsencoder.evaluate.benchmarks.referring import (
     read_referring_predictions,
     read_referring_truth,
 )
-from gsencoder.evaluate.files.retrieval import read_scored_pairs
+from gsencoder.evaluate.benchmarks.retrieval import read_scored_pairs
 from gsencoder.infer.ask.questions import read_answers, read_questions
 from gsencoder.types import Scene
 

@@ -22,7 +22,7 @@ import torch
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.settings.compose import compose
 from gsencoder.data.scenes import load_scene
-from gsencoder.evaluate.rendered import RenderedTally
+from gsencoder.evaluate.sources import RenderedTally
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import Blend, blend
 from gsencoder.teachers.build import build_teacher, words_of

@@ -19,10 +19,14 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.data.labels.classes import ClassTable
 from gsencoder.data.labels.files import write_whole_numbers
-from gsencoder.evaluate.files.instances import match_instance_files, write_instance_prediction
-from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth
-from gsencoder.evaluate.scores.instance_matches import match_instances
-from gsencoder.evaluate.scores.instances import instance_scores
+from gsencoder.evaluate.benchmarks.instances import (
+    InstancePrediction,
+    InstanceTruth,
+    instance_scores,
+    match_instance_files,
+    match_instances,
+    write_instance_prediction,
+)
 
 CLASSES = ClassTable(
     names=tuple(f"class {number}" for number in range(1, 199)),

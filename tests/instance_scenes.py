@@ -3,9 +3,14 @@
 import numpy as np
 
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
-from gsencoder.evaluate.scores.instance_matches import match_instances
-from gsencoder.evaluate.scores.instances import InstanceScores, instance_scores
+from gsencoder.evaluate.benchmarks.instances import (
+    InstancePrediction,
+    InstanceScores,
+    InstanceTruth,
+    instance_scores,
+    match_instances,
+    prediction_of_masks,
+)
 
 CLASSES = ClassTable(
     names=("bed", "chair", "sofa"), ids=(4, 5, 6), groups={"head": ("bed",), "common": ("chair", "sofa"), "tail": ()}

@@ -28,7 +28,7 @@ from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.scenes import kind_of_path
 from gsencoder.data.splats.files import load_property, load_splat
 from gsencoder.data.splats.ply import read_points
-from gsencoder.evaluate.files.scene_folders import scene_files
+from gsencoder.evaluate.benchmarks.files import scene_files
 from gsencoder.infer.ask.questions import is_question_set
 from gsencoder.text.models import _load_tokenizer
 

@@ -19,7 +19,7 @@ from gsencoder.data.labels.expressions import read_nr3d
 from gsencoder.data.labels.files import read_whole_numbers
 from gsencoder.data.splats.files import RawSplat
 from gsencoder.data.splats.repair import inspect_splat
-from gsencoder.evaluate.files.instances import read_instance_prediction
+from gsencoder.evaluate.benchmarks.instances import read_instance_prediction
 from gsencoder.infer.ask.questions import read_questions
 
 BENCH = Path(__file__).parents[1] / "bench"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import Knob
-from gsencoder.evaluate.tradeoff.records import Record, Timing
+from gsencoder.evaluate.tradeoff.measure import Record, Timing
 from gsencoder.evaluate.tradeoff.stage import Judged, Score, Stage
 
 

@@ -2,8 +2,8 @@
 
 Knobs: the values of a stage's settings that trade cost for accuracy, and how they are put into its frozen settings.
 
-Each stage that has knobs lists them beside its settings (`gsencoder.fusion.package`, `gsencoder.reconstruct.knobs`,
-`gsencoder.infer.knobs`), so that whoever chooses settings, a sweep or a budget, needs no more than such a list.
+Stages list their knobs (`gsencoder.fusion.package`, `gsencoder.evaluate.tradeoff.stages`), and whatever chooses
+settings, a sweep or a budget, needs no more than such a list.
 
 Budgets: what the section `budget` of a command may promise, and how promises are checked, ordered and worded.
 

@@ -16,10 +16,21 @@ from gsencoder.data.labels.expressions import Expression, boxes_from_labels, wri
 from gsencoder.data.labels.files import write_whole_numbers
 from gsencoder.data.labels.scans import find_labels, find_scannet_files
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.files.instances import write_instance_prediction
-from gsencoder.evaluate.files.recognition import write_recognition_predictions, write_recognition_truth
-from gsencoder.evaluate.files.referring import write_referring_predictions
-from gsencoder.evaluate.labeled_points import labeled_points
+from gsencoder.evaluate.benchmarks.instances import write_instance_prediction
+from gsencoder.evaluate.benchmarks.recognition import (
+    NamedInstance,
+    RankedNames,
+    write_recognition_predictions,
+    write_recognition_truth,
+)
+from gsencoder.evaluate.benchmarks.referring import (
+    PredictedBoxes,
+    named_classes,
+    score_referring,
+    with_kinds,
+    write_referring_predictions,
+)
+from gsencoder.evaluate.benchmarks.score import score_instances, score_recognition, score_semantics
 from gsencoder.evaluate.protocols.instances import InstancesProtocol, predict_instances, true_instances
 from gsencoder.evaluate.protocols.recognition import RecognitionProtocol, predict_recognition, recognition_truth
 from gsencoder.evaluate.protocols.referring import (
@@ -29,13 +40,8 @@ from gsencoder.evaluate.protocols.referring import (
     read_expressions,
 )
 from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, predict_semantics, semantic_truth
-from gsencoder.evaluate.score_boxes import score_referring
-from gsencoder.evaluate.score_files import score_instances, score_recognition, score_semantics
-from gsencoder.evaluate.score_report import ScoreReport
-from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames
-from gsencoder.evaluate.scores.referring import PredictedBoxes
-from gsencoder.evaluate.scores.referring_kinds import named_classes, with_kinds
-from gsencoder.evaluate.sources import FeatureSource, with_features
+from gsencoder.evaluate.sources import FeatureSource, labeled_points, with_features
+from gsencoder.evaluate.tables import ScoreReport
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import MeshLabels, Scene

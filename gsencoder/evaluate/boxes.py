@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.scores.means import mean_of
+from gsencoder.evaluate.tables import mean_of
 from gsencoder.types import Box, Localization, Scene, SceneObject
 
 
@@ -38,7 +38,7 @@ def aabb_iou(
     """Intersection over union of two axis-aligned boxes; 0 if either has no volume.
 
     It is exact, in any unit. Benchmarks add 1e-8 cubic metres to the union, which lowers the IoU of small boxes, by a
-    percent for a cube of 1 cm; `box_ious` of `gsencoder.evaluate.scores.box_overlap` does so where results must equal
+    percent for a cube of 1 cm; `box_ious` of `gsencoder.evaluate.benchmarks.referring` does so where results must equal
     theirs.
     """
     overlap = np.prod(np.clip(np.minimum(max_a, max_b) - np.maximum(min_a, min_b), 0, None))

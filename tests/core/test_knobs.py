@@ -16,12 +16,18 @@ from gsencoder.core.settings import (
     with_knobs,
     with_values,
 )
+from gsencoder.evaluate.tradeoff.stages import (
+    ENCODER_KNOBS,
+    LOCALIZATION_KNOBS,
+    RECONSTRUCTION_KNOBS,
+    VIEWS_KNOBS,
+    EncoderSettings,
+    ReconstructionSettings,
+)
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.package import FUSION_KNOBS, PACKAGE_KNOBS, PackageSettings
-from gsencoder.infer.knobs import ENCODER_KNOBS, LOCALIZATION_KNOBS, VIEWS_KNOBS, EncoderSettings
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.infer.views.targets import ViewsConfig
-from gsencoder.reconstruct.knobs import RECONSTRUCTION_KNOBS, ReconstructionSettings
 
 STAGES = {
     "fusion": (FuseConfig(), FUSION_KNOBS),

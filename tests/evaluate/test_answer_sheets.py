@@ -12,9 +12,15 @@ from splats import random_gaussians
 
 from gsencoder.data.labels.expressions import Expression
 from gsencoder.data.labels.questions import Question
-from gsencoder.evaluate.answer_sheets import add_expressions, add_pictures, add_questions
-from gsencoder.evaluate.picture_truth import PictureTruth
-from gsencoder.evaluate.scripted_answerer import AnswerSheet, Fact, request_digest
+from gsencoder.evaluate.stand_in_vlm import (
+    AnswerSheet,
+    Fact,
+    PictureTruth,
+    add_expressions,
+    add_pictures,
+    add_questions,
+    request_digest,
+)
 from gsencoder.infer.ask.batch import ANSWERS, REQUEST
 from gsencoder.types import Scene
 

@@ -11,7 +11,7 @@ from PIL import Image
 from tiny_vlm import PATCH, SIDE, save_tiny_vlm
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.captions import FeatureDecoder, generate_from_features, retrieve_captions
+from gsencoder.evaluate.stand_in_vlm import FeatureDecoder, generate_from_features, retrieve_captions
 
 CAPTIONS = ["a mug", "a chair", "a red box"]
 AXES = np.eye(3, 4, dtype=np.float32)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.class_scores import NAMES_AT_ONCE, class_cosines, nearest_class
+from gsencoder.evaluate.sources import NAMES_AT_ONCE, class_cosines, nearest_class
 from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures
 

@@ -7,7 +7,7 @@ import pytest
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.labeled_points import LabeledPoints, labeled_points
+from gsencoder.evaluate.sources import LabeledPoints, labeled_points
 from gsencoder.types import Gaussians, MeshLabels, Scene, SceneObject, Views
 
 MUG, NAMELESS, UNLISTED = 7, 3, 9

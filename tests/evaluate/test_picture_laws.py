@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from splats import front_camera, random_gaussians
 
-from gsencoder.evaluate.picture_truth import PictureTruth
+from gsencoder.evaluate.stand_in_vlm import PictureTruth
 from gsencoder.types import Scene, Views
 
 ORIGIN = np.array([100.0, 0.0, 0.0])

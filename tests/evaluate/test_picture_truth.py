@@ -8,7 +8,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room
-from gsencoder.evaluate.picture_truth import PictureTruth
+from gsencoder.evaluate.stand_in_vlm import PictureTruth
 from gsencoder.types import Scene
 from gsencoder.types.checks import move_origin
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sklearn.metrics.pairwise import paired_cosine_distances
 
-from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
+from gsencoder.evaluate.sources import RenderedErrors, RenderedTally
 
 CHANNELS = 6
 MEAN = (3 * np.random.default_rng(9).normal(size=CHANNELS)).astype(np.float32)

@@ -8,7 +8,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import csv_text
-from gsencoder.evaluate.result_table import PUBLISHED, published_rows, table_of
+from gsencoder.evaluate.tables import PUBLISHED, published_rows, table_of
 
 TABLES = sorted(path.stem for path in PUBLISHED.glob("*.csv"))
 

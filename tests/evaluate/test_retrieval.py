@@ -8,7 +8,7 @@ from sklearn.metrics import top_k_accuracy_score
 from sklearn.metrics.pairwise import cosine_similarity
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.retrieval import (
+from gsencoder.evaluate.benchmarks.retrieval import (
     Pooling,
     Retrieval,
     draw,
@@ -36,7 +36,7 @@ def test_the_score_of_a_view_is_the_pooled_cosine_of_its_cells(pooling: str, poo
 
 def test_cells_in_chunks_give_the_same_scores(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = [view_scores(VIEWS[5], TEXTS, pooling) for pooling in ("max", "mean")]
-    monkeypatch.setattr("gsencoder.evaluate.retrieval.CHUNK_VALUES", 25)
+    monkeypatch.setattr("gsencoder.evaluate.benchmarks.retrieval.CHUNK_VALUES", 25)
     parts = [view_scores(VIEWS[5], TEXTS, pooling) for pooling in ("max", "mean")]
     np.testing.assert_allclose(parts, whole, atol=1e-14)
 

@@ -9,9 +9,15 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.captions import ViewCaption, read_texts, read_view_captions, write_view_captions
-from gsencoder.evaluate.files.retrieval import read_scored_pairs, write_scored_pairs
-from gsencoder.evaluate.retrieval import ScoredPairs, image_to_text, retrieve, text_to_image
-from gsencoder.evaluate.score_retrieval import score_retrieval
+from gsencoder.evaluate.benchmarks.retrieval import (
+    ScoredPairs,
+    image_to_text,
+    read_scored_pairs,
+    retrieve,
+    score_retrieval,
+    text_to_image,
+    write_scored_pairs,
+)
 
 NAMES = [f"room/frame_{number}" for number in range(7)]
 

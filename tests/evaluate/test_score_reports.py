@@ -11,12 +11,17 @@ import pytest
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
 from gsencoder.data.labels.files import write_whole_numbers
-from gsencoder.evaluate.files.instances import write_instance_prediction
-from gsencoder.evaluate.score_boxes import score_referring
-from gsencoder.evaluate.score_files import EQUAL_SCORES, score_instances, score_recognition, score_semantics
-from gsencoder.evaluate.score_report import spread
-from gsencoder.evaluate.score_texts import score_answer_files, score_caption_files
-from gsencoder.evaluate.scores.instance_masks import prediction_of_masks
+from gsencoder.evaluate.benchmarks.instances import prediction_of_masks, write_instance_prediction
+from gsencoder.evaluate.benchmarks.referring import score_referring
+from gsencoder.evaluate.benchmarks.score import (
+    EQUAL_SCORES,
+    score_answer_files,
+    score_caption_files,
+    score_instances,
+    score_recognition,
+    score_semantics,
+)
+from gsencoder.evaluate.tables import spread
 
 CLASSES = ClassTable(
     names=("bed", "chair", "wall"), ids=(4, 5, 1), groups={"head": ("bed",), "tail": ("chair", "wall")}

@@ -12,12 +12,13 @@ import pytest
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.expressions import Expression
 from gsencoder.data.labels.questions import Question
-from gsencoder.evaluate.answer_sheets import add_expressions, add_questions
-from gsencoder.evaluate.scripted_answerer import (
+from gsencoder.evaluate.stand_in_vlm import (
     AnswerSheet,
     Fact,
     ScriptedAnswerer,
     SentPicture,
+    add_expressions,
+    add_questions,
     picture_digest,
     request_digest,
     request_pictures,

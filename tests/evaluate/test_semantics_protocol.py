@@ -8,9 +8,9 @@ from splats import random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.evaluate.labeled_points import LabeledPoints, labeled_points
 from gsencoder.evaluate.protocols.instances import true_instances
 from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, predict_semantics, semantic_truth
+from gsencoder.evaluate.sources import LabeledPoints, labeled_points
 from gsencoder.text.table import make_text_table
 from gsencoder.types import GaussianFeatures, Gaussians, MeshLabels, Scene
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsencoder.evaluate.score_texts import score_answer_files, score_caption_files
-from gsencoder.evaluate.scores import sentences
+from gsencoder.evaluate.benchmarks import text_metrics as sentences
+from gsencoder.evaluate.benchmarks.score import score_answer_files, score_caption_files
 
 
 def written(path: Path, content: Any) -> Path:

@@ -32,7 +32,7 @@ from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.data.video import RECORD_FILE, _taken
-from gsencoder.evaluate.tradeoff.records import IDENTITY_FILE, RECORDS_FILE, Records
+from gsencoder.evaluate.tradeoff.measure import IDENTITY_FILE, RECORDS_FILE, Records
 from gsencoder.fusion.checkpoint import SETTINGS_FILE, FusionCheckpoint
 from gsencoder.infer.ask.batch import ANSWERS, _answered
 from gsencoder.infer.ask.questions import read_answers

@@ -10,7 +10,7 @@ from training_scenes import scene as wall
 
 from gsencoder.app.commands.memory import fit_errors, in_space
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.rendered import RenderedTally
+from gsencoder.evaluate.sources import RenderedTally
 from gsencoder.memory.attention import render_queries
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import BlendConfig, blend

@@ -23,12 +23,12 @@ from gsencoder.evaluate.benchmark_files import (
     score_written,
     write_predictions,
 )
-from gsencoder.evaluate.files.class_files import load_classes, write_classes
+from gsencoder.evaluate.benchmarks.files import load_classes, write_classes
+from gsencoder.evaluate.benchmarks.semantics import check_excluded
 from gsencoder.evaluate.protocols.absent import names_of
 from gsencoder.evaluate.protocols.instances import InstancesProtocol
 from gsencoder.evaluate.protocols.referring import ReferringProtocol, read_expressions
 from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, classes_of
-from gsencoder.evaluate.scores.semantics import check_excluded
 from gsencoder.evaluate.sources import FeatureSource
 from gsencoder.text.vocabulary import Words, check_known
 from gsencoder.train.distributed import fail_together, join_processes, value_of_first, values_of_all

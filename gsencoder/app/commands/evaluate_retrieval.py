@@ -14,10 +14,8 @@ from gsencoder.app.runs.summary import Summary
 from gsencoder.core.errors import InputError, SceneWarning, advised, counted, listed
 from gsencoder.data.labels.captions import read_texts, read_view_captions, write_view_captions
 from gsencoder.data.scenes import find_scenes, load_scene, scene_name
-from gsencoder.evaluate.files.retrieval import write_scored_pairs
+from gsencoder.evaluate.benchmarks.retrieval import ScoredPairs, score_retrieval, write_scored_pairs
 from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol, evaluate_retrieval, views_of
-from gsencoder.evaluate.retrieval import ScoredPairs
-from gsencoder.evaluate.score_retrieval import score_retrieval
 from gsencoder.evaluate.sources import FeatureSource
 from gsencoder.text.vocabulary import Words, check_known
 from gsencoder.types import QueryMemory, Scene

@@ -21,7 +21,7 @@ from gsencoder.core.logs import LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory
 from gsencoder.data.scenes import find_scenes
 from gsencoder.data.seeding.points import unit_of
-from gsencoder.evaluate.rendered import RenderedErrors, RenderedTally
+from gsencoder.evaluate.sources import RenderedErrors, RenderedTally
 from gsencoder.fusion.folder import MEMORY_FILE, file_of_teacher, save_memories, save_tables
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.load import load_encoder

@@ -14,15 +14,19 @@ from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, write_bytes
 from gsencoder.data.labels.classes import COLUMNS, DEFAULT_COLUMN, ids_of_benchmark, read_label_map
 from gsencoder.data.labels.files import read_split
-from gsencoder.evaluate.files.class_files import load_classes
-from gsencoder.evaluate.retrieval import Pooling
-from gsencoder.evaluate.score_boxes import score_referring
-from gsencoder.evaluate.score_files import score_instances, score_recognition, score_semantics
-from gsencoder.evaluate.score_report import ScoreReport
-from gsencoder.evaluate.score_retrieval import score_retrieval
-from gsencoder.evaluate.score_texts import score_answer_files, score_caption_files
-from gsencoder.evaluate.scores.instance_matches import MIN_REGION
-from gsencoder.evaluate.scores.semantics import BACKGROUND
+from gsencoder.evaluate.benchmarks.files import load_classes
+from gsencoder.evaluate.benchmarks.instances import MIN_REGION
+from gsencoder.evaluate.benchmarks.referring import score_referring
+from gsencoder.evaluate.benchmarks.retrieval import Pooling, score_retrieval
+from gsencoder.evaluate.benchmarks.score import (
+    score_answer_files,
+    score_caption_files,
+    score_instances,
+    score_recognition,
+    score_semantics,
+)
+from gsencoder.evaluate.benchmarks.semantics import BACKGROUND
+from gsencoder.evaluate.tables import ScoreReport
 
 TABLE = "table.md"
 MOST_COLUMNS = 10

@@ -19,13 +19,21 @@ from gsencoder.core.files import csv_text, json_bytes, write_bytes
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol
-from gsencoder.evaluate.tradeoff.halving import HalvingConfig
+from gsencoder.evaluate.tradeoff.measure import Records
 from gsencoder.evaluate.tradeoff.plots import page, picture, to_json
-from gsencoder.evaluate.tradeoff.records import Records
-from gsencoder.evaluate.tradeoff.results import SettingResult, pick_within, scene_row
 from gsencoder.evaluate.tradeoff.scaling import ScalingConfig, ScalingResult, scaling
 from gsencoder.evaluate.tradeoff.stage import HIGHER_IS_BETTER, Inputs, StageName
-from gsencoder.evaluate.tradeoff.sweep import STAGES, StageResult, SweepConfig, check_sweep, sweep_stage
+from gsencoder.evaluate.tradeoff.sweep import (
+    STAGES,
+    HalvingConfig,
+    SettingResult,
+    StageResult,
+    SweepConfig,
+    check_sweep,
+    pick_within,
+    scene_row,
+    sweep_stage,
+)
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.localize import LocalizeConfig

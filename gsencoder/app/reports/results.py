@@ -6,7 +6,7 @@ from typing import Any
 
 from gsencoder.app.reports.parts import add_features, add_views, add_words
 from gsencoder.app.runs.summary import Summary, peak_memory_mb
-from gsencoder.evaluate.score_report import ScoreReport
+from gsencoder.evaluate.tables import ScoreReport
 from gsencoder.infer.page.report import HtmlReport
 from gsencoder.types import GaussianFeatures, Localization, Scene
 

@@ -20,8 +20,8 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.boxes import is_seen
-from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features
+from gsencoder.evaluate.tables import mean_of
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures, Scene, SceneObject

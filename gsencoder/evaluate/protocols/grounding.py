@@ -17,8 +17,8 @@ from jaxtyping import Bool, Int32
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.grounding import GroundedPair, ground, grounding_scores
-from gsencoder.evaluate.scores.means import mean_of
 from gsencoder.evaluate.sources import FeatureSource, with_features
+from gsencoder.evaluate.tables import mean_of
 from gsencoder.infer.pictures import pixel_features
 from gsencoder.infer.relevancy import GaussianProducts, word_directions
 from gsencoder.render import blend

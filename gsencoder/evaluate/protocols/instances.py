@@ -13,10 +13,8 @@ import numpy as np
 from gsencoder.core.errors import InputError, about
 from gsencoder.data.labels.classes import ClassTable
 from gsencoder.data.labels.expressions import instance_truth
-from gsencoder.evaluate.class_scores import class_cosines
-from gsencoder.evaluate.labeled_points import LabeledPoints
-from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
-from gsencoder.evaluate.scores.instance_matches import MIN_REGION
+from gsencoder.evaluate.benchmarks.instances import MIN_REGION, InstancePrediction, InstanceTruth, prediction_of_masks
+from gsencoder.evaluate.sources import LabeledPoints, class_cosines
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures, Scene

@@ -8,9 +8,8 @@ from typing import Literal
 import numpy as np
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.class_scores import class_cosines
-from gsencoder.evaluate.labeled_points import LabeledPoints
-from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames
+from gsencoder.evaluate.benchmarks.recognition import NamedInstance, RankedNames
+from gsencoder.evaluate.sources import LabeledPoints, class_cosines
 from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures
 

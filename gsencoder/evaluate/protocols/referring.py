@@ -16,7 +16,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.expressions import Expression, read_nr3d, read_scanrefer
-from gsencoder.evaluate.scores.referring import PredictedBoxes
+from gsencoder.evaluate.benchmarks.referring import PredictedBoxes
 from gsencoder.infer.ask.ask import words_in
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.text.vocabulary import Words, closed_table

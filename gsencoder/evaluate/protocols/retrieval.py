@@ -1,7 +1,7 @@
 """The retrieval protocol: whether rendered views and their captions have each other's best scores (M3 table 2).
 
 The score of a view with a text is the largest cosine of its pixels with the text, or their mean
-(`gsencoder.evaluate.retrieval`). Texts are the captions of all views, and distractors where a file has them.
+(`gsencoder.evaluate.benchmarks.retrieval`). Texts are the captions of all views, and distractors where a file has them.
 """
 
 import time
@@ -15,7 +15,7 @@ from jaxtyping import Float64
 from gsencoder.core.errors import InputError, listed
 from gsencoder.data.labels.captions import ViewCaption
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.retrieval import Pooling
+from gsencoder.evaluate.benchmarks.retrieval import Pooling
 from gsencoder.evaluate.sources import FeatureSource, with_features
 from gsencoder.infer.pictures import pixel_features
 from gsencoder.infer.relevancy import GaussianProducts, Mode, word_directions

@@ -16,9 +16,8 @@ from jaxtyping import Int32
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable, vertex_classes
 from gsencoder.data.labels.mesh import VOTERS, labels_of_vertices
-from gsencoder.evaluate.class_scores import nearest_class
-from gsencoder.evaluate.labeled_points import LabeledPoints
-from gsencoder.evaluate.scores.semantics import BACKGROUND
+from gsencoder.evaluate.benchmarks.semantics import BACKGROUND
+from gsencoder.evaluate.sources import LabeledPoints, nearest_class
 from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures, Gaussians
 

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.files import plain
-from gsencoder.evaluate.tradeoff.results import SettingResult
 from gsencoder.evaluate.tradeoff.scaling import ScalingResult
 from gsencoder.evaluate.tradeoff.stage import HIGHER_IS_BETTER
-from gsencoder.evaluate.tradeoff.sweep import StageResult
+from gsencoder.evaluate.tradeoff.sweep import SettingResult, StageResult
 
 TEMPLATE = Path(__file__).with_name("plot.html")
 DATA = "/*DATA*/"

@@ -14,13 +14,10 @@ from gsencoder.core.process import Track, untracked
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.evaluate.tradeoff.encoder import encoder_of
-from gsencoder.evaluate.tradeoff.exponents import Exponent, fit_exponent
-from gsencoder.evaluate.tradeoff.fused_scene import taught_scene
-from gsencoder.evaluate.tradeoff.measure import interleaved, timed_run
+from gsencoder.evaluate.tradeoff.measure import Exponent, fit_exponent, interleaved, timed_run
 from gsencoder.evaluate.tradeoff.stage import Inputs, StageName
+from gsencoder.evaluate.tradeoff.stages import EncoderSettings, encoder_of, taught_scene
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.knobs import EncoderSettings
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import build_teacher, text_table_of
 from gsencoder.teachers.labels import LabelsConfig

@@ -15,11 +15,17 @@ from gsencoder.data.labels.expressions import read_scanrefer
 from gsencoder.data.labels.questions import read_questions
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.evaluate.answer_sheets import add_expressions, add_pictures, add_questions
+from gsencoder.evaluate.benchmarks.answers import read_answer_predictions
 from gsencoder.evaluate.boxes import aabb_iou
-from gsencoder.evaluate.files.answer_predictions import read_answer_predictions
-from gsencoder.evaluate.picture_truth import PictureTruth
-from gsencoder.evaluate.scripted_answerer import AnswerSheet, ScriptedAnswerer, serving
+from gsencoder.evaluate.stand_in_vlm import (
+    AnswerSheet,
+    PictureTruth,
+    ScriptedAnswerer,
+    add_expressions,
+    add_pictures,
+    add_questions,
+    serving,
+)
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.ask.questions import read_answers
 from gsencoder.infer.views.photographs import with_photographs

@@ -13,8 +13,7 @@ from named_rooms import write_words
 
 from gsencoder.app import cli
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.evaluate.files.instances import write_instance_prediction
-from gsencoder.evaluate.scores.instance_masks import prediction_of_masks
+from gsencoder.evaluate.benchmarks.instances import prediction_of_masks, write_instance_prediction
 
 pytestmark = pytest.mark.slow
 

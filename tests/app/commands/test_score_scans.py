@@ -14,8 +14,7 @@ from gsencoder.data.labels.expressions import write_instance_truth, write_semant
 from gsencoder.data.labels.files import read_whole_numbers, write_whole_numbers
 from gsencoder.data.labels.scans import read_scannet_labels
 from gsencoder.data.synthetic import make_room
-from gsencoder.evaluate.files.instances import write_instance_prediction
-from gsencoder.evaluate.scores.instance_masks import prediction_of_masks
+from gsencoder.evaluate.benchmarks.instances import prediction_of_masks, write_instance_prediction
 from gsencoder.text.table import make_text_table, save_text_table
 
 ROWS = ("1\twall\t1", "2\tchair\t5", "10\toffice chair\t5", "6\tcouch\t6", "43\tpaper\t40")

@@ -8,8 +8,8 @@ from labeled_scans import group, write_scannetpp_labels
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable, ids_of_benchmark, read_benchmark_map, read_instance_classes
-from gsencoder.evaluate.files.class_files import load_classes
-from gsencoder.evaluate.files.scan_truth import classes_of_scan, instances_of_scan
+from gsencoder.evaluate.benchmarks.files import load_classes
+from gsencoder.evaluate.benchmarks.instances import classes_of_scan, instances_of_scan
 
 MAP = """class,count,instance_map_to,semantic_map_to
 wall,90,None,

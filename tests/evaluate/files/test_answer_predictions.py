@@ -10,7 +10,7 @@ import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.questions import Question
-from gsencoder.evaluate.files.answer_predictions import read_answer_predictions, write_answer_predictions
+from gsencoder.evaluate.benchmarks.answers import read_answer_predictions, write_answer_predictions
 
 SCANQA = (
     Question(dataset="scanqa", id="q0", scene="s0", text="What?", answers=("chair",)),

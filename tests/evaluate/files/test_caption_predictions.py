@@ -8,12 +8,14 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.files import box_corners
-from gsencoder.evaluate.files.caption_predictions import (
+from gsencoder.evaluate.benchmarks.captions import (
+    CaptionedBox,
+    CaptionedObject,
+    NamedCaption,
     read_caption_predictions,
     write_box_captions,
     write_named_captions,
 )
-from gsencoder.evaluate.scores.dense_captions import CaptionedBox, CaptionedObject, NamedCaption
 
 OBJECTS = tuple(
     CaptionedObject(scene=scene, object_id=number, object_name="office_chair", captions=("sos a chair eos",))

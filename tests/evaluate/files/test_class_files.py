@@ -9,10 +9,9 @@ from labeled_scans import group, write_scannet_labels
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.classes import ClassTable
 from gsencoder.data.labels.files import write_whole_numbers
-from gsencoder.evaluate.files.class_files import load_classes, write_classes
-from gsencoder.evaluate.files.scan_truth import classes_of_scan, instances_of_scan
-from gsencoder.evaluate.files.scene_folders import scene_files
-from gsencoder.evaluate.files.semantics import count_label_files
+from gsencoder.evaluate.benchmarks.files import load_classes, scene_files, write_classes
+from gsencoder.evaluate.benchmarks.instances import classes_of_scan, instances_of_scan
+from gsencoder.evaluate.benchmarks.semantics import count_label_files
 
 TABLE = ClassTable(
     names=("office chair", "bed", "lamp"), ids=(12, 4, 999_999_999), groups={"tail": ("lamp",), "head": ("bed",)}

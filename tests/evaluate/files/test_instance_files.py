@@ -9,17 +9,17 @@ import pytest
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
 from gsencoder.data.labels.files import read_mask, read_whole_numbers, write_whole_numbers
-from gsencoder.evaluate.files.instances import (
+from gsencoder.evaluate.benchmarks.files import scene_files
+from gsencoder.evaluate.benchmarks.instances import (
+    InstancePrediction,
+    instance_scores,
     match_instance_files,
+    prediction_of_masks,
     read_instance_prediction,
     read_instance_truth,
     write_instance_prediction,
 )
-from gsencoder.evaluate.files.scene_folders import scene_files
-from gsencoder.evaluate.files.semantics import count_label_files
-from gsencoder.evaluate.scores.instance_masks import InstancePrediction, prediction_of_masks
-from gsencoder.evaluate.scores.instances import instance_scores
-from gsencoder.evaluate.scores.semantics import semantic_scores
+from gsencoder.evaluate.benchmarks.semantics import count_label_files, semantic_scores
 
 CLASSES = ClassTable(names=("bed", "chair"), ids=(4, 5))
 IDS = np.repeat([4001, 5001, 0], [150, 120, 30])

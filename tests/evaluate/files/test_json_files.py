@@ -11,21 +11,24 @@ from labeled_scans import group, write_scannet_labels
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.expressions import read_scanrefer, write_scanrefer
-from gsencoder.evaluate.files.recognition import (
+from gsencoder.evaluate.benchmarks.recognition import (
+    NamedInstance,
+    RankedNames,
     read_recognition_predictions,
     read_recognition_truth,
     recognize_files,
     write_recognition_predictions,
     write_recognition_truth,
 )
-from gsencoder.evaluate.files.referring import (
+from gsencoder.evaluate.benchmarks.referring import (
+    NO_TRUE_BOX,
+    PredictedBoxes,
     compare_box_files,
     read_referring_predictions,
     read_referring_truth,
+    referring_scores,
     write_referring_predictions,
 )
-from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames
-from gsencoder.evaluate.scores.referring import NO_TRUE_BOX, PredictedBoxes, referring_scores
 
 CORNERS = [[x, y, z] for x in (0.0, 1.0) for y in (0.0, 2.0) for z in (-1.0, 3.0)]
 BOX = np.array([[0.0, 0, -1], [1, 2, 3]])

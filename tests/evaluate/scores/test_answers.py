@@ -12,15 +12,14 @@ from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.questions import Question
-from gsencoder.evaluate.scores.answers import (
+from gsencoder.evaluate.benchmarks.answers import (
     clean_answer,
     match_cleaned,
     scanqa_kind,
     score_answers,
     sqa3d_kind,
 )
-from gsencoder.evaluate.scores.lemmas import f_value, wordnet_lemmatizer
-from gsencoder.evaluate.scores.sentences import score_sentences
+from gsencoder.evaluate.benchmarks.text_metrics import f_value, score_sentences, wordnet_lemmatizer
 
 NO_JAVA = "no Java here"
 NO_WORDNET = "no WordNet here"

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.captions import wrapped_caption
 from gsencoder.data.labels.expressions import Expression
-from gsencoder.evaluate.scores.dense_captions import (
+from gsencoder.evaluate.benchmarks.captions import (
     CaptionedBox,
     CaptionedObject,
     NamedCaption,

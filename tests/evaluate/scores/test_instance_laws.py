@@ -7,11 +7,17 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
-from gsencoder.evaluate.scores.instance_matches import MAX_TABLE, match_instances
-from gsencoder.evaluate.scores.instances import average_precision, instance_scores
-from gsencoder.evaluate.scores.recognition import NamedInstance, RankedNames, recognition_scores, recognize
-from gsencoder.evaluate.scores.semantics import count_labels, semantic_scores
+from gsencoder.evaluate.benchmarks.instances import (
+    MAX_TABLE,
+    InstancePrediction,
+    InstanceTruth,
+    average_precision,
+    instance_scores,
+    match_instances,
+    prediction_of_masks,
+)
+from gsencoder.evaluate.benchmarks.recognition import NamedInstance, RankedNames, recognition_scores, recognize
+from gsencoder.evaluate.benchmarks.semantics import count_labels, semantic_scores
 
 CLASSES = ClassTable(names=("bed", "chair"), ids=(4, 5), groups={"head": ("chair",), "tail": ("bed",)})
 

@@ -12,9 +12,14 @@ from hypothesis import strategies as st
 from instance_scenes import BED, CHAIR, CLASSES, VERTICES, Mask, aps, masks_of, scored, truth_of
 
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.evaluate.scores.instance_masks import InstanceTruth, prediction_of_masks
-from gsencoder.evaluate.scores.instance_matches import OVERLAPS, match_instances
-from gsencoder.evaluate.scores.instances import InstanceScores, instance_scores
+from gsencoder.evaluate.benchmarks.instances import (
+    OVERLAPS,
+    InstanceScores,
+    InstanceTruth,
+    instance_scores,
+    match_instances,
+    prediction_of_masks,
+)
 
 
 @st.composite

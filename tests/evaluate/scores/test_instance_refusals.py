@@ -5,9 +5,14 @@ import pytest
 from instance_scenes import CLASSES, masks_of, truth_of
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.scores.instance_masks import InstancePrediction, InstanceTruth, prediction_of_masks
-from gsencoder.evaluate.scores.instance_matches import match_instances
-from gsencoder.evaluate.scores.instances import average_precision, instance_scores
+from gsencoder.evaluate.benchmarks.instances import (
+    InstancePrediction,
+    InstanceTruth,
+    average_precision,
+    instance_scores,
+    match_instances,
+    prediction_of_masks,
+)
 
 
 def test_precision_and_recall_of_no_predictions_are_0() -> None:

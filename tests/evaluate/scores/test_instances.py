@@ -6,7 +6,7 @@ import pytest
 from instance_scenes import BED, CHAIR, SOFA, aps, masks_of, scored, truth_of
 
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.evaluate.scores.instance_matches import OVERLAPS, match_instances
+from gsencoder.evaluate.benchmarks.instances import OVERLAPS, match_instances
 
 
 def test_the_thresholds_are_nine_from_a_half_and_a_quarter() -> None:

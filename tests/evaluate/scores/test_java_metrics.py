@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.scores import java_metrics
-from gsencoder.evaluate.scores.java_metrics import JavaTools, find_java_tools, meteor, ptb_tokens
-from gsencoder.evaluate.scores.ngrams import python_tokens
+from gsencoder.evaluate.benchmarks import text_metrics as java_metrics
+from gsencoder.evaluate.benchmarks.text_metrics import JavaTools, find_java_tools, meteor, ptb_tokens, python_tokens
 
 ECHO = """
 import sys

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from gsencoder.evaluate.scores.means import mean_of
+from gsencoder.evaluate.tables import mean_of
 
 
 def test_values_that_are_no_numbers_are_left_out() -> None:

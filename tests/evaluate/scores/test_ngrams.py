@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.scores.ngrams import bleu, cider, python_tokens, rouge_l
+from gsencoder.evaluate.benchmarks.text_metrics import bleu, cider, python_tokens, rouge_l
 
 SENTENCES = st.lists(st.sampled_from("abcd"), max_size=8).map(" ".join)
 SAMPLES = st.lists(st.tuples(SENTENCES, st.lists(SENTENCES, min_size=1, max_size=3)), min_size=1, max_size=6)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sklearn.metrics import recall_score, top_k_accuracy_score
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.scores.recognition import (
+from gsencoder.evaluate.benchmarks.recognition import (
     NamedInstance,
     RankedNames,
     RecognizedInstance,

@@ -9,18 +9,21 @@ from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.expressions import Expression
-from gsencoder.evaluate.boxes import aabb_iou
-from gsencoder.evaluate.scores.box_overlap import box_ious
-from gsencoder.evaluate.scores.referring import (
+from gsencoder.evaluate.benchmarks.referring import (
     NO_TRUE_BOX,
+    OTHERS,
     PredictedBoxes,
     ReferredObject,
     ReferringResult,
+    box_ious,
     compare_boxes,
+    named_classes,
     referred_objects,
     referring_scores,
+    several_of_their_class,
+    with_kinds,
 )
-from gsencoder.evaluate.scores.referring_kinds import OTHERS, named_classes, several_of_their_class, with_kinds
+from gsencoder.evaluate.boxes import aabb_iou
 
 CUBE = np.array([[0.0, 0, 0], [1, 1, 1]])
 FAR = CUBE + 5

@@ -8,9 +8,8 @@ import pytest
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.expressions import Expression
 from gsencoder.data.labels.questions import Question
-from gsencoder.evaluate.scores.answers import clean_answer, match_cleaned, score_answers
-from gsencoder.evaluate.scores.box_overlap import box_ious
-from gsencoder.evaluate.scores.dense_captions import (
+from gsencoder.evaluate.benchmarks.answers import clean_answer, match_cleaned, score_answers
+from gsencoder.evaluate.benchmarks.captions import (
     CaptionedBox,
     CaptionedObject,
     NamedCaption,
@@ -19,9 +18,8 @@ from gsencoder.evaluate.scores.dense_captions import (
     score_named_captions,
     wrapped_caption,
 )
-from gsencoder.evaluate.scores.lemmas import f_value
-from gsencoder.evaluate.scores.ngrams import bleu, cider, python_tokens
-from gsencoder.evaluate.scores.sentences import score_sentences
+from gsencoder.evaluate.benchmarks.referring import box_ious
+from gsencoder.evaluate.benchmarks.text_metrics import bleu, cider, f_value, python_tokens, score_sentences
 
 NO_JAVA = "no Java here"
 

@@ -10,7 +10,7 @@ from sklearn.metrics import accuracy_score, jaccard_score, recall_score
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.evaluate.scores.semantics import LabelCounts, SemanticScores, count_labels, semantic_scores
+from gsencoder.evaluate.benchmarks.semantics import LabelCounts, SemanticScores, count_labels, semantic_scores
 
 CLASSES = ClassTable(names=("wall", "bed", "chair", "sofa"), ids=(1, 4, 5, 6))
 WALL, BED, CHAIR, SOFA = CLASSES.ids

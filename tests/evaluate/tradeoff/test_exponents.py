@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import linregress, t
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.tradeoff.exponents import fit_exponent
+from gsencoder.evaluate.tradeoff.measure import fit_exponent
 from gsencoder.evaluate.tradeoff.scaling import ScalingConfig, geometric_sizes
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.tradeoff.halving import HalvingConfig, draw_settings, successive_halving
+from gsencoder.evaluate.tradeoff.sweep import HalvingConfig, draw_settings, successive_halving
 
 VALUES = {"size": (4, 1, 2, 8), "steps": (10, 1, 100)}
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsencoder.evaluate.tradeoff.pareto import best_first, crowding, non_dominated_ranks, on_front
+from gsencoder.evaluate.tradeoff.sweep import best_first, crowding, non_dominated_ranks, on_front
 
 points = st.integers(1, 12).flatmap(
     lambda n: st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=n, max_size=n)

@@ -11,9 +11,8 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.evaluate.tradeoff.reconstruction import ReconstructionScene, reconstruction_stage
 from gsencoder.evaluate.tradeoff.stage import Inputs
-from gsencoder.reconstruct.knobs import ReconstructionSettings
+from gsencoder.evaluate.tradeoff.stages import ReconstructionScene, ReconstructionSettings, reconstruction_stage
 from gsencoder.reconstruct.optimize import OptimizeConfig
 
 pytestmark = pytest.mark.slow

@@ -13,11 +13,16 @@ from toy_stage import Toy, ToyScene, ToySettings
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Growth
-from gsencoder.evaluate.tradeoff.halving import HalvingConfig
-from gsencoder.evaluate.tradeoff.measure import interleaved, measure
-from gsencoder.evaluate.tradeoff.records import RECORDS_FILE, Record, Records, Timing
+from gsencoder.evaluate.tradeoff.measure import RECORDS_FILE, Record, Records, Timing, interleaved, measure
 from gsencoder.evaluate.tradeoff.stage import Judged, Score
-from gsencoder.evaluate.tradeoff.sweep import SweepConfig, check_sweep, knobs_that_matter, settings_of, sweep_stage
+from gsencoder.evaluate.tradeoff.sweep import (
+    HalvingConfig,
+    SweepConfig,
+    check_sweep,
+    knobs_that_matter,
+    settings_of,
+    sweep_stage,
+)
 
 SCENES = [Path("/rooms/a"), Path("/rooms/b"), Path("/rooms/c")]
 

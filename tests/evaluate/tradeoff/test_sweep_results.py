@@ -8,17 +8,17 @@ from scipy.stats import sem
 from toy_stage import Toy, record
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.tradeoff.records import Record
-from gsencoder.evaluate.tradeoff.results import (
+from gsencoder.evaluate.tradeoff.measure import Record
+from gsencoder.evaluate.tradeoff.stage import Judged, Score
+from gsencoder.evaluate.tradeoff.sweep import (
     estimate,
     estimate_difference,
+    knobs_that_matter,
     mark_front,
     pick_within,
     scene_row,
     summarize,
 )
-from gsencoder.evaluate.tradeoff.stage import Judged, Score
-from gsencoder.evaluate.tradeoff.sweep import knobs_that_matter
 
 
 def test_what_scenes_do_not_agree_on_is_noise_and_a_scene_without_things_says_nothing() -> None:

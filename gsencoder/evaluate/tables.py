@@ -2,10 +2,13 @@
 
 import csv
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 
@@ -152,3 +155,45 @@ def _lines(title: str, head: list[str], rows: Iterable[list[str]]) -> list[str]:
 def _line(cells: Iterable[str]) -> str:
     # A bar ends a cell also where a name holds one.
     return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
+
+
+def mean_of(values: Sequence[float] | Float64[np.ndarray, " n"]) -> float:
+    """The mean of the values that are numbers; NaN if none is."""
+    array = np.asarray(values, np.float64)
+    numbers = array[~np.isnan(array)]
+    return float(numbers.mean()) if len(numbers) else math.nan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScoreReport:
+    """The scores of one protocol.
+
+    Attributes:
+        results: figures as JSON values, shares and not percent.
+        table: the main figures above those that papers print.
+        rows: rows of CSV files by their stem, such as "scenes" and "classes".
+        line: the main figures in one line.
+    """
+
+    results: Mapping[str, Any]
+    table: ResultTable
+    rows: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
+    line: str
+
+
+def spread(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> dict[str, dict[str, float | int]]:
+    """Mean and standard deviation over scenes of some columns, and the number of scenes that have a value.
+
+    Args:
+        rows: one a scene; NaN and None are no values.
+        columns: which.
+    """
+    figures: dict[str, dict[str, float | int]] = {}
+    for column in columns:
+        values = [row[column] for row in rows if row.get(column) is not None and not math.isnan(row[column])]
+        figures[column] = {
+            "scenes": len(values),
+            "mean": mean_of(values),
+            "std": float(np.std(values, ddof=1)) if len(values) > 1 else math.nan,
+        }
+    return figures

@@ -2,19 +2,43 @@
 
 A query is one view or one text. Its pool is what belongs to it and distractors, which M3 takes from COCO. The score of
 a view with a text is the largest cosine of one of its rendered cells with it.
+
+Predictions of retrieval between views and texts, as .npz. There is no official format.
+
+Either scores, however a method makes them:
+
+    queries             text [Q], "SCENE/VIEW" of each view that has a caption
+    scores              float [Q, Q + M]: each view with the captions of the queries, in their order, then with M texts
+                        of other pictures
+    distractor_scores   float [M', Q], optional: other pictures, each with the captions of the queries
+
+or features, whose cosines are the scores:
+
+    queries             the same
+    views               float [Q, n, D]: n cells of each view
+    texts               float [Q, D]: of the captions
+    text_distractors    float [M, D], optional: of texts of other pictures
+    view_distractors    float [M', n', D], optional: cells of other pictures
 """
 
 import hashlib
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
+from gsencoder.core.archive import read_npz
 from gsencoder.core.arrays import first_repeated
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, about, counted, listed
+from gsencoder.core.files import write_bytes
+from gsencoder.data.labels.captions import read_view_captions
+from gsencoder.data.labels.files import PICKLE_SUFFIXES
+from gsencoder.evaluate.tables import ScoreReport, spread, table_of
 
 Pooling = Literal["max", "mean"]
 DISTRACTORS = 1999
@@ -265,3 +289,177 @@ def _unit(vectors: Float32[np.ndarray, "n D"]) -> Float64[np.ndarray, "n D"]:
     # The largest entry is taken out of the root, so that short vectors have directions as well.
     rows = rows / np.maximum(np.abs(rows).max(axis=1, initial=0, keepdims=True), np.finfo(np.float64).tiny)
     return np.asarray(rows / np.sqrt((rows**2).sum(axis=1, keepdims=True) + EPS))
+
+
+EXPECTED = "an .npz with queries and scores, or with queries, views and texts"
+
+
+def read_scored_pairs(path: Path, *, pooling: Pooling = "max") -> ScoredPairs:
+    """Reads scores, or computes them from features.
+
+    Args:
+        path: the .npz.
+        pooling: over the cells of a view, where there are features.
+
+    Raises:
+        InputError: not such a file, scores and features in one, or sizes that do not belong together.
+    """
+    if not path.is_file() or path.suffix.lower() in (".json", *PICKLE_SUFFIXES):
+        fault = "no such file" if not path.exists() else "is none"
+        raise InputError(f"{path}: {fault}; expected {EXPECTED}")
+    arrays = read_npz(
+        path,
+        {"queries": ("U", 1)},
+        {
+            "scores": ("f", 2),
+            "distractor_scores": ("f", 2),
+            "views": ("f", 3),
+            "texts": ("f", 2),
+            "text_distractors": ("f", 2),
+            "view_distractors": ("f", 3),
+        },
+    )
+    queries = tuple(arrays["queries"].tolist())
+    if ("scores" in arrays) == ("views" in arrays or "texts" in arrays):
+        raise InputError(f"{path}: holds {', '.join(arrays)}; expected {EXPECTED}")
+    if "scores" in arrays:
+        others = arrays.get("distractor_scores", np.zeros((0, len(queries))))
+        with about(path):
+            return ScoredPairs(
+                queries=queries, scores=arrays["scores"].astype(np.float64), distractors=others.astype(np.float64)
+            )
+    return _from_features(path, queries, arrays, pooling)
+
+
+def write_scored_pairs(path: Path, pairs: ScoredPairs) -> None:
+    """Writes scores as `read_scored_pairs` reads them."""
+    data = io.BytesIO()
+    arrays = {"queries": np.array(pairs.queries, dtype=np.str_), "scores": pairs.scores}
+    if len(pairs.distractors):
+        arrays["distractor_scores"] = pairs.distractors
+    np.savez_compressed(data, **arrays)  # type: ignore[arg-type]
+    write_bytes(path, data.getvalue())
+
+
+def _from_features(
+    path: Path, queries: tuple[str, ...], arrays: dict[str, np.ndarray], pooling: Pooling
+) -> ScoredPairs:
+    missing = [name for name in ("views", "texts") if name not in arrays]
+    if missing:
+        raise InputError(f"{path}: {missing[0]} is missing; expected {EXPECTED}")
+    views, texts = (arrays[name].astype(np.float32) for name in ("views", "texts"))
+    if not len(queries) == len(views) == len(texts):
+        raise InputError(
+            f"{path}: {len(queries)} queries, {len(views)} views and {len(texts)} texts; expected as many of each"
+        )
+    more = arrays.get("text_distractors", np.zeros((0, texts.shape[1]))).astype(np.float32)
+    others = arrays.get("view_distractors", np.zeros((0, 1, texts.shape[1]))).astype(np.float32)
+    if more.shape[1] != texts.shape[1]:
+        raise InputError(f"{path}: texts have {texts.shape[1]} channels, and text_distractors {more.shape[1]}")
+    every = np.concatenate([texts, more])
+    with about(path):
+        return ScoredPairs(
+            queries=queries,
+            scores=np.array([view_scores(cells, every, pooling) for cells in views]).reshape(len(views), len(every)),
+            distractors=np.array([view_scores(cells, texts, pooling) for cells in others]).reshape(-1, len(texts)),
+        )
+
+
+NAMES = tuple(f"{direction}_{k}" for direction in ("i2t", "t2i") for k in RECALLS)
+
+
+def score_retrieval(
+    predictions: Path,
+    truth: Path,
+    *,
+    method: str = "predictions",
+    count: int = 0,
+    seed: int = 0,
+    pooling: Pooling = "max",
+) -> ScoreReport:
+    """Recall at 1, 5 and 10 of texts for views and of views for texts (M3 table 2).
+
+    Args:
+        predictions: .npz of scores or features (`gsencoder.evaluate.benchmarks.retrieval`).
+        truth: JSON of captions of views.
+        method: name of the predictions' row in the table.
+        count: distractors in a query's pool; 0 = all.
+        seed: of their draw.
+        pooling: over the cells of a view, where predictions are features.
+
+    Raises:
+        InputError: files that cannot be used or that do not belong together.
+    """
+    captions = read_view_captions(truth)
+    pairs = read_scored_pairs(predictions, pooling=pooling)
+    row_of = {name: row for row, name in enumerate(pairs.queries)}
+    missing = [each.name for each in captions if each.name not in row_of]
+    if missing:
+        raise InputError(
+            f"{predictions}: no query of {counted(len(missing), 'view')} with a caption: {listed(missing, 3)}"
+        )
+    foreign = sorted(set(pairs.queries) - {each.name for each in captions})
+    if foreign:
+        raise InputError(
+            f"{predictions}: {counted(len(foreign), 'query', 'queries')} of no view with a caption in {truth}: "
+            f"{listed(foreign, 3)}"
+        )
+    rows = np.array([row_of[each.name] for each in captions])
+    number = len(captions)
+    columns = np.concatenate([rows, np.arange(number, pairs.scores.shape[1])])
+    ordered = ScoredPairs(
+        queries=tuple(each.name for each in captions),
+        scores=pairs.scores[np.ix_(rows, columns)],
+        distractors=pairs.distractors[:, rows],
+    )
+    sides = dict(
+        zip(("i2t", "t2i"), retrieve(ordered, [each.caption for each in captions], count=count, seed=seed), strict=True)
+    )
+    overall = {f"{name}_{k}": side.recall(k) for name, side in sides.items() for k in RECALLS}
+    ranks = [
+        {"scene": each.scene, "view": each.view, "i2t_rank": int(there), "t2i_rank": int(back)}
+        for each, there, back in zip(captions, sides["i2t"].ranks, sides["t2i"].ranks, strict=True)
+    ]
+    by_scene = []
+    for scene in dict.fromkeys(each.scene for each in captions):
+        of_scene = np.array([each.scene == scene for each in captions])
+        recalls = {
+            f"{name}_{k}": float((side.ranks[of_scene] <= k).mean()) for name, side in sides.items() for k in RECALLS
+        }
+        by_scene.append({"scene": scene, "views": int(of_scene.sum()), **recalls})
+    candidates = {"i2t": pairs.scores.shape[1] - number, "t2i": len(pairs.distractors)}
+    same = number - len({each.caption for each in captions})
+    notes = [_pool(name, side, candidates[name]) for name, side in sides.items()]
+    if same and not all(candidates.values()):
+        notes.append("Views with the same text are no rivals of each other.")
+    not_finite = sum(side.not_finite for side in sides.values())
+    if not_finite:
+        notes.append(f"{counted(not_finite, 'score')} of a view with its own text not finite: last in its pool.")
+    return ScoreReport(
+        results={
+            "protocol": "retrieval",
+            "views": number,
+            "pools": {
+                name: {"distractors": side.distractors, "of": "distractors" if candidates[name] else "queries"}
+                for name, side in sides.items()
+            },
+            "not_finite": not_finite,
+            **overall,
+            "spread": spread(by_scene, NAMES),
+        },
+        table=table_of(
+            "Retrieval", {method: overall}, published="m3_2_grounding_and_retrieval", columns=NAMES, notes=notes
+        ),
+        rows={"scenes": by_scene, "ranks": ranks},
+        line=f"{counted(number, 'view')} in {counted(len(by_scene), 'scene')}: image to text R@1 "
+        f"{overall['i2t_1']:.3f}, "
+        f"R@5 {overall['i2t_5']:.3f}, R@10 {overall['i2t_10']:.3f}; text to image {overall['t2i_1']:.3f}, "
+        f"{overall['t2i_5']:.3f}, {overall['t2i_10']:.3f}",
+    )
+
+
+def _pool(name: str, side: Retrieval, others: int) -> str:
+    media = "texts" if name == "i2t" else "pictures"
+    if others:
+        return f"Pools of {name}: {side.distractors:,} of {others:,} {media} of others (M3: 1,999 of COCO)."
+    return f"Pools of {name}: the {media} of the other queries, and none of COCO as in M3, so that they are smaller."

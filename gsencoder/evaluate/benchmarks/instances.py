@@ -1,0 +1,662 @@
+"""Average precision of instances, as ScanNet's `evaluate_semantic_instance.py` counts it (Dai et al. 2017).
+
+`gsencoder.evaluate.benchmarks.instances` decides which predictions match a truth, are wrong, or are ignored.
+Precision p and recall r are taken at each distinct score, from the lowest, and the point (1, 0) is added; AP sums
+p[i] · (r[i - 1] - r[i + 1]) / 2, with r[-1] = r[0] and a 0 after the last. Predictions of one score are one step of the
+curve, whatever their order.
+
+AP of a class is the mean over the thresholds 0.50, 0.55, …, 0.90; AP50 and AP25 are those at 0.5 and 0.25. Without
+truths a class has none, and means leave it out; with truths and no predictions it is 0.
+
+Files of instances: ScanNet's submission format and truth, and .npz in place of the pickles that others use.
+
+Truth is SCENE.txt with one number a line: class id · 1000 + number of the instance, and 0 for none. A prediction is
+SCENE.txt with "mask file, class id, score" in each line, where the mask file lies below the same folder and has one
+number a line, 0 outside of the mask; or SCENE.npz with pred_masks (bool, vertices × masks), pred_classes (integers) and
+pred_scores (floating point), as OpenMask3D and Mask3D name them.
+
+Which predicted instances match true ones, as ScanNet's `evaluate_semantic_instance.py` decides it (Dai et al. 2017).
+
+A truth is an instance of a scored class with 100 vertices or more. A prediction is a mask of vertices with a class and
+a score; masks of fewer than 100 vertices are left out, as are those of classes that are not scored. At a threshold of
+the IoU:
+
+* Truths, in the order of their ids, take the predictions of their class whose IoU is strictly above the threshold, in
+  the order in which these are listed, unless another truth has them already. The highest score is that of the match,
+  and each further prediction is a false positive.
+* A prediction that is above the threshold with no instance of its class is a false positive, unless more than that
+  share of its vertices is ignored: vertices without a scored class, and those of its class's instances that have fewer
+  than 100.
+
+From 0.5 on a prediction can match one truth only, and the order in which predictions are listed means nothing; at 0.25
+one may lie on several truths, and the order counts there, as in the official script, whatever the scores are.
+
+Without classes, truths and predictions are all of one class; what truth labels as no class remains ignored.
+
+Truth of instances and of semantic labels from the labels of scans of ScanNet or ScanNet++, without files in between.
+
+It is what `gsencoder.data.labels.expressions` writes, and what ScanNet's own export writes: class id · 1000 + objectId
++ 1, and class ids.
+"""
+
+import io
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from gsencoder.core.archive import read_npz
+from gsencoder.core.arrays import first_repeated
+from gsencoder.core.errors import InputError, about
+from gsencoder.core.files import write_bytes
+from gsencoder.data.labels.classes import ClassTable, ids_of_names, vertex_classes
+from gsencoder.data.labels.expressions import IDS_PER_CLASS, instance_truth
+from gsencoder.data.labels.files import mask_bytes, read_checked_text, read_mask, read_whole_numbers
+from gsencoder.data.labels.scans import (
+    find_scannet_files,
+    find_scannetpp_files,
+    read_scannet_labels,
+    read_scannetpp_labels,
+)
+from gsencoder.evaluate.benchmarks.files import scene_files
+from gsencoder.types import MeshLabels
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InstanceTruth:
+    """The instance of each vertex of a scene.
+
+    Attributes:
+        scene: its name.
+        ids: class id · 1000 + number of the instance; other ids, such as 0, are no instance.
+    """
+
+    scene: str
+    ids: Int64[np.ndarray, " V"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InstancePrediction:
+    """Masks of a scene, each with a class and a score; masks may overlap.
+
+    Attributes:
+        scene: its name.
+        num_vertices: of the scene, V.
+        vertices: of all masks, one mask after the other; ascending within a mask.
+        offsets: where each mask begins in `vertices`, and at last their number.
+        labels: class ids.
+        scores: finite; predictions are ranked by them.
+    """
+
+    scene: str
+    num_vertices: int
+    vertices: Int64[np.ndarray, " E"]
+    offsets: Int64[np.ndarray, " M_1"]
+    labels: Int64[np.ndarray, " M"]
+    scores: Float64[np.ndarray, " M"]
+
+    def __post_init__(self) -> None:
+        masks, ends = len(self.labels), self.offsets
+        if len(self.scores) != masks or len(ends) != masks + 1:
+            raise InputError(
+                f"{self.scene}: expected as many labels as scores and masks, got {masks} labels, {len(self.scores)} "
+                f"scores and {len(ends) - 1} masks"
+            )
+        if ends[0] != 0 or ends[-1] != len(self.vertices) or (np.diff(ends) < 0).any():
+            raise InputError(
+                f"{self.scene}: the offsets of the masks do not divide their {len(self.vertices):,} vertices"
+            )
+        if not np.isfinite(self.scores).all():
+            worst = int(np.flatnonzero(~np.isfinite(self.scores))[0])
+            raise InputError(
+                f"{self.scene}: prediction {worst} has the score {self.scores[worst]}; expected finite scores"
+            )
+        rising = np.diff(self.vertices) > 0
+        rising[ends[(ends > 0) & (ends < len(self.vertices))] - 1] = True
+        if not rising.all():
+            raise InputError(f"{self.scene}: the vertices of a mask are not ascending, each once")
+        if len(self.vertices) and not (self.vertices.min() >= 0 and self.vertices.max() < self.num_vertices):
+            raise InputError(f"{self.scene}: a mask has a vertex outside of the scene's {self.num_vertices:,}")
+
+    def mask(self, index: int) -> Int64[np.ndarray, " n"]:
+        """The vertices of one mask."""
+        return self.vertices[self.offsets[index] : self.offsets[index + 1]]
+
+
+def prediction_of_masks(
+    scene: str,
+    masks: Sequence[Bool[np.ndarray, " V"]] | Bool[np.ndarray, "M V"],
+    labels: Sequence[int],
+    scores: Sequence[float],
+    *,
+    num_vertices: int,
+) -> InstancePrediction:
+    """The prediction of masks that say for each vertex whether it belongs to them.
+
+    Raises:
+        InputError: masks of another length than `num_vertices`, or what `InstancePrediction` refuses.
+    """
+    for index, mask in enumerate(masks):
+        if len(mask) != num_vertices:
+            raise InputError(f"{scene}: mask {index} has {len(mask):,} vertices, and the scene {num_vertices:,}")
+    parts = [np.flatnonzero(mask) for mask in masks]
+    return InstancePrediction(
+        scene=scene,
+        num_vertices=num_vertices,
+        vertices=np.concatenate([np.zeros(0, np.int64), *parts]),
+        offsets=np.cumsum([0, *(len(part) for part in parts)], dtype=np.int64),
+        labels=np.array(labels, np.int64),
+        scores=np.array(scores, np.float64),
+    )
+
+
+OVERLAPS = np.append(np.arange(0.5, 0.95, 0.05), 0.25)
+"""Thresholds of IoU. Their floating-point values decide ties: 0.6 here is 0.6000000000000001."""
+MIN_REGION = 100
+"""Smallest number of vertices of a truth and of a prediction that count."""
+MAX_TABLE = 1 << 22
+"""Largest range of ids that are counted in a table; ScanNet200's reach 1,191,000."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneMatches:
+    """Which predictions of a scene are right, at each threshold: all that scores need of it.
+
+    Attributes:
+        scene: its name.
+        class_agnostic: whether classes were looked at.
+        truths: numbers of truths by class (one class where they were not looked at).
+        predictions: numbers of predictions that count, by class.
+        scores: of these predictions.
+        shared: number of these predictions that are above the lowest threshold with several truths.
+        other_classes: number of predictions whose class is not scored.
+        rows: class of each outcome; those of ignored predictions are left out.
+        thresholds: index in `OVERLAPS` of each outcome.
+        hits: whether it is a match, or a false positive.
+        outcome_scores: its score.
+    """
+
+    scene: str
+    class_agnostic: bool
+    truths: Int64[np.ndarray, " C"]
+    predictions: Int64[np.ndarray, " C"]
+    scores: Float64[np.ndarray, " n"]
+    shared: int
+    other_classes: int
+    rows: Int64[np.ndarray, " K"]
+    thresholds: Int64[np.ndarray, " K"]
+    hits: Bool[np.ndarray, " K"]
+    outcome_scores: Float64[np.ndarray, " K"]
+
+
+class _Pairs(NamedTuple):
+    """Pairs of a prediction and an instance of its class that have vertices in common."""
+
+    predictions: Int64[np.ndarray, " P"]
+    instances: Int64[np.ndarray, " P"]
+    ious: Float64[np.ndarray, " P"]
+
+
+def match_instances(
+    truth: InstanceTruth,
+    prediction: InstancePrediction,
+    classes: ClassTable,
+    *,
+    class_agnostic: bool = False,
+    min_region: int = MIN_REGION,
+) -> SceneMatches:
+    """Decides at each threshold which predictions of a scene match a truth, are wrong, or are ignored.
+
+    Args:
+        truth: of the scene.
+        prediction: of the same scene and vertices. The order of its masks matters where one of them lies on several
+            truths (see the module).
+        classes: that are scored.
+        class_agnostic: leave the classes out of account; labels of predictions are then not looked at.
+        min_region: smallest number of vertices of a truth and of a prediction that count.
+
+    Raises:
+        InputError: two scenes, or numbers of vertices that differ.
+    """
+    if truth.scene != prediction.scene:
+        raise InputError(f"the prediction is of the scene {prediction.scene!r}, and the truth of {truth.scene!r}")
+    if len(truth.ids) != prediction.num_vertices:
+        raise InputError(
+            f"{truth.scene}: the masks have {prediction.num_vertices:,} vertices, and the truth {len(truth.ids):,}; "
+            "expected those of the same mesh"
+        )
+    ids, codes, sizes = _distinct(truth.ids)
+    instance_rows, rows = classes.rows(ids // IDS_PER_CLASS), classes.rows(prediction.labels)
+    if class_agnostic:
+        instance_rows, rows = np.where(instance_rows < 0, -1, 0), np.zeros_like(rows)
+    number = 1 if class_agnostic else len(classes.names)
+    void = instance_rows < 0
+    instance_rows = np.where(ids == 0, -1, instance_rows)
+    in_score = (instance_rows >= 0) & (ids >= IDS_PER_CLASS) & (sizes >= min_region)
+    other_classes = int((rows < 0).sum())
+    large = np.flatnonzero((rows >= 0) & (np.diff(prediction.offsets) >= min_region))
+    rows, scores, areas = rows[large], prediction.scores[large], np.diff(prediction.offsets)[large]
+    common = np.zeros((len(large), len(ids)), np.int64)
+    for row, index in enumerate(large.tolist()):
+        common[row] = np.bincount(codes[prediction.mask(index)], minlength=len(ids))
+
+    same = rows[:, None] == instance_rows
+    first, second = np.nonzero(same & (common > 0))
+    shared = common[first, second]
+    pairs = _Pairs(first, second, shared / (sizes[second] + areas[first] - shared))
+    # The official script adds an instance that is small and a group (an id below 1000) twice.
+    small = same & (sizes < min_region)
+    groups = same & (ids < IDS_PER_CLASS)
+    ignored = (common * (void + small.astype(np.int64) + groups)).sum(axis=1) / np.maximum(areas, 1)
+
+    outcomes = [_outcomes(pairs, in_score, scores, ignored, overlap) for overlap in OVERLAPS]
+    of_instance = np.concatenate([owners for owners, _, _ in outcomes])
+    hits = np.concatenate([right for _, right, _ in outcomes])
+    multiple = np.bincount(pairs.predictions[(pairs.ious > OVERLAPS.min()) & in_score[pairs.instances]], minlength=1)
+    return SceneMatches(
+        scene=truth.scene,
+        class_agnostic=class_agnostic,
+        truths=np.bincount(instance_rows[in_score], minlength=number),
+        predictions=np.bincount(rows, minlength=number),
+        scores=scores,
+        shared=int((multiple > 1).sum()),
+        other_classes=other_classes,
+        rows=rows[of_instance],
+        thresholds=np.repeat(np.arange(len(OVERLAPS)), [len(owners) for owners, _, _ in outcomes]),
+        hits=hits,
+        outcome_scores=np.concatenate([values for _, _, values in outcomes]),
+    )
+
+
+def _distinct(
+    ids: Int64[np.ndarray, " V"],
+) -> tuple[Int64[np.ndarray, " I"], Int64[np.ndarray, " V"], Int64[np.ndarray, " I"]]:
+    """The distinct ids in ascending order, the index of each vertex's id among them, and their numbers of vertices."""
+    lowest = int(ids.min(initial=0))
+    if int(ids.max(initial=0)) - lowest > MAX_TABLE:
+        return np.unique(ids, return_inverse=True, return_counts=True)
+    # Counting takes a tenth of the time of sorting.
+    counts = np.bincount(ids - lowest)
+    present = np.flatnonzero(counts)
+    codes = np.zeros(len(counts), np.int64)
+    codes[present] = np.arange(len(present))
+    return present + lowest, codes[ids - lowest], counts[present]
+
+
+def _outcomes(
+    pairs: _Pairs,
+    in_score: Bool[np.ndarray, " I"],
+    scores: Float64[np.ndarray, " M"],
+    ignored: Float64[np.ndarray, " M"],
+    overlap: float,
+) -> tuple[Int64[np.ndarray, " K"], Bool[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
+    """The outcomes at one threshold: a prediction of the class of each, whether it is a match, and its score."""
+    above = pairs.ious > overlap
+    candidates = np.flatnonzero(above & in_score[pairs.instances])
+    candidates = candidates[np.lexsort((pairs.predictions[candidates], pairs.instances[candidates]))]
+    used_predictions: set[int] = set()
+    matched: dict[int, tuple[int, float]] = {}
+    wrong: list[tuple[int, float]] = []
+    for prediction, instance in zip(
+        pairs.predictions[candidates].tolist(), pairs.instances[candidates].tolist(), strict=True
+    ):
+        if prediction in used_predictions:
+            continue
+        score = float(scores[prediction])
+        if instance in matched:
+            # A prediction that comes second is not taken, whichever of both scores is the higher one.
+            owner, best = matched[instance]
+            matched[instance] = owner, max(best, score)
+            wrong.append((prediction, min(best, score)))
+        else:
+            used_predictions.add(prediction)
+            matched[instance] = prediction, score
+    alone = np.ones(len(scores), bool)
+    alone[pairs.predictions[above]] = False
+    false = np.flatnonzero(alone & (ignored <= overlap))
+    owned = [*matched.values(), *wrong]
+    return (
+        np.concatenate([np.array([owner for owner, _ in owned], np.int64), false]),
+        np.arange(len(owned) + len(false)) < len(matched),
+        np.concatenate([np.array([score for _, score in owned], np.float64), scores[false]]),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InstanceAverages:
+    """AP over 0.5 to 0.9, at 0.5 and at 0.25; NaN without truths."""
+
+    ap: float
+    ap50: float
+    ap25: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InstanceScores:
+    """The scores of scenes.
+
+    Attributes:
+        scenes: how many.
+        overall: mean over the classes that have truths.
+        classes: by name; the one class of a class-agnostic score is called "any".
+        groups: mean over the classes of each group that have truths.
+        recall: share of the truths that are matched, by class and threshold of `OVERLAPS`; NaN without truths.
+        truths: that count, by class.
+        predictions: that count, by class.
+        equal_scores: whether there are several predictions, all with one score. Their ranking is then undefined, and AP
+            is recall · (precision + 1) / 2 at each threshold.
+        shared: predictions that are above 0.25 with several truths; AP25 depends on the order of the predictions where
+            there are any.
+    """
+
+    scenes: int
+    overall: InstanceAverages
+    classes: dict[str, InstanceAverages]
+    groups: dict[str, InstanceAverages]
+    recall: Float64[np.ndarray, "C T"]
+    truths: Int64[np.ndarray, " C"]
+    predictions: Int64[np.ndarray, " C"]
+    equal_scores: bool
+    shared: int
+
+
+def average_precision(
+    scores: Float64[np.ndarray, " n"], hits: Bool[np.ndarray, " n"], truths: int
+) -> tuple[float, float]:
+    """AP and recall of ranked predictions (the module has the equation); predictions of one score are one step.
+
+    Args:
+        scores: of predictions that are not ignored.
+        hits: which of them match a truth.
+        truths: number of truths, one or more.
+    """
+    order = np.argsort(scores, kind="stable")
+    _, starts = np.unique(scores[order], return_index=True)
+    hits_before = np.concatenate([[0], np.cumsum(hits[order])])
+    right = hits_before[-1] - hits_before[starts]
+    precision = np.append(right / (len(scores) - starts), 1.0)
+    recall = np.append(right / truths, 0.0)
+    around = np.concatenate([recall[:1], recall, [0.0]])
+    return float(precision @ ((around[:-2] - around[2:]) / 2)), float(recall[0])
+
+
+def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> InstanceScores:
+    """The scores of scenes together; of one scene, its own.
+
+    Args:
+        matches: of the scenes, in any order.
+        classes: with which they were matched.
+
+    Raises:
+        InputError: no scene, a scene that is there twice, or matches with and without classes.
+    """
+    if not matches:
+        raise InputError("instances: no scene to score")
+    if repeated := first_repeated(scene.scene for scene in matches):
+        raise InputError(f"instances: the scene {repeated[0]} is there twice; each is scored once")
+    agnostic = matches[0].class_agnostic
+    labels = ("any",) if agnostic else classes.names
+    if any(m.class_agnostic != agnostic or len(m.truths) != len(labels) for m in matches):
+        raise InputError("instances: the scenes were matched with different classes")
+    truths = np.sum([m.truths for m in matches], axis=0)
+    predictions = np.sum([m.predictions for m in matches], axis=0)
+    keys = np.concatenate([m.rows * len(OVERLAPS) + m.thresholds for m in matches])
+    order = np.argsort(keys, kind="stable")
+    starts = np.searchsorted(keys[order], np.arange(len(labels) * len(OVERLAPS) + 1))
+    hits = np.concatenate([m.hits for m in matches])[order]
+    scores = np.concatenate([m.outcome_scores for m in matches])[order]
+    table, recall = np.full((2, len(labels), len(OVERLAPS)), math.nan)
+    for row in np.flatnonzero(truths):
+        for column in range(len(OVERLAPS)):
+            cell = row * len(OVERLAPS) + column
+            part = slice(starts[cell], starts[cell + 1])
+            table[row, column], recall[row, column] = average_precision(scores[part], hits[part], int(truths[row]))
+    ranked = np.concatenate([m.scores for m in matches])
+    # A group's names are rows of the table; none of them are scored without classes.
+    members = {} if agnostic else {g: [labels.index(name) for name in n] for g, n in classes.groups.items()}
+    return InstanceScores(
+        scenes=len(matches),
+        overall=_averages(table),
+        classes={name: _averages(table[row : row + 1]) for row, name in enumerate(labels)},
+        groups={group: _averages(table[rows]) for group, rows in members.items()},
+        recall=recall,
+        truths=truths,
+        predictions=predictions,
+        equal_scores=len(ranked) > 1 and bool((ranked == ranked[0]).all()),
+        shared=sum(m.shared for m in matches),
+    )
+
+
+def _averages(table: Float64[np.ndarray, "c T"]) -> InstanceAverages:
+    """Means over the classes of a table that have truths."""
+    present = table[~np.isnan(table[:, 0])]
+    if not len(present):
+        return InstanceAverages(ap=math.nan, ap50=math.nan, ap25=math.nan)
+    strict, half, quarter = OVERLAPS >= 0.5, OVERLAPS == 0.5, OVERLAPS == 0.25
+    ap, ap50, ap25 = (float(present[:, which].mean()) for which in (strict, half, quarter))
+    return InstanceAverages(ap=ap, ap50=ap50, ap25=ap25)
+
+
+NONE = -1
+"""Of vertices of no class."""
+
+
+def instances_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> InstanceTruth:
+    """The instance of each vertex of a scan's mesh; the scene is named as its folder.
+
+    Args:
+        folder: of the scan.
+        raw_ids: class id of each raw name, of `read_label_map`.
+        classes: that are scored; objects of others do not count.
+
+    Raises:
+        InputError: label files that are missing or wrong, or a class with the id 0.
+    """
+    classes.check_instance_ids()
+    labels = _labels(folder, raw_ids)
+    names = dict(labels.objects)
+    class_of = ids_of_names(names.values(), raw_ids, classes)
+    return InstanceTruth(scene=folder.name, ids=instance_truth(labels.instances, names, class_of))
+
+
+def classes_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> Int64[np.ndarray, " V"]:
+    """The class id of each vertex of a scan's mesh, −1 = none; arguments and errors as of `instances_of_scan`."""
+    labels = _labels(folder, raw_ids)
+    names = dict(labels.objects)
+    ids = ids_of_names(names.values(), raw_ids, classes)
+    # 0 stands for none there, unless a raw name leads to it.
+    class_of = {name: number for name, number in ids.items() if number or (raw_ids.get(name) == 0 and 0 in classes.ids)}
+    return vertex_classes(labels.instances, names, class_of, none=NONE).astype(np.int64)
+
+
+def _labels(folder: Path, raw_ids: Mapping[str, int]) -> MeshLabels:
+    """The labels of a scan; of ScanNet++ those of the objects that have a class, as its toolkit takes them."""
+    if find_scannet_files(folder) is None and find_scannetpp_files(folder) is not None:
+        return read_scannetpp_labels(folder, names=raw_ids)
+    return read_scannet_labels(folder)
+
+
+MASK_FOLDER = "predicted_masks"
+MAX_LIST_BYTES = 64 << 20
+MAX_PATH = 1000
+"""Largest number of characters of the path of a mask."""
+"""Largest size of the list of a scene's masks."""
+MAX_ID = 2**31 - 1
+
+
+def match_instance_files(
+    predictions: Path,
+    truth: Path,
+    classes: ClassTable,
+    *,
+    scenes: Collection[str] | None = None,
+    raw_ids: Mapping[str, int] | None = None,
+    class_agnostic: bool = False,
+    min_region: int = MIN_REGION,
+) -> Iterator[SceneMatches]:
+    """Matches the predictions of a folder with the truth of another, one scene in memory at a time.
+
+    Args:
+        predictions: folder of SCENE.txt or SCENE.npz.
+        truth: folder of SCENE.txt, or of ScanNet's scans.
+        classes: that are scored.
+        scenes: to score; None = all of the truth.
+        raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
+        class_agnostic: leave the classes out of account.
+        min_region: smallest number of vertices that counts.
+
+    Raises:
+        InputError: files that cannot be used, or scenes that are in one folder only.
+    """
+    suffixes, scans = (".txt", ".npz"), raw_ids is not None
+    for files in scene_files(predictions, truth, scenes=scenes, suffixes=suffixes, scans=scans):
+        if raw_ids is None:
+            instances = read_instance_truth(files.truth)
+        else:
+            instances = instances_of_scan(files.truth, raw_ids, classes)
+        masks = read_instance_prediction(files.prediction, num_vertices=len(instances.ids))
+        with about(files.prediction):
+            matches = match_instances(instances, masks, classes, class_agnostic=class_agnostic, min_region=min_region)
+        yield matches
+
+
+def read_instance_truth(path: Path) -> InstanceTruth:
+    """Reads the instance of each vertex; the scene is named as the file.
+
+    Raises:
+        InputError: unreadable, empty, or a line that is no whole number.
+    """
+    ids = read_whole_numbers(path, hint="; predictions and truth may be swapped")
+    if not len(ids):
+        raise InputError(f"{path}: no vertices; expected one whole number for each")
+    return InstanceTruth(scene=path.stem, ids=ids)
+
+
+def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePrediction:
+    """Reads the masks of a scene, which is named as the file.
+
+    Args:
+        path: SCENE.txt or SCENE.npz.
+        num_vertices: of the scene.
+
+    Raises:
+        InputError: unreadable; a mask that is missing, listed twice, outside of the folder or of another length; a
+            class id that is no whole number; a score that is no finite number.
+    """
+    if path.suffix == ".npz":
+        return _read_npz(path, num_vertices)
+    lines = read_checked_text(path, max_bytes=MAX_LIST_BYTES).splitlines()
+    first: dict[Path, int] = {}
+    vertices, labels, scores = [], [], []
+    for number, line in enumerate(lines, start=1):
+        where, words = f"{path}: line {number}", line.split()
+        if len(words) != 3:
+            hint = "; predictions and truth may be swapped" if len(words) == 1 else ""
+            raise InputError(f"{where}: expected a mask file, a class id and a score, got {line[:60]!r}{hint}")
+        if len(words[0]) > MAX_PATH:
+            raise InputError(f"{where}: expected a mask file, got a name of {len(words[0]):,} characters")
+        file = PurePosixPath(words[0])
+        try:
+            mask_path = (path.parent / file).resolve()
+        except (OSError, RuntimeError, ValueError) as error:
+            raise InputError(f"{where}: the mask {words[0][:80]!r} cannot be read: {error}") from error
+        if file.is_absolute() or not mask_path.is_relative_to(path.parent.resolve()):
+            raise InputError(f"{where}: the mask {words[0][:80]!r} is not below {path.parent}")
+        if mask_path in first:
+            raise InputError(f"{where}: the mask {words[0][:80]!r} is that of line {first[mask_path]} already")
+        first[mask_path] = number
+        labels.append(_label(words[1], where))
+        scores.append(_score(words[2], where))
+        with about(where):
+            mask = read_mask(mask_path)
+        if len(mask) != num_vertices:
+            raise InputError(
+                f"{where}: the mask {words[0][:80]!r} has {len(mask):,} lines, and the scene {num_vertices:,} vertices"
+            )
+        vertices.append(np.flatnonzero(mask))
+    return InstancePrediction(
+        scene=path.stem,
+        num_vertices=num_vertices,
+        vertices=np.concatenate([np.zeros(0, np.int64), *vertices]),
+        offsets=np.cumsum([0, *(len(part) for part in vertices)], dtype=np.int64),
+        labels=np.array(labels, np.int64),
+        scores=np.array(scores, np.float64),
+    )
+
+
+def write_instance_prediction(
+    folder: Path, prediction: InstancePrediction, *, form: Literal["text", "npz"] = "text"
+) -> Path:
+    """Writes the masks of a scene as ScanNet's script takes them, or as one .npz, which is much smaller.
+
+    Args:
+        folder: an existing one, for all scenes.
+        prediction: of one scene.
+        form: "text" writes SCENE.txt and predicted_masks/SCENE_000.txt, …; "npz" writes SCENE.npz.
+
+    Returns:
+        The file SCENE.txt or SCENE.npz.
+    """
+    masks = np.zeros((len(prediction.labels), prediction.num_vertices), bool)
+    for index, mask in enumerate(masks):
+        mask[prediction.mask(index)] = True
+    if form == "npz":
+        data = io.BytesIO()
+        np.savez_compressed(data, pred_masks=masks.T, pred_classes=prediction.labels, pred_scores=prediction.scores)
+        write_bytes(folder / f"{prediction.scene}.npz", data.getvalue())
+        return folder / f"{prediction.scene}.npz"
+    (folder / MASK_FOLDER).mkdir(exist_ok=True)
+    lines = []
+    for index, mask in enumerate(masks):
+        name = f"{MASK_FOLDER}/{prediction.scene}_{index:03d}.txt"
+        (folder / name).write_bytes(mask_bytes(mask))
+        lines.append(f"{name} {prediction.labels[index]} {float(prediction.scores[index])!r}\n")
+    write_bytes(folder / f"{prediction.scene}.txt", "".join(lines).encode())
+    return folder / f"{prediction.scene}.txt"
+
+
+def _read_npz(path: Path, num_vertices: int) -> InstancePrediction:
+    arrays = read_npz(path, {"pred_masks": ("b", 2), "pred_classes": ("i", 1), "pred_scores": ("f", 1)})
+    masks, labels, scores = arrays["pred_masks"], arrays["pred_classes"], arrays["pred_scores"]
+    if len(masks) != num_vertices:
+        turned = "; transpose it" if masks.shape[1] == num_vertices else ""
+        raise InputError(
+            f"{path}: pred_masks is {masks.shape[0]:,} × {masks.shape[1]:,}, and the scene has {num_vertices:,} "
+            f"vertices; expected vertices × masks{turned}"
+        )
+    if not len(labels) == len(scores) == masks.shape[1]:
+        raise InputError(
+            f"{path}: {masks.shape[1]} masks, {len(labels)} pred_classes and {len(scores)} pred_scores; expected as "
+            "many of each"
+        )
+    with about(path):
+        return prediction_of_masks(
+            path.stem, np.ascontiguousarray(masks.T), labels.tolist(), scores.tolist(), num_vertices=num_vertices
+        )
+
+
+def _label(word: str, where: str) -> int:
+    """A class id; ScanNet's script takes 5.0 for 5."""
+    value = _number(word)
+    if value is None or not abs(value) <= MAX_ID or value != int(value):
+        raise InputError(f"{where}: expected a whole number as the class id, got {word[:40]!r}")
+    return int(value)
+
+
+def _score(word: str, where: str) -> float:
+    value = _number(word)
+    if value is None or not np.isfinite(value):
+        raise InputError(f"{where}: expected a finite number as the score, got {word[:40]!r}")
+    return value
+
+
+def _number(word: str) -> float | None:
+    try:
+        # Python reads 1_000 as a number, and other tools do not.
+        return None if "_" in word else float(word)
+    except ValueError:
+        return None
