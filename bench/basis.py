@@ -15,7 +15,7 @@ import numpy as np
 from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.fusion.basis import Moments, fit_basis

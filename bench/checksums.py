@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core import archive as mapped_arrays
 
 CHECKED = {"seconds": 0.0, "bytes": 0.0, "calls": 0.0}

@@ -21,7 +21,7 @@ from json_option import add_json_option, write_figures
 from torch.nn import functional
 
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.grid import morton_codes

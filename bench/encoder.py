@@ -26,7 +26,7 @@ from json_option import add_json_option, write_figures
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.core.device import autocast_dtype
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.infer.chunks import EncodeConfig

@@ -14,7 +14,7 @@ import numpy as np
 from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.train.prepare import PreparedDataset, nearest_codes
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe, TrainingScene
 

@@ -34,7 +34,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.fusion.basis import to_coordinates

@@ -23,7 +23,7 @@ from json_option import add_json_option, write_figures
 from PIL import Image
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.evaluate.sources import RenderedTally
 from gsencoder.memory.bank import BankConfig

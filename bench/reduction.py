@@ -19,7 +19,7 @@ import numpy as np
 from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.core.archive import RowFile
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.scenes import load_scene

@@ -15,7 +15,7 @@ from pathlib import Path
 import torch
 
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.core.device import autocast_dtype
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.models.encoder import GaussianEncoder

@@ -22,7 +22,7 @@ import numpy as np
 from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import Hit

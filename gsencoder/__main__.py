@@ -2,7 +2,7 @@
 
 import sys
 
-from gsencoder.app.cli import main
+from gsencoder.app.main import main
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from rooms import STEP, cube, room
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.fusion.folder import WORDS_FILE, save_features
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures

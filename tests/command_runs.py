@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 
 
 def results_of(folder: Path) -> dict[str, Any]:

@@ -38,7 +38,7 @@ class Once:
     def compose_config(self, command: str, written: Sequence[str], mode: Any, *, from_shell: bool) -> Any:
         from omegaconf import OmegaConf
 
-        from gsencoder.app.settings.compose import unseal
+        from gsencoder.app.compose import unseal
 
         texts: list[str] = []
 
@@ -64,7 +64,7 @@ def compose_once() -> None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from gsencoder.app.settings import compose
+    from gsencoder.app import compose
     from gsencoder.core.errors import InputError
 
     open_hydra, store_settings = compose.open_hydra, compose.store_settings

@@ -182,7 +182,7 @@ def words_of(case: Case, given: Path) -> list[str]:
 
 
 def _run(*words: str) -> None:
-    from gsencoder.app import cli
+    from gsencoder.app import main as cli
 
     if cli.main([*words, "quiet=true"]) != 0:
         raise RuntimeError(f"{words[0]}: the inputs cannot be made")

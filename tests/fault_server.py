@@ -46,7 +46,7 @@ def forked(asked: dict[str, Any]) -> int:
             ctypes.c_int(asked["action"]),
             os.fsencode(asked["trace"]),
         )
-        from gsencoder.app import cli
+        from gsencoder.app import main as cli
 
         code = cli.main(asked["words"])
     except BaseException:
@@ -115,7 +115,7 @@ def main() -> None:
             # Its modules and kernels are then those of all children.
             os.environ.update(asked["environment"])
             os.chdir(asked["folder"])
-            from gsencoder.app import cli
+            from gsencoder.app import main as cli
 
             answer = {"code": cli.main(asked["words"]), "seconds": time.perf_counter() - began}
             # The folder of the run may be removed.

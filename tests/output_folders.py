@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.summary import Summary
+from gsencoder.app.output import output_folder
+from gsencoder.app.summary import Summary
 
 
 def names(folder: Path) -> list[str]:

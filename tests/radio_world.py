@@ -4,7 +4,7 @@ from pathlib import Path
 
 from radios import small_joint_model, small_radio
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 
 SEEDS = ("seeds.voxel=0.06",)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.reconstruct.optimize import Optimizer
 
 QUICK = ("quiet=true", "optimize.steps=12", "holdout=4", "seeds.voxel=0.08", "optimize.sh_degree=1")

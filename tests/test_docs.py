@@ -17,10 +17,8 @@ import pytest
 import yaml
 
 import gsencoder
-from gsencoder.app.commands import COMMANDS
-from gsencoder.app.settings.choices import Choices, choices_of
-from gsencoder.app.settings.compose import overrides, read_words
-from gsencoder.app.settings.several import named_members
+from gsencoder.app.compose import Choices, choices_of, named_members, overrides, read_words
+from gsencoder.app.table import COMMANDS
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import find_file
 

@@ -15,7 +15,7 @@ from field_scenes import FieldRoom, write_transforms
 from PIL import Image
 
 import gsencoder
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 
 pytestmark = pytest.mark.slow

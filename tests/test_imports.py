@@ -52,14 +52,12 @@ TORCH_FREE = [
     "gsencoder.infer.localize",
     "gsencoder.infer.draw",
     "gsencoder.infer.page.report",
-    "gsencoder.app.runs.output_folder",
-    "gsencoder.app.settings.config",
-    "gsencoder.app.settings.config_store",
-    "gsencoder.app.settings.compose",
-    "gsencoder.app.settings.multirun",
+    "gsencoder.app.output",
+    "gsencoder.app.options",
+    "gsencoder.app.compose",
     "gsencoder.app.commands.inspect",
     "gsencoder.app.commands.repair",
-    "gsencoder.app.cli",
+    "gsencoder.app.main",
 ]
 
 
@@ -200,7 +198,7 @@ def test_the_package_itself_imports_nothing_at_load() -> None:
         ("gsencoder.core.errors", "import gsencoder.types"),
         ("gsencoder.text.table", "if True:\n    import gsencoder.evaluate.report as report"),
         ("gsencoder.render.blend", "import importlib\nimportlib.import_module('gsencoder.data.splats.files')"),
-        ("gsencoder.evaluate.report", "from gsencoder.app.settings.config import CommonConfig"),
+        ("gsencoder.evaluate.report", "from gsencoder.app.options import CommonConfig"),
         ("gsencoder.infer.ask.ask", "from gsencoder.app import commands"),
     ],
 )
@@ -213,7 +211,7 @@ def test_an_upward_import_is_found_wherever_it_hides(module: str, source: str) -
     [
         ("gsencoder.fusion.fuse", "from gsencoder.render.blend import blend\nfrom ..data import scenes\nimport torch"),
         ("gsencoder.data.scenes", "from gsencoder.data.splats.files import read_raw\nfrom .colmap import read"),
-        ("gsencoder.app.runs.summary", "import gsencoder\nfrom gsencoder import __version__"),
+        ("gsencoder.app.summary", "import gsencoder\nfrom gsencoder import __version__"),
     ],
 )
 def test_a_downward_import_is_left_alone(module: str, source: str) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats.files import load_splat
 from gsencoder.evaluate.boxes import aabb_iou

@@ -8,7 +8,7 @@ import pytest
 from command_runs import refusal, results_of
 from named_rooms import write_words
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.encode import TorchEncoder

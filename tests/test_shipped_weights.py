@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import plain
 from gsencoder.core.settings import with_added_options

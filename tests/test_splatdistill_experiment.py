@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.infer.encode import TorchEncoder

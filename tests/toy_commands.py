@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.settings.config import CommonConfig
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.output import output_folder
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat
 from gsencoder.types import Gaussians

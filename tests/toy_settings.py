@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from gsencoder.app.settings.compose import compose
-from gsencoder.app.settings.config import CommonConfig
+from gsencoder.app.compose import compose
+from gsencoder.app.options import CommonConfig
 from gsencoder.core.errors import InputError
 
 

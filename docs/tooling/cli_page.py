@@ -14,14 +14,14 @@ from typing import Any, get_args, get_origin
 
 import yaml
 
-from gsencoder.app.cli import FLAGS, SHORT
-from gsencoder.app.commands import COMMANDS, Command
-from gsencoder.app.settings.choices import choices_of, conf_folder
-from gsencoder.app.settings.config import CommonConfig
-from gsencoder.app.settings.help import RULES, choice_help
-from gsencoder.app.settings.options import (
+from gsencoder.app.compose import RULES, choice_help, choices_of, conf_folder
+from gsencoder.app.main import FLAGS, SHORT
+from gsencoder.app.options import (
+    PRESET,
+    CommonConfig,
     Option,
     describe,
+    describe_presets,
     field_types,
     join_list,
     member_name,
@@ -29,7 +29,7 @@ from gsencoder.app.settings.options import (
     section_classes,
     union_members,
 )
-from gsencoder.app.settings.presets import PRESET, describe_presets
+from gsencoder.app.table import COMMANDS, Command
 
 PAGE = Path(__file__).resolve().parents[1] / "cli.md"
 HEAD = """\

@@ -11,11 +11,11 @@ import pytest
 from toy_commands import splat, write_toy
 
 from gsencoder import __version__
-from gsencoder.app import cli
-from gsencoder.app.commands import COMMANDS
+from gsencoder.app import main as cli
 from gsencoder.app.commands.inspect import report_table
 from gsencoder.app.commands.repair import Fix
-from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.output import output_folder
+from gsencoder.app.table import COMMANDS
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Stopped
 from gsencoder.data.splats.files import load_splat, read_raw, save_splat
@@ -47,7 +47,7 @@ def test_help_lists_every_command_with_one_line(capsys: pytest.CaptureFixture[st
 def test_help_of_a_command_lists_every_setting_with_default_and_meaning(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from gsencoder.app.settings.options import options_of
+    from gsencoder.app.options import options_of
 
     assert cli.main([name, "--help"]) == 0
     text = " ".join(capsys.readouterr().out.split())

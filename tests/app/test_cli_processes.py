@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 from toy_commands import splat
 
-from gsencoder.app import cli
-from gsencoder.app.commands import COMMANDS
+from gsencoder.app import main as cli
+from gsencoder.app.table import COMMANDS
 
 
 def test_a_launcher_in_another_process_can_take_a_run(tmp_path: Path) -> None:
-    from gsencoder.app.settings.multirun import _job
+    from gsencoder.app.compose import _job
 
     run = partial(cli._run_one, COMMANDS["inspect"], debug=False)
     job = pickle.dumps(partial(_job, cls=COMMANDS["inspect"].load()[0], run=run, swept=()))
@@ -41,7 +41,7 @@ HEAVY = ("torch", "numba", "open3d", "numpy", "hydra", "scipy", "sklearn", "rich
 @pytest.mark.alone
 def test_help_comes_at_once_and_imports_nothing_heavy() -> None:
     code = (
-        "import sys; from gsencoder.app.cli import main; main(['--help']);"
+        "import sys; from gsencoder.app.main import main; main(['--help']);"
         f"print('LOADED', *[name for name in {HEAVY} if name in sys.modules])"
     )
     best = float("inf")
@@ -98,8 +98,8 @@ def test_a_full_standard_output_is_one_line(tmp_path: Path) -> None:
 SLOW = """
 import sys, time
 from gsencoder.app import cli
-from gsencoder.app.commands import inspect
-from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.table import inspect
+from gsencoder.app.output import output_folder
 def run(config, summary):
     with output_folder(config.out) as folder:
         (folder / "half").write_text("x")
@@ -141,7 +141,7 @@ def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code:
 WITHIN_EXEC = """
 import sys
 from gsencoder.app import cli
-from gsencoder.app.commands import inspect
+from gsencoder.app.table import inspect
 def run(config, summary):
     exec("import os, signal; os.kill(os.getpid(), signal.SIGINT)")
 inspect.run = run

@@ -12,10 +12,10 @@ from types import ModuleType
 import pytest
 from splats import random_gaussians
 
-from gsencoder.app import cli
-from gsencoder.app.commands import COMMANDS, Command
-from gsencoder.app.settings.compose import compose
-from gsencoder.app.settings.config import CommonConfig
+from gsencoder.app import main as cli
+from gsencoder.app.compose import compose
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.table import COMMANDS, Command
 from gsencoder.data.splats.files import save_splat
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")
@@ -32,7 +32,7 @@ OPTION, MODULE, LINE = blocks("python")
 @pytest.fixture
 def opaque(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     """A folder with a splat; the page's command is registered."""
-    name = "gsencoder.app.commands.opaque"
+    name = "gsencoder.app.table.opaque"
     module = ModuleType(name)
     monkeypatch.setitem(sys.modules, name, module)
     exec(compile(MODULE, name, "exec"), module.__dict__)

@@ -8,11 +8,10 @@ from typing import Any, Literal
 import pytest
 from toy_settings import FusionConfig, LabelsConfig, OnnxConfig, ToyConfig, toy
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands.localize import LocalizeCommandConfig
-from gsencoder.app.settings.compose import compose
-from gsencoder.app.settings.config import HIDDEN, CommonConfig, check_required, settings, typed
-from gsencoder.app.settings.options import describe
+from gsencoder.app.compose import compose
+from gsencoder.app.options import HIDDEN, CommonConfig, check_required, describe, settings, typed
 from gsencoder.core.errors import InputError
 
 

@@ -8,12 +8,9 @@ from typing import Any, ClassVar, Literal
 
 import pytest
 
-from gsencoder.app.commands import COMMANDS
-from gsencoder.app.settings.choices import choices_of, conf_folder
-from gsencoder.app.settings.compose import compose, open_hydra, plain_settings
-from gsencoder.app.settings.config import CommonConfig, settings
-from gsencoder.app.settings.config_store import EXPERIMENT
-from gsencoder.app.settings.options import field_types, member_name, options_of, section_classes
+from gsencoder.app.compose import EXPERIMENT, choices_of, compose, conf_folder, open_hydra, plain_settings
+from gsencoder.app.options import CommonConfig, field_types, member_name, options_of, section_classes, settings
+from gsencoder.app.table import COMMANDS
 from gsencoder.core.errors import InputError
 
 MISSING = object()

@@ -8,7 +8,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from toy_settings import LabelsConfig, toy
 
-from gsencoder.app.settings.options import join_list, split_list
+from gsencoder.app.options import join_list, split_list
 
 HOSTILE = [
     "mug,banana",

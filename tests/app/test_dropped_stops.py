@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands import inspect
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.progress import Progress
-from gsencoder.app.runs.summary import Summary
+from gsencoder.app.output import output_folder
+from gsencoder.app.progress import Progress
+from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")

@@ -6,8 +6,7 @@ import pytest
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.settings.compose import compose
-from gsencoder.app.settings.multirun import run_many
+from gsencoder.app.compose import compose, run_many
 from gsencoder.core.errors import InputError
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsencoder.app.cli import _impossible_sizes, main
+from gsencoder.app.main import _impossible_sizes, main
 from gsencoder.core.errors import InputError
 
 SETTINGS = {"seed": 0, "model": {"projector": 10**15}, "sizes": [2, 10**11]}

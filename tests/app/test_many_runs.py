@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 
 
 def test_many_runs_sweep_numbers_and_keep_text(

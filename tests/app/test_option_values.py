@@ -5,9 +5,8 @@ from typing import Any
 
 import pytest
 
-from gsencoder.app.commands import COMMANDS
-from gsencoder.app.settings.config import typed
-from gsencoder.app.settings.options import Option, options_of, union_members
+from gsencoder.app.options import Option, options_of, typed, union_members
+from gsencoder.app.table import COMMANDS
 from gsencoder.core.errors import InputError
 
 

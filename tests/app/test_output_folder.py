@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 from output_folders import fill, names, write_and_raise
 
-from gsencoder.app.runs import output_folder as outputs
-from gsencoder.app.runs.output_file import refuse_existing
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.summary import SUMMARY_NAME
+from gsencoder.app import output as outputs
+from gsencoder.app.output import output_folder, refuse_existing
+from gsencoder.app.summary import SUMMARY_NAME
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_bytes
 
@@ -162,7 +161,7 @@ def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
 
 KILLED = """
 import os, sys, time
-from gsencoder.app.runs.output_folder import output_folder
+from gsencoder.app.output import output_folder
 with output_folder(sys.argv[1]) as folder:
     (folder / "half").write_text("x")
     print("writing", flush=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from output_folders import fill, names, write_and_raise
 
-from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
+from gsencoder.app.output import output_folder, refuse_to_replace_inputs
 from gsencoder.core.errors import InputError
 
 
@@ -128,7 +128,7 @@ def test_an_output_that_the_system_does_not_let_go_is_named_and_kept(
     def refused(source: str | Path, *_: object) -> None:
         raise PermissionError(errno.EPERM, "Operation not permitted", str(source))
 
-    monkeypatch.setattr("gsencoder.app.runs.output_folder._exchange", lambda *_: False)
+    monkeypatch.setattr("gsencoder.app.output._exchange", lambda *_: False)
     with monkeypatch.context() as patched:
         patched.setattr(os, "rename", refused)
         with pytest.raises(InputError, match="out: cannot be replaced by the results: Operation not permitted"):

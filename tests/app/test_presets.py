@@ -4,16 +4,21 @@ from pathlib import Path
 
 import pytest
 
-from gsencoder.app.commands import COMMANDS
 from gsencoder.app.commands.encode import EncodeCommandConfig
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.settings.compose import compose
-from gsencoder.app.settings.config import settings, typed
-from gsencoder.app.settings.help import command_help
-from gsencoder.app.settings.multirun import run_many
-from gsencoder.app.settings.options import options_by_key
-from gsencoder.app.settings.presets import PRESET_OPTIONS, PRESETS, describe_presets, preset_node, preset_values
+from gsencoder.app.compose import command_help, compose, run_many
+from gsencoder.app.options import (
+    PRESET_OPTIONS,
+    PRESETS,
+    describe_presets,
+    options_by_key,
+    preset_node,
+    preset_values,
+    settings,
+    typed,
+)
+from gsencoder.app.table import COMMANDS
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import value_at
 from gsencoder.fusion.cost_model import exact_config

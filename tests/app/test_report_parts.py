@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from selected_rooms import SPACE, selected_room, with_more, words
 
-from gsencoder.app.reports import demo, parts, results
-from gsencoder.app.reports.demo import TeacherResult
-from gsencoder.app.runs.summary import Summary
+from gsencoder.app import reports as demo
+from gsencoder.app import reports as parts
+from gsencoder.app import reports as results
+from gsencoder.app.reports import TeacherResult
+from gsencoder.app.summary import Summary
 from gsencoder.fusion.fuse import Fusion
 from gsencoder.infer.localize import localize
 from gsencoder.infer.page.report import HtmlReport

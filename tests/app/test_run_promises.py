@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from gsencoder.app.runs.promises import report_choice, report_promises
-from gsencoder.app.runs.summary import Summary
+from gsencoder.app.summary import Summary, report_choice, report_promises
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.settings import Budget
 

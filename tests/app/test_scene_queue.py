@@ -9,13 +9,11 @@ from typing import Any
 import pytest
 from textured_box import box_cameras, box_views, write_box
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands import fuse
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.progress import console
-from gsencoder.app.runs.promises import report_choice, report_promises
-from gsencoder.app.runs.scene_queue import run_scenes
-from gsencoder.app.runs.summary import Summary
+from gsencoder.app.output import output_folder, run_scenes
+from gsencoder.app.progress import console
+from gsencoder.app.summary import Summary, report_choice, report_promises
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.data.scenes import find_scenes, listed_paths
 from gsencoder.reconstruct.sfm import find_photographed

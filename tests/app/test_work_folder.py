@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gsencoder.app.runs.work_folder import DISCARDED_FILE, MARKER_FILE, WorkFolder
+from gsencoder.app.output import DISCARDED_FILE, MARKER_FILE, WorkFolder
 from gsencoder.core.errors import InputError
 
 

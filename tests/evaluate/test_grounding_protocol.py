@@ -12,7 +12,7 @@ import torch
 from named_rooms import write_words
 from rooms import room
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.grounding import GroundedPair

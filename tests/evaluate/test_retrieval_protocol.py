@@ -12,7 +12,7 @@ from command_runs import refusal, results_of
 from named_rooms import write_words
 from rooms import room
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol, score_views
 from gsencoder.infer.relevancy import word_directions

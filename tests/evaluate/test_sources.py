@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from splats import random_gaussians
 
-from gsencoder.app.cli import main
-from gsencoder.app.commands import evaluate_sources
+from gsencoder.app import evaluate_settings as evaluate_sources
+from gsencoder.app.main import main
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, space_of_words
 from gsencoder.text.table import TextTable, make_text_table, save_text_table

@@ -7,7 +7,7 @@ import pytest
 from fault_checks import Checker, state
 from fault_runs import KILL, FaultServer
 
-from gsencoder.app.runs.work_folder import DISCARDED_FILE, MARKER_FILE
+from gsencoder.app.output import DISCARDED_FILE, MARKER_FILE
 
 DAYS = 3 * 86_400
 MARKERS = (MARKER_FILE, DISCARDED_FILE)

@@ -13,7 +13,7 @@ import pytest
 from asked_rooms import save_room
 from torch.utils.data import DataLoader, Dataset
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.archive import MappedArrays, open_archive, write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import check_fetched, digest_files
@@ -112,7 +112,7 @@ def test_arrays_are_those_that_the_library_reads(tmp_path: Path, rng: np.random.
 
 WITHOUT_A_CHECK = """
 import json, mmap, os, sys
-import gsencoder.app.cli as cli
+import gsencoder.app.main as cli
 
 def load():
     def run(config, summary):

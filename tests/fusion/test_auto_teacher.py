@@ -7,7 +7,7 @@ import pytest
 from field_scenes import FieldRoom
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.teachers.build import SEGMENTER, SENTENCES, AutoConfig, TeacherConfig, choose_teacher, text_table_of
 from gsencoder.teachers.labels import LabelsConfig, PaletteConfig

@@ -16,7 +16,7 @@ from feature_fields import make_features
 from safetensors.numpy import load_file, save_file
 from splats import front_camera, random_gaussians
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.files import load_splat, save_splat

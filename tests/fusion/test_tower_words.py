@@ -14,9 +14,9 @@ from command_runs import refusal
 from text_towers import save_tokenizer
 from vision_towers import save_vision_tower
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands.fuse import FuseCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features

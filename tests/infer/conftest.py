@@ -9,7 +9,7 @@ import pytest
 import torch
 from symbolic import symbolic_sizes
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.onnx.export import lower
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder

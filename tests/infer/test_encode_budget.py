@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from splats import random_gaussians
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.errors import field_error

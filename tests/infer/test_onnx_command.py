@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.splats.files import save_splat
 from gsencoder.infer.onnx.export import TOLERANCE, random_cloud
 
@@ -72,7 +72,7 @@ def test_a_word_is_found_in_an_interpreter_that_has_no_torch(folder: Path, tmp_p
         "        if name.partition('.')[0] == 'torch':\n"
         "            raise ModuleNotFoundError('no torch here', name=name)\n"
         "sys.meta_path.insert(0, NoTorch())\n"
-        "from gsencoder.app.cli import main\n"
+        "from gsencoder.app.main import main\n"
         f"splat, weights, out = {str(tmp_path / 'room.ply')!r}, {str(folder / 'encoder.onnx')!r}, {str(tmp_path)!r}\n"
         "assert main(['encode', splat, f'weights={weights}', f'out={out}/features']) == 0\n"
         "from gsencoder import load_splat, localize\n"

@@ -11,7 +11,7 @@ import pytest
 from memory_samples import make_memory
 from splats import random_gaussians
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.folder import save_memories
 from gsencoder.memory import onnx as module

@@ -14,7 +14,7 @@ import torch
 from onnx import helper
 from symbolic import symbolic_sizes
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat

@@ -11,7 +11,7 @@ from PIL import Image
 from rooms import corner_cameras, room
 from scene_files import OPENGL, rewrite, save
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import load_scene
 from gsencoder.infer.views.choose import choose_views

@@ -8,7 +8,7 @@ import pytest
 from chat_server import answer, serving
 from server_questions import KEY, ask, config
 
-from gsencoder.app.settings.config import HIDDEN, settings
+from gsencoder.app.options import HIDDEN, settings
 from gsencoder.core.errors import InputError
 from gsencoder.infer.ask.server import (
     KEY_VARIABLE,

@@ -10,7 +10,7 @@ import pytest
 from asked_rooms import save_room
 from rooms import room
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.infer.views import budget as module
 from gsencoder.infer.views.budget import ViewsBudget, check_views_budget, choose_views_within

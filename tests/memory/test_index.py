@@ -9,7 +9,7 @@ import pytest
 from feature_fields import SPACE, make_features
 from splats import random_gaussians
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features

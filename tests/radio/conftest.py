@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from radio_world import QUICK, SEEDS, World, run
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.text.table import REFERENCE_NOUNS
 
 

@@ -14,7 +14,7 @@ from command_runs import refusal
 from radio_world import QUICK, SEEDS, World, run
 from radios import change_weights, small_joint_model, small_radio
 
-from gsencoder.app.commands.through_head import words_of_head
+from gsencoder.app.heads import words_of_head
 from gsencoder.core.errors import SceneWarning
 from gsencoder.fusion.measured_heads import find_head, load_heads, save_heads
 from gsencoder.text.models import TransformersTextConfig

@@ -9,7 +9,7 @@ import pytest
 from archives import header_of, rewrite
 from reconstructions import cut_at, refusal, summary_of
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats.files import save_splat

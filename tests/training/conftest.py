@@ -6,7 +6,7 @@ import pytest
 from named_rooms import write_words
 from short_training import QUICK
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 
 

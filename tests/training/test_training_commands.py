@@ -15,9 +15,9 @@ import pytest
 import torch
 from short_training import QUICK
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands.train import TrainCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.errors import field_error

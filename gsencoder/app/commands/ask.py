@@ -6,15 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.commands.asker import load_asker
-from gsencoder.app.commands.question_scenes import localized_captions, photos_of, scene_folders
-from gsencoder.app.commands.words_options import WordsOptions
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.printable import printable
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary
-from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
-from gsencoder.app.settings.config import settings
+from gsencoder.app.inputs import WordsOptions, load_asker, localized_captions, photos_of, scene_folders
+from gsencoder.app.options import settings
+from gsencoder.app.output import WorkFolder, folder_beside, output_folder
+from gsencoder.app.progress import Progress, console, printable
+from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed
 from gsencoder.core.files import write_json
 from gsencoder.core.process import Clock

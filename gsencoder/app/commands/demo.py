@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gsencoder.app.reports.demo import TeacherResult, write_report
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary
-from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.app.options import CommonConfig, settings
+from gsencoder.app.output import output_folder
+from gsencoder.app.progress import Progress, console
+from gsencoder.app.reports import TeacherResult, write_report
+from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file, write_json
 from gsencoder.data.scenes import load_scene

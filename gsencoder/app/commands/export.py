@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.runs.output_file import check_output_files, sole_writer
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary, write_beside
-from gsencoder.app.settings.config import CommonConfig
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.output import check_output_files, sole_writer
+from gsencoder.app.progress import Progress, console
+from gsencoder.app.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file
 from gsencoder.core.process import Stored

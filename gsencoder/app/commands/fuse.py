@@ -1,31 +1,30 @@
 """`gsencoder fuse SCENE… teacher=…`: per-Gaussian features from a teacher's maps of the views."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from gsencoder.app.commands.basis_figures import describe_basis
-from gsencoder.app.commands.fusable_scene import load_fusable
-from gsencoder.app.commands.fuse_budget import check_promises, fuse_in_budget
-from gsencoder.app.commands.head_figures import describe_heads, head_figures
-from gsencoder.app.reports.results import report_fusion
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.scene_queue import run_scenes
-from gsencoder.app.runs.summary import Summary
-from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.app.heads import describe_heads, head_figures
+from gsencoder.app.inputs import load_fusable
+from gsencoder.app.options import CommonConfig, settings
+from gsencoder.app.output import output_folder, run_scenes
+from gsencoder.app.progress import Progress, console
+from gsencoder.app.reports import report_fusion
+from gsencoder.app.summary import Summary, describe_basis, report_choice, report_promises
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.process import Device
+from gsencoder.core.settings import MEGABYTE
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.adapter_heads import Head
-from gsencoder.fusion.budget import BudgetFusion
+from gsencoder.fusion.budget import BudgetFusion, fuse_within, realised_error
 from gsencoder.fusion.cameras import CamerasOfSplat, check_orbits
 from gsencoder.fusion.cost_model import BudgetConfig, check_budget
 from gsencoder.fusion.folder import FEATURES_FILE, HEADS_FILE, WORDS_FILE, save_features
@@ -38,6 +37,79 @@ from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
+
+
+@runtime_checkable
+class BudgetOptions(Protocol):
+    """The options of a command that fuses within a budget."""
+
+    @property
+    def fusion(self) -> FuseConfig: ...
+    @property
+    def budget(self) -> BudgetConfig: ...
+    @property
+    def device(self) -> Device: ...
+    @property
+    def quiet(self) -> bool: ...
+
+
+def fuse_in_budget(
+    scene: Scene, teacher: Teacher, config: BudgetOptions, summary: Summary, work: Path, *, sample_cells: bool
+) -> BudgetFusion:
+    """Chooses a setting and fuses; says which setting that is, and what is predicted of it."""
+    fused = fuse_within(
+        scene,
+        teacher,
+        config.fusion,
+        config.budget,
+        work=None if teacher.cheap else work,
+        sample_cells=sample_cells,
+        device=config.device,
+        track=Progress(quiet=config.quiet),
+    )
+    choice = fused.choice
+    summary.add_seconds({"choose": fused.choosing, **fused.fusion.seconds})
+    report_choice(
+        summary,
+        scene.name,
+        choice.knobs,
+        predicted=_predicted(fused),
+        notes=choice.notes,
+        quiet=config.quiet,
+        of=f", of {len(fused.scene.views or ())} views",
+        of_views=len(scene.views) if scene.views is not None else 0,
+        scatter=choice.scatter,
+        rays_followed=choice.followed,
+        rays_exact=choice.all_rays,
+    )
+    return fused
+
+
+def _predicted(fused: BudgetFusion) -> Mapping[str, float | None]:
+    choice = fused.choice
+    size = None if choice.bytes is None else choice.bytes / MEGABYTE
+    return {
+        "error": choice.predicted.error,
+        "error_deviation": choice.predicted.deviation,
+        "seconds": choice.seconds,
+        "megabytes": size,
+    }
+
+
+def check_promises(fused: BudgetFusion, file: Path, config: BudgetOptions, summary: Summary) -> list[str]:
+    """Measures what was promised; returns a line for each promise, and warns of those that are broken."""
+    budget, realised = config.budget, dict[str, float]()
+    if budget.error is not None and budget.check:
+        with summary.step("check"):
+            track = Progress(quiet=config.quiet)
+            error = realised_error(fused, config.fusion, seed=budget.seed, device=config.device, track=track)
+        realised["error"] = error.total
+        summary.results["budget"]["covered"] = error.covered
+    if budget.seconds is not None:
+        realised["seconds"] = fused.seconds
+    if budget.megabytes is not None:
+        realised["megabytes"] = file.stat().st_size / MEGABYTE
+    return report_promises(summary, budget, realised)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

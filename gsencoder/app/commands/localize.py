@@ -6,20 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from gsencoder.app.commands.from_poses import (
+from gsencoder.app.from_poses import (
     FROM_POSE,
     describe_point,
     memory_of,
     requested_cameras,
     search_from_poses,
 )
-from gsencoder.app.commands.query_words import queried_scene, query_words
-from gsencoder.app.commands.shown_scene import shown_scene
-from gsencoder.app.commands.words_options import WordsOptions
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.printable import one_line
-from gsencoder.app.runs.progress import console
-from gsencoder.app.runs.summary import Summary
+from gsencoder.app.inputs import WordsOptions, queried_scene, query_words, shown_scene
+from gsencoder.app.output import output_folder
+from gsencoder.app.progress import console, one_line
+from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json, write_picture
 from gsencoder.core.process import import_ahead
@@ -125,7 +122,7 @@ def run(config: LocalizeCommandConfig, summary: Summary) -> None:
             write_json(target / FROM_POSE, points)
             summary.results["from_pose"] = points
         if config.report:
-            from gsencoder.app.reports.results import report_words
+            from gsencoder.app.reports import report_words
 
             with summary.step("report"):
                 report_words(target, scene, localization, summary)

@@ -9,12 +9,11 @@ from typing import Any
 
 import torch
 
-from gsencoder.app.commands.fusable_scene import load_fusable
-from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary
-from gsencoder.app.runs.work_folder import WorkFolder
-from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.app.inputs import load_fusable
+from gsencoder.app.options import CommonConfig, settings
+from gsencoder.app.output import WorkFolder, output_folder, refuse_to_replace_inputs
+from gsencoder.app.progress import Progress, console
+from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, about, advised, counted
 from gsencoder.core.files import write_picture
 from gsencoder.core.logs import LOG_FILE

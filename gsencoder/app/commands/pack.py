@@ -5,11 +5,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.progress import console
-from gsencoder.app.runs.promises import report_choice, report_promises
-from gsencoder.app.runs.summary import Summary
-from gsencoder.app.settings.config import CommonConfig
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.output import output_folder
+from gsencoder.app.progress import console
+from gsencoder.app.summary import Summary, report_choice, report_promises
 from gsencoder.core.archive import copy_checked
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.settings import MEGABYTE, check_governed
@@ -96,7 +95,7 @@ def run(config: PackConfig, summary: Summary) -> None:
     words = None
     if config.head:
         # Heads need torch, which packing does without.
-        from gsencoder.app.commands.through_head import packed_through_head
+        from gsencoder.app.heads import packed_through_head
 
         with summary.step("head"):
             scene, words = packed_through_head(scene, source, config.head, config.text, space=config.space)

@@ -5,10 +5,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary
-from gsencoder.app.settings.config import CommonConfig
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.output import output_folder
+from gsencoder.app.progress import Progress, console
+from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.process import Track
 from gsencoder.data.labels.expressions import write_scanrefer

@@ -10,13 +10,10 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.promises import report_choice, report_promises
-from gsencoder.app.runs.scene_queue import run_scenes
-from gsencoder.app.runs.summary import Summary
-from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
-from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.app.options import CommonConfig, settings
+from gsencoder.app.output import WorkFolder, folder_beside, output_folder, refuse_to_replace_inputs, run_scenes
+from gsencoder.app.progress import Progress, console
+from gsencoder.app.summary import Summary, report_choice, report_promises
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import SceneWarning, counted
 from gsencoder.core.files import write_picture

@@ -10,10 +10,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.app.runs.output_file import check_output_files, sole_writer
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary, write_beside
-from gsencoder.app.settings.config import CommonConfig
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.output import check_output_files, sole_writer
+from gsencoder.app.progress import Progress, console
+from gsencoder.app.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
 from gsencoder.data.scenes import SceneConfig, has_views, load_scene, read_posed

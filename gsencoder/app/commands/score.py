@@ -6,10 +6,10 @@ from pathlib import Path
 
 from rich.markdown import Markdown
 
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.progress import console
-from gsencoder.app.runs.summary import Summary
-from gsencoder.app.settings.config import CommonConfig
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.output import output_folder
+from gsencoder.app.progress import console
+from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, write_bytes
 from gsencoder.data.labels.classes import COLUMNS, DEFAULT_COLUMN, ids_of_benchmark, read_label_map
@@ -170,7 +170,7 @@ def write_report(folder: Path, report: ScoreReport, summary: Summary, *, page: b
         write_bytes(folder / f"{name}.csv", csv_text(rounded).encode())
     summary.results.update(report.results)
     if page:
-        from gsencoder.app.reports.results import report_benchmark
+        from gsencoder.app.reports import report_benchmark
 
         report_benchmark(folder, report, summary)
 

@@ -6,12 +6,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from gsencoder.app.commands.query_words import queried_scene, query_words
-from gsencoder.app.commands.words_options import WordsOptions
-from gsencoder.app.runs.output_folder import output_folder
-from gsencoder.app.runs.printable import one_line
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary
+from gsencoder.app.inputs import WordsOptions, queried_scene, query_words
+from gsencoder.app.output import output_folder
+from gsencoder.app.progress import Progress, console, one_line
+from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
 from gsencoder.core.process import import_ahead

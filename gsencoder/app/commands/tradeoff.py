@@ -9,11 +9,10 @@ from typing import Any
 
 from rich.table import Table
 
-from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary
-from gsencoder.app.runs.work_folder import WorkFolder, folder_beside
-from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.app.options import CommonConfig, settings
+from gsencoder.app.output import WorkFolder, folder_beside, output_folder, refuse_to_replace_inputs
+from gsencoder.app.progress import Progress, console
+from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, json_bytes, write_bytes
 from gsencoder.data.scenes import SceneConfig, find_scenes

@@ -9,13 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from gsencoder.app.commands.basis_figures import basis_figures, describe_basis
-from gsencoder.app.commands.head_figures import describe_heads, head_figures
-from gsencoder.app.runs.output_folder import output_folder, refuse_to_replace_inputs
-from gsencoder.app.runs.progress import Progress, console
-from gsencoder.app.runs.summary import Summary
-from gsencoder.app.runs.work_folder import WorkFolder, folder_beside, prepared_folder
-from gsencoder.app.settings.config import CommonConfig, settings
+from gsencoder.app.heads import describe_heads, head_figures
+from gsencoder.app.options import CommonConfig, settings
+from gsencoder.app.output import WorkFolder, folder_beside, output_folder, prepared_folder, refuse_to_replace_inputs
+from gsencoder.app.progress import Progress, console
+from gsencoder.app.summary import Summary, basis_figures, describe_basis
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory, threads_of_torch
 from gsencoder.data.scenes import find_scenes

@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gsencoder.app.commands.query_words import queried_scene
-from gsencoder.app.commands.words_options import WordsOptions
-from gsencoder.app.runs.output_file import check_output_files, sole_writer
-from gsencoder.app.runs.printable import printable
-from gsencoder.app.runs.progress import console
-from gsencoder.app.runs.summary import Summary, write_beside
+from gsencoder.app.inputs import WordsOptions, queried_scene
+from gsencoder.app.output import check_output_files, sole_writer
+from gsencoder.app.progress import console, printable
+from gsencoder.app.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file
 from gsencoder.core.process import accept_stop

@@ -7,7 +7,7 @@ import pytest
 from asked_rooms import KEY, save_room
 from reconstructions import QUICK
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 
 

@@ -12,8 +12,8 @@ from asked_rooms import KEY, ORIGIN, ask
 from chat_server import answer, serving
 from PIL import Image
 
-from gsencoder.app import cli
-from gsencoder.app.runs.printable import printable
+from gsencoder.app import main as cli
+from gsencoder.app.progress import printable
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("vlm_environment")]
 

@@ -11,7 +11,7 @@ import pytest
 from asked_rooms import save_room
 from chat_server import Handler, completion, serving
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 
 pytestmark = pytest.mark.slow
 

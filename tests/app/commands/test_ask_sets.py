@@ -10,7 +10,7 @@ import pytest
 from command_runs import refusal, results_of
 from named_rooms import write_words
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.labels.expressions import read_scanrefer
 from gsencoder.data.labels.questions import read_questions
 from gsencoder.data.scenes import load_scene

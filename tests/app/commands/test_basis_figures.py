@@ -7,8 +7,8 @@ import pytest
 from command_runs import results_of
 from text_towers import WORDS, save_graph, save_tokenizer
 
-from gsencoder.app import cli
-from gsencoder.app.commands.basis_figures import describe_basis
+from gsencoder.app import main as cli
+from gsencoder.app.summary import describe_basis
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room

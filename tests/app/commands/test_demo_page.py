@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.infer.page.page import Bundle
 

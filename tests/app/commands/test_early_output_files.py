@@ -11,7 +11,7 @@ from splats import random_gaussians
 from textured_box import box_cameras, box_views, write_box
 from viewed_rooms import STUB
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands import export, repair, view
 from gsencoder.data.splats.files import save_splat
 

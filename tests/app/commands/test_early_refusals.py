@@ -6,7 +6,7 @@ import pytest
 from command_runs import refusal
 from named_rooms import write_words
 
-from gsencoder.app.commands import evaluate_sources
+from gsencoder.app import evaluate_settings as evaluate_sources
 from gsencoder.data.synthetic import make_room, write_room
 
 

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from textured_box import box_cameras, box_views, write_box
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.check.findings import Finding
 from gsencoder.data.check.repair_scene import repair_posed

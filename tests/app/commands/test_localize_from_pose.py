@@ -10,7 +10,7 @@ from asked_rooms import ORIGIN, save_room
 from command_runs import refusal, results_of
 from PIL import Image
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_memories
 from gsencoder.text.table import load_text_table, save_text_table
 from gsencoder.types import MemoryBank, QueryMemory

@@ -8,7 +8,7 @@ from command_runs import refusal
 from named_rooms import write_words
 from PIL import Image
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room

@@ -9,9 +9,9 @@ from command_runs import refusal, results_of
 from memory_samples import make_memory
 from splats import random_gaussians
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands.memory import MemoryCommandConfig
-from gsencoder.app.settings.options import options_by_key
+from gsencoder.app.options import options_by_key
 from gsencoder.core.logs import read_log
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import save_memories

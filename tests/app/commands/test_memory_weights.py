@@ -9,7 +9,7 @@ from command_runs import refusal
 from named_rooms import write_words
 from training_scenes import SMALL
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_memories
 from gsencoder.models.encoder import GaussianEncoder

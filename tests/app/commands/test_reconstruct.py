@@ -11,7 +11,7 @@ import torch
 from archives import flip_bit
 from reconstructions import QUICK, interrupt, never, refusal, summary_of
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands import reconstruct as command
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat

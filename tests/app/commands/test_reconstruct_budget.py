@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from reconstructions import summary_of
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands import reconstruct as command
 from gsencoder.reconstruct import Reconstruction, reconstruct
 from gsencoder.reconstruct.optimize import OptimizeConfig

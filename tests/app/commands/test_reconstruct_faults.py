@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from reconstructions import QUICK, interrupt, never, refusal, summary_of
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.reconstruct import run as fit
 from gsencoder.reconstruct import run as reconstruct

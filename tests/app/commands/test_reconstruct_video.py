@@ -10,7 +10,7 @@ from reconstructions import summary_of
 from textured_box import box_cameras, look
 
 from gsencoder import load_scene
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.reconstruct import run as reconstruct
 
 av = pytest.importorskip("av")

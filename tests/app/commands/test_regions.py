@@ -9,9 +9,9 @@ import pytest
 from named_rooms import write_words
 from region_scenes import save_colors
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands.fuse import FuseCommandConfig
-from gsencoder.app.settings.compose import compose
+from gsencoder.app.compose import compose
 from gsencoder.core.archive import open_archive
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.synthetic import make_room, write_room

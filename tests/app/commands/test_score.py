@@ -11,7 +11,7 @@ from command_runs import refusal, results_of
 from forked_ranks import RankServer
 from named_rooms import write_words
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.benchmarks.instances import prediction_of_masks, write_instance_prediction
 

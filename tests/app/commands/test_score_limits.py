@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_runs import refusal, results_of
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.evaluate.benchmarks.files import load_classes
 
 CLASSES = "id,name\n1,mug\n2,box\n"

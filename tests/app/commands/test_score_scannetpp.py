@@ -8,7 +8,7 @@ import pytest
 from command_runs import refusal, results_of
 from labeled_scans import ROOM_NAMES, write_scannetpp_scan
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room
 from gsencoder.text.table import make_text_table, save_text_table
 

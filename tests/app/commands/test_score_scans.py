@@ -8,7 +8,7 @@ import pytest
 from command_runs import refusal, results_of
 from labeled_scans import ROOM_NAMES, group, names_of_room, write_scannet_labels, write_scannet_scan
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.labels.classes import ids_of_names, read_label_map
 from gsencoder.data.labels.expressions import write_instance_truth, write_semantic_truth
 from gsencoder.data.labels.files import read_whole_numbers, write_whole_numbers

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from command_runs import refusal, results_of
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 
 QUESTIONS = [
     {"scene_id": "s0", "question_id": "q0", "question": "What color is the chair?", "answers": ["red", "dark red"]},

@@ -9,7 +9,7 @@ import pytest
 from command_runs import refusal, results_of
 from selected_rooms import EMBEDDINGS, SPACE, selected_room, words
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.splats.files import load_splat
 from gsencoder.fusion.folder import WORDS_FILE, save_features, save_memories
 from gsencoder.infer.select_files import read_labels

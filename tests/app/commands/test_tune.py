@@ -12,7 +12,7 @@ from command_runs import refusal, results_of
 from tiny_vlm import PATCH, SIDE
 from tuning_pairs import make_model
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.logs import read_log
 from gsencoder.data.prompts import PromptStore
 
@@ -110,7 +110,7 @@ def test_prompts_are_those_that_ask_sends(given: Path, tmp_path: Path) -> None:
 def test_prepared_prompts_serve_the_next_run_and_what_changed_is_prepared_anew(
     given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from gsencoder.app.commands import tuning_prompts
+    from gsencoder.app.commands import tune as tuning_prompts
 
     made: list[str] = []
     store_prompt = tuning_prompts.store_prompt

@@ -16,7 +16,7 @@ import pytest
 from command_runs import refusal
 from viewed_rooms import STUB, save_viewed_room
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands import view
 from gsencoder.infer.page import page as bundle
 from gsencoder.types import Scene
@@ -123,7 +123,7 @@ from gsencoder.infer.viewer import bundle
 from gsencoder.types import Scene
 bundle.STATIC = Path(sys.argv[1])
 from gsencoder.app import cli
-from gsencoder.app.commands import view
+from gsencoder.app.table import view
 sys.exit(cli.main(["view", sys.argv[2], "open=false"]))
 """
 

@@ -16,7 +16,7 @@ from command_runs import refusal
 from viewed_rooms import STUB, name_features, room_scene, save_viewed_room
 from viewer_containers import read_container
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands import view
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.folder import WORDS_FILE, save_features

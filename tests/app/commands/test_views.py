@@ -8,7 +8,7 @@ import pytest
 from asked_rooms import ORIGIN, save_room
 from PIL import Image
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.archive import open_archive
 
 pytestmark = pytest.mark.slow

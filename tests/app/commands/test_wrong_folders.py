@@ -9,8 +9,8 @@ from command_runs import refusal
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app.commands.fuse import load_weights_spaces
-from gsencoder.app.commands.question_scenes import scene_folders
-from gsencoder.app.runs.work_folder import WorkFolder
+from gsencoder.app.inputs import scene_folders
+from gsencoder.app.output import WorkFolder
 from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import find_scenes
 from gsencoder.data.splats.files import read_raw

@@ -9,7 +9,7 @@ import pytest
 from field_scenes import FieldRoom, with_fields, write_colmap_text, write_ply, write_transforms
 from PIL import Image
 
-from gsencoder.app.cli import main
+from gsencoder.app.main import main
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.facts import scene_facts
 from gsencoder.data.readers.transforms_json import transforms_of

@@ -13,7 +13,7 @@ from named_rooms import write_words
 from PIL import Image
 from rgbd_layouts import write_scannet_frames
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.facts import scene_facts
 from gsencoder.data.labels.mesh import MeshInstances, draw_instances

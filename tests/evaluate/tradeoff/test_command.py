@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.text.table import make_text_table, save_text_table
 

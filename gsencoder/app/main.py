@@ -20,9 +20,9 @@ from functools import partial
 from typing import Any
 
 import gsencoder
-from gsencoder.app.commands import COMMANDS, Command
-from gsencoder.app.runs.printable import clipped, one_line, printable
-from gsencoder.app.settings.options import near, without_value
+from gsencoder.app.options import near, without_value
+from gsencoder.app.progress import clipped, one_line, printable
+from gsencoder.app.table import COMMANDS, Command
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Stopped, refuse_several, stop_of, stopping_signals
 
@@ -195,18 +195,18 @@ def _dispatch(words: Sequence[str], began: float) -> int:
     command = COMMANDS[name]
     cls, _ = command.load()
     if "--help" in flags:
-        from gsencoder.app.settings.help import command_help
+        from gsencoder.app.compose import command_help
 
         print(command_help(command.name, command.help, cls, FLAGS))
         return 0
     if "--multirun" in flags:
         if "--cfg" in flags:
             raise InputError("--cfg: shows one run; leave out -m")
-        from gsencoder.app.settings.multirun import run_many
+        from gsencoder.app.compose import run_many
 
         return run_many(name, cls, words, partial(_run_one, command, debug="--debug" in flags))
-    from gsencoder.app.settings.compose import compose
-    from gsencoder.app.settings.config import settings
+    from gsencoder.app.compose import compose
+    from gsencoder.app.options import settings
 
     config = compose(name, cls, words)
     if "--cfg" in flags:
@@ -220,9 +220,9 @@ def _dispatch(words: Sequence[str], began: float) -> int:
 
 def _run(command: Command, config: Any, debug: bool, began: float | None = None) -> None:
     """Runs a command; what it took to load it counts from `began`."""
-    from gsencoder.app.runs.output_folder import refuse_to_replace_inputs
-    from gsencoder.app.runs.summary import Summary
-    from gsencoder.app.settings.config import check_required, settings
+    from gsencoder.app.options import check_required, settings
+    from gsencoder.app.output import refuse_to_replace_inputs
+    from gsencoder.app.summary import Summary
 
     if not command.several:
         together = ", ".join(each.name for each in COMMANDS.values() if each.several)

@@ -3,6 +3,7 @@
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.adapter_heads import TEXT_KINDS, Head, text_kind
@@ -27,7 +28,7 @@ def queried_through_head(
     scene: Scene, folder: Path, head: str, *, space: str, words_file: str, text: TextConfig
 ) -> tuple[Scene, Words]:
     """A scene with the outputs of a head as its only features, and the words that they are compared with; arguments and
-    errors are those of `gsencoder.app.commands.query_words.queried_scene`."""
+    errors are those of `gsencoder.app.inputs.queried_scene`."""
     heads = heads_of_folder(folder, head)
     measured_head = find_head(heads, head)
     words = words_of_head(measured_head.head, words_file, text)
@@ -171,3 +172,18 @@ def check_head_words(head: Head, words: Words, tower: TextTower | None) -> None:
             SceneWarning,
             stacklevel=2,
         )
+
+
+def head_figures(heads: HeadSet) -> dict[str, Any]:
+    """For each head by name: channels and scale of its outputs; mean and worst 5 % of the cosine, about the mean, of
+    its outputs for vectors in the basis with those for the teacher's full vectors; number of the cells compared."""
+    return {head.name: head.figures() for head in heads.heads}
+
+
+def describe_heads(heads: HeadSet) -> list[str]:
+    """One line for each head."""
+    return [
+        f"head {head.head.describe()}: {head.channels} channels; behind the basis its outputs keep "
+        f"{head.fit.describe()}"
+        for head in heads.heads
+    ]

@@ -1,15 +1,33 @@
-"""What `gsencoder evaluate` evaluates: scenes, the source of their features, and words."""
+"""Settings of `gsencoder evaluate`."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsencoder.app.commands.evaluate_settings import EvaluateConfig
-from gsencoder.app.commands.evaluated_features import stored_source, stored_words, with_stored_features
-from gsencoder.app.commands.through_head import words_of_head
-from gsencoder.app.runs.progress import Progress
+from gsencoder.app.heads import words_of_head
+from gsencoder.app.inputs import stored_source, stored_words, with_stored_features
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.progress import Progress
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import retain_freed_memory
-from gsencoder.data.scenes import find_scenes, load_scene
+from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
+from gsencoder.data.seeding.seed import SeedConfig
+from gsencoder.data.splats.files import READABLE
+from gsencoder.evaluate.protocols.absent import (
+    AbsentProtocol,
+)
+from gsencoder.evaluate.protocols.grounding import (
+    GroundingProtocol,
+)
+from gsencoder.evaluate.protocols.instances import InstancesProtocol
+from gsencoder.evaluate.protocols.localization import (
+    LocalizationProtocol,
+)
+from gsencoder.evaluate.protocols.naming import NamingProtocol
+from gsencoder.evaluate.protocols.recognition import RecognitionProtocol
+from gsencoder.evaluate.protocols.referring import ReferringProtocol
+from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol
+from gsencoder.evaluate.protocols.semantics import SemanticsProtocol
 from gsencoder.evaluate.sources import (
     FeatureSource,
     encoder_source,
@@ -21,12 +39,86 @@ from gsencoder.evaluate.sources import (
     table_beside,
 )
 from gsencoder.fusion.folder import heads_beside
+from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.measured_heads import find_head, heads_of, load_heads
+from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.load import file_of_encoder, load_encoder
-from gsencoder.teachers.build import words_of
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.teachers.build import TeacherConfig, words_of
 from gsencoder.teachers.labels import LabelsConfig
-from gsencoder.text.vocabulary import TableTextConfig, Words, stating_trained, words_of_table
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, stating_trained, words_of_table
 from gsencoder.types import Scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluateConfig(CommonConfig):
+    """Settings of `evaluate`."""
+
+    paths: tuple[str, ...] = field(
+        default=(),
+        metadata={"help": "labeled scenes, or folders of scenes", "metavar": "SCENE", "required": True},
+    )
+    weights: str = field(
+        default="",
+        metadata={
+            "help": "encoder whose features are evaluated (see encode); empty = the fused features of the teacher"
+        },
+    )
+    features: str = field(
+        default="",
+        metadata={
+            "help": "features that are evaluated in place of those: a folder written by fuse, encode, pack or memory, "
+            "or one with such a folder for each scene"
+        },
+    )
+    space: str = field(
+        default="",
+        metadata={
+            "help": "of an encoder or features of several teachers, the one that is evaluated; empty = that of the "
+            "words"
+        },
+    )
+    head: str = field(
+        default="",
+        metadata={
+            "help": "adapter head whose outputs are evaluated, such as siglip, with the words of text=; empty = the "
+            "features themselves"
+        },
+    )
+    protocol: (
+        LocalizationProtocol
+        | NamingProtocol
+        | AbsentProtocol
+        | GroundingProtocol
+        | RecognitionProtocol
+        | InstancesProtocol
+        | SemanticsProtocol
+        | ReferringProtocol
+        | RetrievalProtocol
+    ) = field(default_factory=LocalizationProtocol)
+    classes: str = field(
+        default="",
+        metadata={
+            "help": "of recognition, instances and semantics: scannet20, scannet200, a CSV file with the columns id, "
+            "name and group, or ScanNet++'s top100.txt; empty = the names of the scenes' objects"
+        },
+    )
+    label_map: str = field(
+        default="",
+        metadata={
+            "help": "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv, which gives the raw names of "
+            "objects a class of classes=, and of referring tells unique from multiple"
+        },
+    )
+    splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
+    report: bool = field(default=False, metadata={"help": "write report.html, a page with pictures and figures"})
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    fusion: FuseConfig = field(default_factory=FuseConfig)
+    teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
+    encode: EncodeConfig = field(default_factory=EncodeConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
 
 def teacher_or_encoder(config: EvaluateConfig) -> tuple[FeatureSource, Words]:

@@ -1,0 +1,671 @@
+"""Composition of a command line into settings by Hydra, with text taken literally.
+
+Hydra's override grammar is made for numbers and sweeps. In it `query=mug,banana` is a sweep, `question=What's red?` a
+syntax error, `query=1` a number, `query=${oc.env:HOME}` a look-up. Options whose type is text, a path, or a list of
+those therefore bypass it: their characters are encoded as hexadecimal digits inside an interpolation,
+`${text:x6d7567}`, which OmegaConf resolves to the same characters when the settings are complete.
+
+Rules for words: one of the form `KEY=VALUE` sets an option if KEY is one; otherwise it is a path if a file of that
+name exists, and an error if not. Every other word is a path. After `--` all words are paths. KEY may leave out the
+sections before the last dot where that is unambiguous (`voxel=` for `fusion.voxel=`); of several options with one last
+part, the one with the fewest sections before it.
+
+Hydra's config store, filled from a command's settings class, so that defaults stand in the dataclasses alone.
+
+One node holds all defaults of the command. Beside it are the config groups, for what can be chosen by name:
+- a field whose type is a union of dataclasses; each of them is a member (`teacher=onnx`);
+- a section with presets; `field(…, metadata={"preset": "tiny"})` names the member that is its default (`model=tiny`);
+- `preset`, whose members set options of several sections from the table in `gsencoder.app.options`;
+- `experiment` of a command that has experiments (`CommonConfig.has_experiments`); its member `none` sets nothing.
+YAML files in the folder of a group are further members. They set only what differs from the member they build on.
+
+The nodes are plain dicts: OmegaConf makes a node of a frozen dataclass read-only, and refuses Literal.
+
+Several runs from one command line (`-m`), by Hydra's multirun, sweepers and launchers.
+
+Values follow Hydra's grammar here (`voxel=0.01,0.02`, `teacher=labels,palette`), except for text, which is taken
+literally unless it has the form `query=choice(mug,banana)`. Run k writes to OUT/k; Hydra leaves its `multirun.yaml` in
+OUT.
+"""
+
+import os
+import re
+import shutil
+import sys
+import textwrap
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from omegaconf import OmegaConf
+
+from gsencoder.app.options import (
+    DEFAULT_PRESET,
+    LIKE_GROUP,
+    PRESET,
+    PRESETS,
+    CommonConfig,
+    Option,
+    cached,
+    describe,
+    describe_presets,
+    field_types,
+    join_list,
+    member_name,
+    near,
+    options_by_key,
+    options_of,
+    preset_node,
+    section_classes,
+    settings,
+    typed,
+    without_value,
+    wrong_value,
+)
+from gsencoder.app.progress import one_line
+from gsencoder.core.errors import InputError
+from gsencoder.core.settings import check_removed_option, removed_option
+
+EXPERIMENT = "experiment"
+"""The group whose members set options of several sections; they are merged last, after the command's own defaults and
+presets."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Group:
+    """A config group: named settings of one section, of which a command line chooses one, `KEY=MEMBER`.
+
+    Attributes:
+        key: the section, with a slash before a nested one; also the name of the folder of YAML files.
+        default: name of the member that is used by default.
+        members: the settings of the members that the dataclasses define, as plain dicts.
+    """
+
+    key: str
+    default: str
+    members: Mapping[str, dict[str, Any]]
+
+
+@cached
+def groups_of(cls: type[CommonConfig]) -> tuple[Group, ...]:
+    """The config groups of a command, in order of declaration, presets and experiments last."""
+    groups = list(_section_groups(cls()))
+    presets = {name: {PRESET + LIKE_GROUP: name, **preset_node(cls, name)} for name in PRESETS}
+    groups.append(Group(key=PRESET, default=DEFAULT_PRESET, members=presets))
+    if cls.has_experiments:
+        groups.append(Group(key=EXPERIMENT, default="none", members={"none": {}}))
+    return tuple(groups)
+
+
+def _section_groups(config: Any, prefix: str = "") -> Iterator[Group]:
+    annotations = field_types(type(config))
+    for item in fields(config):
+        key, default = prefix + item.name, getattr(config, item.name)
+        classes = section_classes(annotations[item.name])
+        if len(classes) > 1:
+            configs = [default if type(default) is section else section() for section in classes]
+            members = {member_name(type(each)): settings(each) for each in configs}
+            yield Group(key=key, default=member_name(type(default)), members=members)
+        elif "preset" in item.metadata:
+            name = item.metadata["preset"]
+            yield Group(key=key, default=name, members={name: settings(default)})
+        elif classes:
+            yield from _section_groups(default, key + "/")
+
+
+def store_settings(command: str, cls: type[CommonConfig]) -> None:
+    """Stores the defaults of a command and the members of its groups in Hydra's config store; earlier ones are
+    replaced."""
+    from hydra.core.config_store import ConfigStore
+
+    store = ConfigStore.instance()
+    node, before, after = settings(cls()), [], []
+    for item in fields(cls):
+        if item.metadata.get("like_group"):
+            node[item.name + LIKE_GROUP] = node.pop(item.name)
+    for group in groups_of(cls):
+        is_global = group.key in (PRESET, EXPERIMENT)
+        for name, member in group.members.items():
+            store.store(name=name, node=member, group=group.key, package="_global_" if is_global else None)
+        if is_global:
+            after.append({group.key: group.default})
+        else:
+            before.append({group.key: group.default})
+            *sections, last = group.key.split("/")
+            inner = node
+            for section in sections:
+                inner = inner[section]
+            del inner[last]
+    store.store(name=command, node={"defaults": [*before, "_self_", *after], **node})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choices:
+    """The options and choices of a command.
+
+    Attributes:
+        options: by full key.
+        members: for each key the members of a choice that have this option; empty if it always applies.
+        groups: the names of each choice's members, by the choice's key.
+        chosen: the default of each choice.
+    """
+
+    options: Mapping[str, Option]
+    members: Mapping[str, tuple[str, ...]]
+    groups: Mapping[str, tuple[str, ...]]
+    chosen: Mapping[str, str]
+
+
+def conf_folder() -> Path:
+    """The folder of YAML files: inside an installed package, beside it in a source tree."""
+    package = Path(__file__).resolve().parents[1]
+    return package / "conf" if (package / "conf").is_dir() else package.parent / "conf"
+
+
+def choices_of(cls: type[CommonConfig], conf: Path | None = None) -> Choices:
+    """The options and choices of a command, including the members of choices that are YAML files in `conf`."""
+    folder, groups, defaults = conf or conf_folder(), {}, {}
+    for group in groups_of(cls):
+        files = (path.stem for path in (folder / group.key).glob("*.yaml"))
+        groups[group.key] = tuple(sorted({*group.members, *files}))
+        defaults[group.key] = group.default
+    members: dict[str, tuple[str, ...]] = {}
+    for option in options_of(cls):
+        members[option.key] = (*members.get(option.key, ()), option.member) if option.member else ()
+    return Choices(options=options_by_key(cls), members=members, groups=groups, chosen=defaults)
+
+
+def option_of_several(key: str, choices: Choices) -> Option | None:
+    """The option that `teachers.NAME.OPTION` stands for, which is that of the choice `teacher`; None for other keys."""
+    field, _, rest = key.partition(".")
+    name, _, last = rest.partition(".")
+    several = choices.options[field].several if field in choices.options else ""
+    return choices.options.get(f"{several}.{last}") if several and name and last else None
+
+
+def full_key(key: str, choices: Choices) -> str | None:
+    """The option or choice that `key` stands for, or None."""
+    keys = [*choices.options, *choices.groups]
+    if key in keys or option_of_several(key, choices) is not None:
+        return key
+    ends = [name for name in keys if re.split(r"[./]", name)[-1] == key]
+    # An option of a section within a section gives way to one that is less deep.
+    depths = [len(re.split(r"[./]", name)) for name in ends]
+    ends = [name for name, depth in zip(ends, depths, strict=True) if depth == min(depths)]
+    if len(ends) > 1:
+        raise InputError(f"{key}: stands for more than one option; write {' or '.join(f'{end}=' for end in ends)}")
+    return ends[0] if ends else None
+
+
+def check_options_of_one(texts: Mapping[str, str], choices: Choices) -> None:
+    """Checks that with several members of a choice no options are given for the only one.
+
+    Raises:
+        InputError: there are such options, or no members.
+    """
+    for key, value in texts.items():
+        several = choices.options[key].several if key in choices.options else ""
+        unused = [name for name in texts if name == several or name.startswith(f"{several}.")] if several else []
+        if unused:
+            option = unused[0].partition(".")[2]
+            hint = f"{key}.NAME.{option}=… is that of one of them" if option else f"leave out {several}= or {key}="
+            raise InputError(f"{unused[0]}: is for a single {several}, and {key}={value} gives several; {hint}")
+        if several and not value.strip("[] "):
+            raise InputError(f"{key}: expected one or more of {', '.join(choices.groups[several])}, got {value!r}")
+
+
+def members_of(key: str, value: str, group: str, members: Sequence[str]) -> list[str]:
+    """Overrides that add several members of a choice, each below a name of its own.
+
+    Raises:
+        InputError: an unknown member, or a name that is given twice.
+    """
+    pairs = named_members(value)
+    names = [name for name, _ in pairs]
+    for name, member in pairs:
+        if member not in members:
+            raise InputError(f"{key}: expected some of {', '.join(members)}, got {member!r}{near(member, members)}")
+        if names.count(name) > 1:
+            raise InputError(f"{key}: {name} is given twice; give other names, such as {name}_2:{member}")
+        if not re.fullmatch(r"\w+", name, re.ASCII):
+            raise InputError(f"{key}: expected names of letters, digits and _, got {name!r}")
+    return [f"+{group}@{key}.{name}={member}" for name, member in pairs]
+
+
+def named_members(value: str) -> list[tuple[str, str]]:
+    """The names and members of a list such as [labels,dino:onnx]; a member without a name has its own."""
+    words = [word.strip() for word in value.removeprefix("[").removesuffix("]").split(",") if word.strip()]
+    return [(word.partition(":")[0], word.partition(":")[2] or word) for word in words]
+
+
+def check_single(data: Mapping[str, Any], texts: Mapping[str, str], choices: Choices) -> None:
+    """Checks that nothing was given for a single member of a choice of which an experiment gives several.
+
+    Raises:
+        InputError: it was.
+    """
+    for key, option in choices.options.items():
+        single = option.several
+        unused = [name for name in texts if single and (name == single or name.startswith(f"{single}."))]
+        if unused and data.get(key):
+            raise InputError(
+                f"{unused[0]}: is for a single {single}, and {EXPERIMENT}={texts.get(EXPERIMENT, '')} gives several, "
+                f"{', '.join(data[key])}; options of one of them are {key}.NAME.OPTION=…, others need another "
+                f"{EXPERIMENT}="
+            )
+
+
+HYDRA_KEY = re.compile(r"\+{0,2}hydra[./]")
+"""Settings of Hydra itself, with -m; + adds one, as `+hydra.launcher.additional_parameters.account=…`."""
+
+
+def hydra_error(error: Exception, texts: Mapping[str, str], choices: Choices) -> str:
+    """The message of an error of Hydra; it is explained if an option belongs to a member that was not chosen, or to no
+    launcher, or if the launcher is not installed."""
+    launcher = re.search(r"Could not find 'hydra/launcher/([^']+)'", str(error))
+    if launcher:
+        return (
+            f"hydra/launcher={launcher[1]}: no such launcher is installed; submitit_slurm and submitit_local come with "
+            "pip install 'gsencoder[slurm]'"
+        )
+    twice = re.search(r"(\w+)@(\w+)\.(\w+) appears more than once", str(error))
+    if twice:
+        return (
+            f"{twice[2]}.{twice[3]}: is given by {EXPERIMENT}={texts.get(EXPERIMENT, '')} and once more; leave out "
+            f"{twice[1]}=, since those of an experiment cannot be replaced, or leave out {EXPERIMENT}="
+        )
+    absent = re.search(r"Could not find '(\w+)/([^']+)'", str(error))
+    if absent and absent[1] in choices.groups:
+        names = choices.groups[absent[1]]
+        return f"{absent[1]}: expected one of {', '.join(names)}, got {absent[2]!r}{near(absent[2], names)}"
+    match = re.search(r"Could not override '([^']+)'", str(error))
+    if match and match[1] in texts:
+        key = match[1]
+        if HYDRA_KEY.match(key):
+            return f"{key}: Hydra has no such setting; +{key}=… adds an entry to a table such as additional_parameters"
+        if key not in choices.options:
+            section, _, name = key.rpartition(".")[0].partition(".")
+            member = dict(named_members(texts.get(section, ""))).get(name)
+            if member is None:
+                return f"{key}: there is no {name} among the {section} of this run; {section}= names them"
+            owners = choices.members.get(f"{section.removesuffix('s')}.{key.rpartition('.')[2]}")
+            whose = " and ".join(owners) if owners else "none of them"
+            return f"{key}: is an option of {whose}, and {name} is {section.removesuffix('s')}={member}"
+        section = key.rpartition(".")[0]
+        group = next((name for name in choices.groups if name.replace("/", ".") == section), section)
+        now = texts.get(group, choices.chosen.get(group))
+        return f"{key}: is an option of {' and '.join(choices.members[key]) or section}, and {group} is {now}"
+    return " ".join(str(error).split())
+
+
+Config = TypeVar("Config", bound=CommonConfig)
+
+SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
+"""Form of the value of a text option that is swept, with -m."""
+
+
+def seal(text: str) -> str:
+    """Encodes text as a value in Hydra's grammar that resolves to exactly this text."""
+    digits = text.encode("utf-8", "surrogatepass").hex()
+    return f"'${{text:x{digits}}}'"
+
+
+def unseal(digits: str) -> str:
+    """Decodes the digits that `seal` wrote."""
+    return bytes.fromhex(digits[1:]).decode("utf-8", "surrogatepass")
+
+
+@contextmanager
+def open_hydra(command: str, cls: type[CommonConfig], conf: Path | None) -> Iterator[Any]:
+    """Initializes Hydra with the defaults of a command and a folder of YAML files; its errors become InputErrors."""
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+    from hydra.errors import HydraException
+    from omegaconf import OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    OmegaConf.register_new_resolver("text", unseal, replace=True)
+    store_settings(command, cls)
+    folder = str((conf or conf_folder()).resolve())
+    try:
+        with initialize_config_dir(config_dir=folder, job_name="gsencoder", version_base="1.3"):
+            yield GlobalHydra.instance().hydra
+    except (HydraException, OmegaConfBaseException) as error:
+        raise InputError(" ".join(str(error).split())) from error
+
+
+def read_words(
+    words: Sequence[str], choices: Choices, *, sweep: bool = False
+) -> tuple[tuple[str, ...], dict[str, str]]:
+    """Splits a command line into paths and settings, by the rules in the docstring of this module.
+
+    Raises:
+        InputError: a word that is neither, a setting given twice, or paths for a command without paths.
+    """
+    paths: list[str] = []
+    texts: dict[str, str] = {}
+    only_paths = False
+    for word in words:
+        key, equals, value = word.partition("=")
+        if only_paths or not equals:
+            if word == "--" and not only_paths:
+                only_paths = True
+                continue
+            if not only_paths and not os.path.lexists(word) and full_key(word, choices):
+                raise InputError(f"{word}: needs a value: {word}=…")
+            if not word:
+                raise InputError("a path is empty; leave it out or name a file")
+            paths.append(word)
+            continue
+        full = key if sweep and HYDRA_KEY.match(key) else full_key(key, choices)
+        if full in choices.groups and re.fullmatch(r"\[.*\]", value):
+            # Several members of a choice, where the command takes several, are an option of their own.
+            full = next((name for name, option in choices.options.items() if option.several == full), full)
+        if full is None and os.path.lexists(word):
+            paths.append(word)
+        elif full is None and (removed := removed_option(key, choices.options)) is not None:
+            check_removed_option(removed, value)
+        elif full is None:
+            raise InputError(_unknown(word, key, choices))
+        elif full in texts:
+            secret = full in choices.options and choices.options[full].secret
+            values = "" if secret else f", as {texts[full]!r} and {value!r}"
+            raise InputError(f"{full}: given twice{values}; give it once")
+        elif sweep and full in choices.options and choices.options[full].secret:
+            raise InputError(f"{full}: is not accepted with -m, which writes its values to a file")
+        elif full == "out" and not value:
+            # A variable of a script that is not set would write to the usual folder without a word.
+            raise InputError("out: is empty; name where the results go, or leave it out")
+        else:
+            texts[full] = value
+    if paths and "paths" not in choices.options:
+        keys = [*choices.options, *choices.groups]
+        first = without_value(paths[0])
+        raise InputError(f"{first}: this command takes no path{near(first, keys)}")
+    if paths and "paths" in texts:
+        raise InputError(f"paths: given both as paths= and as the word {without_value(paths[0])!r}; give one of them")
+    return tuple(paths), texts
+
+
+def _unknown(word: str, key: str, choices: Choices) -> str:
+    keys, bare_word = [*choices.options, *choices.groups], without_value(word)
+    single = key.partition(".")[0].removesuffix("s")
+    only_one = not any(option.several for option in choices.options.values())
+    if only_one and single in choices.groups and key.startswith(f"{single}s"):
+        return f"{key}: this command takes a single {single}; give {single}= and its options as {single}.OPTION="
+    sections = [name for name in keys if name.startswith(key + ".")]
+    if sections:
+        return f"{key}: is a section; set its options one by one: {', '.join(f'{name}=' for name in sections[:4])}"
+    if not re.fullmatch(r"[A-Za-z_][\w.]*", key):
+        return f"{bare_word}: is neither an option (KEY=VALUE) nor an existing file"
+    if key.startswith("hydra"):
+        return f"{key}: settings of Hydra itself are accepted only with -m"
+    return f"{bare_word.removesuffix('=…')}: no such option, and no file has this name{near(bare_word, keys)}"
+
+
+def overrides(texts: Mapping[str, str], choices: Choices, *, sweep: bool = False) -> list[str]:
+    """The settings in Hydra's grammar, with text encoded; each is parsed separately, so that errors name it.
+
+    Raises:
+        InputError: an unknown member of a choice, or a value of the wrong type.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    parser = OverridesParser.create()
+    hydra_overrides = []
+    check_options_of_one(texts, choices)
+    for key, value in texts.items():
+        option = choices.options.get(key) or option_of_several(key, choices)
+        if option is not None and option.several:
+            hydra_overrides += members_of(key, value, option.several, choices.groups[option.several])
+            continue
+        text = value
+        if key in choices.groups:
+            names = choices.groups[key]
+            # Hydra merges several experiments in the order in which they are listed.
+            several = re.fullmatch(r"\[(.*)\]", value) if key == EXPERIMENT else None
+            secret = any(name.startswith(f"{key}.") and each.secret for name, each in choices.options.items())
+            members = several[1].replace(" ", "").split(",") if several else [value]
+            if repeated := [name for name in members if members.count(name) > 1]:
+                raise InputError(f"{key}: {repeated[0]} is given twice in {value}; give it once")
+            unknown = [name for name in members if name not in names]
+            if unknown and (secret or not sweep):
+                actual = "" if secret else f", got {unknown[0]!r}{near(unknown[0], names)}"
+                raise InputError(f"{key}: expected one of {', '.join(names)}{actual}")
+        elif option is not None and option.kind != "value":
+            if not (sweep and SWEPT_TEXT.fullmatch(value)):
+                # Users of Hydra write brackets around a list; text may begin with one, names do not.
+                bracketed = option.names and re.fullmatch(r"\[(.*)\]", value)
+                text = seal(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
+        elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
+            text = f"[{value}]"
+        name = option.hydra_key if option is not None and option.like_group and key not in choices.groups else key
+        try:
+            parsed = parser.parse_override(f"{name}={text}")
+            swept = parsed.is_sweep_override()
+        except HydraException as error:
+            message = wrong_value(option, value) if option else f"{key}={value}: {str(error).partition(chr(10))[0]}"
+            raise InputError(message) from error
+        if swept and not sweep and option is not None:
+            raise InputError(f"{wrong_value(option, value)}; several values, one run each, need -m")
+        hydra_overrides.append(f"{name}={text}")
+    return hydra_overrides
+
+
+def _is_list(option: Option) -> bool:
+    return getattr(option.annotation, "__origin__", None) is tuple
+
+
+def compose(
+    command: str, cls: type[Config], words: Sequence[str], conf: Path | None = None, choices: Choices | None = None
+) -> Config:
+    """Composes the settings of a run: defaults of the class, then chosen YAML files, then the command line.
+
+    Raises:
+        InputError: the words, or their combination, are not settings of this command.
+    """
+    from hydra.errors import HydraException
+    from hydra.types import RunMode
+
+    choices = choices or choices_of(cls, conf)
+    paths, texts = read_words(words, choices)
+    if paths:
+        texts["paths"] = join_list(paths)
+    lines = overrides(texts, choices)
+    with open_hydra(command, cls, conf) as hydra:
+        try:
+            composed = hydra.compose_config(command, lines, RunMode.RUN, from_shell=False)
+        except HydraException as error:
+            raise InputError(hydra_error(error, texts, choices)) from error
+        data = plain_settings(composed)
+        check_single(data, texts, choices)
+        return typed(cls, data)
+
+
+def plain_settings(composed: Any) -> dict[str, Any]:
+    """The composed settings as plain dicts, lists and scalars, without Hydra's own."""
+    from omegaconf import OmegaConf
+
+    settings = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
+    data = OmegaConf.to_container(settings, resolve=True)
+    assert isinstance(data, dict)
+    return {str(key).removesuffix(LIKE_GROUP): value for key, value in data.items()}
+
+
+RULES = (
+    "A word KEY=VALUE is a setting if KEY is one of those above (the part after the last dot is enough where only one, "
+    "or one with fewer dots than the others, has it), else a path if such a file exists; every other word is a path, "
+    "and so is every word after --. In lists of text commas separate and \\, is a comma."
+)
+
+
+def _shown(value: Any) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (list, tuple)):
+        return join_list(map(str, value)) if value else "none"
+    return str(value) if value != "" else "empty"
+
+
+def _entry(head: str, text: str, width: int) -> list[str]:
+    body = textwrap.wrap(text, width - 6) or [""]
+    return [f"  {head}", *(f"      {line}" for line in body)]
+
+
+def _option(option: Option, width: int) -> list[str]:
+    kind = option.metavar or describe(option.annotation)
+    return _entry(f"{option.key}={kind}", f"{option.help} [{_shown(option.default)}]", width)
+
+
+def choice_help(cls: type[CommonConfig], group: str) -> str:
+    """What a command says of one of its choices; empty for most, whose members say it."""
+    return str(next((each.metadata.get("help", "") for each in fields(cls) if each.name == group), ""))
+
+
+def command_help(
+    name: str, summary: str, cls: type[CommonConfig], flags: Mapping[str, str], conf: Path | None = None
+) -> str:
+    """The help of one command: usage, paths, settings with type, meaning and default, choices, flags."""
+    width = min(shutil.get_terminal_size((100, 24)).columns, 110)
+    # The options of the command first, then those of its sections.
+    options = sorted(options_of(cls), key=lambda option: "." in option.key)
+    choices = choices_of(cls, conf)
+    paths = next((option for option in options if option.key == "paths"), None)
+    word = f" {paths.metavar or 'PATH'}…" if paths else ""
+    lines = [f"usage: gsencoder {name}{word} [key=value …]", "", *textwrap.wrap(summary, width)]
+    if paths:
+        lines += ["", "paths:", *_entry(paths.metavar or "PATH", paths.help, width)]
+    groups = {group: members for group, members in choices.groups.items() if group != PRESET}
+    if groups:
+        lines += ["", "choices:"]
+        for group, members in groups.items():
+            meaning = f"{choice_help(cls, group)} [{_shown(choices.chosen[group])}]".strip()
+            lines += _entry(f"{group}={'|'.join(members)}", meaning, width)
+    lines += ["", f"presets [{DEFAULT_PRESET}]:"]
+    for preset, changes in describe_presets(cls).items():
+        lines += _entry(f"{PRESET}={preset}", changes, width)
+    lines += ["", "settings [default]:"]
+    for option in options:
+        if option.key != "paths" and not option.member and option.key not in choices.groups:
+            lines += _option(option, width)
+    for member in dict.fromkeys(option.member for option in options if option.member):
+        lines += ["", f"settings with {member} [default]:"]
+        for option in options:
+            if option.member == member:
+                lines += _option(option, width)
+    lines += ["", "flags:", *(f"  {flag:<12}{text}" for flag, text in flags.items())]
+    return "\n".join([*lines, "", *textwrap.wrap(RULES, width)])
+
+
+# A launcher that runs jobs in other processes imports this module there before it resolves the settings.
+OmegaConf.register_new_resolver("text", unseal, replace=True)
+
+
+def _job(
+    composed: Any,
+    *,
+    cls: type[CommonConfig],
+    run: Callable[[Any], str],
+    swept: Sequence[str],
+    texts: Mapping[str, str],
+    choices: Choices,
+) -> str:
+    """Runs one job in its folder and returns its error, so that a failed run does not stop the others."""
+    from hydra.core.hydra_config import HydraConfig
+
+    job = HydraConfig.get()
+    try:
+        data = plain_settings(composed)
+        check_single(data, texts, choices)
+        config = typed(cls, data)
+    except InputError as error:
+        message = f"run {job.job.num}: {error}"
+        print(one_line(f"error: {message}"), file=sys.stderr)
+        return message
+    assert config.out is not None
+    if not config.quiet:
+        values = [text for text in job.overrides.task if text.partition("=")[0] in swept]
+        print(one_line(f"run {job.job.num}: {' '.join(values)}"), file=sys.stderr)
+    # Workers share the scenes of one output folder.
+    shared = set(swept) == {"worker"}
+    return run(config if shared else replace(config, out=config.out / str(job.job.num)))
+
+
+def run_many(
+    command: str,
+    cls: type[CommonConfig],
+    words: Sequence[str],
+    run: Callable[[Any], str],
+    conf: Path | None = None,
+) -> int:
+    """Calls `run(settings)` for every combination of the values given and returns the exit code: 2 if one failed.
+
+    Args:
+        command: its name.
+        cls: the class of its settings.
+        words: the command line after the command.
+        run: does one run, prints its error and returns it; an empty text for none.
+        conf: folder of YAML files; None = the package's.
+
+    Raises:
+        InputError: the words are not settings of this command, out= is missing, or the launcher fails.
+    """
+    from hydra.core.override_parser.overrides_parser import OverridesParser
+    from hydra.errors import HydraException
+
+    choices = choices_of(cls, conf)
+    paths, texts = read_words(words, choices, sweep=True)
+    if paths:
+        texts["paths"] = join_list(paths)
+    _check_out(command, texts, choices)
+    hydra_settings = {
+        "hydra.mode": "MULTIRUN",
+        "hydra.output_subdir": "null",
+        "hydra.sweep.dir": seal(texts["out"]),
+        "hydra.sweep.subdir": ".",
+        "hydra/job_logging": "none",
+        "hydra/hydra_logging": "none",
+    }
+    requested = overrides(texts, choices, sweep=True)
+    lines = [f"{key}={value}" for key, value in hydra_settings.items() if key not in texts] + requested
+    parsed = OverridesParser.create().parse_overrides(requested)
+    swept = tuple(override.get_key_element() for override in parsed if override.is_sweep_override())
+    launcher = texts.get("hydra/launcher", "basic")
+    job = partial(_job, cls=cls, run=run, swept=swept, texts=texts, choices=choices)
+    with open_hydra(command, cls, conf) as hydra:
+        try:
+            batches = hydra.multirun(command, job, lines, with_log_configuration=False)
+        except HydraException as error:
+            raise InputError(hydra_error(error, texts, choices)) from error
+        except Exception as error:
+            # The basic launcher returns the exceptions of a run; others raise their own, of many types.
+            if launcher == "basic":
+                raise
+            raise InputError(
+                f"hydra/launcher={launcher}: {error}; the logs of the jobs are in "
+                f"{texts['out']}/.submitit unless hydra.launcher.submitit_folder= says otherwise"
+            ) from error
+    errors = [str(result.return_value) for batch in batches for result in batch]
+    failed = [error for error in errors if error]
+    if failed:
+        if launcher != "basic":
+            # Jobs in other processes print into logs of their own; workers of one list may fail at the same scenes.
+            for message in dict.fromkeys(line for error in failed for line in error.split("\n")):
+                print(one_line(f"error: {message}"), file=sys.stderr)
+        print(f"error: {len(failed)} of {len(errors)} runs failed", file=sys.stderr)
+    return 2 if failed else 0
+
+
+def _check_out(command: str, texts: dict[str, str], choices: Choices) -> None:
+    if choices.options["out"].metavar == "FILE":
+        raise InputError(f"-m: {command} writes a file, and several runs need a folder")
+    if not texts.get("out"):
+        raise InputError("-m: out= is missing: the folder in which run k writes to OUT/k")
+    if SWEPT_TEXT.fullmatch(texts["out"]):
+        raise InputError("out: cannot be swept; run k writes to OUT/k")

@@ -1,0 +1,411 @@
+"""Inputs that several commands read: scenes to fuse, features to query, words, and questions about scenes."""
+
+import warnings
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from gsencoder.app.from_poses import memory_of
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.progress import Progress, console
+from gsencoder.app.summary import Summary, with_reported_up
+from gsencoder.core.errors import InputError, SceneWarning, listed
+from gsencoder.core.files import read_foreign_text
+from gsencoder.core.pretrained import find_file
+from gsencoder.data.check.scene_check import warn_of_faults
+from gsencoder.data.scenes import DistinctPaths, SceneConfig, kind_of_path, load_scene
+from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
+from gsencoder.fusion.cameras import INSIDE, CamerasOfSplat, with_explained_views
+from gsencoder.fusion.fit import with_fitting_splat
+from gsencoder.fusion.folder import WORDS_FILE, holds_features, load_features, table_path
+from gsencoder.infer.ask.ask import AskConfig, Asker
+from gsencoder.infer.ask.questions import SetQuestion, caption_question
+from gsencoder.infer.ask.server import VlmConfig
+from gsencoder.infer.localize import LocalizeConfig, localize, select_features
+from gsencoder.infer.views.photographs import with_photographs
+from gsencoder.infer.views.targets import ViewsConfig, best_boxes
+from gsencoder.render import BlendConfig
+from gsencoder.text.table import TextTable, load_text_table
+from gsencoder.text.vocabulary import (
+    TableTextConfig,
+    TextConfig,
+    Words,
+    closed_table,
+    stating_trained,
+    vocabulary_of,
+    words_of_table,
+)
+from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
+
+MAX_QUERIES_BYTES = 1 << 20
+"""Largest size of a file of queries, bytes."""
+
+
+def query_words(query: Sequence[str], queries: str) -> list[str]:
+    """The words of query= and of the file queries=, stripped, without repetitions, in order.
+
+    Raises:
+        InputError: no words, or the file is not text.
+    """
+    lines = list(query)
+    if queries:
+        lines += _lines_of(Path(queries))
+    words = list(dict.fromkeys(line.strip() for line in lines if line.strip()))
+    if not words:
+        raise InputError("query= is missing: one or several words, separated by commas (or queries=FILE)")
+    return words
+
+
+def _lines_of(file: Path) -> list[str]:
+    """The lines of a text file, which may begin with a byte order mark."""
+    try:
+        return read_foreign_text(file, MAX_QUERIES_BYTES).splitlines()
+    except InputError as error:
+        raise InputError(f"queries: {error}") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"queries: {file} cannot be read as text: {error}") from error
+
+
+def queried_scene(
+    scene: Scene,
+    folder: Path,
+    *,
+    head: str = "",
+    space: str = "",
+    words_file: str = "",
+    text: TextConfig = TableTextConfig(),
+) -> tuple[Scene, Words]:
+    """A scene with the one feature set that words are compared with, and the words.
+
+    Args:
+        scene: of the folder.
+        folder: of the features.
+        head: name of an adapter head; empty = the features themselves are asked.
+        space: name of the feature set; empty where there is only one.
+        words_file: a file of words; empty = those beside the features, or for a head those of `text`.
+        text: a text tower.
+
+    Raises:
+        InputError: there is no such feature set or head, or no words, or the words are not those of the head's space.
+    """
+    if head:
+        # Heads need torch, which finding boxes does without.
+        from gsencoder.app.heads import queried_through_head
+
+        return queried_through_head(scene, folder, head, space=space, words_file=words_file, text=text)
+    _, features = select_features(scene, space or None)
+    words = load_words(folder, features.space, words_file, text)
+    return replace(scene, features={features.space.name: features}), words
+
+
+def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextConfig = TableTextConfig()) -> Words:
+    """The text table that was given, or the one in the folder of the features, with the tower that made it.
+
+    Args:
+        folder: of the features.
+        space: of the features that are asked; folders with several may hold words for each.
+        words_file: a file of words; empty = the one in the folder.
+        text: a tower that is given; otherwise it is searched for when a phrase needs it.
+
+    Raises:
+        InputError: there are no words, or the tower is another than the one that made them.
+    """
+    if words_file:
+        words = words_of_table(load_text_table(find_file(words_file, "words")), text)
+        return stating_trained(words, _table_beside(folder, space))
+    if not isinstance(text, TableTextConfig):
+        table = _table_beside(folder, space)
+        return vocabulary_of(text) if table is None else words_of_table(table, text)
+    path = table_path(folder, space.text_encoder)
+    if path is None:
+        raise InputError(
+            f"{folder}: there is no {WORDS_FILE} beside these features: no words lead into them, or the file was lost; "
+            "fuse with a teacher that has words, or give words= or text="
+        )
+    return words_of_table(load_text_table(path))
+
+
+def _table_beside(folder: Path, space: FeatureSpace) -> TextTable | None:
+    """The table of a space in a folder of features; None where it is lost, damaged or of another space, for which
+    words= and text= stand in."""
+    try:
+        path = table_path(folder, space.text_encoder)
+        table = None if path is None else load_text_table(path)
+    except InputError:
+        return None
+    return table if table is not None and table.space.text_encoder == space.text_encoder else None
+
+
+def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
+    """Loads a folder of features, with the photographs of the scene `photos` if one is given.
+
+    Raises:
+        InputError: a folder or a scene that cannot be read, or photographs of other cameras.
+    """
+    scene = load_features(folder)
+    return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
+
+
+@runtime_checkable
+class AskerSettings(Protocol):
+    """The settings of an asker, which are those options of `ask`."""
+
+    @property
+    def words(self) -> str: ...
+    @property
+    def space(self) -> str: ...
+    @property
+    def head(self) -> str: ...
+    @property
+    def ask(self) -> AskConfig: ...
+    @property
+    def choose(self) -> ViewsConfig: ...
+    @property
+    def localize(self) -> LocalizeConfig: ...
+    @property
+    def data(self) -> SceneConfig: ...
+    @property
+    def text(self) -> TextConfig: ...
+    @property
+    def vlm(self) -> VlmConfig: ...
+
+
+def load_asker(settings: AskerSettings, folder: Path, photos: str) -> Asker:
+    """The scene of a folder of features, and what is asked about it is looked up with.
+
+    Args:
+        settings: settings.
+        folder: of the features.
+        photos: the scene that was fused, whose photographs are shown; empty = renders are.
+    """
+    return asker_of(settings, shown_scene(folder, photos, settings.data), folder)
+
+
+def asker_of(settings: AskerSettings, scene: Scene, folder: Path) -> Asker:
+    """The asker of a scene that was loaded from a folder of features. A box can be asked about without words."""
+    words: Words | None
+    if settings.head:
+        scene, words = queried_scene(
+            scene, folder, head=settings.head, space=settings.space, words_file=settings.words, text=settings.text
+        )
+    else:
+        space = select_features(scene, settings.space or None)[1].space
+        has_own_words = settings.words or not isinstance(settings.text, TableTextConfig)
+        has_words = has_own_words or table_path(folder, space.text_encoder) is not None
+        words = load_words(folder, space, settings.words, settings.text) if has_words else None
+    return Asker(
+        scene,
+        words,
+        space=None if settings.head else settings.space or None,
+        config=settings.ask,
+        localization=settings.localize,
+        views=settings.choose,
+        vlm=settings.vlm,
+    )
+
+
+def folder_of(features: str, scene: str) -> Path:
+    """The folder of a scene's features: the one of its name in a folder of several, else the folder itself."""
+    inner = Path(features) / scene
+    return inner if inner.is_dir() else Path(features)
+
+
+def stored_words(
+    features: str, scene: str, *, head: str = "", space: str = "", text: TextConfig = TableTextConfig()
+) -> Words:
+    """The words that lead into stored features: those beside the features of a scene, or of `text`.
+
+    Args:
+        features: their folder, or one with a folder for each scene.
+        scene: name of a scene.
+        head: adapter head whose outputs are asked; empty = the features.
+        space: name of the features where there are several.
+        text: a text tower.
+
+    Raises:
+        InputError: there are no such features or words.
+    """
+    folder = folder_of(features, scene)
+    return queried_scene(load_features(folder), folder, head=head, space=space, text=text)[1]
+
+
+def with_stored_features(
+    scenes: Iterable[tuple[Scene, float]],
+    features: str,
+    *,
+    head: str = "",
+    space: str = "",
+    text: TextConfig = TableTextConfig(),
+) -> Iterator[tuple[Scene, float]]:
+    """Labeled scenes with the Gaussians and features of a folder, as `load_scenes` yields scenes.
+
+    The features may have been made from other views of the scene, such as all but those that are evaluated; the origin,
+    which is the mean of the cameras, is then another one.
+
+    Raises:
+        InputError: features of another scene, or none.
+    """
+    for scene, seconds in scenes:
+        folder = folder_of(features, scene.name)
+        stored = load_features(folder)
+        if stored.name != scene.name:
+            raise InputError(
+                f"features: {folder} holds those of scene {stored.name}, and {scene.name} is evaluated; give a folder "
+                f"that has the features of each scene in a folder of its name"
+            )
+        queried, _ = queried_scene(stored, folder, head=head, space=space, text=text)
+        assert queried.gaussians is not None
+        means = (queried.gaussians.means + (stored.origin - scene.origin)).astype(np.float32)
+        gaussians = replace(queried.gaussians, means=means)
+        yield replace(scene, gaussians=gaussians, features=queried.features), seconds
+
+
+def stored_source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
+    """The source of features that came with the scene."""
+    return next(iter(scene.features.values())), {}
+
+
+def stored_memory(features: str, scene: Scene) -> QueryMemory | None:
+    """The memory that the features of a scene were read from; None where features are stored themselves."""
+    return memory_of(folder_of(features, scene.name), scene)
+
+
+@dataclass(frozen=True, kw_only=True)
+class WordsOptions(CommonConfig):
+    """Which words are compared with which features. Without slots, as `CommonConfig`."""
+
+    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
+    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
+    head: str = field(
+        default="",
+        metadata={
+            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
+            "features themselves are"
+        },
+    )
+
+
+def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:
+    """The folders of features at paths: each path, or the folders in it that are called like one of the scenes.
+
+    Raises:
+        InputError: a path that is no folder, that holds neither features nor any such folder, or that is given twice.
+    """
+    folders = DistinctPaths()
+    for path in map(Path, paths):
+        inner = [path] if holds_features(path) else []
+        if not inner and path.is_dir():
+            inner = sorted(filter(holds_features, path.iterdir()))
+        if not inner:
+            raise InputError(
+                f"{path}: {kind_of_path(path)}; expected a folder of features, which `gsencoder fuse`, `encode`, "
+                "`memory` and `pack` write, or a folder of such folders"
+            )
+        folders.add(folder for folder in inner if folder is path or folder.name in scenes)
+    return list(folders.paths)
+
+
+def photos_of(photos: str, features: Path) -> str:
+    """The scene with the photographs of a folder of features: of a folder of scenes the one that is called like it."""
+    return str(folder_of(photos, features.name)) if photos else ""
+
+
+def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[SetQuestion, ...]:
+    """Questions for captions of the best boxes of names, `ask.boxes` for each; names that no table knows have none.
+
+    Raises:
+        InputError: no words lead into the features.
+
+    Warns:
+        SceneWarning: names that no table knows, or none of which has a box.
+    """
+    if asker.words is None:
+        raise InputError(f"proposals=localize: no words lead into the features of {asker.scene.name}; give words=")
+    table = closed_table(asker.words)
+    known_names = [name for name in names if table is None or table.find(name) is not None]
+    if len(known_names) < len(names):
+        unknown = [name for name in names if name not in known_names]
+        warnings.warn(
+            f"proposals=localize: {asker.scene.name}: the text table lacks {len(unknown)} of {len(names)} names of "
+            f"objects, of which there are no captions: {listed(unknown)}; give a text tower (text=)",
+            SceneWarning,
+            stacklevel=2,
+        )
+    if not known_names:
+        return ()
+    localization = localize(asker.scene, known_names, asker.words, asker.localization, space=asker.space)
+    questions = []
+    for number, box in enumerate(best_boxes(localization, asker.config.boxes)):
+        low, high = box.aabb_min.tolist(), box.aabb_max.tolist()
+        aabb = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        keys = {"obj_prob": [1 - float(box.probability), float(box.probability)]}
+        if (box.aabb_min < box.aabb_max).all():
+            questions.append(caption_question(asker.scene.name, str(number), aabb, keys))
+    if not questions:
+        warnings.warn(
+            f"proposals=localize: {asker.scene.name}: no name of an object has a box there ({listed(known_names)}), so "
+            "that there is nothing to caption",
+            SceneWarning,
+            stacklevel=2,
+        )
+    return tuple(questions)
+
+
+def load_fusable(
+    path: Path,
+    summary: Summary,
+    *,
+    splat: str,
+    data: SceneConfig,
+    seeds: SeedConfig,
+    orbits: int,
+    cameras: CamerasOfSplat,
+    blend: BlendConfig,
+    labels: bool,
+    quiet: bool,
+) -> Scene:
+    """Loads a scene with Gaussians and views: seeds if it has no splat, orbit cameras if it has no views.
+
+    Args:
+        path: of the scene.
+        summary: takes the seconds of the steps.
+        splat: file of the Gaussians, or empty.
+        data: how the scene is read.
+        seeds: how Gaussians are made.
+        orbits: largest number of cameras placed in a bare splat.
+        cameras: where they stand.
+        blend: how a bare splat is rendered.
+        labels: whether a teacher needs labels, which a bare splat has not.
+        quiet: print nothing.
+
+    Raises:
+        InputError: the scene cannot be read, or has neither views nor what they would be rendered from.
+    """
+    with summary.step("load"):
+        scene = load_scene(path, splat=splat or None, options=data)
+    with summary.step("check"):
+        warn_of_faults(scene)
+        scene = with_fitting_splat(scene, splat, data)
+    if scene.views is None and labels:
+        raise InputError(
+            f"{path}: a splat without views has no labels for teacher=labels; give a teacher that looks at pictures, "
+            "such as teacher=mosaic text=minilm, or teacher=palette"
+        )
+    if scene.gaussians is None:
+        with summary.step("seeds"):
+            scene = with_gaussians(scene, seeds, track=Progress(quiet=quiet))
+    scene = with_reported_up(scene, summary, quiet=quiet)
+    if scene.views is not None:
+        return scene
+    with summary.step("cameras"):
+        scene, reason = with_explained_views(scene, orbits, blend, cameras=cameras)
+    assert scene.views is not None
+    where = "inside" if scene.views.names[0].startswith(INSIDE) else "around"
+    summary.results["cameras"] = where
+    console(quiet).print(
+        f"{scene.name}: a bare splat; rendered from {len(scene.views)} cameras {where} it, because {reason}"
+    )
+    return scene

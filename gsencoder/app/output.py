@@ -1,0 +1,602 @@
+"""Outputs of a run: a file or a folder, the folder of unfinished work, and the queue of scenes that processes share."""
+
+import ctypes
+import errno
+import json
+import os
+import re
+import secrets
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from hashlib import sha1
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console
+
+from gsencoder.app.progress import one_line
+from gsencoder.app.summary import Summary
+from gsencoder.core.errors import BusyError, InputError, listed
+from gsencoder.core.files import (
+    SUMMARY_NAME,
+    atomic_file,
+    check_writable,
+    checksums_of,
+    is_full_disk,
+    json_bytes,
+    lock_folder,
+    locked,
+    plain,
+    read_foreign_text,
+    write_bytes,
+)
+from gsencoder.core.process import raise_dropped_stop, refuse_several
+from gsencoder.data.scenes import UNFINISHED_FILE, check_names, scene_name
+
+
+def refuse_existing(path: str | Path, overwrite: bool) -> None:
+    """Checks, for commands whose result is one file, that it does not exist or may be replaced.
+
+    Raises:
+        InputError: it exists.
+    """
+    if os.path.isdir(path):
+        raise InputError(f"{path}: is a folder; give the name of a file to write")
+    if os.path.lexists(path) and not overwrite:
+        raise InputError(f"{path}: exists; give another out= or overwrite=true")
+
+
+def check_output_files(paths: Iterable[Path], overwrite: bool) -> None:
+    """Checks files before the work whose results they will hold: none exists that may not be replaced, and all can be
+    written.
+
+    Raises:
+        InputError: one exists, its folder is missing, or the system refuses.
+    """
+    for path in paths:
+        refuse_existing(path, overwrite)
+        check_writable(path)
+
+
+@contextmanager
+def sole_writer(path: Path, *, overwrite: bool) -> Iterator[None]:
+    """Lets one run at a time write a file and what belongs beside it.
+
+    Two runs of one out= would otherwise leave the file of one beside the summary of the other, and the second would
+    replace what the first has written since it began. Runs that write into the same folder wait for each other here,
+    for as long as the writing takes.
+
+    Args:
+        path: the file.
+        overwrite: whether a file that is there is replaced.
+
+    Raises:
+        InputError: another run has written the file meanwhile.
+    """
+    with ExitStack() as stack:
+        # Where the folder is missing or refuses, whoever writes the file says so.
+        with suppress(OSError):
+            stack.enter_context(locked(path.resolve().parent, wait=True))
+        refuse_existing(path, overwrite)
+        yield
+
+
+AT_FDCWD, RENAME_EXCHANGE = -100, 2
+
+
+@contextmanager
+def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary | None = None) -> Iterator[Path]:
+    """Opens a folder to write into, which is renamed to `path` when the block ends without an error.
+
+    Until then it is a hidden folder beside it, `.NAME.partial-XXXXXXXX`. It is removed if the block ends early, also by
+    an interrupt; the folder of a killed run is removed by the next run that writes to the same path. Everything is
+    synced to disk before the folder is renamed.
+
+    Args:
+        path: the folder; its parents are created. It may exist if it is empty.
+        overwrite: replace the output of an earlier run, recognized by its summary.json. Where the system can (Linux),
+            old and new are exchanged in one step.
+        summary: written into the folder at the end, as summary.json, with the checksums of files that have none.
+
+    Raises:
+        InputError: the folder exists, holds something else, is being written by another run, or cannot be written;
+            or the disk is full.
+    """
+    # Of a symbolic link the target is replaced, not the link.
+    target = Path(os.path.realpath(path))
+    _check_target(path, target, overwrite)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        partial, lock = _begin(path, target, overwrite)
+    except BlockingIOError:
+        raise BusyError(f"{path}: another run is writing this folder now; wait for it or give another out=") from None
+    except FileExistsError as error:
+        raise InputError(f"{path}: {error.filename} is a file, so no folder can be made in it") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot write here: {error.strerror or error}") from error
+    try:
+        yield partial
+        if summary is not None:
+            record = summary.to_dict() | {"files": checksums_of(partial)}
+            write_bytes(partial / SUMMARY_NAME, json_bytes(record)[0])
+        _sync(partial)
+        _check_target(path, target, overwrite)
+        raise_dropped_stop()
+        _move_into_place(partial, target)
+    except Exception as error:
+        message = _refusal(error, partial, target, path)
+        if message is None:
+            raise
+        raise InputError(message) from error
+    finally:
+        # After an exchange this is the old output.
+        shutil.rmtree(partial, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+
+
+def _begin(path: str | Path, target: Path, overwrite: bool) -> tuple[Path, int | None]:
+    """Creates and locks the hidden folder. Runs that start at the same moment do so one after the other: a folder that
+    is created and not yet locked would be mistaken for that of a killed run.
+
+    Raises:
+        BlockingIOError: another run is writing `target`.
+        InputError: results are there by now, and are not to be replaced.
+    """
+    parent_lock = lock_folder(target.parent, wait=True)
+    try:
+        if _remove_stale(target):
+            raise BlockingIOError
+        _put_back(target)
+        # Another run may have written the folder since it was looked at.
+        _check_target(path, target, overwrite)
+        partial = target.parent / f".{_short(target.name)}.partial-{secrets.token_hex(4)}"
+        partial.mkdir()
+        return partial, lock_folder(partial)
+    finally:
+        if parent_lock is not None:
+            os.close(parent_lock)
+
+
+def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
+    try:
+        os.lstat(target)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as error:
+        raise InputError(f"{path}: cannot write here: {error.strerror or error}") from error
+    if not target.is_dir():
+        raise InputError(f"{path}: is a file, and the results are a folder; give another out=")
+    if os.path.ismount(target):
+        raise InputError(f"{path}: is a mount point, which cannot be exchanged for the results; give a folder in it")
+    with suppress(OSError):
+        if not any(target.iterdir()):
+            return
+    if not (target / SUMMARY_NAME).is_file():
+        raise InputError(
+            f"{path}: is a folder with other contents (no {SUMMARY_NAME}), which is never replaced; give another out="
+        )
+    if not overwrite:
+        raise InputError(f"{path}: holds the results of an earlier run; give another out= or overwrite=true")
+
+
+def refuse_to_replace_inputs(out: Path | None, values: Mapping[str, Any]) -> None:
+    """Checks that a folder that is about to be replaced holds none of the inputs, and that a file is none.
+
+    Args:
+        out: the folder or file.
+        values: the settings of the run; every text in them that names an existing file or folder is an input.
+
+    Raises:
+        InputError: it holds one, or is one.
+    """
+    if out is None or not os.path.exists(out):
+        return
+    for key, name in _texts({key: value for key, value in values.items() if key != "out"}):
+        if os.path.exists(name) and lies_in(name, out):
+            holds = "holds" if os.path.isdir(out) else "is"
+            raise InputError(f"{out}: {holds} the input {key}={name}, so it cannot be replaced; give another out=")
+
+
+def lies_in(path: str | Path, folder: str | Path) -> bool:
+    """Whether a path is in a folder or is the folder, with symbolic links resolved."""
+    inner, outer = os.path.realpath(path), os.path.realpath(folder)
+    return os.path.commonpath([inner, outer]) == outer
+
+
+def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """Yields all strings in nested settings that could be paths, with their keys."""
+    if isinstance(value, str) and 0 < len(value) < 4096 and "\0" not in value:
+        yield key, value
+    elif isinstance(value, Mapping):
+        for name, item in value.items():
+            yield from _texts(item, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from _texts(item, key)
+
+
+def _short(name: str) -> str:
+    """The name, or a digest of it if the temporary name would be longer than file systems allow."""
+    raw = os.fsencode(name)
+    return name if len(raw) <= 200 else sha1(raw).hexdigest()
+
+
+def _remove_stale(target: Path) -> bool:
+    """Removes the hidden folders of killed runs beside `target`; returns whether another run is writing it now.
+
+    Where folders cannot be locked (some network file systems) nothing is removed and no run is detected.
+    """
+    pattern = re.compile(re.escape(f".{_short(target.name)}.partial-") + "[0-9a-f]{8}")
+    for entry in list(os.scandir(target.parent)):
+        if not pattern.fullmatch(entry.name) or not entry.is_dir(follow_symlinks=False):
+            continue
+        try:
+            descriptor = lock_folder(entry.path)
+        except BlockingIOError:
+            return True
+        except OSError:
+            continue
+        if descriptor is not None:
+            shutil.rmtree(entry.path, ignore_errors=True)
+            os.close(descriptor)
+    return False
+
+
+def _sync(folder: Path) -> None:
+    for root, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            path = os.path.join(root, name)
+            if not os.path.islink(path):
+                _sync_one(path)
+        _sync_one(root)
+
+
+def _sync_one(path: str | Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        # Some file systems cannot sync a folder; a file that cannot be synced is an error.
+        if os.path.isfile(path) or error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise OSError(error.errno, error.strerror, os.fspath(path)) from error
+    finally:
+        os.close(descriptor)
+
+
+def _move_into_place(partial: Path, target: Path) -> None:
+    """Renames `partial` to `target`; an existing `target` is renamed to `partial`."""
+    old = target.is_dir() and any(target.iterdir())
+    if not old:
+        os.rename(partial, target)
+    elif not _exchange(partial, target):
+        # Not the name of a hidden folder that the next run removes: a kill between the two would lose the old results.
+        aside = _aside(target)
+        os.rename(target, aside)
+        try:
+            os.rename(partial, target)
+        except BaseException:
+            os.rename(aside, target)
+            raise
+        os.rename(aside, partial)
+    _sync_one(target.parent)
+
+
+def _aside(target: Path) -> Path:
+    """Where earlier results lie for a moment while new ones take their name, if the system cannot exchange names."""
+    return target.parent / f".{_short(target.name)}.earlier"
+
+
+def _put_back(target: Path) -> None:
+    """Gives earlier results their name back that a run was replacing when it was killed."""
+    aside = _aside(target)
+    if not aside.is_dir():
+        return
+    if os.path.lexists(target):
+        shutil.rmtree(aside, ignore_errors=True)
+    else:
+        os.rename(aside, target)
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Exchanges two names in one step; False if the system does not support it."""
+    try:
+        renameat2 = ctypes.CDLL(None, use_errno=True).renameat2
+    except (OSError, AttributeError, TypeError):
+        return False
+    return bool(renameat2(AT_FDCWD, os.fsencode(first), AT_FDCWD, os.fsencode(second), RENAME_EXCHANGE) == 0)
+
+
+def _refusal(error: Exception, partial: Path, target: Path, path: str | Path) -> str | None:
+    """The message for an error of writing, or None for any other error."""
+    if isinstance(error, InputError) and str(partial) not in str(error):
+        # Files elsewhere, such as the checkpoint of a run that can be resumed, still exist.
+        return str(error)
+    if (isinstance(error, OSError) and error.errno == errno.EFBIG) or os.strerror(errno.EFBIG) in str(error):
+        return f"{path}: a file would grow larger than this system or shell allows (ulimit -f): no result was written"
+    if is_full_disk(error):
+        return f"{path}: no space left on the device: no result was written"
+    if isinstance(error, InputError):
+        return str(error).replace(str(partial), str(path))
+    if not isinstance(error, OSError):
+        return None
+    # A file that is copied has the second name; an error of copying a folder lists such errors.
+    names, reason = [str(each) for each in (error.filename2, error.filename) if each is not None], error.strerror
+    if isinstance(error, shutil.Error) and error.args and error.args[0] and not isinstance(error.args[0], str):
+        source, copy, reason = map(str, error.args[0][0])
+        names = [copy, source]
+        reason = reason.partition("] ")[2].partition(": ")[0] or reason
+    for name in names:
+        if name.startswith(str(partial)):
+            return f"{name.replace(str(partial), str(path))}: cannot write: {reason or error}"
+    if str(target) in names:
+        return f"{path}: cannot be replaced by the results: {error.strerror or error}"
+    if str(target.parent) in names:
+        return f"{path}: the results are written; the system cannot sync {target.parent}: {error.strerror or error}"
+    return None
+
+
+NOT_COMPARED = ("paths", "out", "overwrite", "quiet", "worker", "resume", "device", "preset")
+"""Settings in which two runs with the same results may differ; what a preset sets is compared."""
+GOLDEN = 0.6180339887
+"""Workers begin at the fractional parts of its multiples, which are spread evenly however many there are."""
+
+
+class ScenesFailedError(InputError):
+    """Some of several scenes failed, each of which was said when it did.
+
+    Attributes:
+        reasons: one line a scene.
+    """
+
+    def __init__(self, message: str, reasons: tuple[str, ...]) -> None:
+        super().__init__(message)
+        self.reasons = reasons
+
+
+RunOne = Callable[[Path, Path, Summary], None]
+"""Does one scene: its path, the folder for its results, and the summary that goes into it."""
+
+
+def run_scenes(
+    paths: Sequence[Path],
+    out: Path | None,
+    part: str,
+    run: RunOne,
+    summary: Summary,
+    *,
+    overwrite: bool,
+    worker: int,
+    screen: Console,
+) -> None:
+    """Runs a command for one scene into `out`, or for each of several into the folder OUT/NAME.
+
+    Of several scenes those are skipped whose folder holds the results of the same settings, and those that another
+    process is writing now. An error in one does not stop the others. The summary of each has its own
+    warnings, and those from before the first; that of the run has all, with the names of scenes.
+
+    Args:
+        paths: the scenes.
+        out: the folder; None = outputs/NAME/PART.
+        part: what the results are called there.
+        run: does one scene.
+        summary: of the whole run; that of a single scene.
+        overwrite: whether finished scenes are done again.
+        worker: number of this process among several that share the scenes; each begins at another one.
+        screen: for lines about scenes that are skipped.
+
+    Raises:
+        InputError: two scenes have one name, the error of the only scene, several processes for it, or some of several
+            scenes failed.
+    """
+    check_names(paths)
+    if len(paths) == 1:
+        refuse_several(f"{paths[0]}", "start it once, or give several scenes, which processes share")
+        name = scene_name(paths[0])
+        run(paths[0], out or Path("outputs") / name / part, summary)
+        return
+    first = int(len(paths) * ((worker * GOLDEN) % 1))
+    failures: dict[Path, str] = {}
+    common = tuple(summary.warnings)
+    skipped = 0
+    for path in (*paths[first:], *paths[:first]):
+        name = scene_name(path)
+        target = out / name if out is not None else Path("outputs") / name / part
+        try:
+            if not overwrite and _is_finished(target, summary):
+                skipped += 1
+                continue
+            with summary.of_scene(name, path, common) as summary_of_scene:
+                run(path, target, summary_of_scene)
+        except BusyError:
+            screen.print(f"{target}: another run is writing it now")
+        except InputError as error:
+            if not overwrite and _was_finished(target, summary):
+                continue
+            failures[path] = str(error) if str(error).startswith(f"{path}: ") else f"{path}: {error}"
+            print(one_line(f"failed: {failures[path]}"), file=sys.stderr)
+    if skipped:
+        screen.print(f"{skipped} of {len(paths)} scenes were finished before")
+    if failures:
+        raise ScenesFailedError(
+            f"{len(failures)} of {len(paths)} scenes failed, and the same command tries them again: "
+            f"{listed([str(path) for path in failures])}",
+            tuple(failures.values()),
+        )
+
+
+def _was_finished(target: Path, summary: Summary) -> bool:
+    """Whether another process has finished the scene in the meantime."""
+    try:
+        return _is_finished(target, summary)
+    except InputError:
+        return False
+
+
+def _is_finished(target: Path, summary: Summary) -> bool:
+    """Whether a folder holds the results of this command with these settings.
+
+    Raises:
+        InputError: it holds results of others.
+    """
+    try:
+        record = json.loads(read_foreign_text(target / SUMMARY_NAME))
+    except FileNotFoundError:
+        return False
+    except (OSError, ValueError) as error:
+        raise InputError(f"{target / SUMMARY_NAME}: cannot be read ({type(error).__name__})") from error
+    now = {"command": summary.command, **_compared(json.loads(json.dumps(plain(summary.settings))))}
+    before = {"command": record.get("command"), **_compared(record.get("settings", {}))}
+    differing = sorted(key for key in {*now, *before} if now.get(key) != before.get(key))
+    if differing:
+        raise InputError(
+            f"{target}: holds the results of other settings ({', '.join(differing[:5])}); give another out= or "
+            "overwrite=true"
+        )
+    return True
+
+
+def _compared(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in settings.items() if key not in NOT_COMPARED}
+
+
+MARKER_FILE, DISCARDED_FILE = UNFINISHED_FILE, "discarded.txt"
+"""The marker of a state that can be continued, and its name while the state is removed."""
+_PARTIAL_MARKER = re.compile(re.escape(f".{MARKER_FILE}.") + "([0-9a-f]+[.])?tmp")
+
+
+def folder_beside(out: Path, suffix: str) -> Path:
+    """The folder OUT.suffix beside an output folder; behind a symbolic link, beside the folder that it leads to."""
+    target = Path(os.path.realpath(out))
+    return target.with_name(f"{target.name}.{suffix}")
+
+
+def prepared_folder(prepared: Path | None, out: Path, work: Path) -> Path:
+    """Where a training finds what it has prepared, or prepares it: `prepared`, or OUT.prepared where that is None.
+
+    Raises:
+        InputError: it is in the output folder or in that of the state, which are replaced and removed.
+    """
+    prepared = prepared or folder_beside(out, "prepared")
+    for name, folder in (("out", Path(os.path.realpath(out))), ("the state of the run", work)):
+        if lies_in(prepared, folder):
+            raise InputError(f"prepared={prepared}: is in the folder of {name}, {folder}; give another folder")
+    return prepared
+
+
+class WorkFolder:
+    """A folder with a marker file, by which later runs recognize it.
+
+    Enter it before the output folder and `take` it inside: it is then locked until the results have been renamed into
+    place, and removed after that. If the block ends early, the folder stays as it is, and a note of the error says so;
+    one that holds no state yet is removed.
+
+    Attributes:
+        path: of the folder, with symbolic links resolved.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Args:
+        path: the folder, which may not exist yet.
+        """
+        self.path = Path(os.path.realpath(path))
+        self._descriptor: int | None = None
+        self._taken = False
+
+    def take(self, *, anew: bool) -> None:
+        """Creates and locks the folder, or that of an interrupted run; a folder without the marker is never changed.
+
+        Args:
+            anew: whether to remove the state of an earlier run.
+
+        Raises:
+            InputError: it holds something else, another run uses it, or it cannot be created or emptied.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            names = [entry.name for entry in self.path.iterdir()]
+            # A run that was killed at its start may have left an incomplete marker file alone.
+            if not {MARKER_FILE, DISCARDED_FILE} & {*names} and not all(
+                _PARTIAL_MARKER.fullmatch(name) for name in names
+            ):
+                raise InputError(
+                    f"{self.path}: this run would save its state here, and the folder holds something else "
+                    f"(no {MARKER_FILE}); give another out="
+                )
+            try:
+                self._descriptor = lock_folder(self.path)
+            except BlockingIOError:
+                raise BusyError(
+                    f"{self.path}: another run saves its state here now; wait for it or give another out="
+                ) from None
+            stale = anew or DISCARDED_FILE in names
+            if stale:
+                self._discard()
+            with atomic_file(self.path / MARKER_FILE) as stream:
+                stream.write(b"The state of a run that is not finished, which removes this folder.\n")
+            if stale:
+                (self.path / DISCARDED_FILE).unlink(missing_ok=True)
+        except OSError as error:
+            self._release()
+            raise InputError(
+                f"{self.path}: cannot save the state of this run here: {error.strerror or error}; give another out="
+            ) from error
+        except BaseException:
+            self._release()
+            raise
+        self._taken = True
+
+    def _discard(self) -> None:
+        """Removes everything but a marker of another name: the next run removes what a kill leaves of the state, and
+        does not continue from a part of it."""
+        with suppress(FileNotFoundError):
+            os.replace(self.path / MARKER_FILE, self.path / DISCARDED_FILE)
+        for entry in self.path.iterdir():
+            if entry.name != DISCARDED_FILE:
+                if entry.is_dir() and not entry.is_symlink():
+                    shutil.rmtree(entry)
+                else:
+                    entry.unlink()
+
+    def _release(self) -> None:
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
+
+    def _has_state(self) -> bool:
+        """Whether something was computed; not where the folder cannot be read any more."""
+        with suppress(OSError):
+            return any(entry.name != MARKER_FILE for entry in self.path.iterdir())
+        return False
+
+    def __enter__(self) -> "WorkFolder":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None and self._taken:
+                self._discard()
+                (self.path / DISCARDED_FILE).unlink(missing_ok=True)
+                self.path.rmdir()
+            elif self._taken and not self._has_state():
+                with suppress(OSError):
+                    (self.path / MARKER_FILE).unlink()
+                    self.path.rmdir()
+            elif error is not None and self._taken and str(self.path) not in str(error):
+                # An error that is about the folder says itself what to do with it.
+                error.add_note(
+                    f"{self.path} holds what was computed; a run with the same out= and settings continues it"
+                )
+        except OSError as failure:
+            raise InputError(
+                f"{self.path}: the run is finished and its results are written, but the state that it saved here "
+                "cannot be "
+                f"removed: {failure.strerror or failure}; remove it"
+            ) from failure
+        finally:
+            self._release()
