@@ -1,152 +1,222 @@
 """Modules that `mutants.py` plants faults in, by group, and the test files that belong to them."""
 
 MODULES = (
-    *(
-        "geometry",
-        "fusion/lift",
-        "fusion/basis",
-        "fusion/visibility",
-        "infer/localize/boxes",
-        "infer/localize/relevancy",
-    ),
-    *("infer/views/utility", "train/losses", "train/samples", "models/grid/serialize", "models/grid/plan"),
-    *("data/seeding/depth", "data/readers/transforms_json", "reconstruct/prune"),
+    "geometry",
+    "fusion/lift",
+    "fusion/basis",
+    "infer/boxes",
+    "infer/relevancy",
+    "infer/views/choose",
+    "train/losses",
+    "train/samples",
+    "models/grid",
+    "models/plan",
+    "data/seeding/depth",
+    "data/readers/transforms_json",
+    "reconstruct/optimize",
 )
 FOLDERS = {"geometry": ("tests/test_geometry.py", "tests/render", "tests/data")}
-CHECKS = ("color_agreement", "depth_agreement", "epipolar", "pose_readings", "readings", "scene_check", "stray_views")
-REPAIRS = ("data/check/registration_fit", "data/check/repair_scene", "data/readers/write_transforms")
-LAYOUTS = ("registration", "replica", "scannetpp", "seven_scenes", "tum")
-FILES = ("layouts", "posed")
-PHOTOGRAPHS = ("feature_matches", "from_photographs", "triangulate", "view_pairs")
 SCENE_FILES = {
-    **{f"data/check/{name}": ("tests/data/check",) for name in CHECKS},
-    **dict.fromkeys(REPAIRS, ("tests/data/check", "tests/app/commands/test_inspect_scene.py")),
-    **{f"data/readers/{name}": ("tests/data/readers", "tests/data/test_layouts.py") for name in LAYOUTS},
-    **{
-        f"data/readers/{name}": (
-            "tests/data/readers",
-            "tests/data/test_layouts.py",
-            "tests/data/test_scenes.py",
-            "tests/data/test_transforms_json.py",
-            "tests/data/test_transforms_refusals.py",
-        )
-        for name in FILES
-    },
-    **{f"data/seeding/{name}": ("tests/data/seeding", "tests/data/test_triangulate.py") for name in PHOTOGRAPHS},
+    "app/output": ("tests/app/test_scene_queue.py",),
+    "data/check/agreement": ("tests/data/check", "tests/app/commands/test_inspect_scene.py"),
+    "data/check/epipolar": ("tests/data/check",),
+    "data/check/findings": ("tests/data/check",),
+    "data/check/repair_scene": ("tests/data/check", "tests/app/commands/test_inspect_scene.py"),
+    "data/check/scene_check": ("tests/data/check",),
+    "data/readers/depth_images": ("tests/data/readers", "tests/data/test_layouts.py"),
+    "data/readers/layouts": (
+        "tests/data/readers",
+        "tests/data/test_layouts.py",
+        "tests/data/test_scenes.py",
+        "tests/data/test_transforms_json.py",
+        "tests/data/test_transforms_refusals.py",
+    ),
+    "data/readers/posed": (
+        "tests/data/readers",
+        "tests/data/test_layouts.py",
+        "tests/data/test_scenes.py",
+        "tests/data/test_transforms_json.py",
+        "tests/data/test_transforms_refusals.py",
+    ),
+    "data/readers/rgbd": ("tests/data/readers", "tests/data/test_layouts.py"),
+    "data/readers/scannetpp": ("tests/data/readers", "tests/data/test_layouts.py"),
+    "data/readers/transforms_json": ("tests/data/check", "tests/app/commands/test_inspect_scene.py"),
+    "data/seeding/from_photographs": ("tests/data/seeding", "tests/data/test_triangulate.py"),
+    "data/seeding/matches": ("tests/data/seeding", "tests/data/test_triangulate.py"),
     "data/up": ("tests/data/test_up.py",),
-    **dict.fromkeys(("data/splat_frame", "fusion/fit"), ("tests/fusion/test_fit.py",)),
-    "train/presence": ("tests/train/test_presence.py",),
-    "app/runs/scene_queue": ("tests/app/test_scene_queue.py",),
+    "fusion/fit": ("tests/fusion/test_fit.py",),
+    "train/distributed": ("tests/train/test_presence.py",),
     "types/scene": ("tests/test_types.py",),
 }
 """Modules that read, check and seed scenes of others, drawn with `--scenes`, and the tests that belong to them."""
-SEGMENTER = ("tests/fusion/test_segmenter.py", "tests/fusion/test_segmenter_settings.py")
-TOWERS = ("build", "embedding_cache", "onnx_tower", "open_vocabulary", "towers", "transformers_tower")
-SEGMENTERS = ("build", "segmenter", "segmenter_classes", "segmenter_onnx", "segmenter_transformers")
 WORD_FILES = {
-    **{f"text/{name}": ("tests/text",) for name in TOWERS},
     "core/pretrained": (
         "tests/core/test_pretrained.py",
         "tests/text/test_transformers_tower.py",
         "tests/fusion/test_radio.py",
-        *SEGMENTER,
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
     ),
-    **{f"fusion/teachers/{name}": (*SEGMENTER, "tests/fusion/test_teachers.py") for name in SEGMENTERS},
-    "fusion/lift": ("tests/fusion/test_lift.py", *SEGMENTER, "tests/fusion/test_fuse.py"),
-    "fusion/interior_views": ("tests/fusion/test_interior_views.py",),
-    "fusion/orbit_views": ("tests/fusion/test_interior_views.py",),
-    "fusion/teacher_maps": ("tests/fusion/test_teacher_maps.py", *SEGMENTER),
-    "types/features": ("tests/test_types.py", *SEGMENTER),
-    "infer/localize/presence": ("tests/infer/test_presence.py",),
-    "infer/localize/threshold": ("tests/infer/test_presence.py", "tests/infer/test_relevancy.py"),
-    **{f"reconstruct/{name}": (f"tests/reconstruct/test_{name}.py",) for name in ("exposure_prediction", "budget")},
-    "reconstruct/expected_time": ("tests/reconstruct/test_expected_time.py",),
+    "fusion/cameras": ("tests/fusion/test_interior_views.py",),
+    "fusion/checkpoint": (
+        "tests/fusion/test_teacher_maps.py",
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+    ),
+    "fusion/lift": (
+        "tests/fusion/test_lift.py",
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+        "tests/fusion/test_fuse.py",
+    ),
+    "infer/presence": ("tests/infer/test_presence.py",),
+    "infer/relevancy": ("tests/infer/test_presence.py", "tests/infer/test_relevancy.py"),
+    "reconstruct/exposure": ("tests/reconstruct/test_exposure_prediction.py",),
+    "reconstruct/plan": ("tests/reconstruct/test_budget.py", "tests/reconstruct/test_expected_time.py"),
+    "teachers/build": (
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+        "tests/fusion/test_teachers.py",
+    ),
+    "teachers/segmenter": (
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+        "tests/fusion/test_teachers.py",
+    ),
+    "text/models": ("tests/text",),
+    "text/table": ("tests/text",),
+    "text/vocabulary": ("tests/text",),
+    "types/features": (
+        "tests/test_types.py",
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+    ),
 }
 """Modules of words, of cameras in bare splats and of times and exposures, drawn with `--words`, and their tests."""
-SCORE_TESTS = {
-    "evaluate/scores": {
-        "answers": ("answers", "lemmas", "sentences"),
-        "dense_captions": ("dense_captions",),
-        "instances": ("instance_masks", "instance_matches", "instances"),
-        "instance_orders": ("instance_masks", "instance_matches", "instances"),
-        "instance_refusals": ("instance_masks", "instance_matches", "instances"),
-        "java_metrics": ("java_metrics",),
-        "means": ("means",),
-        "ngrams": ("ngrams",),
-        "recognition": ("recognition",),
-        "referring": ("box_overlap", "referring", "referring_kinds"),
-        "semantics": ("semantics",),
-        "instance_laws": ("instance_masks", "instance_matches", "instances", "recognition", "semantics"),
-        "score_laws": ("answers", "box_overlap", "dense_captions", "lemmas", "ngrams", "sentences"),
-    },
-    "evaluate/files": {
-        "answer_predictions": ("answer_predictions",),
-        "caption_predictions": ("caption_predictions",),
-        "instance_files": ("class_files", "instances", "scan_truth", "scene_folders", "semantics"),
-        "json_files": ("recognition", "referring"),
-        "class_files": ("class_files", "scan_truth", "scene_folders", "semantics"),
-    },
-    "evaluate": {
-        "picture_truth": ("picture_truth",),
-        "picture_laws": ("picture_truth",),
-        "result_table": ("result_table",),
-        "scripted_answerer": ("answer_sheets", "scripted_answerer"),
-        "semantics_protocol": ("class_scores", "labeled_points"),
-        "answer_sheets": ("answer_sheets",),
-        "class_scores": ("class_scores",),
-        "labeled_points": ("labeled_points",),
-        "score_reports": ("score_boxes", "score_files", "score_report", "score_texts"),
-        "text_reports": ("score_texts",),
-    },
-    "data/truth": {
-        "class_table": ("class_table",),
-        "expressions": ("entries", "expression_boxes", "expressions"),
-        "label_sets": ("label_sets", "split_files", "write_truth"),
-        "made_expressions": ("made_expressions", "made_situations", "write_sqa3d"),
-        "made_questions": ("color_names", "english_nouns", "made_questions", "relations", "seen_objects"),
-        "mesh_labels": ("mesh_file", "scannet_labels", "scannetpp_labels", "segment_files"),
-        "nearest_vertices": ("nearest_vertices",),
-        "questions": ("questions",),
-        "scene_labels": ("mesh_instances", "mesh_raster", "scene_labels"),
-        "entries": ("entries",),
-        "expression_boxes": ("expression_boxes",),
-        "instance_maps": ("mesh_instances", "mesh_raster", "scene_labels"),
-        "mesh_limits": ("mesh_file", "scannet_labels", "scannetpp_labels", "segment_files"),
-        "relations": ("english_nouns", "relations"),
-        "seen_laws": (
-            *("color_names", "made_expressions", "made_questions", "made_situations", "questions", "seen_objects"),
-            "write_sqa3d",
-        ),
-    },
-    "infer/ask": {
-        "question_sets": ("predictions", "question_sets"),
-        "ask_predictions": ("predictions", "question_sets"),
-    },
-    "train/tuning": dict.fromkeys(("tuning", "tuning_laws"), ("network", "run", "samples", "towers", "vlm")),
-    "data": {"prompt_store": ("prompt_store",)},
+SCORE_FILES = {
+    "data/labels/classes": ("tests/data/truth/test_class_table.py", "tests/data/truth/test_label_sets.py"),
+    "data/labels/expressions": (
+        "tests/data/truth/test_expressions.py",
+        "tests/data/truth/test_expression_boxes.py",
+        "tests/data/truth/test_label_sets.py",
+    ),
+    "data/labels/files": (
+        "tests/evaluate/files/test_instance_files.py",
+        "tests/data/truth/test_number_files.py",
+        "tests/data/truth/test_expressions.py",
+        "tests/data/truth/test_entries.py",
+        "tests/data/truth/test_label_sets.py",
+    ),
+    "data/labels/made_expressions": ("tests/data/truth/test_made_expressions.py", "tests/data/truth/test_seen_laws.py"),
+    "data/labels/made_questions": (
+        "tests/data/truth/test_made_expressions.py",
+        "tests/data/truth/test_seen_laws.py",
+        "tests/data/truth/test_made_questions.py",
+    ),
+    "data/labels/mesh": (
+        "tests/data/truth/test_mesh_labels.py",
+        "tests/data/truth/test_mesh_limits.py",
+        "tests/data/truth/test_nearest_vertices.py",
+        "tests/data/truth/test_scene_labels.py",
+        "tests/data/truth/test_instance_maps.py",
+    ),
+    "data/labels/names": (
+        "tests/data/truth/test_made_questions.py",
+        "tests/data/truth/test_seen_laws.py",
+        "tests/data/truth/test_relations.py",
+    ),
+    "data/labels/questions": (
+        "tests/data/truth/test_made_expressions.py",
+        "tests/data/truth/test_seen_laws.py",
+        "tests/data/truth/test_questions.py",
+    ),
+    "data/labels/scans": (
+        "tests/data/truth/test_mesh_labels.py",
+        "tests/data/truth/test_mesh_limits.py",
+        "tests/data/truth/test_scene_labels.py",
+        "tests/data/truth/test_instance_maps.py",
+    ),
+    "data/labels/seen_objects": (
+        "tests/data/truth/test_made_questions.py",
+        "tests/data/truth/test_relations.py",
+        "tests/data/truth/test_seen_laws.py",
+    ),
+    "data/prompts": ("tests/data/test_prompt_store.py",),
+    "evaluate/benchmarks/answers": (
+        "tests/evaluate/scores/test_answers.py",
+        "tests/evaluate/scores/test_score_laws.py",
+        "tests/evaluate/files/test_answer_predictions.py",
+    ),
+    "evaluate/benchmarks/captions": (
+        "tests/evaluate/scores/test_dense_captions.py",
+        "tests/evaluate/scores/test_score_laws.py",
+        "tests/evaluate/files/test_caption_predictions.py",
+    ),
+    "evaluate/benchmarks/files": (
+        "tests/evaluate/files/test_instance_files.py",
+        "tests/evaluate/files/test_class_files.py",
+    ),
+    "evaluate/benchmarks/instances": (
+        "tests/evaluate/scores/test_instances.py",
+        "tests/evaluate/scores/test_instance_orders.py",
+        "tests/evaluate/scores/test_instance_refusals.py",
+        "tests/evaluate/scores/test_instance_laws.py",
+        "tests/evaluate/files/test_instance_files.py",
+        "tests/evaluate/files/test_class_files.py",
+    ),
+    "evaluate/benchmarks/recognition": (
+        "tests/evaluate/scores/test_recognition.py",
+        "tests/evaluate/scores/test_instance_laws.py",
+        "tests/evaluate/files/test_json_files.py",
+    ),
+    "evaluate/benchmarks/referring": (
+        "tests/app/commands/test_score_limits.py",
+        "tests/app/commands/test_score_scans.py",
+        "tests/evaluate/test_score_reports.py",
+        "tests/evaluate/scores/test_referring.py",
+        "tests/evaluate/scores/test_score_laws.py",
+        "tests/evaluate/files/test_json_files.py",
+    ),
+    "evaluate/benchmarks/score": (
+        "tests/app/commands/test_score_limits.py",
+        "tests/app/commands/test_score_scans.py",
+        "tests/evaluate/test_score_reports.py",
+        "tests/app/commands/test_score_texts.py",
+        "tests/evaluate/test_text_reports.py",
+    ),
+    "evaluate/benchmarks/semantics": (
+        "tests/evaluate/scores/test_semantics.py",
+        "tests/evaluate/scores/test_instance_laws.py",
+        "tests/evaluate/files/test_instance_files.py",
+        "tests/evaluate/files/test_class_files.py",
+    ),
+    "evaluate/benchmarks/text_metrics": (
+        "tests/evaluate/scores/test_answers.py",
+        "tests/evaluate/scores/test_score_laws.py",
+        "tests/evaluate/scores/test_java_metrics.py",
+        "tests/evaluate/scores/test_ngrams.py",
+    ),
+    "evaluate/sources": (
+        "tests/evaluate/test_semantics_protocol.py",
+        "tests/evaluate/test_class_scores.py",
+        "tests/evaluate/test_labeled_points.py",
+    ),
+    "evaluate/stand_in_vlm": (
+        "tests/evaluate/test_picture_truth.py",
+        "tests/evaluate/test_picture_laws.py",
+        "tests/evaluate/test_scripted_answerer.py",
+        "tests/evaluate/test_answer_sheets.py",
+    ),
+    "evaluate/tables": (
+        "tests/app/commands/test_score_limits.py",
+        "tests/app/commands/test_score_scans.py",
+        "tests/evaluate/test_score_reports.py",
+        "tests/evaluate/scores/test_means.py",
+        "tests/evaluate/test_result_table.py",
+    ),
+    "infer/ask/batch": ("tests/infer/test_question_sets.py", "tests/infer/test_ask_predictions.py"),
+    "infer/ask/questions": ("tests/infer/test_question_sets.py", "tests/infer/test_ask_predictions.py"),
+    "train/tune": ("tests/train/test_tuning.py", "tests/train/test_tuning_laws.py"),
+    "train/vlm": ("tests/train/test_tuning.py", "tests/train/test_tuning_laws.py"),
 }
-"""Modules of a folder by the test files that they have."""
-SCORE_COMMAND = tuple(f"tests/app/commands/test_{name}.py" for name in ("score_limits", "score_scans"))
-OTHER_SCORE_TESTS = {
-    **{f"evaluate/score_{name}": SCORE_COMMAND for name in ("boxes", "files", "report")},
-    "evaluate/score_texts": ("tests/app/commands/test_score_texts.py",),
-    **{
-        f"data/truth/{name}": ("tests/evaluate/files/test_instance_files.py", "tests/data/truth/test_number_files.py")
-        for name in ("checked_files", "number_files")
-    },
-}
-
-
-def _score_files() -> dict[str, tuple[str, ...]]:
-    files = dict(OTHER_SCORE_TESTS)
-    for folder, tests in SCORE_TESTS.items():
-        place = {"infer/ask": "infer", "train/tuning": "train"}.get(folder, folder)
-        for test, modules in tests.items():
-            for module in modules:
-                name = f"{folder}/{module}"
-                files[name] = (*files.get(name, ()), f"tests/{place}/test_{test}.py")
-    return files
-
-
-SCORE_FILES = _score_files()
 """Modules that read the truth of benchmarks, score, ask and tune, drawn with `--scores`, and the tests they have."""

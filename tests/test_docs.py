@@ -327,15 +327,6 @@ def test_every_document_is_in_the_navigation_of_the_site() -> None:
     assert {page.name for page in PAGES if page.parent.name == "docs"} <= listed
 
 
-def test_modules_in_the_table_of_moves_are_gone_from_their_old_places() -> None:
-    moves = re.findall(r"^\| `([\w.]+)` \| `(gsencoder[\w.]+)` \|$", text_of(ROOT / "CHANGELOG.md"), re.MULTILINE)
-    assert len(moves) > 100
-    for old, new in moves:
-        # `infer.views` was a module and is a folder.
-        assert not (PACKAGE / f"{old.replace('.', '/')}.py").exists()
-        assert is_module(new)
-
-
 def test_the_documents_are_looked_at() -> None:
     for contents, at_least in ((links_of, 20), (paths_of, 80), (dotted_names_of, 150), (command_lines_of, 30)):
         assert sum(len(contents(page)) for page in PAGES) >= at_least  # type: ignore[operator]
