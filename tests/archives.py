@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from safetensors import safe_open
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 
 from gsencoder.core.archive import RESERVED_KEYS, write_archive
 
@@ -26,11 +26,6 @@ def rewrite(
     """Writes an archive again with other arrays, or another header, and the checksums of these."""
     contents = load_file(path) if arrays is None else arrays
     write_archive(path, contents, header_of(path) if header is None else header)
-
-
-def as_version_1(path: Path) -> None:
-    """Writes an archive as the first version did, without checksums."""
-    save_file(load_file(path), path, {"gsencoder": json.dumps({**header_of(path), "version": 1})})
 
 
 def flip_bit(path: Path, bit: int) -> None:

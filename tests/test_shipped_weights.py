@@ -9,7 +9,6 @@ from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import plain
-from gsencoder.core.settings import with_added_options
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.boxes import aabb_iou
@@ -48,7 +47,7 @@ def test_they_are_small_and_say_how_they_were_made(name: str) -> None:
 def test_those_of_several_teachers_have_the_settings_of_their_experiment() -> None:
     _, _, made_by = load_weights("house")
     settings = plain(compose("train", TrainCommandConfig, ["MIX", "experiment=house", "out=house"]))
-    made_with = with_added_options(made_by["settings"])
+    made_with = made_by["settings"]
     for section in ("teachers", "text", "model", "sampling", "augment", "loss", "prepare", "splat"):
         assert made_with[section] == settings[section], section
     stored, expected = (

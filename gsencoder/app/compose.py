@@ -67,7 +67,6 @@ from gsencoder.app.options import (
 )
 from gsencoder.app.progress import one_line
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import check_removed_option, removed_option
 
 EXPERIMENT = "experiment"
 """The group whose members set options of several sections; they are merged last, after the command's own defaults and
@@ -366,8 +365,6 @@ def read_words(
             full = next((name for name, option in choices.options.items() if option.several == full), full)
         if full is None and os.path.lexists(word):
             paths.append(word)
-        elif full is None and (removed := removed_option(key, choices.options)) is not None:
-            check_removed_option(removed, value)
         elif full is None:
             raise InputError(_unknown(word, key, choices))
         elif full in texts:

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import REMOVED_OPTIONS, REMOVED_VALUES, check_removed_option, shown_value
+from gsencoder.core.settings import shown_value
 
 Kind = Literal["text", "list", "value"]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -283,8 +283,7 @@ def wrong_value(option: Option, value: Any) -> str:
     if isinstance(value, (list, tuple)) and option.kind == "list":
         value = join_list(map(str, value))
     allowed = [str(word) for word in _words(option.annotation)]
-    removed = REMOVED_VALUES.get(f"{option.key}={value}")
-    hint = f", which was removed: {removed}" if removed else near(str(value), allowed) if allowed else ""
+    hint = near(str(value), allowed) if allowed else ""
     is_list = any(get_origin(member) is tuple for member in union_members(option.annotation))
     if is_list and option.kind == "value" and isinstance(value, str) and "," in value:
         hint = f"; a list of numbers stands in brackets: {option.key}=[{value}]"
@@ -460,9 +459,6 @@ def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
     types = field_types(cls)
     values: dict[str, Any] = {}
     for name, value in data.items():
-        if name not in types and f"{prefix}{name}" in REMOVED_OPTIONS:
-            check_removed_option(f"{prefix}{name}", value)
-            continue
         if name not in types:
             options = [prefix + option for option in types]
             raise InputError(f"{prefix}{name}: no such option{near(f'{prefix}{name}', options)}")

@@ -1,8 +1,7 @@
 """Archives: safetensors files with a JSON header and checksums, written atomically and validated when they are read.
 
 Files are not trusted: an array of another size would otherwise be broadcast, or fail far from the cause. Against
-damage, files of version 2 carry checksums (`checksums.py`) of the header and the arrays, and each array is verified
-when it is read. Files of version 1 have none, and are read with a warning. `safetensors_bytes.py` has the bytes.
+damage, files carry checksums of the header and the arrays, and each array is verified when it is read.
 
 Checksums of array files: a CRC-32 for each block of each array, and one SHA-256 over the header and all of these.
 
@@ -21,7 +20,6 @@ import json
 import math
 import mmap
 import os
-import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -34,7 +32,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from jaxtyping import Float32, Int, Int64, UInt8
 
-from gsencoder.core.errors import InputError, SceneWarning, about, readable
+from gsencoder.core.errors import InputError, about, readable
 from gsencoder.core.files import atomic_file, check_foreign, open_foreign
 from gsencoder.core.pretrained import check_fetched
 
@@ -184,8 +182,6 @@ def safetensors_header(entries: Entries, metadata: Mapping[str, str]) -> bytes:
 
 
 VERSION = 2
-WITHOUT_CHECKSUMS = 1
-"""The version without checksums, except for packages, which had one over the file."""
 RESERVED_KEYS = ("version", "checksums", "digest")
 """Keys of the header that callers may not use: version, checksums of the blocks by array, and the digest of the rest.
 """
@@ -219,11 +215,6 @@ class Archive:
         self._file, self._header, self._names = file, header, frozenset(file.keys())
         self._stream, self._offsets = stream, array_offsets(stream)
         version = header.get("version")
-        self.checksums: Mapping[str, str] | None = None
-        if type(version) is int and version == WITHOUT_CHECKSUMS and not {"checksums", "digest"} & set(header):
-            if "sum" not in header:
-                warn_without_checksums(path)
-            return
         if version != VERSION:
             raise InputError(f"{path}: expected version {VERSION} of the format, got {str(version)[:20]}")
         covered = {key: value for key, value in header.items() if key != "digest"}
@@ -231,7 +222,7 @@ class Archive:
         good = isinstance(checksums, dict) and checksums.keys() == self._names
         if not good or header.get("digest") != file_digest(covered, {name: self._stored(name) for name in self._names}):
             raise InputError(f"{path}: {DAMAGED}: its header does not have the checksum that was written with it")
-        self.checksums = checksums
+        self.checksums: Mapping[str, str] = checksums
 
     def array(self, name: str, dtype: str, shape: tuple[int | str, ...]) -> np.ndarray:
         """Reads an array; a letter in its shape stands for the same size in all arrays of the file.
@@ -272,7 +263,7 @@ class Archive:
 
     def _read(self, name: str) -> np.ndarray:
         values = self._values(name)
-        if self.checksums is not None and damaged_blocks(bytes_of(values), self.checksums[name]):
+        if damaged_blocks(bytes_of(values), self.checksums[name]):
             raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
         return values
 
@@ -313,19 +304,13 @@ class Archive:
         return value
 
     def verify(self) -> None:
-        """Verifies the checksums of all arrays, or of the file where its version is 1.
+        """Verifies the checksums of all arrays.
 
         Raises:
-            InputError: the file is damaged, or has no checksums.
+            InputError: the file is damaged.
         """
-        if self.checksums is not None:
-            for name in sorted(self._names):
-                self._read(name)
-            return
-        arrays = {name: self._values(name) for name in self._names}
-        header = {key: value for key, value in self._header.items() if key not in ("version", "sum")}
-        if self.value("sum", str) != _sum_of_version_1(arrays, header):
-            raise InputError(f"{self.path}: {DAMAGED}: it does not have the checksum that was written with it")
+        for name in sorted(self._names):
+            self._read(name)
 
     def section(self, prefix: str, header: Mapping[str, Any]) -> "ArchiveSection":
         """A part of the archive: the arrays whose names begin with `prefix`, with a header of its own."""
@@ -352,31 +337,6 @@ class ArchiveSection(Archive):
 
 def _listed(shape: tuple[int | str, ...]) -> str:
     return ", ".join(map(str, shape))
-
-
-def warn_without_checksums(path: Path) -> None:
-    """Warns once for each folder, since a run may read hundreds of such files from it."""
-    if path.parent not in _WARNED:
-        _WARNED.add(path.parent)
-        warnings.warn(
-            f"{path}: was written by an earlier version, without checksums, so damage to it or to files beside it "
-            "would not be noticed; write it again to add them",
-            SceneWarning,
-            stacklevel=5,
-        )
-
-
-_WARNED: set[Path] = set()
-
-
-def _sum_of_version_1(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> str:
-    """sha256 over the header and over names, types, shapes and bytes of all arrays."""
-    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
-    for name in sorted(arrays):
-        array = _contiguous(arrays[name])
-        digest.update(f"{name} {array.dtype.name}{array.shape}".encode())
-        digest.update(array.data)
-    return digest.hexdigest()
 
 
 def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
@@ -456,7 +416,7 @@ def verify_archive(path: Path) -> None:
     """Reads an archive and verifies its checksums.
 
     Raises:
-        InputError: missing, damaged, of another version, or without checksums.
+        InputError: missing, damaged, or of another version.
     """
     with open_archive(path) as file:
         file.verify()
@@ -464,7 +424,7 @@ def verify_archive(path: Path) -> None:
 
 class MappedArrays:
     """Read-only arrays of a file. A block is verified against its checksum when it is first used, and not again; values
-    are not validated otherwise. Files of version 1 have no checksums, and are read as they are.
+    are not validated otherwise.
 
     The system ends a process that reads a page of the map beyond the end of the file (SIGBUS). So the size of the file
     is compared whenever an array is asked for, which leaves the moment in which its values are used.
@@ -498,12 +458,10 @@ class MappedArrays:
             first, last = offsets[name]
             self._bytes[name] = raw[first:last]
             self._arrays[name] = self._bytes[name].view(dtype).reshape(shapes[name])
-        self._unchecked: dict[str, np.ndarray] = {}
-        if self._checksums is not None:
-            blocks = {name: -(-len(data) // BLOCK_BYTES) for name, data in self._bytes.items()}
-            self._unchecked = {name: np.ones(count, bool) for name, count in blocks.items() if count}
-            if earlier is not None and earlier._stamp == self._stamp:
-                self._unchecked = earlier._unchecked
+        blocks = {name: -(-len(data) // BLOCK_BYTES) for name, data in self._bytes.items()}
+        self._unchecked = {name: np.ones(count, bool) for name, count in blocks.items() if count}
+        if earlier is not None and earlier._stamp == self._stamp:
+            self._unchecked = earlier._unchecked
 
     def close(self) -> None:
         """Closes the file; only the record of verified blocks remains."""
@@ -570,7 +528,6 @@ class MappedArrays:
             )
 
     def _check(self, name: str, blocks: Int64[np.ndarray, " n"]) -> None:
-        assert self._checksums is not None
         if damaged_blocks(self._bytes[name], self._checksums[name], blocks):
             raise InputError(f"{self.path}: {DAMAGED}: {name} does not have the checksum that was written with it")
         self._unchecked[name][blocks] = False

@@ -95,9 +95,7 @@ class OutputSpace:
 def output_space_parts(outputs: OutputSpace) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and header values that represent an output space in a file."""
     arrays, header = space_parts(outputs.space, outputs.mean, outputs.basis)
-    # Left out where true, so that files of such spaces are those of versions that knew no others.
-    switches = {name: False for name in ("centered", "scaled") if not getattr(outputs, name)}
-    return arrays, {**header, "scale": outputs.scale, **switches}
+    return arrays, {**header, "scale": outputs.scale, "centered": outputs.centered, "scaled": outputs.scaled}
 
 
 def read_output_space(file: Archive) -> OutputSpace:
@@ -107,7 +105,7 @@ def read_output_space(file: Archive) -> OutputSpace:
         InputError: the file is damaged, or was not written by gsencoder.
     """
     space, mean, basis = read_space(file)
-    switches = {name: bool(file.value(name, bool)) for name in ("centered", "scaled") if name in file}
+    switches = {name: bool(file.value(name, bool)) for name in ("centered", "scaled")}
     return OutputSpace(space=space, mean=mean, scale=file.value("scale", float, int), basis=basis, **switches)
 
 
@@ -259,10 +257,7 @@ def read_output_spaces(file: Archive) -> OutputSpaces:
         InputError: the file is damaged, or was not written by gsencoder.
     """
     if "outputs" not in file:
-        # Files of earlier versions, which had one teacher, do not name it otherwise.
-        outputs = read_output_space(file)
-        name = file.value("teacher", str) if "teacher" in file else outputs.space.teacher or outputs.space.name
-        return OutputSpaces(by_teacher={name: outputs})
+        return OutputSpaces(by_teacher={file.value("teacher", str): read_output_space(file)})
     by_teacher: dict[str, OutputSpace] = {}
     for number, header in enumerate(file.value("outputs", list)):
         if not isinstance(header, dict):

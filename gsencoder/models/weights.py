@@ -144,8 +144,6 @@ def load_weights(source: str | Path, option: str = "weights") -> tuple[GaussianE
 def _read_config(values: dict[str, Any]) -> EncoderConfig:
     import dacite
 
-    # Files of versions without projectors do not state it, and have one linear layer.
-    values = {"projector": 0, **values}
     try:
         return dacite.from_dict(EncoderConfig, values, dacite.Config(strict=True, cast=[tuple]))
     except (dacite.DaciteError, TypeError) as error:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
-from gsencoder.core.settings import PROMISES, first_difference, without_removed_options
+from gsencoder.core.settings import first_difference
 from gsencoder.reconstruct.optimize import Anchor
 from gsencoder.reconstruct.parameters import RowAdam, shapes_of
 
@@ -110,23 +110,7 @@ def load_state(
         InputError: damaged, or of a run with other settings; the first that differs is named.
     """
     with advised(f"give resume=false to begin anew, or remove {path}"), open_archive(path) as file:
-        earlier = without_removed_options(file.value("settings", dict))
-        if "budget" not in earlier:
-            # Runs of earlier versions had none, and took the steps of their settings.
-            settings = {name: value for name, value in settings.items() if name != "budget"}
-        elif isinstance(earlier["budget"], dict):
-            # Others had minutes alone.
-            earlier["budget"] = {**dict.fromkeys(PROMISES), **earlier["budget"]}
-        if IMAGE_SCALE not in earlier:
-            # They did not say at which size they looked at photographs, which shows in the digest of these.
-            settings = {name: value for name, value in settings.items() if name != IMAGE_SCALE}
-        # Runs of earlier versions fitted photographs as they were.
-        if "optimize" in earlier:
-            earlier["optimize"] = {"exposure": False, "earlier": [], **earlier["optimize"]}
-        # What they would have taken for empty shows in the digest of the photographs.
-        for section, option in (("optimize", "empty_weight"), ("data", "background")):
-            if section in earlier and option in settings.get(section, {}):
-                earlier[section] = {option: settings[section][option], **earlier[section]}
+        earlier = file.value("settings", dict)
         if earlier != settings:
             raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")
         step, adam_steps = file.value("step", int), file.value("adam_steps", int)

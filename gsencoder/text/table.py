@@ -8,7 +8,6 @@ with checksums. It holds nothing that cannot be computed again, so a damaged one
 
 import difflib
 import hashlib
-import json
 import os
 import re
 import unicodedata
@@ -21,7 +20,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.core.archive import open_archive, read_npz, warn_without_checksums, write_archive
+from gsencoder.core.archive import open_archive, read_npz, write_archive
 from gsencoder.core.errors import InputError, SceneWarning, about, readable
 from gsencoder.core.files import open_foreign
 from gsencoder.types import FeatureSpace
@@ -187,7 +186,6 @@ def unit(vectors: np.ndarray) -> Float32[np.ndarray, "Q D"]:
 
 NORM_TOLERANCE = 1e-2
 """Largest difference from 1 of the norm of a stored embedding; float16 rounding is about 1e-3."""
-FORMAT_1 = "gsencoder text table 1"
 MAX_SHOWN = 80
 """Number of characters of a word that an error repeats."""
 MAX_NAME = 1000
@@ -372,7 +370,7 @@ def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
         zipped = stream.read(2) == b"PK"
     if zipped or file.suffix == ".npz":
         return _read_npz(file, encoder)
-    return _read_version_1(file) if _is_version_1(file) else _read_archive(file)
+    return _read_archive(file)
 
 
 def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float32", "float16"] = "float32") -> None:
@@ -407,12 +405,10 @@ def tower_from_json(values: Any) -> TowerRecord:
     Raises:
         InputError: they hold none.
     """
-    if not isinstance(values, dict) or {"lower", *values} != {item.name for item in fields(TowerRecord)}:
+    if not isinstance(values, dict) or values.keys() != {item.name for item in fields(TowerRecord)}:
         raise InputError(f"expected the record of a text tower, got {str(values)[:60]!r}")
     if not isinstance(values["templates"], list):
         raise InputError("expected a list of templates in the record of a text tower")
-    # Records of earlier versions do not state it.
-    values = {"lower": False, **values}
     if not isinstance(values["lower"], bool):
         raise InputError("expected true or false as lower in the record of a text tower")
     return TowerRecord(**{**values, "templates": tuple(values["templates"])})
@@ -441,31 +437,6 @@ def _read_archive(file: Path) -> TextTable:
         tower = tower_from_json(archive.value("tower", dict)) if "tower" in archive else None
         trained = trained_from_json(archive.value("trained", list)) if "trained" in archive else None
         return _table(file, archive.value("names", list), archive.value("space", dict), arrays, tower, trained)
-
-
-def _is_version_1(file: Path) -> bool:
-    """Whether a safetensors file is a text table of the first version, which has another format and no checksums."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(file, framework="np") as stored:
-            return (stored.metadata() or {}).get("format") == FORMAT_1
-    except (OSError, SafetensorError, ValueError) as error:
-        raise InputError(f"{file}: cannot be read as a text table: {_one_line(error)}") from error
-
-
-def _read_version_1(file: Path) -> TextTable:
-    from safetensors import SafetensorError, safe_open
-
-    warn_without_checksums(file)
-    try:
-        with safe_open(file, framework="np") as stored:
-            arrays = {name: stored.get_tensor(name) for name in ("embeddings", "mean")}
-            header = json.loads(stored.metadata()["table"])
-        names, space = header["names"], header["space"]
-    except (OSError, SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise InputError(f"{file}: cannot be read as a text table: {_one_line(error)}") from error
-    return _table(file, names, space, arrays)
 
 
 def _table(

@@ -37,7 +37,7 @@ from gsencoder.core.process import (
     threads_of_torch,
     untracked,
 )
-from gsencoder.core.settings import first_difference, with_added_options
+from gsencoder.core.settings import first_difference
 from gsencoder.train import distributed
 from gsencoder.train.distributed import (
     check_agreement,
@@ -197,7 +197,7 @@ def load_checkpoint(
             that differs is named.
     """
     with advised(_begin_anew(path)), open_archive(path) as file:
-        stored_settings = with_added_options(file.value("settings", dict))
+        stored_settings = file.value("settings", dict)
         if stored_settings != settings:
             raise InputError(f"{path}: {_describe_difference(stored_settings, settings)}")
         parameters = {

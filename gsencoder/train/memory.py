@@ -35,7 +35,7 @@ from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files import plain, read_foreign, write_json
 from gsencoder.core.process import ProcessRank, Track, untracked
-from gsencoder.core.settings import first_difference, with_added_options
+from gsencoder.core.settings import first_difference
 from gsencoder.data.scene_arrays import bank_parts, read_bank
 from gsencoder.data.splats.files import fingerprint
 from gsencoder.fusion.basis import to_coordinates
@@ -162,7 +162,7 @@ def open_memory_scene(folder: Path, settings: Mapping[str, Any] | None = None) -
         InputError: missing, damaged, or prepared with other settings.
     """
     with _advice(folder), open_archive(folder / BANK_FILE) as file:
-        stored = with_added_options(file.value("made_with", dict))
+        stored = file.value("made_with", dict)
         if settings is not None and stored != settings:
             raise InputError(f"was prepared with {first_difference(stored, dict(settings))}")
         outputs = read_output_space(file)
@@ -192,7 +192,7 @@ def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
             write_json(path, settings)
             return
         try:
-            stored = with_added_options(json.loads(read_foreign(path)))
+            stored = json.loads(read_foreign(path))
         except (OSError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: cannot be read ({type(error).__name__})") from error
         if stored != settings:

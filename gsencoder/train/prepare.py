@@ -25,7 +25,7 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, advised, listed, readable
 from gsencoder.core.files import atomic_file, locked, read_foreign, read_foreign_text
 from gsencoder.core.process import ProcessRank, Track
-from gsencoder.core.settings import first_difference, with_added_options
+from gsencoder.core.settings import first_difference
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.checkpoint import CachedTeacher, upright
 from gsencoder.fusion.fuse import FuseConfig, fuse
@@ -322,7 +322,6 @@ class PreparedDataset:
                 f"{folder}: holds something else than prepared scenes (no {DATASET_SETTINGS_FILE}); "
                 "give another folder as prepared="
             )
-        stored = None if stored is None else with_added_options(stored)
         expected: dict[str, Any] = stored if settings is None else json.loads(json.dumps(settings, default=str))
         self.settings = expected
         if stored is not None and stored != expected:

@@ -322,14 +322,9 @@ def resume_settings(
     heads = f"{','.join(config.heads)} ({digest})" if config.heads else ""
     spaces = {name: dataset.fingerprint() for name, dataset in datasets.items()}
     prepared = {name: dataset.settings for name, dataset in datasets.items()}
-    if len(datasets) == 1:
-        # The form of runs of earlier versions, which had one teacher and can be resumed.
-        (space,), (of_preparation,) = spaces.values(), prepared.values()
-        of_teachers: dict[str, Any] = {"space": space, "prepared": of_preparation}
-    else:
-        # The order, which a mapping does not state when it is compared, is that of the columns.
-        scenes = {name: [each.name for each in dataset.scenes(training)] for name, dataset in datasets.items()}
-        of_teachers = {"teachers": list(datasets), "spaces": spaces, "prepared": prepared, "scenes": scenes}
+    # The order, which a mapping does not state when it is compared, is that of the columns.
+    scenes = {name: [each.name for each in dataset.scenes(training)] for name, dataset in datasets.items()}
+    of_teachers = {"teachers": list(datasets), "spaces": spaces, "prepared": prepared, "scenes": scenes}
     return {
         **shared,
         **of_teachers,

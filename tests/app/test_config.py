@@ -9,7 +9,6 @@ import pytest
 from toy_settings import FusionConfig, LabelsConfig, OnnxConfig, ToyConfig, toy
 
 from gsencoder.app import main as cli
-from gsencoder.app.commands.localize import LocalizeCommandConfig
 from gsencoder.app.compose import compose
 from gsencoder.app.options import HIDDEN, CommonConfig, check_required, describe, settings, typed
 from gsencoder.core.errors import InputError
@@ -70,20 +69,6 @@ def test_a_wrong_setting_is_told_in_one_line_with_its_full_key(conf: Path, word:
         toy(conf, word)
     assert problem in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_a_removed_option_is_accepted_with_its_former_default_alone() -> None:
-    words = ["features", "query=mug"]
-    same = compose("localize", LocalizeCommandConfig, words)
-    assert compose("localize", LocalizeCommandConfig, [*words, "localize.margin=0"]) == same
-    assert compose("localize", LocalizeCommandConfig, [*words, "margin=0.0"]) == same
-    assert typed(LocalizeCommandConfig, {"paths": ["features"], "query": "mug", "localize": {"margin": 0}}) == same
-    for refused in (
-        lambda: compose("localize", LocalizeCommandConfig, [*words, "margin=0.1"]),
-        lambda: typed(LocalizeCommandConfig, {"paths": ["features"], "query": "mug", "localize": {"margin": 0.1}}),
-    ):
-        with pytest.raises(InputError, match=r"localize\.margin: this option was removed"):
-            refused()
 
 
 def test_a_setting_given_twice_is_an_error_also_under_its_short_name(conf: Path) -> None:

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from archives import as_version_1, flip_bit, header_of, rewrite
+from archives import flip_bit, header_of, rewrite
 from safetensors import safe_open
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import save_file
 
 from gsencoder.core.archive import BLOCK_BYTES, MappedArrays, archive_bytes, open_archive, shape_only, write_archive
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError
 
 ARRAYS = {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.arange(3, dtype=np.float32)}
 
@@ -97,19 +97,10 @@ def test_a_file_whose_checksums_are_gone_is_refused(tmp_path: Path) -> None:
         save_file(ARRAYS, path, {"gsencoder": json.dumps({k: v for k, v in header.items() if k != missing})})
         with pytest.raises(InputError, match="its header does not have the checksum"):
             taken(path)
-    # Nor does it help to pass for the first version.
+    # Nor does another version help.
     save_file(ARRAYS, path, {"gsencoder": json.dumps({**header, "version": 1})})
     with pytest.raises(InputError, match="expected version 2 of the format, got 1"):
         taken(path)
-
-
-def test_a_file_of_the_first_version_is_read_with_one_warning_a_folder(tmp_path: Path) -> None:
-    for name in ("x", "y"):
-        write_archive(tmp_path / name, ARRAYS, {"name": "n"})
-        as_version_1(tmp_path / name)
-    with pytest.warns(SceneWarning, match="without checksums"):
-        assert taken(tmp_path / "x")[2] == "n"
-    assert taken(tmp_path / "y")[2] == "n"
 
 
 @pytest.mark.parametrize(
@@ -209,13 +200,6 @@ def test_a_block_is_checked_once(mapped: Path, monkeypatch: pytest.MonkeyPatch) 
     arrays.array("wide")
     arrays.row_range("wide", 0, 4)
     assert looked_at == [0, 3, 2, 1]
-
-
-def test_mapped_files_of_the_first_version_are_read(mapped: Path) -> None:
-    save_file(load_file(mapped), mapped, {"gsencoder": json.dumps({"version": 1})})
-    with pytest.warns(SceneWarning, match="without checksums"):
-        arrays = open_mapped(mapped)
-    np.testing.assert_array_equal(arrays.rows("odd", np.array([5])), SIZES["odd"][5:6])
 
 
 def test_what_was_checked_is_remembered_until_the_file_is_written_again(

@@ -11,14 +11,13 @@ from typing import Any
 import gsply
 import numpy as np
 import pytest
-from archives import header_of
 from feature_fields import make_features
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 from splats import front_camera, random_gaussians
 
 from gsencoder.app import main as cli
 from gsencoder.core.archive import open_archive, write_archive
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, open_package, save_package
@@ -127,22 +126,6 @@ def test_a_package_of_another_version_is_refused(package: Path) -> None:
             open_package(file)
     write_archive(file, arrays, header)
     open_package(file)
-
-
-def test_a_package_of_the_first_version_is_held_against_its_one_sum(package: Path) -> None:
-    from gsencoder.core.archive import _sum_of_version_1
-
-    file = package / PACKAGE_FILE
-    arrays, header = load_file(file), header_of(file)
-    whole = {"gsencoder": json.dumps({**header, "version": 1, "sum": _sum_of_version_1(arrays, header)})}
-    save_file(arrays, file, whole)
-    load_features(package)
-    save_file({**arrays, "mean": arrays["mean"] + 1}, file, whole)
-    with pytest.raises(InputError, match="does not have the checksum"):
-        load_features(package)
-    save_file(arrays, file, {"gsencoder": json.dumps({**header, "version": 1})})
-    with pytest.warns(SceneWarning, match="without checksums"), pytest.raises(InputError, match="expected sum"):
-        load_features(package)
 
 
 HEADER = ("name", "metres_per_unit", "up", "views", "space", "energy_kept", "form", "fingerprint", "total")

@@ -39,10 +39,6 @@ def test_the_command_tells_what_it_compared(folder: Path) -> None:
         (["out=encoder.onnx", "tolerance=0"], "tolerance: expected a share between 0 and 1"),
         (["out=encoder.onnx", "cosine=2"], "cosine: expected -1 to 1"),
         (["out=encoder.onnx", "precision=int4"], "precision"),
-        (
-            ["out=encoder.onnx", "precision=int8_static"],
-            "was removed: it was slower and less accurate than int8_dynamic",
-        ),
         (["out=encoder.onnx", "weights=nothing"], "weights: no file at nothing"),
         (["out=taken.onnx"], "taken.onnx: exists; give another out= or overwrite=true"),
         (["out=encoder.onnx", "none.ply"], "none.ply"),

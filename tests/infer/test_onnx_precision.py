@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,7 @@ from gsencoder.infer.onnx.export import (
     lower,
     random_cloud,
 )
-from gsencoder.infer.onnx.runtime import OnnxEncoder, from_metadata, to_metadata
+from gsencoder.infer.onnx.runtime import OnnxEncoder
 from gsencoder.models.neighbors import convolve_reference, neighbor_table
 
 pytestmark = pytest.mark.slow
@@ -162,11 +161,6 @@ def test_a_linear_layer_of_integers_is_that_of_what_they_stand_for() -> None:
     }
     expected = 0.5 * (x.astype(float) - 7) @ (weight * scale.astype(float)) + bias
     np.testing.assert_allclose(operator("linear_int8", values), expected, rtol=1e-5, atol=1e-3)
-
-
-def test_a_static_file_of_an_earlier_version_is_still_read(build: Callable[[Any], bytes]) -> None:
-    header = OnnxEncoder(build("int8_dynamic"), device="cpu").header
-    assert from_metadata(to_metadata(replace(header, precision="int8_static"))).precision == "int8_static"
 
 
 @pytest.mark.parametrize("most", [1, 63, 127])

@@ -1,7 +1,6 @@
 """The closed vocabulary: what counts as the same word, and files that are whole, cut or hostile."""
 
 import io
-import json
 import tracemalloc
 import zipfile
 from dataclasses import replace
@@ -12,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError
 from gsencoder.text.table import TextTable, load_text_table, make_text_table, save_text_table
 
 NAMES = (
@@ -251,24 +250,6 @@ def test_a_safetensors_file_of_something_else_is_refused(tmp_path: Path) -> None
     save_file({"embeddings": np.eye(2, dtype=np.float32)}, path)
     with pytest.raises(InputError, match="expected version 2 of the format, got None"):
         load_text_table(path)
-    header = json.dumps({"names": ["x"], "space": {"name": "s", "channels": "many"}})
-    metadata = {"format": "gsencoder text table 1", "table": header}
-    save_file({"embeddings": np.eye(2, dtype=np.float32), "mean": np.zeros(2, np.float32)}, path, metadata)
-    with pytest.warns(SceneWarning), pytest.raises(InputError, match="names and a space of text"):
-        load_text_table(path)
-
-
-def test_a_table_of_the_first_version_is_read_with_a_warning(tmp_path: Path) -> None:
-    from safetensors.numpy import save_file
-
-    path = tmp_path / "old.safetensors"
-    header = json.dumps({"names": ["x", "y"], "space": {"name": "s", "channels": 2, "text_encoder": "s"}})
-    arrays = {"embeddings": np.eye(2, dtype=np.float16), "mean": np.full(2, 0.5, np.float32)}
-    save_file(arrays, path, {"format": "gsencoder text table 1", "table": header})
-    with pytest.warns(SceneWarning, match="without checksums"):
-        table = load_text_table(path)
-    assert table.names == ("x", "y")
-    np.testing.assert_array_equal(table.embeddings, np.eye(2))
 
 
 def test_a_missing_file_is_an_error_that_names_it(tmp_path: Path) -> None:
@@ -296,8 +277,8 @@ def test_a_header_nested_without_end_is_refused(tmp_path: Path) -> None:
     from safetensors.numpy import save_file
 
     arrays = {"embeddings": np.eye(2, dtype=np.float32), "mean": np.zeros(2, np.float32)}
-    save_file(arrays, tmp_path / "t.safetensors", {"format": "gsencoder text table 1", "table": "[" * 100_000})
-    with pytest.warns(SceneWarning), pytest.raises(InputError, match="cannot be read as a text table"):
+    save_file(arrays, tmp_path / "t.safetensors", {"gsencoder": "[" * 100_000})
+    with pytest.raises(InputError, match="damaged or no safetensors file"):
         load_text_table(tmp_path / "t.safetensors")
 
 

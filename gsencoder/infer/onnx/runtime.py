@@ -62,7 +62,7 @@ class OnnxHeader:
         patch: most tokens in a patch.
         outputs: what the features mean; the graph has restored them already.
         tables: what turns words into their spaces, by teacher, where there are such tables.
-        precision: what the graph computes in; files of earlier versions may say "int8_static".
+        precision: what the graph computes in.
         made_by: settings and results of training and export, as JSON values.
     """
 
@@ -83,9 +83,9 @@ class OnnxHeader:
                 f"expected a positive voxel, 1 to {ALIGN.bit_length()} levels and patches of 1 or more, got "
                 f"{self.voxel}, {self.levels}, {self.patch}"
             )
-        readable = (*get_args(Stored), "int8_static")
-        if self.precision not in readable:
-            raise InputError(f"expected a precision among {', '.join(readable)}, got {str(self.precision)[:40]}")
+        if self.precision not in get_args(Stored):
+            listed = ", ".join(get_args(Stored))
+            raise InputError(f"expected a precision among {listed}, got {str(self.precision)[:40]}")
         if not self.orders or not set(self.orders) <= possible_orders:
             raise InputError(f"expected orders among {', '.join(sorted(possible_orders))}, got {str(self.orders)[:80]}")
 
@@ -165,8 +165,7 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
             forms = {name: values["arrays"][prefix + name] for name in ARRAYS if prefix + name in values["arrays"]}
             arrays = {name: _array(entries, prefix + name, **form) for name, form in forms.items()}
             outputs = _output_space(part, arrays)
-            # Files of earlier versions do not name their teacher otherwise.
-            teacher = str(part.get("teacher") or outputs.space.teacher or outputs.space.name)
+            teacher = str(part["teacher"])
             if teacher in by_teacher:
                 raise InputError(f"expected output spaces of distinct teachers, got two of {teacher[:60]!r}")
             by_teacher[teacher] = outputs
@@ -195,7 +194,7 @@ def _output_space(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
     if "components" in arrays:
         components, energy_kept = arrays["components"], values["energy_kept"]
         basis = FeatureBasis(mean=mean, components=components, energy_kept=energy_kept, space=space)
-    switches = {name: values[name] for name in ("centered", "scaled") if name in values}
+    switches = {name: values[name] for name in ("centered", "scaled")}
     return OutputSpace(space=space, mean=mean, scale=float(values["scale"]), basis=basis, **switches)
 
 
