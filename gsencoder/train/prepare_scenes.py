@@ -17,7 +17,6 @@ from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
-from gsencoder.core.settings import TRAINED
 from gsencoder.data.labels.files import read_split
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.points import unit_of
@@ -38,6 +37,9 @@ from gsencoder.train.distributed import check_agreement, fail_together
 from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PrepareConfig, PreparedDataset
 from gsencoder.train.space import fit_space
 from gsencoder.types import Scene
+
+TRAINED = "trained on"
+"""What the settings of prepared scenes say of each scene that defines their space."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
