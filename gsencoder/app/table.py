@@ -13,7 +13,7 @@ class Command:
     """A command of the command line.
 
     Attributes:
-        name: as the user types it; `gsencoder.app.table.NAME` is its module.
+        name: as the user types it; `gsencoder.app.commands.NAME` is its module.
         config: the name of the settings class in that module.
         help: its purpose, one line.
         several: whether several processes of one launcher (torchrun, SLURM) can run it together.
