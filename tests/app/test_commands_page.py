@@ -32,7 +32,7 @@ OPTION, MODULE, LINE = blocks("python")
 @pytest.fixture
 def opaque(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
     """A folder with a splat; the page's command is registered."""
-    name = "gsencoder.app.table.opaque"
+    name = "gsencoder.app.commands.opaque"
     module = ModuleType(name)
     monkeypatch.setitem(sys.modules, name, module)
     exec(compile(MODULE, name, "exec"), module.__dict__)

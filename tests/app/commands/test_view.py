@@ -123,7 +123,7 @@ from gsencoder.infer.viewer import bundle
 from gsencoder.types import Scene
 bundle.STATIC = Path(sys.argv[1])
 from gsencoder.app import cli
-from gsencoder.app.table import view
+from gsencoder.app.commands import view
 sys.exit(cli.main(["view", sys.argv[2], "open=false"]))
 """
 
