@@ -16,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bars
 from rich.segment import Segment
 
+from gsencoder.core.errors import printable
 from gsencoder.core.process import raise_dropped_stop
 
 T = TypeVar("T")
