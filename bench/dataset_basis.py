@@ -17,7 +17,7 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.compose import compose
-from gsencoder.core.process import threads_of_torch
+from gsencoder.core.threads import threads_of_torch
 from gsencoder.train.distributed import join_processes, values_of_all
 from gsencoder.train.prepare import SPACE_FILE, PreparedDataset
 from gsencoder.train.prepare_scenes import SceneReader

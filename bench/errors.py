@@ -7,8 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from subprocess import CalledProcessError
 
-from gsencoder.app.progress import one_line
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, one_line
 
 
 @contextmanager

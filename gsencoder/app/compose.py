@@ -65,8 +65,7 @@ from gsencoder.app.options import (
     without_value,
     wrong_value,
 )
-from gsencoder.app.progress import one_line
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, one_line
 
 EXPERIMENT = "experiment"
 """The group whose members set options of several sections; they are merged last, after the command's own defaults and

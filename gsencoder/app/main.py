@@ -21,9 +21,8 @@ from typing import Any
 
 import gsencoder
 from gsencoder.app.options import near, without_value
-from gsencoder.app.progress import clipped, one_line, printable
 from gsencoder.app.table import COMMANDS, Command
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning, clipped, one_line, printable
 from gsencoder.core.process import Stopped, refuse_several, stop_of, stopping_signals
 
 FLAGS = {

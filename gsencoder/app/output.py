@@ -17,9 +17,8 @@ from typing import Any
 
 from rich.console import Console
 
-from gsencoder.app.progress import one_line
 from gsencoder.app.summary import Summary
-from gsencoder.core.errors import BusyError, InputError, listed
+from gsencoder.core.errors import BusyError, InputError, listed, one_line
 from gsencoder.core.files import (
     SUMMARY_NAME,
     atomic_file,

@@ -15,8 +15,9 @@ import gsencoder
 from gsencoder.app.progress import console
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.files import SUMMARY_NAME, plain, sha256_of, write_json
-from gsencoder.core.process import available_cores, raise_dropped_stop
+from gsencoder.core.process import raise_dropped_stop
 from gsencoder.core.settings import Budget, describe_values, shown_value
+from gsencoder.core.threads import available_cores
 from gsencoder.data.up import with_up
 from gsencoder.types import FeatureBasis, Scene
 

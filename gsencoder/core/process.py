@@ -1,4 +1,4 @@
-"""The process of a command: signals, rank, progress, clock, memory, threads and the names of devices.
+"""The process of a command: signals, rank, progress, clock, memory and the names of devices.
 
 The rank of this process among those that one launcher started.
 
@@ -10,18 +10,10 @@ Heap settings of a CPU process that runs networks: freed blocks are reused inste
 glibc returns every block above 32 MB to the system when it is freed, and threads other than the first get heaps that
 cannot grow beyond 64 MB. Each layer's activations are then new pages, which the system must clear: that costs more than
 the arithmetic (`bench/cpu.py`).
-
-CPU kernels: numba functions without the GIL, called from a pool of Python threads.
-
-numba's parallel loops are not used, since an OpenMP pool aborts a process that was forked after its first use, as data
-loaders do. Work is cut into a fixed number of pieces, so that results do not depend on the number of threads.
 """
 
-import contextlib
 import ctypes
-import functools
 import gc
-import importlib
 import math
 import os
 import re
@@ -29,10 +21,7 @@ import signal
 import sys
 import threading
 import time
-import warnings
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -41,10 +30,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Literal, ParamSpec, TypeVar
 
-import numpy as np
-from jaxtyping import Int64
-
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP", "SIGINT") if hasattr(signal, name))
 """Signals with which a user, a shell or a cluster ends a process."""
@@ -456,194 +442,6 @@ def retain_freed_memory() -> bool:
     settings = ((_M_MMAP_THRESHOLD, 1 << 30), (_M_TRIM_THRESHOLD, _NEVER_TRIM), (_M_ARENA_MAX, 1))
     accepted = [mallopt(name, value) for name, value in settings]
     return accepted == [1, 1, 1]
-
-
-Result = TypeVar("Result")
-
-PIECES = 32
-"""Number of pieces that work is cut into: enough to balance a dozen cores, few enough to cost nothing on two."""
-
-
-def kernel(function: Callable[..., Any]) -> Any:
-    """Compiles a function for `parallel`; reassociation is off, so that sums have one order."""
-    return compiled(function, fastmath={"contract", "nsz"})
-
-
-def compiled(function: Callable[..., Any], **options: Any) -> Any:
-    """Compiles a function that does not hold the GIL, with further options of numba, and stores what was compiled.
-
-    Warns:
-        SceneWarning: it cannot be stored for later runs; once a process.
-    """
-    # Threads are also asked for where nothing is compiled, and numba takes half a second to load.
-    from numba import njit
-
-    options |= {"nogil": True, "error_model": "numpy"}
-    try:
-        return njit(cache=True, **options)(function)
-    except RuntimeError as error:
-        # A package that another user installed, and no home that can be written, as in some containers.
-        if "no locator available" not in str(error):
-            raise
-        _warn_uncached()
-        return njit(**options)(function)
-
-
-@functools.cache
-def _warn_uncached() -> None:
-    warnings.warn(
-        "compiled kernels cannot be stored beside the package or in the user's cache, so that every run compiles them "
-        "anew, for up to a minute; NUMBA_CACHE_DIR=FOLDER names a folder that can be written",
-        SceneWarning,
-        stacklevel=3,
-    )
-
-
-_here = threading.local()
-
-
-def _limit_threads(threads: int) -> None:
-    """Lets work on this thread have so many threads of its own."""
-    _here.threads = threads
-
-
-def thread_count() -> int:
-    """As many threads as torch uses, or would use if it were loaded."""
-    cores = os.cpu_count() or 1
-    torch_threads = getattr(sys.modules.get("torch"), "get_num_threads", None)
-    if torch_threads is not None:
-        return min(int(torch_threads()), cores)
-    stated = os.environ.get("OMP_NUM_THREADS", "")
-    return min(max(int(stated), 1), cores) if stated.isdecimal() else cores
-
-
-def available_cores() -> int:
-    """The cores that this process may use."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
-
-
-@contextlib.contextmanager
-def threads_of_torch(count: int) -> Iterator[None]:
-    """Lets torch and the kernels use so many threads within the block. torchrun starts each of several processes with
-    one thread, which suits a training on GPUs and leaves most cores idle where a CPU computes."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@contextlib.contextmanager
-def threads_unchanged() -> Iterator[None]:
-    """Gives torch the threads again that it had before the block. Where a library runs a parallel loop of numba, OpenMP
-    has as many threads as numba ever after, and torch with it."""
-    torch = sys.modules.get("torch")
-    before = torch.get_num_threads() if torch is not None else 0
-    try:
-        yield
-    finally:
-        if torch is not None:
-            torch.set_num_threads(before)
-
-
-def parallel(work: Callable[[int], Result], pieces: Iterable[int]) -> list[Result]:
-    """Runs `work` for each piece in `thread_count` threads, the caller's among them, and returns the results in order.
-    A nested call runs its pieces one after the other, since all threads are busy.
-
-    Raises:
-        BaseException: what `work` raised of the first piece that failed; pieces that no thread has begun are left out.
-    """
-    waiting = list(pieces)
-    threads = min(getattr(_here, "threads", thread_count()), len(waiting))
-    if threads <= 1:
-        return [work(piece) for piece in waiting]
-    results: dict[int, Result] = {}
-    errors: dict[int, BaseException] = {}
-    # Each thread takes the next piece by itself: handing pieces over one by one costs more than small ones take.
-    following = iter(range(len(waiting)))
-
-    def run() -> None:
-        with _one_thread():
-            for number in following:
-                try:
-                    results[number] = work(waiting[number])
-                except BaseException as error:
-                    errors[number] = error
-                if errors:
-                    return
-
-    others = [threading.Thread(target=run) for _ in range(threads - 1)]
-    try:
-        for thread in others:
-            thread.start()
-        run()
-        _join(others)
-    except BaseException:
-        # Interrupted between two pieces, or while it waits: nothing goes on when this returns.
-        deque(following, maxlen=0)
-        _join(others)
-        raise
-    if errors:
-        raise errors[min(errors)]
-    return [results[number] for number in range(len(waiting))]
-
-
-def _join(threads: Iterable[threading.Thread]) -> None:
-    for thread in threads:
-        if thread.ident is not None:
-            thread.join()
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Lets work within the block have no threads but the one that it runs on."""
-    before = getattr(_here, "threads", None)
-    _limit_threads(1)
-    try:
-        yield
-    finally:
-        if before is None:
-            del _here.threads
-        else:
-            _limit_threads(before)
-
-
-def ahead(work: Callable[[int], Result], items: Iterable[int], workers: int = 1) -> Iterator[Result]:
-    """`work` of each item, in order; the next ones are computed in `workers` threads while the caller uses the last.
-    The threads that `parallel` has are shared out among the workers."""
-    share = max(1, thread_count() // workers)
-    pending: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(workers, initializer=_limit_threads, initargs=(share,)) as pool:
-        try:
-            for item in items:
-                pending.append(pool.submit(work, item))
-                if len(pending) > workers:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
-        finally:
-            for future in pending:
-                future.cancel()
-
-
-def import_ahead(module: str) -> None:
-    """Starts to import a module in a thread. Whoever imports it later waits for that, and meets its errors."""
-
-    def load() -> None:
-        with contextlib.suppress(Exception):
-            importlib.import_module(module)
-
-    threading.Thread(target=load).start()
-
-
-def even_cuts(starts: Int64[np.ndarray, " n_plus_1"]) -> Int64[np.ndarray, " pieces_plus_1"]:
-    """Cuts the rows of a compressed array into pieces with about equally many entries."""
-    inner = np.searchsorted(starts, np.linspace(0, starts[-1], PIECES + 1)[1:-1])
-    return np.concatenate(([0], inner, [len(starts) - 1]))
 
 
 Device = Literal["auto", "cpu", "cuda"]

@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import kernel
 from gsencoder.core.settings import MEGABYTE, Budget, check_governed
+from gsencoder.core.threads import kernel
 from gsencoder.fusion.basis import Moments
 from gsencoder.fusion.errors import row_cosines
 from gsencoder.fusion.fuse import FuseConfig

@@ -32,7 +32,7 @@ from gsencoder.core.archive import (
 )
 from gsencoder.core.arrays import rise_within
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import parallel
+from gsencoder.core.threads import parallel
 from gsencoder.data.scene_arrays import (
     bank_parts,
     check_splat,

@@ -21,7 +21,8 @@ from jaxtyping import Float32
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import Clock, Device, Track, ahead, thread_count, timed, untracked
+from gsencoder.core.process import Clock, Device, Track, timed, untracked
+from gsencoder.core.threads import ahead, thread_count
 from gsencoder.fusion.basis import Moments, fit_basis, table_basis
 from gsencoder.fusion.checkpoint import open_checkpoint, upright
 from gsencoder.fusion.errors import CellSample, ProjectionSums

@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import kernel, timed
+from gsencoder.core.process import timed
+from gsencoder.core.threads import kernel
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import depth_image

@@ -14,7 +14,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
-from gsencoder.core.process import kernel, parallel
+from gsencoder.core.threads import kernel, parallel
 from gsencoder.fusion.lift import VisibilityConfig, row_mask, visible_depths
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 from gsencoder.render import BlendConfig

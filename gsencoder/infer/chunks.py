@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.process import Device, Precision, Track, ahead, untracked
+from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.core.settings import Budget, check_governed
+from gsencoder.core.threads import ahead
 from gsencoder.models.grid import SceneCurves
 from gsencoder.types import Gaussians
 

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import parallel
+from gsencoder.core.threads import parallel
 
 MAX_LEVELS = 22
 """Largest number of bits of a coordinate that Hilbert codes handle; even, since levels are processed in pairs."""

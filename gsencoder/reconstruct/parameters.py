@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gsencoder.core.process import PIECES, kernel, parallel
+from gsencoder.core.threads import PIECES, kernel, parallel
 from gsencoder.geometry import colors_from_sh, normalize_quats, project_points, transform
 from gsencoder.types import Cameras, Gaussians
 

@@ -6,7 +6,7 @@ from typing import Protocol, no_type_check, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
-from gsencoder.core.process import PIECES, even_cuts, kernel, parallel
+from gsencoder.core.threads import PIECES, even_cuts, kernel, parallel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 from gsencoder.render.rays import Lattice
 

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Integer, UInt8
 from torch import Tensor
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import kernel, parallel
+from gsencoder.core.threads import kernel, parallel
 from gsencoder.geometry import colors_from_sh
 from gsencoder.render.blend import Blend, BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from gsencoder import geometry
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import PIECES, even_cuts, kernel, parallel
+from gsencoder.core.threads import PIECES, even_cuts, kernel, parallel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN, Projected
 from gsencoder.render import reference
 from gsencoder.render.rays import pixel_lattice

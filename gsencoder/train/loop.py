@@ -27,17 +27,9 @@ from gsencoder.core.archive import Archive, open_archive, write_archive
 from gsencoder.core.device import autocast_dtype
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.logs import Log
-from gsencoder.core.process import (
-    Precision,
-    ProcessRank,
-    Track,
-    available_cores,
-    defer_signals,
-    stop_of,
-    threads_of_torch,
-    untracked,
-)
+from gsencoder.core.process import Precision, ProcessRank, Track, defer_signals, stop_of, untracked
 from gsencoder.core.settings import first_difference
+from gsencoder.core.threads import available_cores, threads_of_torch
 from gsencoder.train import distributed
 from gsencoder.train.distributed import (
     check_agreement,

@@ -12,7 +12,8 @@ from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import plain
-from gsencoder.core.process import Device, ProcessRank, Track, threads_of_torch, untracked
+from gsencoder.core.process import Device, ProcessRank, Track, untracked
+from gsencoder.core.threads import threads_of_torch
 from gsencoder.fusion.measured_heads import heads_digest
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces

@@ -97,7 +97,7 @@ def test_a_full_standard_output_is_one_line(tmp_path: Path) -> None:
 
 SLOW = """
 import sys, time
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands import inspect
 from gsencoder.app.output import output_folder
 def run(config, summary):
@@ -140,7 +140,7 @@ def test_signals_leave_no_half_written_output(tmp_path: Path, number: int, code:
 
 WITHIN_EXEC = """
 import sys
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands import inspect
 def run(config, summary):
     exec("import os, signal; os.kill(os.getpid(), signal.SIGINT)")

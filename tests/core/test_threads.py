@@ -13,7 +13,7 @@ import torch
 
 from gsencoder.core import process as threads
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.process import ahead, kernel, parallel
+from gsencoder.core.threads import ahead, kernel, parallel
 
 
 @pytest.mark.parametrize("threads", [1, 3])
@@ -150,7 +150,7 @@ def test_work_ahead_comes_in_order_and_one_item_before_it_is_asked_for() -> None
 def test_workers_ahead_share_the_threads_and_give_results_in_order(
     threads: int, workers: int, share: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsencoder.core.process.thread_count", lambda: threads)
+    monkeypatch.setattr("gsencoder.core.threads.thread_count", lambda: threads)
     together = threading.Barrier(workers)
 
     def work(item: int) -> tuple[int, set[int]]:

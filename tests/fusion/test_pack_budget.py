@@ -141,9 +141,10 @@ def test_an_error_by_its_short_name_is_the_budget(pack: Pack) -> None:
 def test_an_error_that_no_table_reaches_is_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(index_budget, "MAX_ROWS", 300)
+    indexed = index_budget._indexed
+    monkeypatch.setattr(index_budget, "_indexed", lambda scene, at, most=None: indexed(scene, at, most and 300))
     out = f"out={tmp_path / 'out'}"
     assert cli.main(["pack", str(folder), "form=index", "budget.error=0.02", out]) == 2
-    assert "budget.error=0.02: a table of up to 300 rows" in capsys.readouterr().err
+    assert "budget.error=0.02: a table of up to 65,535 rows" in capsys.readouterr().err
     assert cli.main(["pack", str(folder), "budget.error=1e-9", out]) == 2
     assert "8 bits a coordinate reach" in capsys.readouterr().err

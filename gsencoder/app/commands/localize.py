@@ -15,11 +15,11 @@ from gsencoder.app.from_poses import (
 )
 from gsencoder.app.inputs import WordsOptions, queried_scene, query_words, shown_scene
 from gsencoder.app.output import output_folder
-from gsencoder.app.progress import console, one_line
+from gsencoder.app.progress import console
 from gsencoder.app.summary import Summary
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, one_line
 from gsencoder.core.files import write_json, write_picture
-from gsencoder.core.process import import_ahead
+from gsencoder.core.threads import import_ahead
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.up import with_up
 from gsencoder.infer.boxes import localization_to_json, words_to_json

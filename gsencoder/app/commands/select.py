@@ -8,11 +8,11 @@ import numpy as np
 
 from gsencoder.app.inputs import WordsOptions, queried_scene, query_words
 from gsencoder.app.output import output_folder
-from gsencoder.app.progress import Progress, console, one_line
+from gsencoder.app.progress import Progress, console
 from gsencoder.app.summary import Summary
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, one_line
 from gsencoder.core.files import write_json
-from gsencoder.core.process import import_ahead
+from gsencoder.core.threads import import_ahead
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features

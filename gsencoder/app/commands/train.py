@@ -15,7 +15,8 @@ from gsencoder.app.output import WorkFolder, folder_beside, output_folder, prepa
 from gsencoder.app.progress import Progress, console
 from gsencoder.app.summary import Summary, basis_figures, describe_basis
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE
-from gsencoder.core.process import Device, retain_freed_memory, threads_of_torch
+from gsencoder.core.process import Device, retain_freed_memory
+from gsencoder.core.threads import threads_of_torch
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.errors import total_fit

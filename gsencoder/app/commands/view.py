@@ -8,9 +8,9 @@ from pathlib import Path
 
 from gsencoder.app.inputs import WordsOptions, queried_scene
 from gsencoder.app.output import check_output_files, sole_writer
-from gsencoder.app.progress import console, printable
+from gsencoder.app.progress import console
 from gsencoder.app.summary import Summary, write_beside
-from gsencoder.core.errors import InputError
+from gsencoder.core.errors import InputError, printable
 from gsencoder.core.files import atomic_file
 from gsencoder.core.process import accept_stop
 from gsencoder.data.scenes import DistinctPaths, SceneConfig, load_scene

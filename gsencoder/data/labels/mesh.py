@@ -31,7 +31,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64
 
 from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files import open_foreign
-from gsencoder.core.process import compiled
+from gsencoder.core.threads import compiled
 from gsencoder.data.splats.ply import PlyElement, PlyHeader, read_header, read_property
 from gsencoder.types import MeshLabels, Views
 from gsencoder.types.checks import move_origin, transform
@@ -215,7 +215,7 @@ def draw_instances(
         return instances, (1 / inverse).astype(np.float32)
 
 
-# Without fused products, unlike `gsencoder.core.process.kernel`: of an edge of two triangles, each then finds a
+# Without fused products, unlike `gsencoder.core.threads.kernel`: of an edge of two triangles, each then finds a
 # pixel exactly as far on its side as the other finds it beyond, and no pixel between them is left to neither.
 @compiled
 @no_type_check

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import kernel
+from gsencoder.core.threads import kernel
 from gsencoder.data.readers.images import PictureFiles, PixelGrid, load_npy, read_integers
 from gsencoder.data.readers.undistort import RemapCache, pinhole_for
 from gsencoder.types.scene import pixel_centers, unproject_points

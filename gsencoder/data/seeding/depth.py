@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
 from gsencoder.core.errors import InputError, about
-from gsencoder.core.process import ahead, kernel
+from gsencoder.core.threads import ahead, kernel
 from gsencoder.types import Cameras, Views
 from gsencoder.types.scene import pixel_centers, unproject_points
 

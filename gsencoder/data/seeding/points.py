@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.process import thread_count
+from gsencoder.core.threads import thread_count
 from gsencoder.types import Gaussians, Scene, Views, sh_from_colors
 
 SIZE = 0.6

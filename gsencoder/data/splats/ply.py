@@ -23,7 +23,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning, readable
 from gsencoder.core.files import open_foreign
-from gsencoder.core.process import threads_unchanged
+from gsencoder.core.threads import threads_unchanged
 from gsencoder.data.splats.raw import (
     SH_COEFFICIENTS,
     RawSplat,

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Int64, Integer
 
 from gsencoder.core.arrays import even_indices
-from gsencoder.core.process import parallel
+from gsencoder.core.threads import parallel
 from gsencoder.data.orbits import looking_cameras, spiral_directions
 from gsencoder.data.seeding.points import NEIGHBOR
 from gsencoder.geometry import covariances, rotmats_from_quats

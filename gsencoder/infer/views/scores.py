@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float32, Float64
 
 from gsencoder.core.arrays import even_indices
-from gsencoder.core.process import parallel
+from gsencoder.core.threads import parallel
 from gsencoder.infer.views.targets import CONSTANTS, Target
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians

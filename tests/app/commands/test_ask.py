@@ -13,7 +13,7 @@ from chat_server import answer, serving
 from PIL import Image
 
 from gsencoder.app import main as cli
-from gsencoder.app.progress import printable
+from gsencoder.core.errors import printable
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("vlm_environment")]
 

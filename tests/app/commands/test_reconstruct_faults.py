@@ -124,7 +124,7 @@ def test_a_disk_without_room_for_the_database_is_told_before_it_fills(
 def test_a_signal_is_ours_after_pycolmap_came(tmp_path: Path, ten: Path) -> None:
     script = (
         "import os, signal, sys\n"
-        "from gsencoder.app import cli\n"
+        "from gsencoder.app import main as cli\n"
         "from gsencoder.reconstruct import run as reconstruct\n"
         "reconstruct.initial_gaussians = lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM)\n"
         "sys.exit(cli.main(sys.argv[1:]))\n"

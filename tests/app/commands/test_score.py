@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 COMMAND = """
 import sys
 import gsencoder.app.commands.evaluate
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 
 sys.exit(cli.main())
 """

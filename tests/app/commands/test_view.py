@@ -119,10 +119,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from shutil import copytree
-from gsencoder.infer.viewer import bundle
+from gsencoder.infer.page import page as bundle
 from gsencoder.types import Scene
 bundle.STATIC = Path(sys.argv[1])
-from gsencoder.app import cli
+from gsencoder.app import main as cli
 from gsencoder.app.commands import view
 sys.exit(cli.main(["view", sys.argv[2], "open=false"]))
 """
