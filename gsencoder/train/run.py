@@ -323,9 +323,13 @@ def resume_settings(
     heads = f"{','.join(config.heads)} ({digest})" if config.heads else ""
     spaces = {name: dataset.fingerprint() for name, dataset in datasets.items()}
     prepared = {name: dataset.settings for name, dataset in datasets.items()}
-    # The order, which a mapping does not state when it is compared, is that of the columns.
-    scenes = {name: [each.name for each in dataset.scenes(training)] for name, dataset in datasets.items()}
-    of_teachers = {"teachers": list(datasets), "spaces": spaces, "prepared": prepared, "scenes": scenes}
+    if len(datasets) == 1:
+        (space,), (of_preparation,) = spaces.values(), prepared.values()
+        of_teachers: dict[str, Any] = {"space": space, "prepared": of_preparation}
+    else:
+        # The order, which a mapping does not state when it is compared, is that of the columns.
+        scenes = {name: [each.name for each in dataset.scenes(training)] for name, dataset in datasets.items()}
+        of_teachers = {"teachers": list(datasets), "spaces": spaces, "prepared": prepared, "scenes": scenes}
     return {
         **shared,
         **of_teachers,

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from gsencoder.core import process as threads
+from gsencoder.core import threads
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.threads import ahead, kernel, parallel
 
@@ -176,7 +176,7 @@ def test_without_torch_there_are_as_many_threads_as_the_environment_says(stated:
     code = (
         "import os, sys\n"
         f"os.environ['OMP_NUM_THREADS'] = {stated!r}\n"
-        "from gsencoder.core.process import thread_count\n"
+        "from gsencoder.core.threads import thread_count\n"
         "cores = os.cpu_count()\n"
         f"sys.exit('torch' in sys.modules or thread_count() != {expected if expected != 'cores' else 'cores'})"
     )

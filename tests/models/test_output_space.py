@@ -65,11 +65,6 @@ def test_a_file_restores_the_space(tmp_path: Path, centered: bool, scaled: bool)
     np.testing.assert_array_equal(again.standardize(vectors()), outputs.standardize(vectors()))
 
 
-def test_files_of_standardized_spaces_have_no_new_entries() -> None:
-    _, header = output_space_parts(space())
-    assert header.keys() == {"space", "scale"}
-
-
 def test_coordinates_of_a_basis_are_always_about_the_mean() -> None:
     basis = FeatureBasis(
         mean=np.ones(6, np.float32), components=np.eye(2, 6, dtype=np.float32), energy_kept=0.9, space=SPACE
@@ -134,16 +129,3 @@ def test_a_header_without_spaces_is_refused(tmp_path: Path, outputs: list[object
     write_archive(tmp_path / "spaces.safetensors", {}, {"outputs": outputs})
     with open_archive(tmp_path / "spaces.safetensors") as file, pytest.raises(InputError, match=message):
         read_output_spaces(file)
-
-
-def test_a_file_of_one_space_is_what_earlier_versions_read(tmp_path: Path) -> None:
-    spaces = OutputSpaces(by_teacher={"palette": space()})
-    arrays, header = output_spaces_parts(spaces)
-    write_archive(tmp_path / "spaces.safetensors", arrays, header)
-    with open_archive(tmp_path / "spaces.safetensors") as file:
-        assert read_output_space(file).space == SPACE
-        assert list(read_output_spaces(file)) == ["palette"]
-    del header["teacher"]
-    write_archive(tmp_path / "old.safetensors", arrays, header)
-    with open_archive(tmp_path / "old.safetensors") as file:
-        assert list(read_output_spaces(file)) == ["s"]

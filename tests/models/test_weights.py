@@ -114,18 +114,6 @@ def test_a_truncated_file_is_refused(cut: int, tmp_path: Path) -> None:
         load_weights(path)
 
 
-def test_a_file_that_does_not_state_projectors_has_one_linear_layer(tmp_path: Path) -> None:
-    space, path = outputs(True), tmp_path / "e.safetensors"
-    written = GaussianEncoder(replace(SMALL, projector=0), space.widths)
-    save_weights(path, written, space, {}, dtype="float32")
-    config = header_of(path)["encoder"]
-    del config["projector"]
-    with_header(path, {"encoder": config})
-    read, _, _ = load_weights(path)
-    assert read.config.projector == 0
-    torch.testing.assert_close(read.state_dict()["head.weight"], written.state_dict()["head.weight"])
-
-
 def test_several_teachers_of_equal_width_keep_their_projectors_and_bases(tmp_path: Path) -> None:
     first = outputs(basis=True)["labels"]
     assert first.basis is not None

@@ -1,17 +1,14 @@
 """Affine colors: they are recovered where photographs differ, and change nothing where they agree."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from walls import wall_views
 
-from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.checkpoint import State, load_state, save_state
 from gsencoder.reconstruct.exposure import (
     IDENTITY,
     ROUNDS,
@@ -169,17 +166,3 @@ def test_brightness_within_the_limit_is_no_difference() -> None:
     assert describe_exposure(1 - 0.9 * SAME, 1 + 0.9 * SAME, "order") is None
     assert "before and after" in (describe_exposure(1 - 1.1 * SAME, 1.0, "order") or "")
     assert describe_exposure(1.0, 1 + 1.1 * SAME, "cameras") is not None
-
-
-def test_a_checkpoint_from_before_exposures_is_of_another_setting(tmp_path: Path) -> None:
-    adam = RowAdam(parameters_from(seed_from_depth(wall_views(depth=True), voxel=0.3), 0))
-    state = State(adam=adam, anchor=None, step=1, seconds=0.0, facts={})
-    save_state(tmp_path / "state", state, {"optimize": {"steps": 4}})
-    with pytest.raises(InputError, match=r"optimize.exposure=False, and this run asks optimize.exposure=True; give"):
-        load_state(
-            tmp_path / "state", {"optimize": {"steps": 4, "exposure": True, "earlier": []}}, steps=4, sh_degree=0
-        )
-    same = load_state(
-        tmp_path / "state", {"optimize": {"steps": 4, "exposure": False, "earlier": []}}, steps=4, sh_degree=0
-    )
-    assert same.exposures is None

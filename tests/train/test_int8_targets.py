@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from archives import header_of, rewrite
+from archives import rewrite
 from memory_scenes import PREPARE as MEMORY_PREPARE
-from memory_scenes import BlendedTeacher, prepared_wall
+from memory_scenes import BlendedTeacher
 from safetensors.numpy import load_file
 from training_scenes import PREPARE, SPACE, DenseSideTeacher, prepared, samples, scene
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import plain
-from gsencoder.train.memory import BANK_FILE, prepare_memory
+from gsencoder.train.memory import prepare_memory
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset, prepare_scene
 from gsencoder.train.prepared_file import PreparedScene
 from gsencoder.types import FeatureMap, Views
@@ -97,8 +97,7 @@ def dataset_of(folder: Path, config: PrepareConfig, **without: str) -> PreparedD
     return PreparedDataset(folder, settings)
 
 
-def test_a_folder_of_the_other_type_is_refused_and_one_of_an_earlier_version_is_of_float16(tmp_path: Path) -> None:
-    dataset_of(tmp_path, PREPARE, prepare="targets")
+def test_a_folder_of_the_other_type_is_refused(tmp_path: Path) -> None:
     assert dataset_of(tmp_path, PREPARE).precision == "float16"
     problem = "prepare.targets=float16, and this run asks prepare.targets=int8; give another folder as prepared="
     with pytest.raises(InputError, match=problem):
@@ -136,14 +135,3 @@ def test_a_memory_reads_its_features_from_its_targets_and_refuses_eight_bits(tmp
     config = replace(MEMORY_PREPARE, targets="int8")
     with pytest.raises(InputError, match=r"prepare\.targets: expected float16"):
         prepare_memory(scene(0), BlendedTeacher(scene(0)), tmp_path, prepare=config)
-
-
-def test_a_memory_that_an_earlier_version_prepared_is_used(tmp_path: Path) -> None:
-    prepared_wall(tmp_path, "a")
-    (path,) = tmp_path.rglob(BANK_FILE)
-    header = header_of(path)
-    del header["made_with"]["prepare"]["targets"]
-    rewrite(path, header=header)
-    before = path.read_bytes()
-    prepared_wall(tmp_path, "a")
-    assert path.read_bytes() == before
