@@ -219,8 +219,8 @@ class Archive:
             raise InputError(f"{path}: expected version {VERSION} of the format, got {str(version)[:20]}")
         covered = {key: value for key, value in header.items() if key != "digest"}
         checksums = header.get("checksums")
-        good = isinstance(checksums, dict) and checksums.keys() == self._names
-        if not good or header.get("digest") != file_digest(covered, {name: self._stored(name) for name in self._names}):
+        digest = file_digest(covered, {name: self._stored(name) for name in self._names})
+        if not isinstance(checksums, dict) or checksums.keys() != self._names or header.get("digest") != digest:
             raise InputError(f"{path}: {DAMAGED}: its header does not have the checksum that was written with it")
         self.checksums: Mapping[str, str] = checksums
 
