@@ -13,7 +13,8 @@ from pathlib import Path
 from training_scenes import LOSSES, SHORT, prepared, samples, small_encoder
 import torch
 from gsencoder.core.errors import InputError
-from gsencoder.train import distributed, presence
+from gsencoder.train import distributed
+from gsencoder.train import distributed as presence
 from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.loop import TrainerConfig
 

@@ -17,7 +17,7 @@ import os, signal, sys, time, warnings
 from pathlib import Path
 
 from gsencoder.core.errors import InputError
-from gsencoder.train import presence
+from gsencoder.train import distributed as presence
 from gsencoder.train.distributed import fail_together, join_processes, values_of_all
 
 presence.BEAT_SECONDS, presence.SAY_SECONDS, presence.LOST_SECONDS, presence.GRACE_SECONDS = 0.2, 0.8, 2.5, 0.5
