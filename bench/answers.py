@@ -28,7 +28,8 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from gsencoder.app.inputs import load_words, stored_words, with_stored_features
+from gsencoder.app.inputs import stored_words, with_stored_features
+from gsencoder.app.scenes import load_words
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import write_json
 from gsencoder.core.pretrained import find_file

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from json_option import add_json_option, write_figures
 
-from gsencoder.app.inputs import queried_scene
+from gsencoder.app.scenes import queried_scene
 from gsencoder.core.errors import SceneWarning
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, localize

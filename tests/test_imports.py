@@ -47,6 +47,8 @@ TORCH_FREE = [
     "gsencoder.infer.load",
     "gsencoder.infer.onnx.runtime",
     "gsencoder.app.commands.encode",
+    "gsencoder.app.commands.localize",
+    "gsencoder.app.commands.view",
     "gsencoder.evaluate.benchmarks.answers",
     "gsencoder.evaluate.benchmarks.captions",
     "gsencoder.infer.localize",

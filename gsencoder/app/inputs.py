@@ -2,151 +2,36 @@
 
 import warnings
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from gsencoder.app.from_poses import memory_of
-from gsencoder.app.options import CommonConfig
 from gsencoder.app.progress import Progress, console
-from gsencoder.app.summary import Summary, with_reported_up
+from gsencoder.app.scenes import load_words, queried_scene, shown_scene, with_reported_up
+from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, SceneWarning, listed
-from gsencoder.core.files import read_foreign_text
-from gsencoder.core.pretrained import find_file
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import DistinctPaths, SceneConfig, kind_of_path, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.cameras import INSIDE, CamerasOfSplat, with_explained_views
 from gsencoder.fusion.fit import with_fitting_splat
-from gsencoder.fusion.folder import WORDS_FILE, holds_features, load_features, table_path
+from gsencoder.fusion.folder import holds_features, load_features, table_path
 from gsencoder.infer.ask.ask import AskConfig, Asker
 from gsencoder.infer.ask.questions import SetQuestion, caption_question
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.localize import LocalizeConfig, localize, select_features
-from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.infer.views.targets import ViewsConfig, best_boxes
 from gsencoder.render import BlendConfig
-from gsencoder.text.table import TextTable, load_text_table
 from gsencoder.text.vocabulary import (
     TableTextConfig,
     TextConfig,
     Words,
     closed_table,
-    stating_trained,
-    vocabulary_of,
-    words_of_table,
 )
-from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
-
-MAX_QUERIES_BYTES = 1 << 20
-"""Largest size of a file of queries, bytes."""
-
-
-def query_words(query: Sequence[str], queries: str) -> list[str]:
-    """The words of query= and of the file queries=, stripped, without repetitions, in order.
-
-    Raises:
-        InputError: no words, or the file is not text.
-    """
-    lines = list(query)
-    if queries:
-        lines += _lines_of(Path(queries))
-    words = list(dict.fromkeys(line.strip() for line in lines if line.strip()))
-    if not words:
-        raise InputError("query= is missing: one or several words, separated by commas (or queries=FILE)")
-    return words
-
-
-def _lines_of(file: Path) -> list[str]:
-    """The lines of a text file, which may begin with a byte order mark."""
-    try:
-        return read_foreign_text(file, MAX_QUERIES_BYTES).splitlines()
-    except InputError as error:
-        raise InputError(f"queries: {error}") from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"queries: {file} cannot be read as text: {error}") from error
-
-
-def queried_scene(
-    scene: Scene,
-    folder: Path,
-    *,
-    head: str = "",
-    space: str = "",
-    words_file: str = "",
-    text: TextConfig = TableTextConfig(),
-) -> tuple[Scene, Words]:
-    """A scene with the one feature set that words are compared with, and the words.
-
-    Args:
-        scene: of the folder.
-        folder: of the features.
-        head: name of an adapter head; empty = the features themselves are asked.
-        space: name of the feature set; empty where there is only one.
-        words_file: a file of words; empty = those beside the features, or for a head those of `text`.
-        text: a text tower.
-
-    Raises:
-        InputError: there is no such feature set or head, or no words, or the words are not those of the head's space.
-    """
-    if head:
-        # Heads need torch, which finding boxes does without.
-        from gsencoder.app.heads import queried_through_head
-
-        return queried_through_head(scene, folder, head, space=space, words_file=words_file, text=text)
-    _, features = select_features(scene, space or None)
-    words = load_words(folder, features.space, words_file, text)
-    return replace(scene, features={features.space.name: features}), words
-
-
-def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextConfig = TableTextConfig()) -> Words:
-    """The text table that was given, or the one in the folder of the features, with the tower that made it.
-
-    Args:
-        folder: of the features.
-        space: of the features that are asked; folders with several may hold words for each.
-        words_file: a file of words; empty = the one in the folder.
-        text: a tower that is given; otherwise it is searched for when a phrase needs it.
-
-    Raises:
-        InputError: there are no words, or the tower is another than the one that made them.
-    """
-    if words_file:
-        words = words_of_table(load_text_table(find_file(words_file, "words")), text)
-        return stating_trained(words, _table_beside(folder, space))
-    if not isinstance(text, TableTextConfig):
-        table = _table_beside(folder, space)
-        return vocabulary_of(text) if table is None else words_of_table(table, text)
-    path = table_path(folder, space.text_encoder)
-    if path is None:
-        raise InputError(
-            f"{folder}: there is no {WORDS_FILE} beside these features: no words lead into them, or the file was lost; "
-            "fuse with a teacher that has words, or give words= or text="
-        )
-    return words_of_table(load_text_table(path))
-
-
-def _table_beside(folder: Path, space: FeatureSpace) -> TextTable | None:
-    """The table of a space in a folder of features; None where it is lost, damaged or of another space, for which
-    words= and text= stand in."""
-    try:
-        path = table_path(folder, space.text_encoder)
-        table = None if path is None else load_text_table(path)
-    except InputError:
-        return None
-    return table if table is not None and table.space.text_encoder == space.text_encoder else None
-
-
-def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
-    """Loads a folder of features, with the photographs of the scene `photos` if one is given.
-
-    Raises:
-        InputError: a folder or a scene that cannot be read, or photographs of other cameras.
-    """
-    scene = load_features(folder)
-    return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
+from gsencoder.types import GaussianFeatures, QueryMemory, Scene
 
 
 @runtime_checkable
@@ -271,21 +156,6 @@ def stored_source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
 def stored_memory(features: str, scene: Scene) -> QueryMemory | None:
     """The memory that the features of a scene were read from; None where features are stored themselves."""
     return memory_of(folder_of(features, scene.name), scene)
-
-
-@dataclass(frozen=True, kw_only=True)
-class WordsOptions(CommonConfig):
-    """Which words are compared with which features. Without slots, as `CommonConfig`."""
-
-    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
-    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
-    head: str = field(
-        default="",
-        metadata={
-            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
-            "features themselves are"
-        },
-    )
 
 
 def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:

@@ -1,6 +1,4 @@
-"""Progress bars on standard error, results on standard output, and text that a terminal can show.
-
-Progress bars on standard error, and the console for results on standard output.
+"""Progress bars on standard error, and the console for results on standard output.
 
 Stages do not import this module. A function with a long loop has an argument
 `track: Callable[[Iterable[T], str], Iterable[T]]` and loops over `track(items, "views")`; `Progress` is one.

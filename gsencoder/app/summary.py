@@ -18,8 +18,7 @@ from gsencoder.core.files import SUMMARY_NAME, plain, sha256_of, write_json
 from gsencoder.core.process import raise_dropped_stop
 from gsencoder.core.settings import Budget, describe_values, shown_value
 from gsencoder.core.threads import available_cores
-from gsencoder.data.up import with_up
-from gsencoder.types import FeatureBasis, Scene
+from gsencoder.types import FeatureBasis
 
 LIBRARIES = {
     "numpy": "numpy",
@@ -225,15 +224,6 @@ def report_promises(summary: Summary, budget: Budget, realised: Mapping[str, flo
                 stacklevel=3,
             )
     return lines
-
-
-def with_reported_up(scene: Scene, summary: Summary, *, quiet: bool) -> Scene:
-    """The scene with `up`, which the summary records; an estimate is printed."""
-    scene, up = with_up(scene)
-    summary.results["up"] = None if up is None else up.to_dict()
-    if up is not None and up.source != "stated":
-        console(quiet).print(f"up of {scene.name}: {up.describe()} (data.up= states it)")
-    return scene
 
 
 def basis_figures(basis: FeatureBasis | None, rank: int) -> dict[str, int | float]:

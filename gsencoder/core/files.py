@@ -487,3 +487,7 @@ def unsealed(row: Any) -> dict[str, Any]:
     if row != sealed(plain):
         raise ValueError("the row is not as it was written")
     return plain
+
+
+UNFINISHED_FILE = "unfinished.txt"
+"""The file by which the state of an unfinished run is recognized."""

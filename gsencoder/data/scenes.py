@@ -21,7 +21,7 @@ from jaxtyping import Float64, UInt8
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files import SUMMARY_NAME, read_foreign_text
+from gsencoder.core.files import SUMMARY_NAME, UNFINISHED_FILE, read_foreign_text
 from gsencoder.data.labels.scans import (
     labels_of_layout,
     objects_of_labels,
@@ -61,8 +61,6 @@ from gsencoder.types.orientation import EXCHANGED, INVERSE, UNMIRRORED
 
 FEATURES_FILE = "scene.safetensors"
 """The file by which a folder of features, or of a memory of a scene, is recognized."""
-UNFINISHED_FILE = "unfinished.txt"
-"""The file by which the state of an unfinished run is recognized."""
 
 
 def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:

@@ -1,7 +1,7 @@
 """The rasterizer that is differentiable in the geometry, for photometric reconstruction.
 
 Projection is plain torch (geometry.project), so autograd differentiates it; compositing has a backward of its own:
-numba kernels on a CPU (raster_cpu.py), gsplat on CUDA, and torch operations in any float type as their twin.
+numba kernels on a CPU, gsplat on CUDA, and torch operations in any float type as their twin.
 
 Compositing that is differentiable in the geometry, on a CPU: numba kernels; the plain twin is in reference.py.
 
@@ -147,7 +147,7 @@ def _composite_cpu(
 
 
 class _Composite(torch.autograd.Function):
-    """Kernels of raster_cpu.py: differentiable in means2d, conics, opacities and values of the splats in view."""
+    """The numba kernels: differentiable in means2d, conics, opacities and values of the splats in view."""
 
     @staticmethod
     def forward(

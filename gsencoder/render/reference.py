@@ -53,7 +53,7 @@ def blend_weights(
 def composite(
     projected: Projected, opacities: Float[Tensor, " N"], values: Float[Tensor, "N D"], lattice: Lattice, *, stop: float
 ) -> Float[Tensor, "P D"]:
-    """B @ values for single rays, differentiable in the geometry as well: the twin of raster_cpu.py.
+    """B @ values for single rays, differentiable in the geometry as well: the twin of the kernels in rasterize.py.
 
     Args:
         projected: see geometry.project.

@@ -477,10 +477,6 @@ def _read_npz(file: Path, encoder: str) -> TextTable:
         raise InputError(f"{file}: {error}") from error
 
 
-def _one_line(error: BaseException) -> str:
-    return (" ".join(str(error).split()) or type(error).__name__)[:200]
-
-
 @runtime_checkable
 class TextEncoder(Protocol):
     """Encodes words as vectors of a feature space.

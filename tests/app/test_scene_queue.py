@@ -11,8 +11,9 @@ from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app import main as cli
 from gsencoder.app.commands import fuse
-from gsencoder.app.output import output_folder, run_scenes
+from gsencoder.app.output import output_folder
 from gsencoder.app.progress import console
+from gsencoder.app.scenes import run_scenes
 from gsencoder.app.summary import Summary, report_choice, report_promises
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.data.scenes import find_scenes, listed_paths

@@ -22,7 +22,8 @@ from scene_files import write_transforms
 from splats import random_gaussians
 from tuning_pairs import png
 
-from gsencoder.app.output import _is_finished, output_folder
+from gsencoder.app.output import output_folder
+from gsencoder.app.scenes import _is_finished
 from gsencoder.app.summary import Summary, write_beside
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import check_written, checksums_of, sealed, write_bytes, write_json, write_picture

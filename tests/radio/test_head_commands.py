@@ -10,7 +10,7 @@ from radio_world import QUICK, SEEDS, World, run
 from symbolic import symbolic_sizes
 
 from gsencoder.app import main as cli
-from gsencoder.app.inputs import queried_scene
+from gsencoder.app.scenes import queried_scene
 from gsencoder.core.archive import open_archive
 from gsencoder.fusion.folder import load_features
 from gsencoder.fusion.measured_heads import find_head, head_outputs, load_heads

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.inputs import WordsOptions, load_asker, localized_captions, photos_of, scene_folders
+from gsencoder.app.inputs import load_asker, localized_captions, photos_of, scene_folders
 from gsencoder.app.options import settings
 from gsencoder.app.output import WorkFolder, folder_beside, output_folder
 from gsencoder.app.progress import Progress, console
+from gsencoder.app.scenes import WordsOptions
 from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed, printable
 from gsencoder.core.files import write_json

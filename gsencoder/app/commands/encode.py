@@ -9,16 +9,10 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from gsencoder.app.options import CommonConfig, settings, typed
-from gsencoder.app.output import output_folder, run_scenes
+from gsencoder.app.output import output_folder
 from gsencoder.app.progress import Progress, console
-from gsencoder.app.summary import (
-    Summary,
-    basis_figures,
-    describe_basis,
-    report_choice,
-    report_promises,
-    with_reported_up,
-)
+from gsencoder.app.scenes import run_scenes, with_reported_up
+from gsencoder.app.summary import Summary, basis_figures, describe_basis, report_choice, report_promises
 from gsencoder.core.errors import InputError, SceneWarning, about, counted
 from gsencoder.core.pretrained import digest_files
 from gsencoder.core.process import retain_freed_memory

@@ -12,9 +12,10 @@ import numpy as np
 from gsencoder.app.heads import describe_heads, head_figures
 from gsencoder.app.inputs import load_fusable
 from gsencoder.app.options import CommonConfig, settings
-from gsencoder.app.output import output_folder, run_scenes
+from gsencoder.app.output import output_folder
 from gsencoder.app.progress import Progress, console
 from gsencoder.app.reports import report_fusion
+from gsencoder.app.scenes import run_scenes
 from gsencoder.app.summary import Summary, describe_basis, report_choice, report_promises
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, counted

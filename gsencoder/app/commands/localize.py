@@ -13,9 +13,9 @@ from gsencoder.app.from_poses import (
     requested_cameras,
     search_from_poses,
 )
-from gsencoder.app.inputs import WordsOptions, queried_scene, query_words, shown_scene
 from gsencoder.app.output import output_folder
 from gsencoder.app.progress import console
+from gsencoder.app.scenes import WordsOptions, queried_scene, query_words, shown_scene
 from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, one_line
 from gsencoder.core.files import write_json, write_picture

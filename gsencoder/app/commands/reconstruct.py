@@ -11,8 +11,9 @@ import numpy as np
 from rich.console import Console
 
 from gsencoder.app.options import CommonConfig, settings
-from gsencoder.app.output import WorkFolder, folder_beside, output_folder, refuse_to_replace_inputs, run_scenes
+from gsencoder.app.output import WorkFolder, folder_beside, output_folder, refuse_to_replace_inputs
 from gsencoder.app.progress import Progress, console
+from gsencoder.app.scenes import run_scenes
 from gsencoder.app.summary import Summary, report_choice, report_promises
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import SceneWarning, counted

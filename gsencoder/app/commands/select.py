@@ -6,9 +6,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from gsencoder.app.inputs import WordsOptions, queried_scene, query_words
 from gsencoder.app.output import output_folder
 from gsencoder.app.progress import Progress, console
+from gsencoder.app.scenes import WordsOptions, queried_scene, query_words
 from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, one_line
 from gsencoder.core.files import write_json

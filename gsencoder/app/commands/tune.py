@@ -14,10 +14,11 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-from gsencoder.app.inputs import WordsOptions, asker_of, shown_scene
+from gsencoder.app.inputs import asker_of
 from gsencoder.app.options import settings
 from gsencoder.app.output import WorkFolder, folder_beside, output_folder, prepared_folder, refuse_to_replace_inputs
 from gsencoder.app.progress import Progress, console
+from gsencoder.app.scenes import WordsOptions, shown_scene
 from gsencoder.app.summary import Summary
 from gsencoder.core.errors import BusyError, InputError, SceneWarning, about, counted, listed
 from gsencoder.core.files import lock_folder, plain

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gsencoder.app.inputs import WordsOptions, queried_scene
 from gsencoder.app.output import check_output_files, sole_writer
 from gsencoder.app.progress import console
+from gsencoder.app.scenes import WordsOptions, queried_scene
 from gsencoder.app.summary import Summary, write_beside
 from gsencoder.core.errors import InputError, printable
 from gsencoder.core.files import atomic_file

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from gsencoder.app.heads import features_for_heads, heads_of_folder
-from gsencoder.app.inputs import WordsOptions, queried_scene, query_words, shown_scene
 from gsencoder.app.output import output_folder
 from gsencoder.app.progress import console
+from gsencoder.app.scenes import WordsOptions, queried_scene, query_words, shown_scene
 from gsencoder.app.summary import Summary, report_choice, report_promises
 from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError

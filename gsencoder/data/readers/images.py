@@ -1,4 +1,4 @@
-"""Pictures on disk as lazy sequences of views: files that are decoded on access (`image_file.py`), undistorted and
+"""Pictures on disk as lazy sequences of views: files that are decoded on access, undistorted and
 scaled. `depth_images.py` has depth of sensors, `masks.py` masks.
 
 - Distorted pictures are resampled once (undistort.py): color bilinearly, everything else by the nearest pixel.

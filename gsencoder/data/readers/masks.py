@@ -1,7 +1,7 @@
 """Masks on disk as lazy sequences: which pixels of a view to use, and which show that nothing is there.
 
 A pixel of the photograph is used if its mask file is not 0, alpha is at least one half, it is no background of one
-color (background.py), and it has content in the distorted picture; each counts only where it exists. After scaling a
+color, and it has content in the distorted picture; each counts only where it exists. After scaling a
 pixel counts only if all that it covers does.
 
 Photographs of an object before a background of one color, as renderings and product pictures have.

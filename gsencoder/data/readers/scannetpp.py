@@ -1,7 +1,7 @@
 """ScanNet++ scenes: a dslr/ folder with nerfstudio/transforms.json and colmap/, and an iphone/ folder with a video.
 
 The DSLR photographs of dslr/resized_images (fisheye, masks in resized_anon_masks) are read through its
-transforms.json, else through its COLMAP model; iphone.py reads the other folder, which is used where dslr/ has no
+transforms.json, else through its COLMAP model; the other folder is read by itself, which is used where dslr/ has no
 photographs, or where it is given itself. The world is that of the laser scan: metres, z up. The COLMAP models and
 the meshes are in it; nerfstudio/transforms.json is not, since its poses went through nerfstudio's convention, which
 exchanges x and y and turns z around. They are taken back here.

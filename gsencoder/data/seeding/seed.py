@@ -232,8 +232,8 @@ def seed_from_depth(views: Views, *, voxel: float, min_cos: float = 0.1, max_dep
     """Flat Gaussians on the surfaces that RGB-D frames show, one for each surface in each voxel.
 
     Frames are read one at a time. Depth is smoothed within its own noise; pixels that float between two surfaces are
-    dropped; samples are averaged by voxel, facing and layer (see surface_grid.py), so that thin objects keep their
-    edges. The grid stands in a frame that turns and moves with the scene (see room_frame.py). The order of the views
+    dropped; samples are averaged by voxel, facing and layer, so that thin objects keep their
+    edges. The grid stands in a frame that turns and moves with the scene. The order of the views
     changes no more than rounding, unless there are more than those a frame is taken from.
 
     Args:

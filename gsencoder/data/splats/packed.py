@@ -68,7 +68,7 @@ def read_spz(path: Path, stream: BinaryIO, size: int) -> RawSplat:
         raise InputError(
             f"{path}: expected {len(sizes)} streams listed within the file, got {streams} at byte {table:,}"
         )
-    # As in sog.py: imported where it is used.
+    # Imported where it is used.
     import imagecodecs
 
     parts = []

@@ -25,7 +25,7 @@ class ViewConstants:
     point_radius_scales: float = 2.0
     """Smallest radius of a target, in median scales of its Gaussians: a single Gaussian is as large as it is drawn."""
 
-    # Free space (free_space.py, split_gaussians.py)
+    # Free space
     min_obstacle_opacity: float = 0.3
     """Gaussians of less opacity are no obstacle."""
     free_space_cameras: int = 12
@@ -53,7 +53,7 @@ class ViewConstants:
     max_patches: int = 1 << 21
     """Patches that a splat is cut into at most, as far as one for each Gaussian allows (memory)."""
 
-    # The scene's own frames, ranked by rays before any render (frames.py)
+    # The scene's own frames, ranked by rays before any render
     frame_rays: int = 12
     """Rays from a target to each frame."""
     frame_batch: int = 32
@@ -68,7 +68,7 @@ class ViewConstants:
     min_frame_depth: float = 1e-9
     """Depth at which a target around the camera is taken to lie, world units."""
 
-    # Cameras on shells around a target (shells.py)
+    # Cameras on shells around a target
     tried_directions: int = 8
     """Directions tried for each camera: many are blocked, or look at holes where nobody has been …"""
     min_tried_directions: int = 64
@@ -92,7 +92,7 @@ class ViewConstants:
     background_radii: float = 1.5
     """Rays that test what is behind a target pass so many radii beside its center."""
 
-    # Close-ups from photographs (closeups.py)
+    # Close-ups from photographs
     closeup_sample: int = 1000
     """Gaussians of a target that tell where it is in a frame."""
     min_closeup_inside: float = 0.5
@@ -117,7 +117,7 @@ class ViewConstants:
     frame_margin: float = 0.5
     """Margin around a target on every side, as a share of its size: for its opacity score, and in close-ups."""
 
-    # Budgets of error and of megabytes (shown_error.py, picture_size.py)
+    # Budgets of error and of megabytes
     window_sigmas: float = 6.0
     """A Gaussian reaches no farther than so many standard deviations in a picture, and is left out of none by it."""
     error_safety: float = 1.2

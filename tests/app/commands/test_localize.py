@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gsencoder.app.commands.localize import LocalizeCommandConfig
-from gsencoder.app.inputs import MAX_QUERIES_BYTES, load_words, query_words
+from gsencoder.app.scenes import MAX_QUERIES_BYTES, load_words, query_words
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.folder import WORDS_FILE
 from gsencoder.text.table import make_text_table, save_text_table
