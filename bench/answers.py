@@ -34,8 +34,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import write_json
 from gsencoder.core.pretrained import find_file
 from gsencoder.data.labels.expressions import Expression
-from gsencoder.data.labels.made_expressions import make_expressions
-from gsencoder.data.labels.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
+from gsencoder.data.labels.made_questions import KINDS, QuestionsConfig, kind_of, make_expressions, make_questions
 from gsencoder.data.labels.questions import Question as TruthQuestion
 from gsencoder.data.labels.seen_objects import see_objects
 from gsencoder.data.scenes import load_scene

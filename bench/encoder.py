@@ -37,8 +37,8 @@ from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.plan import plan_cloud
 from gsencoder.train import samples
 from gsencoder.train.batch import Batch, join_samples
-from gsencoder.train.distill import Distillation
 from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.run import Distillation
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TrainingScene
 from gsencoder.types import FeatureSpace, Gaussians
 

@@ -20,8 +20,8 @@ from gsencoder.core.device import autocast_dtype
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.train.batch import Batch, join_samples
-from gsencoder.train.distill import Distillation
 from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.run import Distillation
 from gsencoder.train.samples import SampleDataset, SampleRecipe, TeacherRecipe, TrainingScene
 
 

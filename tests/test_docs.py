@@ -18,7 +18,7 @@ import yaml
 
 import gsencoder
 from gsencoder.app.compose import Choices, choices_of, named_members, overrides, read_words
-from gsencoder.app.table import COMMANDS
+from gsencoder.app.main import COMMANDS
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import find_file
 

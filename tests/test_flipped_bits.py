@@ -37,9 +37,7 @@ from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_packag
 from gsencoder.memory.index import index_features
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights
-from gsencoder.reconstruct.checkpoint import State, load_state, save_state
-from gsencoder.reconstruct.optimize import anchor_at
-from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.parameters import RowAdam, State, anchor_at, load_state, parameters_from, save_state
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.loop import TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE

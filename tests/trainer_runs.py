@@ -8,9 +8,9 @@ from training_scenes import LOSSES, SHORT, samples, small_encoder
 
 from gsencoder.core.archive import open_archive
 from gsencoder.core.logs import LOG_FILE, read_log
-from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE, Trainer, TrainerConfig
 from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.run import encoder_trainer
 
 Prepared = tuple[PreparedDataset, list[str]]
 

@@ -15,7 +15,7 @@ from typing import Any, get_args, get_origin
 import yaml
 
 from gsencoder.app.compose import RULES, choice_help, choices_of, conf_folder
-from gsencoder.app.main import FLAGS, SHORT
+from gsencoder.app.main import COMMANDS, FLAGS, SHORT, Command
 from gsencoder.app.options import (
     PRESET,
     CommonConfig,
@@ -29,7 +29,6 @@ from gsencoder.app.options import (
     section_classes,
     union_members,
 )
-from gsencoder.app.table import COMMANDS, Command
 
 PAGE = Path(__file__).resolve().parents[1] / "cli.md"
 HEAD = """\

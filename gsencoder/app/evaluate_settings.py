@@ -13,21 +13,21 @@ from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
+from gsencoder.evaluate.benchmarks.instances import InstancesProtocol
+from gsencoder.evaluate.benchmarks.recognition import RecognitionProtocol
+from gsencoder.evaluate.benchmarks.referring import ReferringProtocol
+from gsencoder.evaluate.benchmarks.retrieval import RetrievalProtocol
+from gsencoder.evaluate.benchmarks.semantics import SemanticsProtocol
 from gsencoder.evaluate.protocols.absent import (
     AbsentProtocol,
 )
 from gsencoder.evaluate.protocols.grounding import (
     GroundingProtocol,
 )
-from gsencoder.evaluate.protocols.instances import InstancesProtocol
 from gsencoder.evaluate.protocols.localization import (
     LocalizationProtocol,
 )
 from gsencoder.evaluate.protocols.naming import NamingProtocol
-from gsencoder.evaluate.protocols.recognition import RecognitionProtocol
-from gsencoder.evaluate.protocols.referring import ReferringProtocol
-from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol
-from gsencoder.evaluate.protocols.semantics import SemanticsProtocol
 from gsencoder.evaluate.sources import (
     FeatureSource,
     encoder_source,

@@ -16,30 +16,34 @@ from gsencoder.data.labels.expressions import Expression, boxes_from_labels, wri
 from gsencoder.data.labels.files import write_whole_numbers
 from gsencoder.data.labels.scans import find_labels, find_scannet_files
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.benchmarks.instances import write_instance_prediction
+from gsencoder.evaluate.benchmarks.instances import (
+    InstancesProtocol,
+    predict_instances,
+    true_instances,
+    write_instance_prediction,
+)
 from gsencoder.evaluate.benchmarks.recognition import (
     NamedInstance,
     RankedNames,
+    RecognitionProtocol,
+    predict_recognition,
+    recognition_truth,
     write_recognition_predictions,
     write_recognition_truth,
 )
 from gsencoder.evaluate.benchmarks.referring import (
     PredictedBoxes,
+    ReferringProtocol,
+    expressions_of_objects,
     named_classes,
+    predict_referring,
+    read_expressions,
     score_referring,
     with_kinds,
     write_referring_predictions,
 )
 from gsencoder.evaluate.benchmarks.score import score_instances, score_recognition, score_semantics
-from gsencoder.evaluate.protocols.instances import InstancesProtocol, predict_instances, true_instances
-from gsencoder.evaluate.protocols.recognition import RecognitionProtocol, predict_recognition, recognition_truth
-from gsencoder.evaluate.protocols.referring import (
-    ReferringProtocol,
-    expressions_of_objects,
-    predict_referring,
-    read_expressions,
-)
-from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, predict_semantics, semantic_truth
+from gsencoder.evaluate.benchmarks.semantics import SemanticsProtocol, predict_semantics, semantic_truth
 from gsencoder.evaluate.sources import FeatureSource, labeled_points, with_features
 from gsencoder.evaluate.tables import ScoreReport
 from gsencoder.infer.localize import LocalizeConfig

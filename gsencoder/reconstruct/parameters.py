@@ -1,13 +1,21 @@
 """The parameters that are optimized: a splat with logarithms of scales and logits of opacities."""
 
+import math
+import os
 from collections.abc import Mapping
-from typing import no_type_check
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 from torch import Tensor
 
+from gsencoder.core.archive import open_archive, write_archive
+from gsencoder.core.errors import InputError, advised
+from gsencoder.core.settings import first_difference
 from gsencoder.core.threads import PIECES, kernel, parallel
 from gsencoder.geometry import colors_from_sh, normalize_quats, project_points, transform
 from gsencoder.types import Cameras, Gaussians
@@ -194,3 +202,158 @@ class RowAdam:
         for table in self.tables().values():
             for name, value in table.items():
                 table[name] = value[rows].contiguous()
+
+
+CHECKPOINT_FILE = "reconstruction.safetensors"
+IMAGE_SCALE = "image_scale"
+"""The setting that says by which factor a budget made the photographs smaller."""
+PLANNED_DEGREE = "sh_degree_planned"
+"""The fact that says up to which degree colors depend on the direction."""
+ANCHOR_SHAPES: dict[str, tuple[int | str, ...]] = {"means": ("N", 3), "reach": ("N",)}
+
+
+MIN_REACH = 1e-30
+"""Smallest reach in world units: a reach of 0 would divide a learning rate of 0 by 0."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Anchor:
+    """Initial means of Gaussians, and how far each may move from there.
+
+    A step of Adam moves a coordinate by its rate at most, or little more. Pulling back by rate / reach of the way after
+    each step therefore leaves it within about one reach, whatever its gradients say; those that disagree from one
+    photograph to the next move it less. It is AdamW's decay (Loshchilov & Hutter 2019), towards the seed instead of 0.
+
+    Attributes:
+        means: initial centers, world units.
+        reach: distance in world units, above 0.
+    """
+
+    means: Float32[Tensor, "N 3"]
+    reach: Float32[Tensor, " N"]
+
+    def pull(self, means: Float32[Tensor, "N 3"], rows: Int64[Tensor, " n"], rate: float) -> None:
+        """Moves rows of `means` back, in place, after a step at a learning rate in world units."""
+        share = (rate / self.reach[rows]).clamp(max=1).unsqueeze(1)
+        means[rows] = means[rows].lerp(self.means[rows], share)
+
+    def keep(self, rows: Int64[Tensor, " n"]) -> "Anchor":
+        """The anchor of some rows."""
+        return Anchor(means=self.means[rows], reach=self.reach[rows])
+
+
+def anchor_at(raw: Parameters, length: float) -> Anchor:
+    """An anchor at the present means, with a reach of `length` times each Gaussian's largest standard deviation."""
+    return Anchor(means=raw["means"].clone(), reach=(length * raw["log_scales"].amax(dim=1).exp()).clamp(min=MIN_REACH))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class State:
+    """A reconstruction between two steps. The first is of step 0: seeds are sought once.
+
+    Attributes:
+        adam: parameters and moments.
+        anchor: what holds positions near their seeds, if anything does.
+        exposures: an affine map of colors for each fitted photograph, if they are fitted; None at step 0, and
+            where photographs do not differ in exposure.
+        step: steps that are done.
+        seconds: that they took.
+        facts: how it began, as JSON values: number and source of the seeds, what was added to points, and what is
+            planned.
+    """
+
+    adam: RowAdam
+    anchor: Anchor | None
+    exposures: Float[Tensor, "V 3 4"] | None = None
+    step: int
+    seconds: float
+    facts: Mapping[str, Any]
+
+
+def save_state(path: Path, state: State, settings: Mapping[str, Any]) -> None:
+    """Writes the state; the one before stays until the new one is whole.
+
+    Args:
+        path: the file.
+        state: to keep.
+        settings: what a run must have in common to go on from here, as JSON values.
+
+    Raises:
+        InputError: the disk is full.
+    """
+    arrays = {
+        f"{kind}.{name}": value.detach().cpu().numpy()
+        for kind, table in state.adam.tables().items()
+        for name, value in table.items()
+    }
+    if state.anchor is not None:
+        arrays |= {f"leash.{name}": getattr(state.anchor, name).cpu().numpy() for name in ANCHOR_SHAPES}
+    if state.exposures is not None:
+        arrays["exposure.maps"] = state.exposures.numpy()
+    header = {
+        "step": state.step,
+        "adam_steps": state.adam.steps,
+        "seconds": state.seconds,
+        "facts": dict(state.facts),
+        "settings": dict(settings),
+    }
+    write_archive(path, arrays, header)
+
+
+def image_scale_of(path: Path) -> float | None:
+    """The factor by which an unfinished run makes photographs smaller; None where there is no such run, or its
+    checkpoint does not say so or is damaged, which `load_state` says.
+
+    Args:
+        path: the file.
+    """
+    if not os.path.lexists(path):
+        return None
+    with suppress(InputError), open_archive(path) as file:
+        scale = file.value("settings", dict).get(IMAGE_SCALE)
+        return scale if isinstance(scale, float) and 0 < scale <= 1 else None
+    return None
+
+
+def load_state(
+    path: Path, settings: Mapping[str, Any], *, steps: int, sh_degree: int, device: torch.device | str = "cpu"
+) -> State:
+    """The state that a run has left.
+
+    Args:
+        path: the file.
+        settings: of this run.
+        steps: that this run takes at most.
+        sh_degree: of its colors, unless `facts` have another one under `PLANNED_DEGREE`.
+        device: where it computes.
+
+    Raises:
+        InputError: damaged, or of a run with other settings; the first that differs is named.
+    """
+    with advised(f"give resume=false to begin anew, or remove {path}"), open_archive(path) as file:
+        earlier = file.value("settings", dict)
+        if earlier != settings:
+            raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")
+        step, adam_steps = file.value("step", int), file.value("adam_steps", int)
+        seconds, facts = float(file.value("seconds", float, int)), file.value("facts", dict)
+        if not (0 <= adam_steps <= step <= steps and 0 <= seconds < math.inf):
+            raise InputError(f"a state that no run was in (step {step} of {steps})")
+        degree = facts.get(PLANNED_DEGREE, sh_degree)
+        if degree not in range(sh_degree + 1):
+            raise InputError(f"colors of a degree that no run has ({degree!r})")
+        tables = {
+            kind: {
+                name: torch.from_numpy(file.array(f"{kind}.{name}", "float32", ("N", *shape)).copy()).to(device)
+                for name, shape in shapes_of(degree).items()
+            }
+            for kind in RowAdam.KINDS
+        }
+        anchor = None
+        if "leash.means" in file:
+            arrays = {name: file.array(f"leash.{name}", "float32", shape) for name, shape in ANCHOR_SHAPES.items()}
+            anchor = Anchor(**{name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()})
+        exposures = None
+        if "exposure.maps" in file:
+            exposures = torch.from_numpy(file.array("exposure.maps", "float32", ("V", 3, 4)).copy())
+    adam = RowAdam.restored(tables, adam_steps)
+    return State(adam=adam, anchor=anchor, exposures=exposures, step=step, seconds=seconds, facts=facts)

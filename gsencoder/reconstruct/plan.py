@@ -26,9 +26,8 @@ import torch
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import MEGABYTE, PLANNED, Budget
 from gsencoder.data.splats.ply import inria_row_bytes
-from gsencoder.reconstruct.checkpoint import PLANNED_DEGREE
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
-from gsencoder.reconstruct.parameters import RowAdam
+from gsencoder.reconstruct.parameters import PLANNED_DEGREE, RowAdam
 from gsencoder.reconstruct.score import MAX_COMPARISONS, LogRow, score
 from gsencoder.types import Cameras
 

@@ -32,10 +32,17 @@ from gsencoder.data.seeding.from_photographs import (
 )
 from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
 from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
-from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, State, load_state, save_state
 from gsencoder.reconstruct.exposure import predict_exposures
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig, anchor_at
-from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import (
+    CHECKPOINT_FILE,
+    RowAdam,
+    State,
+    anchor_at,
+    load_state,
+    parameters_from,
+    save_state,
+)
 from gsencoder.reconstruct.plan import (
     AIMED,
     PLAN,

@@ -20,7 +20,7 @@ from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.data.scenes import DistinctPaths, SceneConfig, find_scenes, is_scene, listed_paths, load_scene
 from gsencoder.data.video import SUFFIXES as VIDEO_SUFFIXES
 from gsencoder.data.video import VideoConfig, is_video, take_frames
-from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
+from gsencoder.reconstruct.parameters import CHECKPOINT_FILE
 from gsencoder.types import Scene
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")

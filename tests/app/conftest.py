@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 from toy_commands import ToyConfig, write_toy
 
+from gsencoder.app.main import COMMANDS, Command
 from gsencoder.app.options import CommonConfig
-from gsencoder.app.table import COMMANDS, Command
 
 
 @pytest.fixture

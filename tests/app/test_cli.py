@@ -14,8 +14,8 @@ from gsencoder import __version__
 from gsencoder.app import main as cli
 from gsencoder.app.commands.inspect import report_table
 from gsencoder.app.commands.repair import Fix
+from gsencoder.app.main import COMMANDS
 from gsencoder.app.output import output_folder
-from gsencoder.app.table import COMMANDS
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Stopped
 from gsencoder.data.splats.files import load_splat, read_raw, save_splat

@@ -14,7 +14,7 @@ import pytest
 from toy_commands import splat
 
 from gsencoder.app import main as cli
-from gsencoder.app.table import COMMANDS
+from gsencoder.app.main import COMMANDS
 
 
 def test_a_launcher_in_another_process_can_take_a_run(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from splats import random_gaussians
 
 from gsencoder.app import main as cli
 from gsencoder.app.compose import compose
+from gsencoder.app.main import COMMANDS, Command
 from gsencoder.app.options import CommonConfig
-from gsencoder.app.table import COMMANDS, Command
 from gsencoder.data.splats.files import save_splat
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "commands.md").read_text(encoding="utf-8")

@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal
 import pytest
 
 from gsencoder.app.compose import EXPERIMENT, choices_of, compose, conf_folder, open_hydra, plain_settings
+from gsencoder.app.main import COMMANDS
 from gsencoder.app.options import CommonConfig, field_types, member_name, options_of, section_classes, settings
-from gsencoder.app.table import COMMANDS
 from gsencoder.core.errors import InputError
 
 MISSING = object()

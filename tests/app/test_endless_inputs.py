@@ -8,8 +8,7 @@ import pytest
 from no_files import ends_within, make_no_file
 from viewed_rooms import save_viewed_room
 
-from gsencoder.app.main import main
-from gsencoder.app.table import COMMANDS
+from gsencoder.app.main import COMMANDS, main
 
 SECONDS = 10.0
 OUT = {"export": "out.onnx", "repair": "out.ply"}

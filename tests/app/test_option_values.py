@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
+from gsencoder.app.main import COMMANDS
 from gsencoder.app.options import Option, options_of, typed, union_members
-from gsencoder.app.table import COMMANDS
 from gsencoder.core.errors import InputError
 
 

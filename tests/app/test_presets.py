@@ -8,6 +8,7 @@ from gsencoder.app.commands.encode import EncodeCommandConfig
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.compose import command_help, compose, run_many
+from gsencoder.app.main import COMMANDS
 from gsencoder.app.options import (
     PRESET_OPTIONS,
     PRESETS,
@@ -18,7 +19,6 @@ from gsencoder.app.options import (
     settings,
     typed,
 )
-from gsencoder.app.table import COMMANDS
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import value_at
 from gsencoder.fusion.cost_model import exact_config

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from command_runs import refusal
 
-from gsencoder.app.table import COMMANDS
+from gsencoder.app.main import COMMANDS
 from gsencoder.data.synthetic import make_room, write_room
 
 GIVEN = {"ask": ["features", "question=where"], "score": ["answers"], "demo": []}

@@ -15,8 +15,8 @@ from rooms import room
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.evaluate.grounding import GroundedPair
 from gsencoder.evaluate.protocols.grounding import (
+    GroundedPair,
     GroundingProtocol,
     evaluate_grounding,
     ground_scene,

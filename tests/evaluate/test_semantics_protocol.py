@@ -8,8 +8,8 @@ from splats import random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.evaluate.protocols.instances import true_instances
-from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, predict_semantics, semantic_truth
+from gsencoder.evaluate.benchmarks.instances import true_instances
+from gsencoder.evaluate.benchmarks.semantics import SemanticsProtocol, predict_semantics, semantic_truth
 from gsencoder.evaluate.sources import LabeledPoints, labeled_points
 from gsencoder.text.table import make_text_table
 from gsencoder.types import GaussianFeatures, Gaussians, MeshLabels, Scene

@@ -15,7 +15,7 @@ import torch
 from gsencoder.core.errors import InputError
 from gsencoder.train import distributed
 from gsencoder.train import distributed as presence
-from gsencoder.train.distill import encoder_trainer
+from gsencoder.train.run import encoder_trainer
 from gsencoder.train.loop import TrainerConfig
 
 torch.set_num_threads(1)

@@ -14,8 +14,8 @@ from splats import random_gaussians
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.folder import save_memories
-from gsencoder.memory import onnx as module
-from gsencoder.memory.onnx import export_memory
+from gsencoder.memory import attention as module
+from gsencoder.memory.attention import export_memory
 from gsencoder.types import FeatureSpace, Scene
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsencoder.infer.ask.ask import WordRules, words_in
+from gsencoder.text.question_words import WordRules, words_in
 from gsencoder.text.table import make_text_table
 
 

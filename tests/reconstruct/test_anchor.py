@@ -9,9 +9,8 @@ from walls import wall_views
 
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.checkpoint import State, load_state, save_state
-from gsencoder.reconstruct.optimize import Anchor, OptimizeConfig, Optimizer, PruneConfig, anchor_at
-from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import Anchor, RowAdam, State, anchor_at, load_state, parameters_from, save_state
 
 ALL = OptimizeConfig(steps=30, sh_degree=0, shrinks=(2, 1), shares=(0.5, 0.5), means_rate=0.03)
 PRUNED = PruneConfig(at=(0.3,))

@@ -11,7 +11,7 @@ from textured_box import box_cameras, box_views, write_box
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.reconstruct import sfm as opening
-from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE
+from gsencoder.reconstruct.parameters import CHECKPOINT_FILE
 from gsencoder.reconstruct.sfm import FRAMES_FOLDER, PLACED_FILE, Placed, SfmConfig, find_photographed, open_scene
 from gsencoder.types import Scene
 

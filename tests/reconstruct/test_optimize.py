@@ -15,9 +15,17 @@ from walls import wall_views
 from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.checkpoint import State, load_state, save_state
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig, rows_to_keep
-from gsencoder.reconstruct.parameters import RowAdam, camera_of, gaussians_of, parameters_from, rows_in_view
+from gsencoder.reconstruct.parameters import (
+    RowAdam,
+    State,
+    camera_of,
+    gaussians_of,
+    load_state,
+    parameters_from,
+    rows_in_view,
+    save_state,
+)
 from gsencoder.reconstruct.score import score
 from gsencoder.render.rasterize import RasterConfig
 from gsencoder.types import Gaussians, Views

@@ -15,8 +15,8 @@ from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats.files import save_splat
 from gsencoder.reconstruct import Reconstruction, reconstruct
 from gsencoder.reconstruct import plan as planning
-from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, PLANNED_DEGREE
 from gsencoder.reconstruct.optimize import OptimizeConfig, PruneConfig
+from gsencoder.reconstruct.parameters import CHECKPOINT_FILE, PLANNED_DEGREE
 from gsencoder.reconstruct.plan import BudgetConfig, error_of
 from gsencoder.reconstruct.run import ReconstructConfig
 from gsencoder.types import Scene

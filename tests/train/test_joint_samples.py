@@ -7,8 +7,8 @@ from joint_training import Datasets, batch_of, joint
 from training_scenes import LOSSES, small_encoder
 
 from gsencoder.train import samples as module
-from gsencoder.train.distill import Distillation
 from gsencoder.train.losses import AdapterHead, render_loss
+from gsencoder.train.run import Distillation
 from gsencoder.train.samples import SampleDataset, TrainingScene
 
 

@@ -13,8 +13,7 @@ from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.core.process import ProcessRank
 from gsencoder.core.settings import first_difference
 from gsencoder.teachers.labels import PaletteConfig
-from gsencoder.train.distill import Distillation, encoder_trainer
-from gsencoder.train.run import TrainConfig, resume_settings
+from gsencoder.train.run import Distillation, TrainConfig, encoder_trainer, resume_settings
 from gsencoder.train.samples import SampleDataset
 
 

@@ -15,7 +15,6 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.core.process import ProcessRank
 from gsencoder.train import loop as data_workers
-from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.loop import (
     TRAINING_CHECKPOINT_FILE,
     TrainerConfig,
@@ -25,6 +24,7 @@ from gsencoder.train.loop import (
 )
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepared_file import PreparedScene
+from gsencoder.train.run import encoder_trainer
 
 pytestmark = pytest.mark.slow
 

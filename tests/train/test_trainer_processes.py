@@ -33,7 +33,7 @@ from training_scenes import LOSSES, SHORT, samples, small_encoder
 from gsencoder.train.distributed import join_processes
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_file import PreparedScene
-from gsencoder.train.distill import encoder_trainer
+from gsencoder.train.run import encoder_trainer
 
 if __name__ == "__main__":
     dataset = PreparedDataset(Path({prepared!r}), {{"made": "for a test"}})

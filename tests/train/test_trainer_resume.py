@@ -16,8 +16,8 @@ from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.core.process import Stopped
-from gsencoder.train.distill import encoder_trainer
 from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE, ValidationResult, silence_connection_errors
+from gsencoder.train.run import encoder_trainer
 
 pytestmark = pytest.mark.slow
 

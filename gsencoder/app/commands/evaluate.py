@@ -21,7 +21,7 @@ from gsencoder.core.files import csv_text, write_bytes
 from gsencoder.core.process import refuse_several
 from gsencoder.data.scenes import check_names, find_scenes
 from gsencoder.evaluate.benchmark_files import BenchmarkProtocol
-from gsencoder.evaluate.grounding import grounding_scores
+from gsencoder.evaluate.benchmarks.retrieval import RetrievalProtocol
 from gsencoder.evaluate.protocols.absent import (
     AbsentProtocol,
     absent_scores,
@@ -32,6 +32,7 @@ from gsencoder.evaluate.protocols.absent import (
 from gsencoder.evaluate.protocols.grounding import (
     GroundingProtocol,
     evaluate_grounding,
+    grounding_scores,
     phrase_mean,
     scores_by_phrase,
 )
@@ -43,7 +44,6 @@ from gsencoder.evaluate.protocols.localization import (
     scores_by_name,
 )
 from gsencoder.evaluate.protocols.naming import NamingProtocol, evaluate_naming, naming_scores
-from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol
 from gsencoder.evaluate.sources import (
     FeatureSource,
 )

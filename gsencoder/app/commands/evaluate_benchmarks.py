@@ -27,13 +27,18 @@ from gsencoder.evaluate.benchmark_files import (
     write_predictions,
 )
 from gsencoder.evaluate.benchmarks.files import load_classes, write_classes
-from gsencoder.evaluate.benchmarks.retrieval import ScoredPairs, score_retrieval, write_scored_pairs
-from gsencoder.evaluate.benchmarks.semantics import check_excluded
+from gsencoder.evaluate.benchmarks.instances import InstancesProtocol
+from gsencoder.evaluate.benchmarks.referring import ReferringProtocol, read_expressions
+from gsencoder.evaluate.benchmarks.retrieval import (
+    RetrievalProtocol,
+    ScoredPairs,
+    evaluate_retrieval,
+    score_retrieval,
+    views_of,
+    write_scored_pairs,
+)
+from gsencoder.evaluate.benchmarks.semantics import SemanticsProtocol, check_excluded, classes_of
 from gsencoder.evaluate.protocols.absent import names_of
-from gsencoder.evaluate.protocols.instances import InstancesProtocol
-from gsencoder.evaluate.protocols.referring import ReferringProtocol, read_expressions
-from gsencoder.evaluate.protocols.retrieval import RetrievalProtocol, evaluate_retrieval, views_of
-from gsencoder.evaluate.protocols.semantics import SemanticsProtocol, classes_of
 from gsencoder.evaluate.sources import FeatureSource
 from gsencoder.text.vocabulary import Words, check_known
 from gsencoder.train.distributed import fail_together, join_processes, value_of_first, values_of_all

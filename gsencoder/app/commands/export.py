@@ -30,7 +30,7 @@ from gsencoder.infer.onnx.export import (
     random_cloud,
 )
 from gsencoder.infer.onnx.runtime import SUFFIX
-from gsencoder.memory.onnx import export_memory
+from gsencoder.memory.attention import export_memory
 from gsencoder.types import QueryMemory
 
 MAX_SIZE = 10_000_000

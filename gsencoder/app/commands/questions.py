@@ -12,8 +12,14 @@ from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.process import Track
 from gsencoder.data.labels.expressions import write_scanrefer
-from gsencoder.data.labels.made_expressions import make_expressions
-from gsencoder.data.labels.made_questions import KINDS, QuestionsConfig, kind_of, make_questions, make_situations
+from gsencoder.data.labels.made_questions import (
+    KINDS,
+    QuestionsConfig,
+    kind_of,
+    make_expressions,
+    make_questions,
+    make_situations,
+)
 from gsencoder.data.labels.questions import write_scanqa, write_sqa3d
 from gsencoder.data.labels.seen_objects import SeenScene, see_objects
 from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene

@@ -27,7 +27,7 @@ from gsencoder.data.splats.files import READABLE, save_splat
 from gsencoder.data.video import RECORD_FILE, VideoConfig
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.infer.draw import contact_sheet
-from gsencoder.reconstruct.checkpoint import CHECKPOINT_FILE, IMAGE_SCALE, image_scale_of
+from gsencoder.reconstruct.parameters import CHECKPOINT_FILE, IMAGE_SCALE, image_scale_of
 from gsencoder.reconstruct.plan import PhotographsTooLargeError, choose_scale, error_of, refuse_late
 from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
 from gsencoder.reconstruct.score import Comparison, LogRow, Score, describe

@@ -9,8 +9,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.expressions import read_scanrefer, write_scanrefer
-from gsencoder.data.labels.made_expressions import make_expressions
-from gsencoder.data.labels.made_questions import make_situations, side_of
+from gsencoder.data.labels.made_questions import make_expressions, make_situations, side_of
 from gsencoder.data.labels.questions import read_questions, write_sqa3d
 from gsencoder.data.labels.seen_objects import SeenObject, SeenScene, see_objects
 from gsencoder.data.synthetic import make_room

@@ -10,8 +10,13 @@ import pytest
 from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.made_expressions import make_expressions
-from gsencoder.data.labels.made_questions import QuestionsConfig, make_questions, make_situations, side_of
+from gsencoder.data.labels.made_questions import (
+    QuestionsConfig,
+    make_expressions,
+    make_questions,
+    make_situations,
+    side_of,
+)
 from gsencoder.data.labels.names import RANGES, color_counts, color_word, hsv
 from gsencoder.data.labels.questions import Question, read_questions, read_sqa3d, write_sqa3d
 from gsencoder.data.labels.seen_objects import COLOR_VIEWS, SeenObject, SeenScene, see_objects
