@@ -38,10 +38,6 @@ def requested_cameras(scene: Scene, pose: str, views: Sequence[str]) -> Requeste
     Args:
         scene: whose views and origin they are.
         pose: path of a JSON file in the form of `gsencoder.data.readers.transforms_json`, or empty.
-        views: names of views.
-
-    Raises:
-        InputError: an unknown or malformed file, or an unknown view.
     """
     parts, names = [], [*views]
     in_file = 0
@@ -89,18 +85,11 @@ def search_from_poses(
     """What each camera sees of the words.
 
     Args:
-        scene: the scene with one feature set.
-        cameras: relative to its origin.
-        words: that `text` knows.
         text: turns words into the features' space.
-        config: its mode and threshold are used.
         absent: words that are not in the scene, with the probability that they are. They are not visible from anywhere,
             however relevant a pixel may be.
         memory: of the Gaussians, where the features come from one.
         pictures: draw a picture for each word.
-
-    Yields:
-        For each camera the points of the words as JSON values, and pictures with their names.
     """
     # Rendering needs torch, which finding boxes does without.
     from gsencoder.infer.from_pose import FeatureField, FromPoseConfig, pose_picture, view_picture

@@ -26,7 +26,6 @@ class Cluster:
         rows: its Gaussians, ascending.
         score: mean relevancy, weighted by the Gaussians' weights, times the fourth root of its share of the weight of
             all that was selected for the word.
-        weight: summed weight.
         share: of this weight in that of all that was selected for the word.
     """
 
@@ -54,8 +53,6 @@ def score_clusters(
     Args:
         labels: cluster of each selected Gaussian, −1 = none.
         rows: row numbers of the selected Gaussians.
-        relevancy: their relevancy for the word.
-        weights: their summed blending weights.
         min_share: clusters with less than this share of the best one's weight are floaters and are left out.
     """
     total = float(weights.sum(dtype=np.float64))
@@ -82,7 +79,6 @@ class Extents:
     """Axis-aligned and oriented box, in the frame of the points; float64.
 
     Attributes:
-        aabb_min, aabb_max: axis-aligned corners.
         center: of the oriented box.
         rotation: its axes as columns, right-handed.
         size: its full side lengths, ≥ 0.
@@ -106,11 +102,9 @@ def box_around(
     """The axis-aligned and the oriented box of some Gaussians.
 
     Args:
-        gaussians: the splat.
         rows: at least one of its rows.
         extent: "means" bounds the centers; "sigma" bounds the ellipsoids of `sigmas` standard deviations, whose
             half-width along a unit vector a is sigmas·√(aᵀΣa).
-        sigmas: see there.
         up: direction of the last axis of the oriented box; None = the smallest box of any orientation.
     """
     from scipy.spatial.transform import Rotation
@@ -150,13 +144,7 @@ def boxes_of_word(
     """The boxes of a word in world coordinates, ranked in the order of its clusters.
 
     Args:
-        word: the word.
         clusters: clusters and their probabilities, best first.
-        gaussians: the splat.
-        origin: of the scene, added to the positions.
-        extent: see `box_around`.
-        sigmas: see `box_around`.
-        up: see `box_around`.
     """
     boxes = []
     for rank, (cluster, probability) in enumerate(clusters):

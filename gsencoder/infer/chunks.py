@@ -75,11 +75,7 @@ class Chunk:
     region: int = 0
 
     def seen_around(self, means: Float32[np.ndarray, "N 3"]) -> Float[np.ndarray, " n"]:
-        """How far the network sees around each row of the core before the scene is cut off; infinite where it is not.
-
-        Args:
-            means: of the scene.
-        """
+        """How far the network sees around each row of the core; infinite where the scene is not cut off."""
         points = means[self.core_rows]
         return self.halo + np.minimum(points - self.low, self.high - points).min(axis=1)
 
@@ -99,21 +95,12 @@ def encode_by_chunks(
     not copied. Each region is a scene of its own: its features do not depend on what else the splat holds.
 
     Args:
-        gaussians: the splat.
         run: the encoder: features of the first n Gaussians of a subset, given the subset, the curves of the complete
             region where it has several chunks, and n.
         curves: computes these curves, given the centers of a region.
-        config: settings.
         voxel: edge of the encoder's finest cells, world units.
         metres_per_unit: unit of length of the splat.
-        columns: of each space in the encoder's output.
         track: wraps the loops that cut and encode to show progress.
-
-    Raises:
-        InputError: no Gaussians, or features that are not finite.
-
-    Warns:
-        SceneWarning: chunks and their halos take many times the work that the scene would take at once.
     """
     if not len(gaussians):
         raise InputError("encode: the splat has no Gaussians")
@@ -288,12 +275,7 @@ def _rows_near(
 
 
 def _smallest(values: Float[np.ndarray, " n"], count: int) -> tuple[Bool[np.ndarray, " n"], float]:
-    """Which values a stable sort would put first, and the one that comes after them.
-
-    Args:
-        values: more than `count` of them.
-        count: how many are wanted.
-    """
+    """Which values a stable sort would put first, and the one that comes after them."""
     following = np.partition(values, count)[count]
     smallest = values < following
     smallest[np.flatnonzero(values == following)[: count - np.count_nonzero(smallest)]] = True
@@ -333,11 +315,7 @@ class EncodeBudget(Budget):
 
 
 def check_encode_budget(budget: EncodeBudget, config: EncodeConfig) -> None:
-    """Refuses options that a budget chooses where they are set.
-
-    Raises:
-        InputError: one of `GOVERNED` is set.
-    """
+    """Refuses options that a budget chooses where they are set."""
     check_governed(budget, config, EncodeConfig(), GOVERNED, "encode")
 
 

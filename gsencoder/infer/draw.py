@@ -56,13 +56,8 @@ def write_boxes_ply(
     those that draw lines). Boxes after a word's first are darker. Positions are doubles in world coordinates.
 
     Args:
-        path: a .ply file.
-        scene: its Gaussians and origin.
         localization: what was found in it.
         oriented: draw the oriented boxes, not the axis-aligned ones.
-
-    Raises:
-        InputError: a scene without Gaussians or with fewer than the boxes name, or a file that cannot be written.
     """
     means = np.zeros((0, 3), np.float32) if scene.gaussians is None else scene.gaussians.means
     points: list[np.ndarray] = []
@@ -157,11 +152,7 @@ def relevancy_overlay(
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Relevancy as color (turbo: blue low, red high) over the grey view; NaN shows the grey view alone.
 
-    The ends are given, not found, so that pictures of different views and words can be compared.
-
-    Raises:
-        InputError: maps of another size than the picture.
-    """
+    The ends are given, not found, so that pictures of different views and words can be compared."""
     if rgb.shape[:2] != relevancy.shape:
         raise InputError(f"relevancy_overlay: relevancy {relevancy.shape} over a picture of {rgb.shape[:2]}")
     grey = (rgb @ np.array([0.299, 0.587, 0.114]))[..., None]
@@ -202,11 +193,8 @@ def draw_boxes(
     Edges behind surfaces are drawn too.
 
     Args:
-        rgb: a view.
         boxes: in world coordinates, origin included.
-        cam_from_world: the view's pose, relative to `origin`.
         K: its intrinsics in pixels of `rgb`.
-        origin: the scene's; zero if left out.
         oriented: draw the oriented boxes, not the axis-aligned ones.
     """
     factor = legible_factor(rgb.shape[1])
@@ -320,11 +308,7 @@ def fit_pca_colors(features: Float32[np.ndarray, "n R"], *, sample: int = 50_000
     """Fits colors to features or basis coordinates, such as those of all seen Gaussians.
 
     Signs are chosen so that the largest entry of each direction is positive; fewer than three directions leave a
-    channel at its middle.
-
-    Raises:
-        InputError: no features.
-    """
+    channel at its middle."""
     if len(features) == 0:
         raise InputError("fit_pca_colors: no features to fit colors to; were any Gaussians seen?")
     chosen = features[:: max(1, len(features) // sample)].astype(np.float64)
@@ -380,11 +364,7 @@ def contact_sheet(
     columns: int,
     width: int = 480,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Pictures in a grid on white, each brought to one width, with its title above.
-
-    Raises:
-        InputError: no pictures, or another number of titles.
-    """
+    """Pictures in a grid on white, each brought to one width, with its title above."""
     if not pictures or len(pictures) != len(titles) or columns < 1:
         raise InputError(f"contact_sheet: {len(pictures)} pictures, {len(titles)} titles, {columns} columns")
     gap, head = 12, 28

@@ -23,11 +23,7 @@ class TorchEncoder:
     """A trained network with its output spaces and its words; see `gsencoder.infer.load.Encoder`."""
 
     def __init__(self, weights: str) -> None:
-        """Reads a file, a folder of `train`, or weights that come with the package; see `find_weights`.
-
-        Raises:
-            InputError: they cannot be read, or the words beside them are those of another encoder.
-        """
+        """Reads a file, a folder of `train`, or weights that come with the package; see `find_weights`."""
         file = find_weights(weights)
         self.network, self.outputs, self.made_by = load_weights(file)
         self.tables: Mapping[str, TextTable] = load_tables(file.parent, self.outputs)
@@ -101,16 +97,10 @@ def encode(
     """Features of every Gaussian in one space, all with weight 1.
 
     Args:
-        gaussians: the splat.
-        encoder: from `load_weights`; put into evaluation mode here.
         outputs: what its output channels mean.
-        config: settings.
         space: name of a teacher or of its feature space; None = the only one.
         metres_per_unit: unit of length of the splat; the encoder's grid is in metres.
         track: wraps the loop over chunks to show progress.
-
-    Raises:
-        InputError: see `encode_spaces`; or there is no such space, or there are several and none is named.
     """
     teacher = outputs.resolve(space)
     values = _restored(gaussians, encoder, outputs, [teacher], config, metres_per_unit, track)
@@ -126,12 +116,7 @@ def encode_spaces(
     metres_per_unit: float = 1.0,
     track: Track = untracked,
 ) -> dict[str, GaussianFeatures]:
-    """Features of every Gaussian in all spaces, by the names of their teachers; arguments are those of `encode`.
-
-    Raises:
-        InputError: no Gaussians, or they spread over too many cells, or features that are not finite, or a unit that
-            is not positive.
-    """
+    """Features of every Gaussian in all spaces, by the names of their teachers; arguments are those of `encode`."""
     values = _restored(gaussians, encoder, outputs, list(outputs), config, metres_per_unit, track)
     return {teacher: outputs[teacher].features(values[teacher]) for teacher in outputs}
 

@@ -71,7 +71,6 @@ class PosePoint:
     """Where a camera sees what a word says.
 
     Attributes:
-        query: the word.
         camera: number of the camera.
         visible: whether the relevancy of the pixel reaches the threshold. Where it does not, the other values are those
             of the best pixel there is.
@@ -111,15 +110,9 @@ class FeatureField:
         config: FromPoseConfig = FromPoseConfig(),
     ) -> None:
         """Args:
-        scene: Gaussians with features.
         space: name of the feature set; None where the scene has only one.
         memory: queries of the same Gaussians. The feature of a pixel is then what its blended query attends to, and
-            the features of the scene, if it has any, give only the threshold; they are those of the memory.
-        config: how words are found.
-
-        Raises:
-            InputError: no Gaussians or features, or a memory of other Gaussians or of another space.
-        """
+            the features of the scene, if it has any, give only the threshold; they are those of the memory."""
         if memory is not None and not scene.features:
             features, gaussians = memory.features(), scene.gaussians
             if gaussians is None:
@@ -151,11 +144,7 @@ class FeatureField:
 
         Args:
             cameras: relative to the scene's origin.
-            view: which camera.
             b: its blend at the stride of this field, where it has been made already.
-
-        Raises:
-            InputError: no such view, or the blend of other Gaussians or pixels.
         """
         if not -len(cameras) <= view < len(cameras):
             raise InputError(f"view: expected 0 to {len(cameras) - 1}, got {view}")
@@ -175,7 +164,6 @@ class SeenField:
     """A feature field as one camera sees it; its geometry is kept and answers any number of words.
 
     Attributes:
-        field: of the scene.
         cameras: relative to the scene's origin.
         view: number of the camera.
         b: its blend, a row for each pixel that is looked at.
@@ -190,14 +178,10 @@ class SeenField:
         """Where the camera sees each word.
 
         Args:
-            queries: words that `text` knows.
             text: turns words into the features' space.
 
         Returns:
             One point for each word, in the order asked.
-
-        Raises:
-            InputError: no or unknown words, or words of another space.
         """
         points: list[PosePoint] = []
         for start in range(0, len(directions := self._directions(queries, text)), BLOCK_WORDS):
@@ -274,19 +258,13 @@ def from_pose(
     """Where each camera sees each word: `FeatureField` for those who ask once.
 
     Args:
-        scene: Gaussians with features.
         cameras: one or several, relative to the scene's origin.
-        queries: words that `text` knows.
         text: turns words into the features' space.
-        config: how words are found.
         space: name of the feature set; None where the scene has only one.
         memory: queries of the same Gaussians; see `FeatureField`.
 
     Returns:
         A point for each camera and word: all words of the first camera, then those of the next.
-
-    Raises:
-        InputError: no Gaussians or features, no or unknown words, words of another space.
     """
     field = FeatureField(scene, space=space, memory=memory, config=config)
     return tuple(point for view in range(len(cameras)) for point in field.at(cameras, view).find(queries, text))
@@ -313,9 +291,6 @@ def pose_picture(
     views are enlarged.
 
     Args:
-        rgb: of `view_picture`.
-        seen: what the camera sees.
-        point: of the word.
         relevancy: of the word at the pixels that were looked at; NaN where there is no surface.
     """
     lattice, (height, width) = seen.b.lattice, rgb.shape[:2]

@@ -62,11 +62,7 @@ class Encoder(Protocol):
 
 
 def file_of_encoder(weights: str) -> Path:
-    """The file of an encoder; what lies beside it belongs to it.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The file of an encoder; what lies beside it belongs to it."""
     if Path(weights).suffix.lower() == SUFFIX:
         return find_file(weights, "weights")
     from gsencoder.models.weights import find_weights
@@ -80,9 +76,6 @@ def load_encoder(weights: str, device: Device = "auto") -> Encoder:
     Args:
         weights: a file that `gsencoder export` wrote, else what `gsencoder.models.weights.find_weights` takes.
         device: where an exported graph runs; trained weights follow `EncodeConfig.device`.
-
-    Raises:
-        InputError: no such encoder, or it cannot be read.
     """
     if Path(weights).suffix.lower() == SUFFIX:
         return OnnxEncoder(weights, device=device)

@@ -50,9 +50,7 @@ def cluster_by_gaps(points: Float32[np.ndarray, "n 3"], smallest: float, min_sam
     0.8 of a square's side), which does not depend on the axes of the world.
 
     Args:
-        points: positions.
         smallest: radius of DBSCAN, in their unit, `EPS_SPACINGS` of the scene; larger where the points are sparser.
-        min_samples: see `cluster`.
     """
     radius = smallest
     for _ in range(SPARSE_RADII):
@@ -103,7 +101,6 @@ def cluster(points: Float32[np.ndarray, "n 3"], eps: float, min_samples: int) ->
     number of points, and points take the label of their cell: distances are then off by up to 0.43 eps.
 
     Args:
-        points: positions.
         eps: radius, in their unit. Points at this distance are neighbors, also where their float32 coordinates round.
         min_samples: points within the radius, the point itself included, that make it a core point.
     """
@@ -259,10 +256,7 @@ def localize(
     `config.contrast` is on.
 
     Args:
-        scene: Gaussians with features.
-        queries: words that `text` knows.
         text: turns words into the features' space.
-        config: settings.
         space: name of the feature set; None where the scene has only one.
         rivals: words that may fit the Gaussians better than those asked; None = the names that
             `text` knows, if it knows any.
@@ -270,12 +264,6 @@ def localize(
 
     Returns:
         Relevancy, thresholds, probabilities, and the boxes best first within each word.
-
-    Warns:
-        SceneWarning: words without a box (one warning that names them); negative words unknown to `text`.
-
-    Raises:
-        InputError: no Gaussians or features, no or unknown words, words of another space.
     """
     gaussians, _ = select_features(scene, space)
     candidates = find_candidates(scene, queries, text, config, space=space, rivals=rivals, spacing=spacing)
@@ -313,7 +301,6 @@ class WordCandidates:
 
     Attributes:
         threshold: the relevancy from which on Gaussians were taken.
-        clusters: best first.
         evidence: for each cluster, that it is what the word says.
     """
 
@@ -327,7 +314,6 @@ class Candidates:
     """What words select in a scene.
 
     Attributes:
-        relevancy: see `Localization`.
         words: one for each word, in the order asked.
     """
 
@@ -392,12 +378,8 @@ def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, Gaussia
     """A scene's Gaussians and one of its feature sets.
 
     Args:
-        scene: with both.
         space: name of the feature set, of its space, or of its teacher; None = the only one, or the only one that words
             lead into.
-
-    Raises:
-        InputError: no feature set of that name, or several and no name.
     """
     if scene.gaussians is None or not scene.features:
         missing = "Gaussians" if scene.gaussians is None else "features"

@@ -55,17 +55,9 @@ def strongest_components(
     """The components that a pixel's rendered query gives the largest weights; of equal ones the first.
 
     Args:
-        memory: of the Gaussians.
-        gaussians: the splat.
-        cameras: in the same world.
-        view: which camera.
-        pixel: its column x and row y.
         count: at most so many components.
         config: accuracy of the rendering, where the blend must be made.
         blended: the view's pixel blend, where it has been made already.
-
-    Raises:
-        InputError: no such pixel, nothing with a query is seen in it, a count below 1, or a memory of other Gaussians.
     """
     x, y = pixel
     width, height = int(cameras.widths[view]), int(cameras.heights[view])
@@ -91,11 +83,7 @@ def salient_pixel(memory: QueryMemory, b: Blend) -> tuple[int, int] | None:
     pixels that are opaque, those of the middle half of the view if any of them is. None where no pixel is opaque.
 
     Args:
-        memory: of the Gaussians of B.
         b: of all pixels of the view.
-
-    Raises:
-        InputError: B has other Gaussians.
     """
     height, width = b.shape
     columns, rows = (even_indices(size, max(1, size * GRID // max(height, width))) for size in (width, height))
@@ -139,17 +127,9 @@ def attention_pictures(
     lowest entropy.
 
     Args:
-        memory: of the scene's Gaussians.
         scene: Gaussians, and the views that the memory was made from.
         views: so many, or all if there are fewer.
         count: components that are shown, at most.
-        config: accuracy of the rendering.
-
-    Yields:
-        The number of the view and the picture. A view that shows nothing with a query is left out with a warning.
-
-    Raises:
-        InputError: the scene has no Gaussians or no cameras, or other ones than the memory was made of.
     """
     if scene.gaussians is None or scene.views is None:
         raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")
@@ -180,17 +160,9 @@ def attention_picture(
     Where the scene has no photographs, the views that the components come from are rendered.
 
     Args:
-        memory: of the scene's Gaussians.
         scene: Gaussians, and the views that the memory was made from.
-        view: number of the view.
-        pixel: its column x and row y.
         count: components that are shown, at most.
-        config: accuracy of the rendering.
         blended: the view's pixel blend, where it has been made already.
-
-    Raises:
-        InputError: the scene has no Gaussians or no cameras, or other ones than the memory was made of; or no such
-            pixel, or nothing with a query is seen in it.
     """
     gaussians, views, bank = scene.gaussians, scene.views, memory.bank
     if gaussians is None or views is None:
@@ -241,7 +213,6 @@ def cell_tile(rgb: UInt8[np.ndarray, "h w 3"], cell: Float64[np.ndarray, "4"]) -
     cell the cell and what is around it, enlarged.
 
     Args:
-        rgb: the photograph.
         cell: left, top, right and bottom edge in its pixels; what is outside the photograph is cut off.
     """
     height, width = rgb.shape[:2]
@@ -360,13 +331,8 @@ def component_scatter(
     the raw features vary most, and with `umap` beside it by UMAP (McInnes et al. 2018), as the paper does.
 
     Args:
-        bank: the components.
         sample: raw features of the same maps.
         umap: whether to draw a second panel, by the cosines that the bank compares features by.
-        seed: of UMAP.
-
-    Raises:
-        InputError: features of another number of channels, or UMAP is asked for and not installed.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -428,9 +394,6 @@ def umap_plane(vectors: Float32[np.ndarray, "n D"], seed: int = 0) -> Float32[np
     Args:
         vectors: `UMAP_LEAST` or more, compared by their distances.
         seed: of its optimization, which then runs in one thread.
-
-    Raises:
-        InputError: umap-learn is not installed, or there are too few vectors.
     """
     check_umap()
     if len(vectors) < UMAP_LEAST:

@@ -93,11 +93,7 @@ PixelFeatures = BlendedFeatures | AttendedQueries
 def pixel_features(
     products: GaussianProducts, b: Blend, *, memory: QueryMemory | None = None, mode: Mode = "centered"
 ) -> PixelFeatures:
-    """The features at the pixels of a view: of a memory if one is given, else of the Gaussians.
-
-    Raises:
-        InputError: B has other Gaussians.
-    """
+    """The features at the pixels of a view: of a memory if one is given, else of the Gaussians."""
     if b.gaussians != len(products.features):
         raise InputError(f"features of {len(products.features):,} Gaussians, and a view of {b.gaussians:,}")
     return BlendedFeatures(products, b) if memory is None else AttendedQueries(memory, b, mode)
@@ -150,13 +146,6 @@ def relevancy_pictures(
         scene: Gaussians, and cameras with photographs or without.
         localization: relevancy and boxes of the words.
         per_word: views drawn for each word.
-        config: accuracy of the rendering.
-
-    Yields:
-        A name (word and view, safe for a file) and the picture, view by view.
-
-    Raises:
-        InputError: the scene has no Gaussians or no cameras.
     """
     if scene.gaussians is None or scene.views is None:
         raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")

@@ -102,10 +102,8 @@ class Presence:
         vocabulary: TextTable | None,
     ) -> None:
         """Args:
-        features: of the scene's Gaussians.
         text_mean: mean of the text side.
-        vocabulary: words of the features' space that may fit better than the one asked; None where there are none.
-        """
+        vocabulary: words of the features' space that may fit better than the one asked; None where there are none."""
         self._features, self._text_mean = features, text_mean
         self._axes: FeatureAxes = feature_axes(features)
         self._rivals: Float64[np.ndarray, "C D"] | None = None
@@ -124,9 +122,7 @@ class Presence:
         """The evidence for each cluster of one word.
 
         Args:
-            word: its vector.
             cosines: its centered cosine with every Gaussian, NaN where that was never seen.
-            clusters: those of the word.
             trained: whether the encoder of the features was trained on the word; None where that is not stated.
         """
         if not clusters:

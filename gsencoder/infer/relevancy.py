@@ -34,7 +34,6 @@ class FeatureAxes:
 
     Attributes:
         matrix: from stored rows to the axes; None where the rows are the vectors themselves.
-        offset: added after it.
         axes: the axes as columns; None where they are the channels.
         floor: squared length that is added to that of a feature: one much shorter than the mean has no direction.
     """
@@ -102,13 +101,9 @@ def relevancy(
         text_mean: mean of the text side.
         negatives: vectors of negative words (there may be none of them), or None for plain cosines.
         temperature: t above; LERF's factor of 10 is 0.1.
-        mode: "centered" or "raw" cosines.
 
     Returns:
         Relevancy, in [−1, 1] for cosines; NaN for Gaussians never seen.
-
-    Raises:
-        InputError: sizes that differ from the space's, values that are not finite, a temperature that is not positive.
     """
     words = text if negatives is None else np.concatenate([text, negatives])
     channels = features.space.channels
@@ -163,7 +158,6 @@ class GaussianProducts:
     """Products of words with the features of Gaussians, less the mean; the lengths of the features are kept.
 
     Attributes:
-        features: of the Gaussians.
         axes: their axes.
     """
 

@@ -175,14 +175,10 @@ def grow(
     """The labels of all Gaussians, and the number of views that corrected them.
 
     Args:
-        gaussians: the splat.
         features: of the space in which the words were asked.
         cameras: of the views that correct the labels; None = features and positions alone decide.
         parts: what each word's selection starts with.
-        relevancy: of each word.
-        config: settings.
         spacing: of the scene, world units.
-        track: progress over the views.
     """
     candidates = labels_by_features(gaussians, features, parts, relevancy, config, spacing)
     labels = candidates.labels
@@ -225,24 +221,12 @@ def select(
 
     Args:
         scene: Gaussians with one feature set, or several of which one is of the space of `text`.
-        words: each once.
         text: turns words into the features' space.
-        config: how selections grow.
         boxes: numbers of the boxes of each word, best first from 0; empty = the most probable, and those that are
             nearly as probable.
-        threshold: a relevancy instead of boxes.
-        localization: how words become boxes.
-        track: progress over the views.
 
     Returns:
         The selection, and the boxes that it started from.
-
-    Raises:
-        InputError: what `localize` raises; two words with the same vector; boxes and a threshold; a box that a word
-            does not have; no Gaussian is selected, or every one.
-
-    Warns:
-        SceneWarning: words without a box; a splat without views.
     """
     if boxes and threshold is not None:
         raise InputError("box= and threshold= are two ways to choose where a selection starts; give one of them")

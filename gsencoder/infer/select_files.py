@@ -33,10 +33,8 @@ class Label:
         label: its number; 0 = none of the words.
         name: the word; None for label 0.
         color: RGB, 0 to 255.
-        count: of its Gaussians.
         aabb_min: lower corner of the box around their centers, world coordinates; None where there are none, and for
             label 0.
-        aabb_max: upper corner.
         file: of the splat of these Gaussians alone, beside labels.json; None where none was written.
     """
 
@@ -54,7 +52,6 @@ class LabeledSplat:
     """A splat with a label for each Gaussian.
 
     Attributes:
-        gaussians: relative to `origin`.
         origin: of the scene, world coordinates.
         labels: of each Gaussian, a row of `names`.
         names: what the labels stand for, by their number.
@@ -70,8 +67,6 @@ def labels_to_json(scene: Scene, selection: Selection, files: Mapping[int, str])
     """Names, colors, counts and boxes as JSON values.
 
     Args:
-        scene: that was labeled.
-        selection: its labels.
         files: names of the splats that were written, by label.
     """
     assert scene.gaussians is not None
@@ -114,11 +109,7 @@ def write_labels(folder: Path, scene: Scene, selection: Selection, files: Mappin
 
 
 def read_labels(folder: str | Path) -> LabeledSplat:
-    """Reads labels.ply and labels.json.
-
-    Raises:
-        InputError: a file is missing or damaged, or they do not belong together.
-    """
+    """Reads labels.ply and labels.json."""
     path = Path(folder) / LABELS_JSON
     check_written(path)
     try:

@@ -95,8 +95,6 @@ class Selection:
     """A label for each Gaussian of a scene: 0 = none of the words, k + 1 = word k.
 
     Attributes:
-        words: what was asked.
-        labels: of every Gaussian.
         seeds: the labels before they grew.
         views: how many views were looked at.
         placed: whether these are cameras that were placed around or inside a splat without views.
@@ -140,13 +138,8 @@ def box_parts(localization: Localization, ranks: Sequence[int], *, probable: flo
     """The Gaussians of each word's boxes.
 
     Args:
-        localization: of the words.
         ranks: numbers of the boxes of every word, as in boxes.json; empty = the boxes that are at least `probable`
             times as probable as the most probable box of their word.
-        probable: see there.
-
-    Raises:
-        InputError: a word has no box of a number.
     """
     parts = []
     for word in localization.queries:
@@ -168,11 +161,7 @@ def _probable(boxes: Sequence[Box], share: float) -> list[Box]:
 
 
 def threshold_parts(words: Sequence[str], relevancy: Float32[np.ndarray, "Q N"], threshold: float) -> Parts:
-    """All Gaussians whose relevancy for a word is at least `threshold`, a part for each word.
-
-    Raises:
-        InputError: no Gaussian reaches it for any word.
-    """
+    """All Gaussians whose relevancy for a word is at least `threshold`, a part for each word."""
     # Comparisons with NaN are false: Gaussians never seen are never taken.
     rows = [np.flatnonzero(scores >= threshold) for scores in relevancy]
     if not any(len(each) for each in rows):
@@ -229,9 +218,6 @@ def object_shares(
     """The share of the object in the Gaussians at and around one of its parts.
 
     Args:
-        features: of all Gaussians.
-        means: their centers.
-        rows: the Gaussians that the part starts with.
         relevancy: of all Gaussians for the word; finite where `features` were seen.
         spacing: of the scene, world units.
         reach: candidates lie within so many spacings of `rows`.
@@ -353,13 +339,9 @@ def votes(
     """Where the blending weight of each Gaussian falls.
 
     Args:
-        gaussians: the splat.
-        cameras: in the same world.
         labels: of the Gaussians, 0 to `count`.
-        count: the largest label there can be.
         chosen: which pixels are looked at; a pixel of every second line and column counts four times.
         spacing: entries that lie farther behind a pixel's surface than this, and a share of its depth, do not count.
-        track: progress over the views.
 
     Returns:
         Weights over labels 0 to `count`; rows of zeros for Gaussians that no view shows.
@@ -400,8 +382,6 @@ class Hole:
     """Pixels of one view that are empty after the removal and were not before.
 
     Attributes:
-        view: row number.
-        pixels: how many.
         removed: how many pixels the removed Gaussians dominated.
         area: of the hole at the depth of the surface that was there, in world units².
     """
@@ -426,11 +406,8 @@ def find_holes(
     or more, and is less without them. It covers z² / (fx·fy) of a surface at depth z that faces the camera.
 
     Args:
-        gaussians: the whole splat.
-        cameras: in the same world.
         removed: which Gaussians are taken out.
         chosen: which pixels are looked at; numbers are those of the whole view.
-        track: progress over the views.
     """
     rest = gaussians.select(~removed)
     values = torch.from_numpy(removed.astype(np.float32))

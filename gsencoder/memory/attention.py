@@ -47,13 +47,9 @@ class MemoryAttention(nn.Module):
         values: Float[Tensor, "M C"] | None = None,
     ) -> None:
         """Args:
-        bank: the components.
-        projection: initial W_m.
         mean: of the space, about which centered cosines are; that of the bank is zero where it was made without.
         scoring: how queries are compared with components.
-        temperature: τ.
-        values: what is averaged, such as the components in a basis; None = the components.
-        """
+        values: what is averaged, such as the components in a basis; None = the components."""
         super().__init__()
         self.scoring, self.temperature = scoring, temperature
         self.projection = nn.Parameter(projection)
@@ -103,11 +99,7 @@ def render_features(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, 
     """The features of the rows of B, and how opaque these rows are. Where nothing is hit a feature means nothing.
 
     Args:
-        memory: of the Gaussians of B.
         b: of pixels or patches.
-
-    Raises:
-        InputError: B has other Gaussians.
     """
     queries, _ = render_queries(memory, b)
     return memory.attend(queries), b.alpha.numpy()
@@ -118,11 +110,7 @@ def render_queries(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, "
     part in the mean. Where that share is 0 a query is zero and means nothing.
 
     Args:
-        memory: of the Gaussians of B.
         b: of pixels or patches.
-
-    Raises:
-        InputError: B has other Gaussians.
     """
     if b.gaussians != len(memory):
         raise InputError(f"memory: queries of {len(memory):,} Gaussians, and a view of {b.gaussians:,}")
@@ -143,7 +131,6 @@ def make_decoder(
         kind: linear, or a perceptron of one hidden layer.
         projection: initial weights of the linear decoder.
         hidden: units of the perceptron.
-        generator: of the perceptron's initial weights.
     """
     channels, width = projection.shape
     if kind == "linear":
@@ -195,11 +182,7 @@ def export_memory(memory: QueryMemory) -> bytes:
     """A graph with the input `queries` f32[n, s] and the output `features` f32[n, D], compared with numpy.
 
     A runtime holds the scores of all queries that it is given at once, n × M numbers, so that large pictures go in
-    blocks. The metadata entry `gsencoder` is a JSON object with the feature space and the figures of the bank.
-
-    Raises:
-        InputError: onnx or onnxscript is missing, or the graph and numpy differ.
-    """
+    blocks. The metadata entry `gsencoder` is a JSON object with the feature space and the figures of the bank."""
     try:
         import onnx  # noqa: F401
         import onnxscript  # noqa: F401

@@ -65,17 +65,7 @@ def draw_sample(maps: MapStream, space: FeatureSpace, limit: int, *, seed: int =
     """Draws raw features without replacement, each with the same probability.
 
     Every feature gets a random number, and those with the smallest numbers are the sample. Every n-th feature would
-    come from the same few columns of maps whose width divides n.
-
-    Args:
-        maps: of the scene; read once.
-        space: of the maps.
-        limit: largest number of features.
-        seed: of the random numbers.
-
-    Raises:
-        InputError: a limit below 1.
-    """
+    come from the same few columns of maps whose width divides n."""
     if limit < 1:
         raise InputError(f"limit: expected 1 or more, got {limit}")
     features = np.zeros((0, space.channels), np.float32)
@@ -180,14 +170,7 @@ def build_bank(
     with all others, and keeps all of them in a temporary file.
 
     Args:
-        maps: of the scene.
-        space: of the maps.
         mean: of the space, which is subtracted where the configuration asks for centered cosines.
-        config: method and threshold.
-
-    Raises:
-        InputError: no features; features that are infinite; more components than memory holds; or fewer components
-            asked for than the features have directions.
     """
     builder = _Builder(maps, space, mean if config.center else np.zeros_like(mean), config)
     return builder.build()
@@ -300,11 +283,7 @@ class _Builder:
         return cover
 
     def _cover_all(self, threshold: float) -> tuple[Float32[np.ndarray, "M D"], Int32[np.ndarray, "M 3"]]:
-        """The cover of all features, and where its components come from.
-
-        Raises:
-            InputError: no features, or more components than memory holds.
-        """
+        """The cover of all features, and where its components come from."""
         cover = CoverReduction(self._space.channels, threshold)
         sources: list[np.ndarray] = []
         without_direction: list[tuple[np.ndarray, np.ndarray]] = []
@@ -434,9 +413,6 @@ def principal_queries(
         bank: that the queries will attend to.
         channels: s. Where the components have fewer directions, further channels are zero.
         scoring: how queries will be compared with components.
-
-    Raises:
-        InputError: features and bank are of different spaces, or no Gaussian has features.
     """
     if features.space != bank.space:
         raise InputError(
@@ -480,12 +456,7 @@ def memory_of_features(
     Args:
         features: of the Gaussians, fused or predicted by an encoder.
         bank: of the scene's own views, or of other scenes.
-        channels: of a query.
         scoring: how queries are compared with components.
-        temperature: of the attention.
-
-    Raises:
-        InputError: features and bank are of different spaces, or no Gaussian has features.
     """
     queries, projection = principal_queries(features, bank, channels, scoring)
     return QueryMemory(

@@ -79,13 +79,7 @@ def index_features(
     """Makes a table of rows that features share.
 
     Args:
-        features: fused or encoded.
-        config: how many rows.
         most: a table of more rows is given up; None = one of more than two bytes can number.
-
-    Raises:
-        TooManyRowsError: the table would have more rows than `most`.
-        InputError: no features, or more rows than two bytes can number.
     """
     seen = np.flatnonzero(features.seen)
     if not len(seen):
@@ -127,11 +121,7 @@ def index_features(
 def _leaders(
     centered: Float32[np.ndarray, "n C"], config: IndexConfig, limit: int, *, search: bool
 ) -> tuple[float, Int64[np.ndarray, " M"]]:
-    """The threshold of a cover, and its rows, at most so many; with `search` an error says which threshold has them.
-
-    Raises:
-        InputError: more rows than the numbers of an index.
-    """
+    """The threshold of a cover, and its rows, at most so many; with `search` an error says which threshold has them."""
 
     def cover(threshold: float, limit: int) -> CoverReduction:
         reduction = CoverReduction(centered.shape[1], threshold)
@@ -209,16 +199,8 @@ def index_within(
     Thresholds come from a fixed list. What a sample says of one is too good: its table has fewer rows than that of all
     Gaussians, and is nearer to them. All Gaussians then decide, from there on towards what is safe.
 
-    Args:
-        features: fused or encoded.
-        budget: at least one promise.
-        bytes_of: of a package with so many rows.
-
     Returns:
         The table, and its error: 1 − mean centered cosine over Gaussians, or over their kinds where that is larger.
-
-    Raises:
-        InputError: no features, or no table keeps the budget; the message says how near one comes.
     """
     seen = features.seen.nonzero()[0]
     if not len(seen):

@@ -25,11 +25,7 @@ WITNESSES = 4096
 
 
 def unit_rows(rows: Float32[np.ndarray, "n D"], where: str = "features") -> Float32[np.ndarray, "n D"]:
-    """Rows of unit length, without overflow or underflow of their squares.
-
-    Raises:
-        InputError: a row is not finite, or zero, so that it has no direction; the message names the row.
-    """
+    """Rows of unit length, without overflow or underflow of their squares."""
     largest = np.abs(rows).max(axis=1, initial=0.0, keepdims=True)
     bad = ~np.isfinite(largest[:, 0]) | (largest[:, 0] == 0)
     if bad.any():
@@ -78,12 +74,8 @@ def reduce_as_published(
 
     Args:
         features: raw features of all views, in order.
-        threshold: θ, a cosine.
         drop_last: a chunk size c: the last n mod c rows become no components, as the printed loop has it; 0 = they may.
         seed: of the order in which witnesses are searched, which changes nothing of the result.
-
-    Raises:
-        InputError: a threshold outside of (0, 1], or rows without a direction.
     """
     check_threshold(threshold)
     return reduce_units_as_published(unit_rows(features), threshold, drop_last=drop_last, seed=seed)
@@ -146,13 +138,6 @@ class CoverReduction:
     """
 
     def __init__(self, channels: int, threshold: float) -> None:
-        """Args:
-        channels: of the rows.
-        threshold: θ, a cosine.
-
-        Raises:
-            InputError: a threshold outside of (0, 1].
-        """
         check_threshold(threshold)
         # Rounding of float32 products depends on their block. The smallest cosine that counts is a little above the
         # threshold, so that a row that counts is within the threshold in exact arithmetic, and a little below 1, so
@@ -184,12 +169,8 @@ class CoverReduction:
         """Takes more rows.
 
         Args:
-            features: the rows.
             where: what they are, for the error.
             limit: rows are no longer taken once there are more components than this, which is for the caller to see.
-
-        Raises:
-            InputError: rows without a direction.
         """
         for start in range(0, len(features), BLOCK):
             if limit is not None and len(self) > limit:
@@ -246,11 +227,7 @@ def largest_threshold(fits: Callable[[float], bool]) -> float:
 
 
 def reduce_to_cover(features: Float32[np.ndarray, "n D"], threshold: float) -> Reduction:
-    """`CoverReduction` of rows that are all at hand.
-
-    Raises:
-        InputError: a threshold outside of (0, 1], or rows without a direction.
-    """
+    """`CoverReduction` of rows that are all at hand."""
     cover = CoverReduction(features.shape[1], threshold)
     cover.add(features)
     return Reduction(rows=cover.rows, used=np.ones(len(features), bool))

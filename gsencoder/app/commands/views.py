@@ -93,13 +93,7 @@ def check_promises(
     """Measures what was promised; returns a line for each promise, and warns of those that are broken.
 
     Args:
-        choice: of `choose_in_budget`.
-        scene: in which it was made.
         targets: for which it was made.
-        views: that are shown.
-        files: their pictures.
-        config: with the promises.
-        summary: of the run.
     """
     budget, realised = config.budget, dict[str, float]()
     if budget.error is not None and budget.check:

@@ -64,16 +64,10 @@ def prompt_text(
     """What is asked, in words.
 
     Args:
-        task: see the module.
-        question: the user's; a caption needs none.
         names: of what was looked for and found, in the order of their marks; empty where a thing has no name.
         marks: the numbers, from 1, that the pictures carry.
-        kinds: of the pictures.
         probabilities: that each of the names is right, in their order; empty where nothing says.
         absent: words that were looked for and not found, and the probability that they are there after all.
-
-    Raises:
-        InputError: no question for a task that needs one; nothing to ground or caption.
     """
     question = question.strip()
     check_question(task, question)
@@ -102,11 +96,7 @@ def prompt_text(
 
 
 def check_question(task: Task, question: str) -> None:
-    """Complains where a task needs a question and there is none, or one that cannot be sent.
-
-    Raises:
-        InputError: see above.
-    """
+    """Complains where a task needs a question and there is none, or one that cannot be sent."""
     if not question.strip() and task != "caption":
         raise InputError("question= is missing: what to ask about the scene")
     try:
@@ -119,10 +109,8 @@ def messages(text: str, pictures: Sequence[Picture], *, side: int, kind: ImageFo
     """One message of the user: pictures, then words.
 
     Args:
-        text: of `prompt_text`.
         pictures: what the model sees, in order.
         side: longer pictures are made smaller, pixels.
-        kind: how they are written.
     """
     parts: list[dict[str, Any]] = [
         {"type": "image_url", "image_url": {"url": data_url(picture, side=side, kind=kind)}} for picture in pictures
@@ -142,7 +130,6 @@ def encoded_picture(picture: Picture, *, side: int, kind: ImageFormat) -> bytes:
     Args:
         picture: uint8 [H, W, 3].
         side: a longer picture is made smaller, pixels.
-        kind: of the file.
     """
     height, width = picture.shape[:2]
     if max(width, height) > side:
@@ -181,7 +168,6 @@ class Question:
 
     Attributes:
         text: the question; may be empty for a caption.
-        task: see `prompts`.
         query: words to look for; empty = the words of the table that the text holds.
         aabb: a box in world coordinates to look at in place of words: lower corner, upper corner.
     """
@@ -222,7 +208,6 @@ class Prompt:
     """What a VLM is shown and told.
 
     Attributes:
-        text: the words.
         pictures: as they are sent.
         views: where they were taken, and why.
         targets: what they are of, in the order of their marks.
@@ -247,7 +232,6 @@ class Lookup:
     """What the words of a question, or its box, lead to.
 
     Attributes:
-        targets, boxes, absent: see `Prompt`.
         views: chosen for the targets.
     """
 
@@ -275,13 +259,8 @@ class Asker:
         """Args:
         scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
         words: what leads into the features; None where nothing does.
-        space: which features are asked.
-        config: settings.
-        localization: how words become boxes.
-        views: how views are chosen.
         vlm: how requests are made; pictures are made smaller than its `image_side`.
-        word_rules: which words of a question make a name a verb or a color.
-        """
+        word_rules: which words of a question make a name a verb or a color."""
         self.scene, self.words, self.space = scene, words, space
         self.table = closed_table(words) if words is not None else None
         self.config, self.localization, self.views, self.vlm = config, localization, views, vlm
@@ -294,14 +273,7 @@ class Asker:
     def prompt(self, question: Question) -> Prompt:
         """What to send for a question.
 
-        Where no words are given and the question holds none that the table knows, evenly spread frames are shown.
-
-        Warns:
-            SceneWarning: nothing was looked for, or nothing of it was found.
-
-        Raises:
-            InputError: words that the table does not know, a box without Gaussians, a task that needs what is missing.
-        """
+        Where no words are given and the question holds none that the table knows, evenly spread frames are shown."""
         words = question.query
         if not words and not question.aabb and self.table is not None:
             words = words_in(question.text, self.table, self.word_rules)
@@ -422,11 +394,7 @@ def prompt_messages(prompt: Prompt, config: VlmConfig) -> list[dict[str, Any]]:
 
 
 def chosen_mark(prompt: Prompt, text: str) -> int | None:
-    """Which target an answer to task=ground means, from 1; 0 for none of them, None where it names no mark.
-
-    Warns:
-        SceneWarning: the answer names no mark, several, or one that no picture carries.
-    """
+    """Which target an answer to task=ground means, from 1; 0 for none of them, None where it names no mark."""
     number = number_in(text, len(prompt.targets))
     if number is None or (number and number not in prompt.marks):
         message = " ".join(text.split())[:80]

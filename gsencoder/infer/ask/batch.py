@@ -40,23 +40,13 @@ def ask_question(
     """Asks one question, and writes what was sent and what came back.
 
     Args:
-        question: see there.
         asker: of the scene that the question is about.
         server: None = a dry run, which writes prompt, request and pictures, and asks nobody.
-        folder: an existing one.
         clock: counts the seconds of the steps "views", "write" and "ask".
 
     Returns:
         The row of the answer as JSON values: question, task, words, absent, targets, views and, from a server, answer,
         model, finish, tokens, seconds, and for task=ground the mark and its box.
-
-    Raises:
-        InputError: a question that cannot be asked of this scene.
-        ServerError: a fault of the server.
-        WriteError: the disk is full, or the system refuses.
-
-    Warns:
-        SceneWarning: nothing was found, or the answer was cut off or names no mark.
     """
     clock = clock or Clock()
     scene, vlm = asker.scene, asker.vlm
@@ -124,21 +114,13 @@ def ask_questions(
     interrupted is continued by the next with the same `work`, and asks no question twice.
 
     Args:
-        questions: of `read_questions`.
-        asker: of the scene that they are about.
         server: None = a dry run.
         work: an existing folder for the rows so far, `answers.jsonl`, and one folder a question, named by its digest.
         made_from: what else answers depend on, as JSON values, such as the folders that the scene was read from.
         unanswered: collects the ids of questions that have no answer, and why; None = these are an error.
-        clock: as in `ask_question`.
-        track: progress.
 
     Returns:
         One row a question, in their order, each with its digest; none for those in `unanswered`.
-
-    Raises:
-        InputError: questions that have no answer, after all others were asked; the first is named. A fault of the
-            server, or a file that cannot be written: no further question is asked.
     """
     depends_on = _depends_on(asker, server is None, made_from)
     digests = {each.id: each.digest(depends_on) for each in questions}
@@ -191,8 +173,6 @@ def write_answers(folder: Path, work: Path, rows: Sequence[Mapping[str, Any]]) -
 
     Args:
         folder: an existing one to write into.
-        work: the folder that `ask_questions` filled.
-        rows: its result.
     """
     lines = []
     for number, row in enumerate(rows, start=1):
@@ -288,7 +268,6 @@ def predictions(
     Boxes are eight corners. Of an answer the case and a full stop at its end are left out (`short_answer`).
 
     Args:
-        benchmark: whose form is wanted.
         answered: questions with the rows of `gsencoder.infer.ask.batch.ask_questions`.
         unanswered: questions without one; besides ScanRefer's they have no entry.
     """
@@ -353,20 +332,11 @@ def store_prompt(
     """Writes the prompt that `ask` would send for a question.
 
     Args:
-        store: to write to.
         key: states all that the prompt is made from.
-        asker: of the scene.
-        question: about it.
         features: of the scene's Gaussians; they are rendered in each view as tokens of a vision tower; None = no
             tokens.
         grid: rows and columns of the tower's patches.
         fit: how the tower's preprocessing makes pictures square.
-
-    Raises:
-        InputError: see `Asker.prompt`.
-
-    Warns:
-        SceneWarning: nothing was looked for, or nothing of it was found.
     """
     prompt = asker.prompt(question)
     side, kind = asker.vlm.image_side, asker.vlm.image_format
@@ -381,15 +351,7 @@ def store_prompt(
 def view_tokens(
     gaussians: Gaussians, views: ViewSet, features: GaussianFeatures, grid: tuple[int, int], fit: Fit
 ) -> Float16[np.ndarray, "V P D"]:
-    """Rendered features of chosen views on the grid of a tower.
-
-    Args:
-        gaussians: of the scene.
-        views: as chosen.
-        features: of the Gaussians.
-        grid: rows and columns.
-        fit: see `gsencoder.infer.views.pictures.tower_grid`.
-    """
+    """Rendered features of chosen views on the grid of a tower."""
     config = BlendConfig(near=min(BlendConfig().near, views.near))
     tokens = feature_tokens(token_blends(gaussians, views.cameras, grid, fit=fit, config=config), features)
     limit = float(np.finfo(np.float16).max)

@@ -35,7 +35,6 @@ class BatchQuestion:
 
     Attributes:
         id: of the question; the number of its line where it has none.
-        question: what is asked.
     """
 
     id: str
@@ -49,15 +48,7 @@ class BatchQuestion:
 
 def read_questions(path: Path, task: Task = "answer") -> tuple[BatchQuestion, ...]:
     """Reads lines such as {"id": "7", "question": "What is on the table?", "query": "table"}; id, task, query and aabb
-    may be left out, empty lines are skipped.
-
-    Args:
-        path: of the file.
-        task: of lines that name none.
-
-    Raises:
-        InputError: no such file, a line that is no such object, an id that comes twice, or no questions.
-    """
+    may be left out, empty lines are skipped."""
     with about("questions"):
         lines = read_checked_text(path, max_bytes=MAX_FILE_BYTES).split("\n")
     questions: dict[str, BatchQuestion] = {}
@@ -115,11 +106,7 @@ def _parse_line(line: str, number: str, task: Task) -> BatchQuestion:
 
 
 def read_answers(path: Path) -> dict[str, dict[str, Any]]:
-    """The finished lines of a file of answers, by id; a last line that was cut off is none.
-
-    Raises:
-        InputError: it cannot be read, or holds something else.
-    """
+    """The finished lines of a file of answers, by id; a last line that was cut off is none."""
     if not path.exists():
         return {}
     check_written(path)
@@ -204,16 +191,9 @@ def read_question_set(path: Path, task: Task = "answer", proposals: str = "") ->
     Scan2Cap's has them), in those of `proposals`, or in those that are localized. Answers in the file are not read.
 
     Args:
-        path: of the file.
         task: "answer" stands for what the benchmark asks.
         proposals: a file of boxes, {scene: [{"box": eight corners}, …]} as Scan2Cap's predictions have them;
             "localize" = the boxes of the objects' names; empty = those of the file.
-
-    Raises:
-        InputError: no such file, another task than the benchmark's, or boxes are missing.
-
-    Warns:
-        SceneWarning: scenes without captions, since they have no proposals or no descriptions.
     """
     content = read_benchmark_json(path)
     first = content[0] if isinstance(content, list) and content and isinstance(content[0], dict) else {}
@@ -239,8 +219,6 @@ def caption_question(scene: str, name: str, aabb: tuple[Corner, Corner], keys: M
     """The question for a caption of what is in a box.
 
     Args:
-        scene: of the box.
-        name: of the question, unique in the scene.
         aabb: lower and upper corner in world coordinates.
         keys: what the prediction says besides caption and box, such as probabilities.
     """

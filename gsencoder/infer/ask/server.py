@@ -36,16 +36,10 @@ class ReplyGuard:
     """
 
     def __init__(self, max_tokens: int) -> None:
-        """Args:
-        max_tokens: of an answer.
-        """
         self.fault = ""
         self._largest = LARGEST_REPLY + BYTES_PER_TOKEN * max_tokens
 
     def __call__(self, response: Any) -> None:
-        """Args:
-        response: of httpx, or of httpx2 since openai 3.
-        """
         self.fault = ""
         self._check_redirect(response)
         headers, coding = response.headers, response.headers.get("content-encoding", "identity").strip().lower()
@@ -194,7 +188,6 @@ class Reply:
     """What a model said.
 
     Attributes:
-        text: the answer.
         model: as the server names it.
         finish: why it ended: "stop", "length" (max_tokens), …
         tokens: of prompt and answer, where the server counts them.
@@ -213,7 +206,6 @@ class Heard:
     """An answer as far as it has come.
 
     Attributes:
-        text, model, finish, tokens: as in `Reply`.
         refusal: the model's words where it refuses to answer.
         thought: whether there was reasoning beside the answer.
         parts: how many parts have come.
@@ -230,11 +222,7 @@ class Heard:
     unstreamed: bool = False
 
     def hear(self, part: Any) -> None:
-        """Takes up a completion, or a chunk of one.
-
-        Raises:
-            ValueError: the server tells of an error, or it is no part of a completion.
-        """
+        """Takes up a completion, or a chunk of one."""
         choices = getattr(part, "choices", None)
         if choices is None:
             extra = getattr(part, "model_extra", None) or {}
@@ -352,12 +340,7 @@ def request_body(messages: Sequence[Message], config: VlmConfig, *, named: bool 
     """What is sent, but for the key.
 
     Args:
-        messages: of `prompts.messages`.
-        config: settings.
         named: a model must be named; a dry run needs none.
-
-    Raises:
-        InputError: no model is named.
     """
     model = config.model or os.environ.get(MODEL_VARIABLE, "")
     if named and not model:
@@ -373,11 +356,7 @@ def request_body(messages: Sequence[Message], config: VlmConfig, *, named: bool 
 
 
 def check_url(url: str, name: str) -> None:
-    """Complains about what is no server's address, or holds what belongs in the key.
-
-    Raises:
-        InputError: which never repeats the address where it may hold a key.
-    """
+    """Complains about what is no server's address, or holds what belongs in the key."""
     try:
         parts = urlsplit(url)
         secret = parts.username is not None or parts.password is not None or bool(parts.query or parts.fragment)
@@ -393,19 +372,9 @@ def check_url(url: str, name: str) -> None:
 
 
 class VlmServer:
-    """A server that answers.
-
-    Attributes:
-        url: where it is.
-    """
+    """A server that answers."""
 
     def __init__(self, config: VlmConfig) -> None:
-        """Args:
-        config: see there; what it leaves empty comes from the environment.
-
-        Raises:
-            InputError: no address or a wrong one, a key that cannot be sent, or the openai package is missing.
-        """
         try:
             import openai
         except ImportError as error:
@@ -445,15 +414,7 @@ class VlmServer:
             raise InputError(f"vlm: no connection can be set up ({reason}){_proxies()}") from self._downscaled(error)
 
     def ask(self, body: Mapping[str, Any]) -> Reply:
-        """One answer.
-
-        Args:
-            body: of `request_body`.
-
-        Raises:
-            ServerError: the server cannot be reached, fails, or breaks off.
-            InputError: it refuses this question, or gives no whole answer to it; in its own words where it has any.
-        """
+        """One answer."""
         begun = time.monotonic()
         heard, failed = Heard(), list[BaseException]()
         self._guard.fault = ""

@@ -69,13 +69,7 @@ ON_CPU = EncodeConfig(precision="float32", device="cpu")
 
 
 class Cloud(NamedTuple):
-    """Gaussians to compare on.
-
-    Attributes:
-        name: for messages.
-        gaussians: they.
-        metres_per_unit: of their world.
-    """
+    """Gaussians to compare on."""
 
     name: str
     gaussians: Gaussians
@@ -87,11 +81,7 @@ def lower(encoder: TorchEncoder, *, half: bool = False) -> Any:
     `gsencoder.infer.onnx.export`.
 
     Args:
-        encoder: to be exported.
         half: compute in float16 once Gaussians have been merged into tokens.
-
-    Raises:
-        InputError: onnx or onnxscript is missing, or torch is too old to export this network.
     """
     try:
         import onnx  # noqa: F401
@@ -142,7 +132,6 @@ def export_onnx(
     """What the file is to hold: the graph, and what a runtime must know of it.
 
     Args:
-        encoder: to be exported.
         lowered: what `lower` made of it, in half precision for float16.
         precision: what the graph is to compute in.
     """
@@ -204,9 +193,7 @@ def random_cloud(count: int, voxel: float, seed: int = 0) -> Gaussians:
     """A sheet of Gaussians of all sizes and shapes, two to a cell and many cells apart.
 
     Args:
-        count: how many.
         voxel: edge of a cell, which sizes are measured in.
-        seed: of the generator.
     """
     rng = np.random.default_rng(seed)
     side = voxel * max(count, 1) ** 0.5
@@ -232,16 +219,10 @@ def check_parity(
 
     Args:
         model: what `export_onnx` gave, in float32.
-        encoder: see there.
-        clouds: to try.
-        tolerance: see `TOLERANCE`.
         track: wraps the loop over clouds to show progress.
 
     Returns:
         The largest difference on each cloud, as a share of the largest output of the space.
-
-    Raises:
-        InputError: they differ by more.
     """
     runtime = OnnxEncoder(model, device="cpu")
     errors: dict[str, float] = {}
@@ -267,17 +248,11 @@ def check_cosines(
     """Runs a model of a cheaper precision, and the same in float32, on the same clouds.
 
     Args:
-        model: what `export_onnx` gave.
         exact: what it gave in float32.
-        clouds: to try.
-        cosine: see `COSINE`.
         track: wraps the loop over clouds to show progress.
 
     Returns:
         The mean centered cosine of the two's features on each cloud, in the space where it is smallest.
-
-    Raises:
-        InputError: they are further apart.
     """
     cheap, full = OnnxEncoder(model, device="cpu"), OnnxEncoder(exact, device="cpu")
     cosines: dict[str, float] = {}
@@ -531,8 +506,6 @@ class Product(NamedTuple):
     """A product with weights that do not change: a linear layer or a convolution.
 
     Attributes:
-        node: of the graph.
-        x: what is multiplied.
         weight: name of the weights.
         matrix: the same, a column for each output channel.
         cells: cells of a convolution's neighborhood; 1 for a linear layer.

@@ -57,7 +57,6 @@ class OnnxHeader:
 
     Attributes:
         voxel: edge of the finest grid, metres.
-        levels: of the network.
         orders: the curves that attention follows.
         patch: most tokens in a patch.
         outputs: what the features mean; the graph has restored them already.
@@ -133,11 +132,7 @@ def _words_parts(words: TextTable, *, in_int8: bool) -> tuple[dict[str, np.ndarr
 
 
 def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
-    """The header that entries of text hold.
-
-    Raises:
-        InputError: there is none, it is of another version, or damaged.
-    """
+    """The header that entries of text hold."""
     if KEY not in entries:
         raise InputError("is no encoder that `gsencoder export` wrote")
     try:
@@ -219,11 +214,7 @@ def with_sum(model: bytes) -> bytes:
 
 
 def check_sum(model: bytes) -> bool:
-    """Whether a file has a sum.
-
-    Raises:
-        InputError: it has another than its contents.
-    """
+    """Whether a file has a sum."""
     position = _sum_position(model)
     if position is not None and model[position : position + len(NO_SUM)] != _digest(model, position):
         raise InputError(
@@ -283,10 +274,6 @@ class OnnxEncoder:
             file: a path, a name in the folder GSENCODER_MODELS, or what the file holds.
             device: where it is to run; auto = a GPU where this onnxruntime has one.
             threads: of the CPU; 0 = onnxruntime's own choice.
-
-        Raises:
-            InputError: no such file, not one that `gsencoder export` wrote, damaged, of another version, or no such
-                device.
         """
         self.name = "the model" if isinstance(file, bytes) else str(find_file(str(file), "weights"))
         with readable(self.name):
@@ -356,15 +343,10 @@ class OnnxEncoder:
         within rounding.
 
         Args:
-            gaussians: the splat.
             config: of its parts; the precision is the file's.
             space: name of a teacher or of its feature space; None = the only one.
             metres_per_unit: of the splat's world; the encoder's grid is in metres.
             track: wraps the loop over chunks to show progress.
-
-        Raises:
-            InputError: no Gaussians, or they spread over too many cells, or features that are not finite, or a unit
-                that is not positive; or there is no such space, or there are several and none is named.
         """
         teacher = self.header.outputs.resolve(space)
         values = self._restored(gaussians, [teacher], config, metres_per_unit, track)
@@ -431,11 +413,7 @@ class OnnxEncoder:
 
 def feed_of(subset: Gaussians, scene_curves: SceneCurves | None, voxel: float) -> dict[str, np.ndarray]:
     """What the graph takes of a part of a scene, in the grid of the whole; `scene_curves` is None where it is all of
-    it.
-
-    Raises:
-        InputError: the part spreads over too many cells.
-    """
+    it."""
     scaled = np.floor(subset.means.astype(np.float64) / voxel)
     check_extent(float((scaled.max(axis=0) - scaled.min(axis=0)).max()) + 1, voxel)
     feed = inputs_of(subset) | {"voxel": np.array(voxel, np.float64)}
@@ -460,11 +438,7 @@ def starts_table(curves: SceneCurves) -> Int64[np.ndarray, "rows P"]:
 
 
 def open_session(model: bytes, name: str, device: Device, threads: int = 0) -> Any:
-    """onnxruntime with a graph.
-
-    Raises:
-        InputError: no model that it reads, or no such device.
-    """
+    """onnxruntime with a graph."""
     import onnxruntime
 
     available = onnxruntime.get_available_providers()

@@ -55,9 +55,6 @@ def load_bundle(folder: Path | None = None) -> Bundle:
 
     Args:
         folder: where it lies; None = `STATIC`.
-
-    Raises:
-        InputError: it was not built.
     """
     folder = STATIC if folder is None else folder
     try:
@@ -88,11 +85,7 @@ class Container:
     arrays: Mapping[str, np.ndarray]
 
     def to_bytes(self) -> bytes:
-        """The container in the form that the module describes.
-
-        Raises:
-            InputError: an array of another type.
-        """
+        """The container in the form that the module describes."""
         listed: dict[str, Any] = {}
         parts: list[bytes] = []
         offset = 0
@@ -124,8 +117,6 @@ def served_page(bundle: Bundle, title: str, settings: Mapping[str, Any]) -> tupl
     """The page of a server, and the content security policy that its response states.
 
     Args:
-        bundle: script and style.
-        title: of the page, for people.
         settings: for the script: `kind` is "server", and `scenes` the number of scenes.
     """
     policy = content_policy(bundle, connect="'self'")
@@ -133,14 +124,7 @@ def served_page(bundle: Bundle, title: str, settings: Mapping[str, Any]) -> tupl
 
 
 def file_page(bundle: Bundle, title: str, settings: Mapping[str, Any], scenes: Sequence[Container]) -> bytes:
-    """The page as one file with its scenes, which opens without a network.
-
-    Args:
-        bundle: script and style.
-        title: of the page.
-        settings: for the script.
-        scenes: of `file_container`.
-    """
+    """The page as one file with its scenes, which opens without a network."""
     blobs = [gzip.compress(scene.to_bytes(), COMPRESSION, mtime=0) for scene in scenes]
     parts = [
         f'<script type="application/octet-stream" id="scene-{number}">{base64.b64encode(blob).decode("ascii")}</script>'
@@ -209,7 +193,6 @@ def scene_container(search: SceneSearch, objects: tuple[SceneObject, ...], *, sh
     """What a page needs of a scene whose words a server answers.
 
     Args:
-        search: over the scene.
         objects: labeled ones with boxes in world coordinates; may be empty.
         sh_degree: largest degree of spherical harmonics.
     """
@@ -267,11 +250,7 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
 
     Features are coordinates z of the codes and levels of `gsencoder.fusion.quantize`. The relevancy of the word
     with vector t in `words` is z·t / √(|z|² + floor), since the basis is orthonormal and its mean is what centered
-    cosines remove.
-
-    Raises:
-        InputError: nothing was seen, or a threshold that pages do not compute.
-    """
+    cosines remove."""
     if search.config.threshold.kind == "otsu":
         raise InputError("localize.threshold.kind=otsu: a page does not compute it; use another, or leave out= out")
     base = scene_container(search, objects, sh_degree=options.sh_degree)
@@ -332,11 +311,7 @@ def photograph_bytes(views: Views | None, options: FileOptions) -> tuple[list[UI
 
 
 def jpeg_of(views: Views, view: int, side: int) -> bytes:
-    """The photograph of a view as JPEG, its longer side at most `side` pixels.
-
-    Raises:
-        InputError: the scene has no photographs, or no such view.
-    """
+    """The photograph of a view as JPEG, its longer side at most `side` pixels."""
     if views.images is None or not 0 <= view < len(views):
         raise InputError(f"photograph: expected one of {len(views)} views with photographs, got {view}")
     image = Image.fromarray(np.ascontiguousarray(views.images[view]))
@@ -357,10 +332,6 @@ class MadePage:
     """A page and what became of the scenes in it.
 
     Attributes:
-        page: the file.
-        gaussians: in each scene.
-        sh_degree: of each scene.
-        photographs: in each scene.
         feature_error: what quantization cost, 1 − mean centered cosine, of each scene.
         notes: what was left out, a sentence each.
     """
@@ -386,16 +357,9 @@ def fitting_page(
     """The page with as much as fits: spherical harmonics are left out degree by degree, then Gaussians.
 
     Args:
-        bundle: script and style.
         scenes: each with its title and words.
-        config: how words become boxes.
         objects: labeled ones, which may be none.
         options: what the file holds at most.
-        max_gaussians: in each scene.
-        max_bytes: of the file.
-
-    Raises:
-        InputError: not even a thousand Gaussians fit, or what `file_container` raises.
     """
     highest = max(_degree(scene) for scene, _, _ in scenes)
     largest = max(len(select_features(scene, None)[0]) for scene, _, _ in scenes)

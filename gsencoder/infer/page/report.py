@@ -87,12 +87,8 @@ class HtmlReport:
 
         Args:
             pictures: uint8 RGB.
-            captions: one a picture.
             cell: smallest width of a picture on the page, in CSS pixels.
             lossless: PNG, not JPEG: for plots and flat colors.
-
-        Raises:
-            InputError: another number of captions than pictures.
         """
         if len(pictures) != len(captions):
             raise InputError(f"HtmlReport.pictures: {len(pictures)} pictures but {len(captions)} captions")
@@ -104,11 +100,7 @@ class HtmlReport:
         self._add(f'<div class="grid" style="--cell: {int(cell)}px">{"".join(figures)}</div>')
 
     def table(self, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-        """Adds a table; columns of numbers align to the right. It scrolls sideways on narrow screens.
-
-        Raises:
-            InputError: a row of another length than the head.
-        """
+        """Adds a table; columns of numbers align to the right. It scrolls sideways on narrow screens."""
         bad = [index for index, row in enumerate(rows) if len(row) != len(columns)]
         if bad:
             raise InputError(f"HtmlReport.table: row {bad[0]} has {len(rows[bad[0]])} cells, expected {len(columns)}")
@@ -160,11 +152,7 @@ class HtmlReport:
         )
 
     def write(self, path: str | Path) -> None:
-        """Writes the page, whole or not at all.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Writes the page, whole or not at all."""
         with atomic_file(path) as stream:
             # Lone surrogates, which a hostile file name can hold, have no UTF-8.
             stream.write(self.html().encode("utf-8", "replace"))

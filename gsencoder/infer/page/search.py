@@ -36,7 +36,6 @@ class ShownScene:
     Attributes:
         scene: its Gaussians, and the features under the name of their space alone.
         title: for people; the name of the folder.
-        total: Gaussians before thinning.
         notes: what was left out or changed, a sentence each.
     """
 
@@ -60,12 +59,8 @@ def drawn_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "
 
     Args:
         scene: with one feature set, or one that words lead into.
-        title: for people.
         max_gaussians: at least 1.
         advice: what a note about thinning ends with.
-
-    Raises:
-        InputError: no Gaussians, no features, or several feature sets.
     """
     gaussians, features = select_features(scene, None)
     total = len(gaussians)
@@ -148,9 +143,7 @@ def object_numbers(
     """For each Gaussian the place, from 1, of the smallest object whose box holds its mean; 0 = none.
 
     Args:
-        means: relative to the origin.
         objects: with boxes in world coordinates.
-        origin: of the scene.
         margin: by which boxes are enlarged on each side, world units.
     """
     if len(objects) >= 1 << 16:
@@ -210,7 +203,6 @@ class SceneSearch:
     """A scene that is asked many times; what does not depend on the word is computed once. May be asked from threads.
 
     Attributes:
-        shown: the scene.
         words: turn words into the space of its features; None where none lead into it.
         config: how words become boxes; the cosines are centered.
     """
@@ -243,11 +235,7 @@ class SceneSearch:
         return self.words
 
     def ask(self, word: str) -> Answer:
-        """The relevancy of a word.
-
-        Raises:
-            InputError: the word is empty, or unknown and there is no text tower; or no words lead into the features.
-        """
+        """The relevancy of a word."""
         # A tower is loaded when the first phrase needs it.
         words = self._encoder()
         with self._lock:
@@ -260,11 +248,7 @@ class SceneSearch:
         return Answer(word=word, relevancy=steps, threshold=cutoff if np.isfinite(cutoff) else None)
 
     def boxes(self, word: str) -> dict[str, Any]:
-        """The boxes of a word with their probabilities, as `gsencoder localize` writes them, and that of the word.
-
-        Raises:
-            InputError: as `ask` does.
-        """
+        """The boxes of a word with their probabilities, as `gsencoder localize` writes them, and that of the word."""
         words = self._encoder()
         # The spacing, which takes most of the time, is known; what is asked meanwhile does not wait.
         with self._boxes_lock, warnings.catch_warnings():

@@ -73,14 +73,8 @@ class ViewServer(ThreadingHTTPServer):
     ) -> None:
         """Args:
         page: the HTML, and the content security policy of its response.
-        searches: over the scenes.
         scenes: what the page gets of each.
-        host: address to listen on.
-        port: 0 = any that is free.
-
-        Raises:
-            InputError: the address cannot be listened on.
-        """
+        port: 0 = any that is free."""
         self.page, self.searches = page, tuple(searches)
         self.scene_bytes = [scene.to_bytes() for scene in scenes]
         self.token = secrets.token_urlsafe(24)
@@ -137,11 +131,7 @@ class ViewServer(ThreadingHTTPServer):
             super().handle_error(request, client_address)
 
     def search_of(self, value: Any) -> SceneSearch:
-        """The scene of a request.
-
-        Raises:
-            RefusedError: no number of a scene.
-        """
+        """The scene of a request."""
         if type(value) is not int or not 0 <= value < len(self.searches):
             raise RefusedError(HTTPStatus.BAD_REQUEST, f"scene: expected a number below {len(self.searches)}")
         return self.searches[value]

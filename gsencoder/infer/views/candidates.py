@@ -32,8 +32,6 @@ def closeups(
     """The frames' cameras with windows around a target, where these are clearly smaller than the frame.
 
     Args:
-        frames: in the sizes of their photographs.
-        gaussians: the splat.
         target: what is looked at; half of its size is left on every side.
         width: of the pictures to be shown, pixels.
         height: of the pictures to be shown, pixels; windows have the same shape.
@@ -79,7 +77,6 @@ class Patches:
 
     Attributes:
         centers: of the patches, world units.
-        rows: of their Gaussians.
         scales: standard deviations along the axes of the Gaussian.
     """
 
@@ -146,9 +143,6 @@ class FreeSpace:
     """
 
     def __init__(self, gaussians: Gaussians) -> None:
-        """Args:
-        gaussians: the splat.
-        """
         from scipy.spatial import cKDTree
 
         solid = np.flatnonzero(gaussians.opacities >= CONSTANTS.min_obstacle_opacity)
@@ -226,7 +220,6 @@ class FreeSpace:
         """How far each ray goes before the first cell that holds a Gaussian; +inf where it meets none.
 
         Args:
-            starts: of the rays.
             directions: unit vectors.
             lengths: rays are followed so far, world units, or for `ViewConstants.max_ray_cells` cells.
         """
@@ -274,9 +267,6 @@ def frames_on(
     recording, so that the frames of a film are not all neighbors.
 
     Args:
-        cameras: the scene's.
-        gaussians: the splat.
-        targets: one or more.
         count: frames.
         spaces: what rays meet, one for each target, which is itself left out.
     """
@@ -374,14 +364,8 @@ def shell_cameras(
     Of those that remain the ones are kept with most of the scene behind and around the target, evenly spread.
 
     Args:
-        gaussians: the splat.
-        target: what is looked at.
-        count: at most so many.
-        free: where a camera can stand.
-        up: of the world, where known.
         width: of the pictures, pixels.
         height: of the pictures, pixels.
-        fov_degrees: horizontal field of view.
         between: shares of the picture that the target is to fill at least, and at most.
 
     Returns:

@@ -122,14 +122,7 @@ def choose_views(
         scene: Gaussians, and cameras where it has any. Frames of a scene with photographs are judged as these, and
             close-ups cut from them are candidates too.
         targets: what is looked at; all count alike. Evenly spread frames need none.
-        config: settings.
         free: the free space of the scene's Gaussians, for callers that choose more than once; None = it is made.
-
-    Warns:
-        SceneWarning: fewer views than were asked for, a target that no view shows, no room around one.
-
-    Raises:
-        InputError: no Gaussians; no targets; frames are asked for where there are none; no camera finds room.
     """
     gaussians = checked_gaussians(scene, targets, config)
     free = free or FreeSpace(gaussians)
@@ -137,11 +130,7 @@ def choose_views(
 
 
 def checked_gaussians(scene: Scene, targets: Sequence[Target], config: ViewsConfig) -> Gaussians:
-    """The Gaussians of a scene in which views can be chosen.
-
-    Raises:
-        InputError: there are none, or no targets.
-    """
+    """The Gaussians of a scene in which views can be chosen."""
     if scene.gaussians is None:
         raise InputError(f"views: scene {scene.name} has no Gaussians")
     if targets or config.method == "greedy":

@@ -71,10 +71,7 @@ def photograph_of(views: Views, frame: int, cameras: Cameras, view: int) -> UInt
     """What a camera in a frame's place shows of its photograph: all or a window, by its K, in the camera's size.
 
     Args:
-        views: with photographs.
-        frame: which of them.
         cameras: with one of the same pose that sees no more than the frame.
-        view: which of these.
     """
     assert views.images is not None
     picture = views.images.photograph_at(frame) if isinstance(views.images, FramePhotographs) else views.images[frame]
@@ -92,9 +89,6 @@ def photograph_window(
 
     Args:
         views: of the frame.
-        frame: which of them.
-        cameras: see `photograph_of`.
-        view: which of these.
         size: width and height of the photograph, pixels.
 
     Returns:
@@ -118,9 +112,6 @@ def with_photographs(scene: Scene, photographed: Scene) -> Scene:
     Args:
         scene: with cameras; their names say which photograph is whose.
         photographed: the same scene with its photographs, and perhaps more of them, in whatever size.
-
-    Raises:
-        InputError: cameras or photographs are missing, or the cameras of a name are not the same.
     """
     if scene.views is None or not len(scene.views):
         raise InputError(f"photos: the features of {scene.name} have no cameras that photographs could belong to")

@@ -47,9 +47,7 @@ def draw_marks(
     hide a small target, another disc, or leave the picture, it stands beside it, and a line leads to that pixel.
 
     Args:
-        picture: the view.
         blended: the blending weights of its pixels.
-        targets: what is marked.
 
     Returns:
         The picture, and the numbers that it carries.
@@ -120,12 +118,6 @@ def view_pictures(
 
     Args:
         scene: with Gaussians, and with photographs where frames are to be shown as these.
-        views: as chosen.
-        marked: targets that carry numbers.
-        config: accuracy of the renders.
-
-    Raises:
-        InputError: a scene without Gaussians.
     """
     if scene.gaussians is None:
         raise InputError(f"views: scene {scene.name} has no Gaussians")
@@ -156,15 +148,7 @@ def _photograph(scene: Scene, views: ViewSet, view: int) -> Picture:
 def view_sheet(
     scene: Scene, views: ViewSet, pictures: Sequence[Picture], boxes: Sequence[Box], *, columns: int = 4
 ) -> Picture:
-    """All chosen views with the boxes drawn, and what each shows above it.
-
-    Args:
-        scene: where the boxes are.
-        views: as chosen.
-        pictures: of `view_pictures`.
-        boxes: to draw.
-        columns: of the sheet.
-    """
+    """All chosen views with the boxes drawn, and what each shows above it."""
     drawn = [
         draw_boxes(picture, boxes, pose, K, origin=scene.origin)
         for picture, pose, K in zip(pictures, views.cameras.cam_from_world, views.cameras.Ks, strict=True)
@@ -255,9 +239,6 @@ def tower_grid(width: int, height: int, grid: tuple[int, int], fit: Fit = "stret
         fit: stretch = the whole picture is resized to the tower's, whatever its shape; crop = it is resized until it
             covers the tower's, and the middle is cut out. Square pictures need neither, nor the padding of towers that
             make a square by it.
-
-    Raises:
-        InputError: a grid without cells.
     """
     lines, columns = grid
     if not (lines >= 1 and columns >= 1 and lines * columns <= MOST_CELLS):
@@ -280,14 +261,7 @@ def token_blends(
     """The blending weights of each view, pooled to a tower's grid: keep them to render several features.
 
     Args:
-        gaussians: the splat.
-        cameras: in the same world.
         grid: rows and columns of the tower's patches.
-        fit: see `tower_grid`.
-        config: accuracy knobs.
-
-    Raises:
-        InputError: a grid without cells.
     """
     # A blend takes its grid from a map.
     space, cells = FeatureSpace(name="grid", channels=1), np.zeros((*grid, 1), np.float32)
@@ -317,13 +291,9 @@ def feature_tokens(blends: Sequence[Blend], features: GaussianFeatures) -> Float
 
     Args:
         blends: of `token_blends`, one for each view, all on one grid.
-        features: of the same Gaussians.
 
     Returns:
         float32.
-
-    Raises:
-        InputError: blends of another splat or of several grids, or no blends.
     """
     if not blends or len({each.shape for each in blends}) > 1:
         raise InputError(f"tokens: expected blends on one grid, got {sorted({each.shape for each in blends})}")

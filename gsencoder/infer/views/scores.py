@@ -51,11 +51,7 @@ def score_views(
     """Judges cameras by small renders, one for each, in which every Gaussian hides what is behind it.
 
     Args:
-        gaussians: the splat.
-        cameras: in the same world.
-        targets: what is looked at.
         side: longer side of the renders, pixels.
-        config: accuracy of the renders.
     """
     if not targets:
         return ()

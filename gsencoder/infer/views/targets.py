@@ -152,7 +152,6 @@ class Target:
 
     Attributes:
         name: for people, such as "mug" or "mug 2".
-        rows: its Gaussians.
         center: the middle of their means, relative to the scene's origin.
         radius: of the ball around it that holds their means, world units, > 0.
     """
@@ -164,11 +163,7 @@ class Target:
 
 
 def target_of(name: str, gaussians: Gaussians, rows: Integer[np.ndarray, " n"]) -> Target:
-    """A target of some Gaussians.
-
-    Raises:
-        InputError: no rows.
-    """
+    """A target of some Gaussians."""
     if not len(rows):
         raise InputError(f"views: {name!r} has no Gaussians to look at")
     means = gaussians.means[rows].astype(np.float64)
@@ -188,7 +183,6 @@ def targets_of(gaussians: Gaussians, localization: Localization, per_word: int =
     """The best boxes of each word as targets; words without a box give none.
 
     Args:
-        gaussians: the scene's.
         localization: relevancy and boxes of the words.
         per_word: boxes taken of each word, best first.
     """
@@ -198,11 +192,7 @@ def targets_of(gaussians: Gaussians, localization: Localization, per_word: int =
 
 
 def check_targets(targets: Sequence[Target], gaussians: Gaussians) -> None:
-    """Complains about targets of another splat.
-
-    Raises:
-        InputError: no targets, or rows that the splat does not have.
-    """
+    """Complains about targets of another splat."""
     if not targets:
         raise InputError("views: there is nothing to look at; give one target or more")
     for target in targets:
@@ -280,7 +270,6 @@ class TargetScore:
     """What one view shows of one target; see `ViewScores`.
 
     Attributes:
-        target: its name.
         visible, share, inside, alpha, blur: as in `ViewScores`; alpha 1 and blur 0 where a photograph is shown.
         utility: of the view for this target alone, 0 to 1.
     """
