@@ -129,10 +129,8 @@ def project(
 
     Args:
         means: centers, world units.
-        quats: rotations wxyz, normalized here.
         scales: standard deviations, world units.
         opacities: in [0, 1].
-        cam_from_world: rigid.
         K: intrinsics in pixels.
         width: image width in pixels.
         height: image height in pixels.
@@ -176,7 +174,6 @@ def sh_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n 
 
     Args:
         directions: unit vectors from the camera to the Gaussian, world axes.
-        degree: 0 to 3.
     """
     x, y, z = directions.unbind(dim=-1)
     pi = math.pi

@@ -53,12 +53,7 @@ class Surfaces(NamedTuple):
 
 
 def surfaces_of_gaussians(gaussians: Gaussians, *, seed: int = 0) -> Surfaces:
-    """A random choice of the flat Gaussians; areas are times opacity.
-
-    Args:
-        gaussians: a splat or seeds.
-        seed: of the choice.
-    """
+    """A random choice of the flat Gaussians; areas are times opacity."""
     from scipy.spatial.transform import Rotation
 
     rows = np.random.default_rng(seed).permutation(len(gaussians))[: 4 * MAX_SAMPLES]
@@ -76,12 +71,7 @@ def surfaces_of_gaussians(gaussians: Gaussians, *, seed: int = 0) -> Surfaces:
 
 
 def planes_of_gaussians(gaussians: Gaussians, *, seed: int = 0) -> Surfaces:
-    """Planes through the neighbors of a random choice of the means; areas are squared distances to the last neighbor.
-
-    Args:
-        gaussians: a splat or seeds.
-        seed: of the choice.
-    """
+    """Planes through the neighbors of randomly chosen means; areas are squared distances to the last neighbor."""
     from scipy.spatial import cKDTree
 
     opaque = np.flatnonzero(gaussians.opacities >= MIN_OPACITY)
@@ -104,9 +94,7 @@ def surfaces_of_depth(views: Views, *, limit: int = 16, seed: int = 0) -> Surfac
     """Samples of the surfaces that depth images show.
 
     Args:
-        views: with depth.
         limit: largest number of views to look at, evenly spaced.
-        seed: of the choice of samples.
     """
     # Its kernels load numba, which a scene that states its up does without.
     from gsencoder.data.seeding.depth import surface_pixels

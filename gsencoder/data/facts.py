@@ -93,12 +93,7 @@ def scene_facts(scene: Scene, posed: PosedImages, layout: str) -> SceneFacts:
     """The facts of a loaded scene; some of its depth images are read.
 
     Args:
-        scene: with views.
         posed: the same views as their files describe them.
-        layout: the name of the layout.
-
-    Raises:
-        InputError: a depth image is damaged.
     """
     views = scene.views
     assert views is not None

@@ -38,19 +38,13 @@ def orbit_cameras(
     ball of that radius fits into the smaller field of view. Directions follow a golden-angle spiral.
 
     Args:
-        gaussians: at least one.
-        count: number of cameras.
         width: of the pictures, pixels.
         height: of the pictures, pixels.
-        fov_degrees: horizontal field of view.
         up: if known, cameras are between 15° below and 60° above the horizon. If None, cameras surround the splat on
             all sides, and -y is upward in the pictures, as in COLMAP's worlds.
 
     Returns:
         `count` cameras, relative to the origin of the Gaussians.
-
-    Raises:
-        InputError: no Gaussian, or an option out of its range.
     """
     if not len(gaussians):
         raise InputError("orbit cameras need at least one Gaussian, got none")
@@ -73,12 +67,8 @@ def spiral_directions(
     """Unit vectors from the center to the cameras, evenly spread, and the vertical.
 
     Args:
-        count: number of directions, along a golden-angle spiral.
         up: if known, they are between two elevations; else they cover all directions except the poles of -y.
         elevations: lowest and highest angle above the horizon, degrees.
-
-    Raises:
-        InputError: `up` is not a direction.
     """
     vertical = np.array([0.0, -1.0, 0.0]) if up is None else np.asarray(up, np.float64)
     length = float(np.linalg.norm(vertical))

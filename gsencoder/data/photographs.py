@@ -52,11 +52,7 @@ class Photographs:
     """
 
     def __init__(self, views: Views, *, track: Track = untracked) -> None:
-        """Decodes every picture once.
-
-        Raises:
-            InputError: no photographs, or a file that cannot be read.
-        """
+        """Decodes every picture once."""
         if views.images is None:
             raise InputError("the scene has cameras but no photographs")
         self.cameras: Cameras = views.cameras

@@ -52,9 +52,6 @@ class PromptStore:
     def __init__(self, folder: Path) -> None:
         """Args:
         folder: an existing one; empty, or filled by a store.
-
-        Raises:
-            InputError: it holds something else, or a line that no store wrote.
         """
         self.folder = folder
         self.prompts: dict[str, StoredPrompt] = {}
@@ -92,14 +89,7 @@ class PromptStore:
         """Writes a prompt.
 
         Args:
-            key: states all that it was made from.
-            text: the words.
-            pictures: encoded as JPEG or PNG.
             tokens: rendered features of the pictures on the grid of a vision tower.
-            space: of these features.
-
-        Raises:
-            InputError: the disk is full.
         """
         names = tuple(self._write_picture(each) for each in pictures)
         file = "" if tokens is None else self._write_tokens(tokens)
@@ -146,11 +136,7 @@ class PromptStore:
         return name
 
     def picture(self, name: str) -> UInt8[np.ndarray, "H W 3"]:
-        """A picture as a model gets it.
-
-        Raises:
-            InputError: it is gone or damaged.
-        """
+        """A picture as a model gets it."""
         path = self.folder / PICTURES_FOLDER / name
         try:
             data = read_foreign(path)
@@ -161,11 +147,7 @@ class PromptStore:
             raise InputError(f"{path}: cannot be read; remove {self.folder} to prepare it anew") from error
 
     def tokens(self, name: str) -> Float16[np.ndarray, "V P D"]:
-        """Rendered features of the pictures of a prompt.
-
-        Raises:
-            InputError: they are gone or damaged.
-        """
+        """Rendered features of the pictures of a prompt."""
         path = self.folder / TOKENS_FOLDER / name
         with open_archive(path) as file:
             return file.array("tokens", "float16", file.shape("tokens", "float16", 3))

@@ -14,11 +14,7 @@ from gsencoder.types.orientation import TURNS
 
 
 def check_splat(file: Archive, gaussians: Gaussians, advice: str) -> None:
-    """Checks that a file of features was made for exactly these Gaussians.
-
-    Raises:
-        InputError: the fingerprint in its header differs; the message ends with `advice`.
-    """
+    """Checks that a file of features was made for exactly these Gaussians."""
     expected, actual = file.value("fingerprint", str), fingerprint(gaussians)
     if expected != actual:
         raise InputError(f"the features belong to splat {expected[:8]}…, the folder holds {actual[:8]}…; {advice}")
@@ -30,11 +26,7 @@ def camera_arrays(cameras: Cameras) -> dict[str, np.ndarray]:
 
 
 def read_cameras(file: Archive) -> Cameras:
-    """Reads cameras.
-
-    Raises:
-        InputError: missing, damaged, or not cameras.
-    """
+    """Reads cameras."""
     return Cameras(
         cam_from_world=file.array("cam_from_world", "float32", ("V", 4, 4)),
         Ks=file.array("Ks", "float32", ("V", 3, 3)),
@@ -56,11 +48,7 @@ def space_parts(
 
 
 def read_space(file: Archive) -> tuple[FeatureSpace, Float32[np.ndarray, " D"], FeatureBasis | None]:
-    """Reads a feature space, its mean, and its basis or None.
-
-    Raises:
-        InputError: missing, damaged, or other fields than a feature space has.
-    """
+    """Reads a feature space, its mean, and its basis or None."""
     values = file.value("space", dict)
     if set(values) != set(FeatureSpace.__dataclass_fields__):
         raise InputError(f"expected a feature space with {', '.join(FeatureSpace.__dataclass_fields__)}")
@@ -78,11 +66,7 @@ def bank_parts(bank: MemoryBank) -> tuple[dict[str, np.ndarray], dict[str, float
 
 
 def read_bank(file: Archive, components: Float32[np.ndarray, "M D"], space: FeatureSpace) -> MemoryBank:
-    """Reads a bank whose components and space have been read.
-
-    Raises:
-        InputError: damaged, or arrays of other sizes.
-    """
+    """Reads a bank whose components and space have been read."""
     return MemoryBank(
         components=components,
         sources=file.array("sources", "int32", (len(components), 3)),
@@ -116,11 +100,7 @@ def scene_parts(scene: Scene) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def read_scene(file: Archive, gaussians: Gaussians) -> Scene:
-    """Reads a scene; its Gaussians are given, since they may be in another file.
-
-    Raises:
-        InputError: missing or damaged.
-    """
+    """Reads a scene; its Gaussians are given, since they may be in another file."""
     up = file.value("up", list, None)
     if up is not None and not (len(up) == 3 and all(type(part) in (int, float) and abs(part) < 2 for part in up)):
         raise InputError(f"expected three numbers for up in the header, got {str(up)[:60]}")

@@ -67,9 +67,6 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
     """The scenes at paths: a path is a scene, a folder of scenes, which are sorted by name, or a list of paths (.txt).
 
     A folder is a scene if `load_scene` recognizes it; of any other folder the direct subfolders are searched.
-
-    Raises:
-        InputError: a path does not exist, a folder holds no scene, or a scene is given twice, also by different paths.
     """
     scenes = DistinctPaths()
     for path in listed_paths(paths):
@@ -106,11 +103,7 @@ class DistinctPaths:
         return tuple(self._by_target.values())
 
     def add(self, paths: Iterable[Path]) -> None:
-        """Adds paths.
-
-        Raises:
-            InputError: one is there already, also under another name or by a link.
-        """
+        """Adds paths."""
         for path in paths:
             target = path.resolve()
             first = self._by_target.get(target)
@@ -123,11 +116,7 @@ class DistinctPaths:
 
 def listed_paths(paths: Iterable[str | Path]) -> list[Path]:
     """Paths, with those in list files in place of the files: text files (.txt) with one path a line, relative to the
-    file; blank lines and those that begin with # are left out.
-
-    Raises:
-        InputError: a list cannot be read, or is empty.
-    """
+    file; blank lines and those that begin with # are left out."""
     result: list[Path] = []
     for path in map(Path, paths):
         try:
@@ -186,11 +175,7 @@ def name_of_folder(folder: Path) -> str:
 
 
 def check_names(paths: Sequence[Path]) -> None:
-    """Checks that no two scenes have the same name, since their results would be in one folder.
-
-    Raises:
-        InputError: two have.
-    """
+    """Checks that no two scenes have the same name, since their results would be in one folder."""
     first: dict[str, Path] = {}
     for path in paths:
         name = scene_name(path)
@@ -249,13 +234,7 @@ def make_views(
     """Cameras without distortion and lazy pictures, and the origin that was subtracted from the cameras.
 
     Args:
-        posed: views as their files describe them.
-        max_views: see SceneConfig.
-        image_scale: see SceneConfig.
         mask_background: whether a background of one color is looked for, and masked with a warning.
-
-    Raises:
-        InputError: no picture, a picture or depth of the wrong size, a camera that cannot be undistorted.
     """
     images = posed.images
     if not images:
@@ -401,8 +380,7 @@ def _check_sizes(image: PosedImage, grid: PixelGrid, depth_grid: PixelGrid, size
 
 
 def _have_empty_pixels(cameras: set[tuple[Pinhole, CameraModel, int]], remaps: RemapCache) -> bool:
-    """Whether some pixel of a pinhole camera is outside the distorted picture. With many cameras the check would cost
-    more than masks do, and the result is True."""
+    """Whether some pixel of a pinhole camera is outside the distorted picture."""
     distorted = [camera for camera in cameras if not camera[1].is_pinhole]
     if len(distorted) > FEW_CAMERAS:
         return True
@@ -495,20 +473,15 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     of its means), each coordinate rounded to a multiple of 1000 units. It is subtracted in float64.
 
     Args:
-        path: a folder or file.
         splat: the Gaussians of a scene that has views; relative to the scene or else to the current folder, with
             {scene} for the name of the scene's folder. They must be in the world of the cameras. Without it a splat
             beside the views is not used.
-        options: see SceneConfig.
 
     Returns:
         A scene with views, or with Gaussians only, or both. A ScanNet or ScanNet++ scene whose label files lie beside
         it has objects, and where there are no pictures of instances, maps that are drawn from the labeled mesh on
         access. `views.masks` exists if there are mask files, transparency, a background of one color, or pinhole
         pixels that the distorted picture does not cover.
-
-    Raises:
-        InputError: no scene is recognized, no view is left, or a file is wrong.
 
     Warns:
         SceneWarning: a background of one color is masked.
@@ -584,11 +557,7 @@ def _unit(direction: tuple[float, float, float] | None) -> Float64[np.ndarray, "
 
 def read_posed(root: Path, options: SceneConfig = SceneConfig()) -> tuple[PosedImages | None, Path, str]:
     """The posed images of an existing folder or file as its files describe them, the folder of the scene, and the name
-    of the layout; None and "splat" where there are no views.
-
-    Raises:
-        InputError: a file is wrong.
-    """
+    of the layout; None and "splat" where there are no views."""
     read_options = ReadOptions(
         allow_outside=options.allow_outside,
         depth_scale=options.depth_scale,

@@ -209,9 +209,6 @@ def plan_room(seed: int = 0, *, objects: int = 8) -> tuple[PlannedObject, ...]:
     """Floor, walls, table, shelf, then `objects` things with distinct names, from the seed alone.
 
     Colors are distinct too for up to 8 objects.
-
-    Raises:
-        InputError: `objects` is below 0 or above the number of known things.
     """
     if not 0 <= objects <= len(_CATALOGUE):
         raise InputError(f"synthetic room: objects must lie between 0 and {len(_CATALOGUE)}, got {objects}")
@@ -369,10 +366,6 @@ def write_room(scene: Scene, folder: str | Path) -> None:
 
     transforms.json (nerfstudio: OpenGL axes, camera to world), images/*.png, depth/*.png (uint16 millimetres, 0 =
     none), instance/*.png (uint16), objects.json.
-
-    Raises:
-        InputError: the folder exists and is not empty, something is missing in the scene, cameras differ, or the disk
-            refuses.
     """
     target = Path(folder)
     views = scene.views
@@ -484,15 +477,10 @@ def make_room(
     same bits on the same machine.
 
     Args:
-        seed: decides what stands where.
         objects: named things, with distinct names, and distinct colors up to 8.
         views: cameras on a ring around the table, looking at it.
         width: of the images, pixels.
-        height: of the images.
         spacing: between Gaussians, metres.
-
-    Raises:
-        InputError: sizes that are not positive, or more objects than there are kinds.
     """
     if min(width, height) < 1 or views < 0:
         raise InputError(f"synthetic room: expected positive sizes and views ≥ 0, got {width}×{height} and {views}")

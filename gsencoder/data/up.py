@@ -145,11 +145,7 @@ def _needed_confidence(direction: Float64[np.ndarray, "3"]) -> float:
 
 
 def estimate_up(surfaces: Surfaces | None, cameras: Cameras | None) -> Up:
-    """Up from surfaces, from cameras, or from both.
-
-    Raises:
-        InputError: neither.
-    """
+    """Up from surfaces, from cameras, or from both."""
     prior = None if cameras is None or not len(cameras) else up_of_cameras(cameras)
     if surfaces is None or not surfaces.areas.sum() > 0:
         if prior is None:
@@ -254,10 +250,7 @@ def _floor_area(
     normals: Float64[np.ndarray, "n 3"],
     areas: Float64[np.ndarray, " n"],
 ) -> float:
-    """The area that lies in the fullest slice of the lowest fifth of the scene, less that in its highest fifth / 2.
-
-    Ceilings are as large as floors where they were photographed; they mostly were not.
-    """
+    """The area that lies in the fullest slice of the lowest fifth of the scene, less that in its highest fifth / 2."""
     heights = means @ up
     low, high = np.quantile(heights, (0.01, 0.99))
     if high <= low:

@@ -107,13 +107,9 @@ def choose_frames(course: Course, *, motion: float, most: int, least: int) -> In
     """Indices of the frames to take, rising: of those nearest to each of evenly spaced positions a sharp one.
 
     Args:
-        course: of the video.
         motion: wanted distance between two frames in widths of the picture.
         most: so many frames at most; they stand farther apart where that is too few.
         least: so many at least, closer together where the picture moves little.
-
-    Raises:
-        InputError: the picture hardly moves.
     """
     total = float(course.positions[-1])
     if total < motion:
@@ -157,21 +153,13 @@ def is_video(path: Path) -> bool:
 
 
 def refuse_video(path: Path) -> None:
-    """Checks that a path where a scene or a splat is expected is no video.
-
-    Raises:
-        InputError: it is one.
-    """
+    """Checks that a path where a scene or a splat is expected is no video."""
     if is_video(path):
         raise InputError(f"{path}: is a video; gsencoder reconstruct makes a scene of it")
 
 
 def load_av() -> Any:
-    """The module av.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """The module av."""
     try:
         import av
     except ImportError:
@@ -193,12 +181,6 @@ class Video:
     """
 
     def __init__(self, path: Path) -> None:
-        """Args:
-        path: of the file.
-
-        Raises:
-            InputError: PyAV is missing, the file is no video, or it has no picture.
-        """
         self.path = path
         self._av = load_av()
         with self._open() as container:
@@ -222,11 +204,7 @@ class Video:
 
     def frames(self) -> Iterator[Any]:
         """All frames, as PyAV's VideoFrame, in the order in which they are shown. Where decoding fails they end, and
-        `failure` says why.
-
-        Raises:
-            InputError: the file cannot be opened any more, or its first frame cannot be decoded.
-        """
+        `failure` says why."""
         self.failure, self.decoded, empty = None, 0.0, True
         with self._open() as container:
             stream = container.streams.video[0]
@@ -247,7 +225,6 @@ def grey_picture(frame: Any, size: int) -> UInt8[np.ndarray, "H W"]:
     """Brightness of a frame as stored, not rotated.
 
     Args:
-        frame: of `Video.frames`.
         size: its longer side becomes so many pixels at most.
     """
     width, height = _fitted(frame.width, frame.height, size)
@@ -259,7 +236,6 @@ def color_picture(frame: Any, size: int, pixel_aspect: float = 1.0) -> UInt8[np.
     """RGB of a frame as it is meant to be seen: rotated as the file states, with square pixels.
 
     Args:
-        frame: of `Video.frames`.
         size: its longer side becomes so many pixels at most.
         pixel_aspect: width of a stored pixel by its height.
     """
@@ -316,17 +292,11 @@ def take_frames(
     taken. A folder that an earlier call completed for the same file and settings is used again.
 
     Args:
-        path: of the video.
         folder: is replaced; it receives `frame_000000.jpg` and so on, the number being that of the frame in the video,
             and a record of what they were made from.
-        config: settings.
-        track: progress of decoding.
 
     Returns:
         Names of the files, in the order of the video.
-
-    Raises:
-        InputError: PyAV is missing, no video, or a camera that hardly moves.
 
     Warns:
         SceneWarning: the video ends early because it is damaged, or the frames are far apart.

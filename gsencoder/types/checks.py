@@ -52,11 +52,7 @@ def check_finite(owner: str, name: str, array: np.ndarray) -> None:
 
 
 def check_unit(metres_per_unit: float, name: str) -> None:
-    """Complains about what is no unit of length.
-
-    Raises:
-        InputError: not a positive finite number; `name` begins the message.
-    """
+    """Complains about what is no unit of length."""
     good = isinstance(metres_per_unit, (int, float)) and not isinstance(metres_per_unit, bool)
     if not good or not 0 < metres_per_unit <= sys.float_info.max:
         raise InputError(f"{name}: expected a positive number of metres, got {str(metres_per_unit)[:40]}")

@@ -52,7 +52,6 @@ def upright_views(views: Views, *, unmirror: bool = False) -> Views:
     """The same views with cameras that stand upright, and their pictures; a camera turns about its optical axis.
 
     Args:
-        views: as stored.
         unmirror: whether pictures that the orientation mirrors are mirrored as well, as people see them. Their cameras
             cannot be, so that geometry fits only without it; `orientations` of the result then say what is left.
     """
@@ -100,8 +99,6 @@ def stored_map(feature_map: FeatureMap, orientation: int, width: int, height: in
     """The map of an upright picture as the map of its stored pixels.
 
     Args:
-        feature_map: of the upright picture.
-        orientation: that made it upright.
         width: of the stored picture, pixels.
         height: of the stored picture, pixels.
     """

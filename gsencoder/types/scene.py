@@ -113,7 +113,6 @@ def project_points(
 
     Args:
         points: [x, y, z] in camera axes.
-        K: intrinsics of each camera.
         min_depth: where given, z is raised to it first, so that points behind the camera leave the image sideways.
     """
     rows = points.mT
@@ -216,8 +215,6 @@ class Cameras:
         """Which projected points lie in the image and beyond depth `near`; what may hide them is not asked.
 
         Args:
-            pixels: of `project`, for the same view.
-            depths: beside them.
             view: one camera; None = all of them.
             near: smallest depth, world units, itself excluded.
         """
@@ -239,7 +236,6 @@ class Cameras:
         """World directions through pixels, of depth 1: `center + depth · ray` is the point of that depth.
 
         Args:
-            view: the camera.
             pixels: (u, v); None = the centers of all pixels of the image, [H, W].
         """
         if pixels is None:

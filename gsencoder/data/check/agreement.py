@@ -80,13 +80,7 @@ class DepthViews:
 
 
 def depth_views(views: Views, numbers: Int64[np.ndarray, " V"], *, seed: int = 0) -> DepthViews:
-    """Small depth images of some views and samples on their surfaces.
-
-    Args:
-        views: with depth.
-        numbers: their row numbers.
-        seed: of the choice of samples.
-    """
+    """Small depth images of some views and samples on their surfaces."""
     assert views.depths is not None
     rng = np.random.default_rng(seed)
     cameras = views.cameras.select(numbers)
@@ -287,9 +281,7 @@ def color_correlations(
     A place is shared where the depth of both agrees within `TOLERANCE`.
 
     Args:
-        views: depth under the reading that fits best.
         grey: photographs at the size of the depth images.
-        Ks: intrinsics of these photographs.
     """
     result = np.full((len(views), len(views)), np.nan)
     for view, other, here, there in shared_samples(views, MIN_SAMPLES):
@@ -376,7 +368,6 @@ def fit_registration(views: Views, rows: Int64[np.ndarray, " V"], depth: DepthVi
     """The color camera under which photographs show the same details where their depth agrees.
 
     Args:
-        views: with photographs and depth.
         rows: the rows of the views that are compared.
         depth: their depth images, under the reading that fits best.
     """

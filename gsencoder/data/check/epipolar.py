@@ -108,12 +108,7 @@ def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) ->
     """Matches photographs and holds the matches against the poses, and against other readings of them.
 
     Args:
-        views: with photographs.
         limit: largest number of views to look at: evenly spaced groups of three neighbors.
-        track: progress.
-
-    Raises:
-        InputError: pycolmap is missing or refuses the photographs.
     """
     rows = _spread_triples(len(views), limit)
     cameras = views.cameras.select(rows).resized(PICTURE_SIZE, enlarge=False)
@@ -133,11 +128,7 @@ def judge_matches(
     """Holds consistent matches of views against their poses, and against other readings of them.
 
     Args:
-        matches: of pairs of the views.
         cameras: of the views, at the size of the matched pictures.
-        all_cameras: of the scene.
-        rows: of the views in it.
-        names: of the views.
     """
     if not matches:
         return EpipolarCheck(views=rows, cameras=cameras)
@@ -332,8 +323,6 @@ def fit_pose_to_matches(cameras: Cameras, view: int, matches: Sequence[PairMatch
     of them meet, or where it is said to be, or where one of the others is. The best of these is refined.
 
     Args:
-        cameras: at the size of the matched pictures.
-        view: its row.
         matches: pairs of it and others, whose poses stay.
     """
     from scipy.spatial.transform import Rotation

@@ -101,8 +101,6 @@ def other_readings(
     """Every other reading, those with a factor at the factor where depths agree best.
 
     Args:
-        views: the depth images that are compared.
-        rows: their rows among all views.
         all_poses: cam_from_world of all views.
     """
     fixed: list[tuple[str, float | None, DepthViews]] = [

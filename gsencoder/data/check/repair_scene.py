@@ -34,12 +34,7 @@ def repair_posed(
     """Posed images read as the findings say they should be, without the views that do not fit.
 
     Args:
-        posed: as the files describe them.
-        findings: of a check of these views.
         registration: of the same check, for the finding "color registration".
-
-    Raises:
-        InputError: no finding, or one that cannot be mended.
     """
     if not findings:
         raise InputError(f"{posed.source}: nothing wrong was seen, so there is nothing to repair")

@@ -77,13 +77,7 @@ def surface_normals(views: DepthViews, view: int) -> Float64[np.ndarray, "h w 3"
 
 
 def fit_pose(views: DepthViews, view: int, normals: list[Float64[np.ndarray, "h w 3"]]) -> PoseFit:
-    """Moves one view by point-to-plane steps (Chen and Medioni 1992) onto the surfaces of the others, which stay.
-
-    Args:
-        views: under the reading that fits best.
-        view: to be moved.
-        normals: of all views, by `surface_normals`.
-    """
+    """Moves one view by point-to-plane steps (Chen and Medioni 1992) onto the surfaces of the others, which stay."""
     from scipy.spatial.transform import Rotation
 
     points = world_samples(views)[view]
@@ -209,12 +203,7 @@ def check_scene(
     """Holds the views of a scene against each other: by their depth and, where that says nothing, by matched features.
 
     Args:
-        views: posed.
         limit: largest number of views to look at; 0 = 32 of depth images, 24 of photographs.
-        track: progress.
-
-    Raises:
-        InputError: a file is damaged, or photographs need matching and pycolmap is missing.
     """
     depth = check_depth(views, limit=limit or 32) if views.depths is not None and len(views) > 1 else None
     if depth is not None and depth.comparable:
@@ -297,7 +286,6 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
     """Holds the depth images of a scene against each other, and its photographs against each other through depth.
 
     Args:
-        views: with depth.
         limit: largest number of views to look at, evenly spaced.
     """
     rows = even_indices(len(views), limit)
@@ -340,12 +328,7 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
 
 
 def suspicious_depth(views: Views, *, limit: int = 10) -> tuple[Agreement, Finding | None]:
-    """A quick look at few views: how well their depth agrees and, if not well, the likely cause.
-
-    Args:
-        views: with depth, two or more.
-        limit: largest number of views to look at.
-    """
+    """A quick look at few views: how well their depth agrees and, if not well, the likely cause."""
     rows = even_indices(len(views), limit)
     small = depth_views(views, rows)
     stated = stated_reading(small)

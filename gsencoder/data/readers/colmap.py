@@ -137,11 +137,7 @@ _FILES: dict[str, Callable[[_Walker], None]] = {
 
 
 def check_binary_model(folder: Path) -> None:
-    """Walks the records of every .bin file of a model.
-
-    Raises:
-        InputError: a file is missing, ends inside a record, announces more records than it holds, or has extra bytes.
-    """
+    """Walks the records of every .bin file of a model."""
     for name, walk in _FILES.items():
         path = folder / name
         if not path.is_file():
@@ -181,16 +177,11 @@ def read_colmap(
         model: folder of cameras, images and points3D (.bin before .txt where both are there), rigs and frames.
         images: folder that the names of the model are relative to.
         root: the scene folder, which names may not leave.
-        allow_outside: let them.
         base_names: photographs lie in `images` itself, whatever folders the names of the model begin with.
-        masks: folder of masks; it may be missing.
 
     Returns:
         The registered pictures sorted by name, in the model's own world, and its points with their colors. The unit
         of length and up are unknown.
-
-    Raises:
-        InputError: damaged files, no registered picture whose photograph exists, an unusable camera or pose.
     """
     reconstruction = _load(model)
     masks = masks if masks is not None and masks.is_dir() else None
@@ -274,15 +265,7 @@ def _pose_file(model: Path) -> str:
 
 
 def _image_lines(file: Path) -> tuple[list[str], bool, bool]:
-    """The lines of an images.txt, two for each image, whether the file itself has them, and whether any has points.
-
-    pycolmap takes the line after an image for its points, whatever it holds. Where no image has points, every line is
-    an image, and empty ones may be missing.
-
-    Raises:
-        InputError: a line that is no image, a pose that is not finite, or an image in the line of another one's points;
-            the message names the line.
-    """
+    """The lines of an images.txt, two for each image, whether the file itself has them, and whether any has points."""
     lines: list[str] = []
     lost, with_points, complete = 0, 0, True
     with io.TextIOWrapper(open_foreign(file), encoding="utf-8", errors="replace") as stream:

@@ -62,11 +62,7 @@ def open_picture(path: Path, data: io.BytesIO | None = None) -> "Image":
     """A picture whose header was read, and whose pixels were not.
 
     Args:
-        path: the file.
         data: its content, where that was read already; `path` names it in messages.
-
-    Raises:
-        InputError: unreadable, or more than `PIXEL_LIMIT` pixels.
     """
     from PIL import Image
 
@@ -125,11 +121,7 @@ def _stored_size(picture: "Image") -> tuple[int, int]:
 
 
 def check_picture(path: Path) -> None:
-    """Decodes a picture to its end.
-
-    Raises:
-        InputError: missing, of another format, too large, or damaged; the file is named.
-    """
+    """Decodes a picture to its end."""
     with open_picture(path) as picture:
         _decode(path, picture)
 
@@ -138,12 +130,8 @@ def load_npy(path: Path, *, header_only: bool = False) -> np.ndarray:
     """The array of a .npy file; its header is checked before its values are read.
 
     Args:
-        path: the file.
         header_only: whether to leave the values unread, for the shape and the type. Those of a file that is cut off
             afterwards must not be touched: the system would end the process.
-
-    Raises:
-        InputError: unreadable, no array of numbers [H, W], too large, or cut off.
     """
     values = _checked_npy(path, "r")
     return values if header_only else _checked_npy(path, None)
@@ -166,11 +154,7 @@ def _checked_npy(path: Path, mapped: Literal["r"] | None) -> np.ndarray:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """(width, height) from the header alone.
-
-    Raises:
-        InputError: unreadable, or more than `PIXEL_LIMIT` pixels.
-    """
+    """(width, height) from the header alone."""
     if path.suffix.lower() == ".npy":
         height, width = load_npy(path, header_only=True).shape
         return width, height
@@ -189,11 +173,7 @@ def picture_info(path: Path) -> tuple[tuple[int, int], bool, int]:
 
 
 def is_deep_grey(path: Path) -> bool:
-    """Whether a picture has one channel of 16 bits, as depth images have, from the header alone.
-
-    Raises:
-        InputError: unreadable.
-    """
+    """Whether a picture has one channel of 16 bits, as depth images have, from the header alone."""
     with open_picture(path) as picture:
         return picture.mode in DEEP_GREY
 
@@ -202,11 +182,7 @@ def read_rgba(path: Path, *, reduction: int = 1) -> tuple[UInt8[np.ndarray, "H W
     """Color (composited over black) and alpha, None where the file has none.
 
     Args:
-        path: the file.
         reduction: 1, 2, 4 or 8: JPEG is decoded so many times smaller, and files of other formats are not.
-
-    Raises:
-        InputError: unreadable, damaged, too large, or of a kind that is not color.
     """
     with open_picture(path) as file:
         if file.format == "JPEG" and reduction > 1:
@@ -234,11 +210,7 @@ def read_rgba(path: Path, *, reduction: int = 1) -> tuple[UInt8[np.ndarray, "H W
 
 def read_small(path: Path, side: int) -> UInt8[np.ndarray, "h w 3"]:
     """About side × side pixels or more of a picture, for a quick look: JPEG is decoded at a fraction of its size, of
-    other files every n-th pixel is taken.
-
-    Raises:
-        InputError: as `read_rgba`.
-    """
+    other files every n-th pixel is taken."""
     with open_picture(path) as file:
         if file.format == "JPEG":
             file.draft("RGB", (side, side))
@@ -250,11 +222,7 @@ def read_small(path: Path, side: int) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
-    """Where a mask file is not 0. One that was saved as RGB is white and black like any other; alpha says nothing.
-
-    Raises:
-        InputError: unreadable or damaged.
-    """
+    """Where a mask file is not 0. One that was saved as RGB is white and black like any other; alpha says nothing."""
     with open_picture(path) as file:
         picture = _decode(path, file)
         values, bands = np.asarray(picture), picture.getbands()
@@ -466,11 +434,7 @@ def frame_key(stem: str) -> tuple[bool, int, str]:
 
 
 def files_by_stem(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
-    """The files of a folder by their stems, in the order of `frame_key`; hidden files are left out.
-
-    Raises:
-        InputError: two files have one stem.
-    """
+    """The files of a folder by their stems, in the order of `frame_key`; hidden files are left out."""
     if not folder.is_dir():
         return {}
     files = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".")]
@@ -490,12 +454,7 @@ def is_lost(pose: Float64[np.ndarray, "4 4"]) -> bool:
 def pinhole_of(
     fx: float, fy: float, cx: float, cy: float, picture: Path, where: str, *, size: tuple[int, int] | None = None
 ) -> CameraModel:
-    """A camera without distortion at the size of a picture, or at another that is given.
-
-    Raises:
-        InputError: numbers that are no camera's, or a principal point that lies outside the middle of the picture, as
-            that of intrinsics for another size does.
-    """
+    """A camera without distortion at the size of a picture, or at another that is given."""
     width, height = size or picture_size(picture)
     camera = CameraModel(model="PINHOLE", width=width, height=height, params=(fx, fy, cx, cy))
     check_camera(camera, where)

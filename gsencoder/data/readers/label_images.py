@@ -47,9 +47,7 @@ def label_files(paths: Sequence[Path], views: Views, kind: type[LabelFiles] = La
     """Label images of views, read on access.
 
     Args:
-        paths: a file for each view.
         views: where their photographs come from files, labels belong to the pixels of these files; else to the cameras.
-        kind: how files are read.
 
     Returns:
         int32 [H, W] for each view, 0 = none.
@@ -80,9 +78,6 @@ def read_labels(path: Path) -> Int32[np.ndarray, "H W"]:
 
     Args:
         path: a PNG of 8 or 16 bits with one channel, a .npy array, or a .safetensors file with one array, of integers.
-
-    Raises:
-        InputError: unreadable, damaged, of another type or shape, or with labels that are negative or too large.
     """
     kind = path.suffix.lower()
     if kind not in LABEL_SUFFIXES:
@@ -136,11 +131,7 @@ class ArchivedLabels(LabelFiles):
 
 
 def members_by_stem(archive: Path) -> dict[str, Path]:
-    """The .png files of an archive by their stems, as paths below that of the archive.
-
-    Raises:
-        InputError: it cannot be read as .zip, or two files have one stem.
-    """
+    """The .png files of an archive by their stems, as paths below that of the archive."""
     try:
         check_foreign(archive)
         with zipfile.ZipFile(archive) as file:
@@ -157,11 +148,7 @@ def members_by_stem(archive: Path) -> dict[str, Path]:
 
 
 def archived_size(path: Path) -> tuple[int, int]:
-    """(width, height) of a member, from its header.
-
-    Raises:
-        InputError: damaged or no picture.
-    """
+    """(width, height) of a member, from its header."""
     with open_picture(path, member_bytes(path)) as picture:
         return picture.size
 
@@ -172,11 +159,7 @@ def archive_of(path: Path) -> Path:
 
 
 def member_bytes(path: Path) -> io.BytesIO:
-    """The content of a member.
-
-    Raises:
-        InputError: the archive or the member is damaged, encrypted or too large.
-    """
+    """The content of a member."""
     archive = archive_of(path)
     name = path.relative_to(archive).as_posix()
     try:
@@ -193,11 +176,7 @@ def member_bytes(path: Path) -> io.BytesIO:
 
 
 def table_lines(path: Path) -> list[list[str]]:
-    """The words of each line that is neither empty nor a comment; a byte order mark is skipped.
-
-    Raises:
-        InputError: unreadable, too large, or not text.
-    """
+    """The words of each line that is neither empty nor a comment; a byte order mark is skipped."""
     try:
         text = read_foreign_text(path)
     except FileNotFoundError:
@@ -211,11 +190,7 @@ def table_lines(path: Path) -> list[list[str]]:
 
 
 def read_numbers(path: Path, *shapes: tuple[int | None, int]) -> Float64[np.ndarray, "rows columns"]:
-    """A table of numbers of one of the shapes; None = any number of rows, at least one. NaN and infinity are numbers.
-
-    Raises:
-        InputError: unreadable, words that are no numbers, lines of different lengths, another shape.
-    """
+    """A table of numbers of one of the shapes; None = any number of rows from 1. NaN and infinity are numbers."""
     lines = table_lines(path)
     expected = " or ".join(f"{'n' if rows is None else rows}×{columns}" for rows, columns in shapes)
     lengths = {len(words) for words in lines}

@@ -196,11 +196,7 @@ SPLAT_NAMES = ("splat.ply", "point_cloud.ply")
 
 
 def find_splat(root: Path) -> Path:
-    """The splat that `root` is or holds.
-
-    Raises:
-        InputError: none, or several.
-    """
+    """The splat that `root` is or holds."""
     if root.is_file():
         if root.suffix.lower() in SPLAT_SUFFIXES or root.name == "meta.json":
             return root
@@ -222,11 +218,7 @@ def find_splat(root: Path) -> Path:
 
 def file_of_scene(option: str, name: str | Path, folder: Path) -> Path:
     """The file that an option of several scenes names: in each scene's own folder, or else from here. `{scene}` in it
-    stands for the name of the scene's folder, as in splats/{scene}/splat.ply.
-
-    Raises:
-        InputError: neither exists.
-    """
+    stands for the name of the scene's folder, as in splats/{scene}/splat.ply."""
     name = str(name).replace("{scene}", folder.name)
     try:
         # An absolute path stays itself.
@@ -239,11 +231,7 @@ def file_of_scene(option: str, name: str | Path, folder: Path) -> Path:
 
 
 def read_bare_splat(path: Path) -> tuple[Gaussians, Float64[np.ndarray, "3"]]:
-    """A splat without views, and an origin near the median of its means, taken off before they become float32.
-
-    Raises:
-        InputError: what `load_splat` refuses.
-    """
+    """A splat without views, and an origin near the median of its means, taken off before they become float32."""
     raw = read_raw(path)
     finite = raw.means[np.isfinite(raw.means).all(axis=1)]
     origin = choose_origin(np.median(finite, axis=0, keepdims=True)) if len(finite) else np.zeros(3)

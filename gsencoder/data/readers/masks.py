@@ -75,9 +75,6 @@ def find_background(paths: Sequence[Path]) -> Background | None:
 
     Args:
         paths: of the photographs, none of which has transparency.
-
-    Raises:
-        InputError: a file that is damaged.
     """
     sample = [paths[int(row)] for row in even_indices(len(paths), LOOKED_AT)]
     if len(sample) < MIN_PICTURES:
@@ -140,8 +137,6 @@ def background_pixels(
     """The pixels of a picture that have the color of the background and are connected to the border.
 
     Args:
-        picture: RGB.
-        color: of the background.
         path: the file, whose format says how exact the color is.
     """
     from scipy import ndimage
@@ -175,7 +170,6 @@ def outline(path: Path, background: Background | None) -> tuple[Bool[np.ndarray,
     color the two nearest pixels do neither.
 
     Args:
-        path: of the photograph.
         background: of its scene; None = only its alpha counts.
     """
     from scipy import ndimage
@@ -201,13 +195,6 @@ class _OutlineFiles(PictureFiles[Bool[np.ndarray, "H W"]]):
         outlined: Sequence[Path | None],
         background: Background | None = None,
     ) -> None:
-        """Args:
-        paths: mask files.
-        grids: of the views.
-        remaps: shared maps of undistortion.
-        outlined: the photograph of each view that has transparency or a background; None = it has neither.
-        background: of the scene.
-        """
         super().__init__(paths, grids, remaps)
         self._outlined, self._background = tuple(outlined), background
 

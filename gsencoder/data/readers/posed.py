@@ -105,11 +105,7 @@ def choose_origin(points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3"
 
 
 def rigid_pose(matrix: Float64[np.ndarray, "4 4"], where: str) -> Float64[np.ndarray, "4 4"]:
-    """The pose with the nearest exact rotation, by SVD, since files hold a few digits only.
-
-    Raises:
-        InputError: not finite, singular, scaled, sheared, mirrored, or too far away; `where` starts the message.
-    """
+    """The pose with the nearest exact rotation, by SVD, since files hold a few digits only."""
     if not np.isfinite(matrix).all():
         raise InputError(f"{where}: the pose has values that are not finite")
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
@@ -148,14 +144,8 @@ def inside(folder: Path, relative: str, where: str, *, root: Path | None = None,
     """`folder / relative`, which may not leave `root` through "..", an absolute path or a link unless allowed.
 
     Args:
-        folder: what the path is relative to.
         relative: as written in the files of the scene.
-        where: start of the message.
         root: the scene folder; None = `folder`.
-        allow_outside: whether it may leave.
-
-    Raises:
-        InputError: it leaves, or is not a path.
     """
     root = folder if root is None else root
     # No file has a longer path, and resolving links takes time quadratic in the length.
@@ -178,11 +168,7 @@ def inside(folder: Path, relative: str, where: str, *, root: Path | None = None,
 
 
 def number(values: Mapping[str, object], key: str, where: str) -> float | None:
-    """A finite number of a JSON object; None if the key is missing.
-
-    Raises:
-        InputError: not a finite number; `where` starts the message.
-    """
+    """A finite number of a JSON object; None if the key is missing."""
     value = values.get(key)
     if value is None:
         return None

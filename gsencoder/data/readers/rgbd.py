@@ -67,9 +67,6 @@ def read_scannet(root: Path, *, allow_outside: bool = False, depth_scale: float 
         root: the folder that holds color/ and pose/, and depth/ and intrinsic/.
         allow_outside: let links in it lead out of it.
         depth_scale: metres for each step of a depth file; None = 0.001.
-
-    Raises:
-        InputError: no usable frame, no intrinsics, intrinsics that do not belong to the pictures, a bad pose.
     """
     color = files_by_stem(root / "color", PICTURE_SUFFIXES)
     if not color:
@@ -163,12 +160,8 @@ def read_seven_scenes(root: Path, *, allow_outside: bool = False, depth_scale: f
     """Reads a sequence.
 
     Args:
-        root: the folder with the frames.
         allow_outside: let links in it lead out of it.
         depth_scale: metres for each step of a depth file; None = 0.001.
-
-    Raises:
-        InputError: no usable frame, or intrinsics or a pose that cannot be.
     """
     matches = sorted((match, path) for path in root.iterdir() if (match := _frame_of(path)))
     skipped = SkippedFrames(str(root), len(matches))
@@ -257,13 +250,9 @@ def read_tum(
     """Reads a sequence.
 
     Args:
-        root: the folder with the three lists.
         allow_outside: let paths in them lead out of it.
         depth_scale: metres for each step of a depth file; None = 1/5000.
         intrinsics: fx, fy, cx, cy in pixels of the photographs; None = those of the benchmark's camera.
-
-    Raises:
-        InputError: no frame, times that do not match, intrinsics that nobody knows, or lists that cannot be read.
     """
     colors = _listed_files(root / COLOR_FILE)
     depths = _listed_files(root / DEPTH_FILE) if (root / DEPTH_FILE).is_file() else []
@@ -328,11 +317,7 @@ def _listed_files(path: Path) -> list[tuple[float, str]]:
 
 
 def read_trajectory(path: Path) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n 4 4"]]:
-    """Times and world_from_camera of `time tx ty tz qx qy qz qw` lines, sorted; poses that are not finite are left out.
-
-    Raises:
-        InputError: unreadable, no finite pose, or a quaternion that is no rotation.
-    """
+    """Times and world_from_camera of `time tx ty tz qx qy qz qw` lines, sorted, without poses that are not finite."""
     from scipy.spatial.transform import Rotation
 
     rows = read_numbers(path, (None, 8))
@@ -420,12 +405,8 @@ def read_replica(root: Path, *, allow_outside: bool = False, depth_scale: float 
     """Reads an export.
 
     Args:
-        root: the folder with traj.txt and results/.
         allow_outside: let links in it lead out of it.
         depth_scale: metres for each step of a depth file; None = that of cam_params.json.
-
-    Raises:
-        InputError: no frame, fewer poses than frames, or intrinsics that do not belong to the pictures.
     """
     pictures = files_by_stem(root / PICTURES, PICTURE_SUFFIXES)
     colors = {stem[5:]: path for stem, path in pictures.items() if stem.startswith("frame")}

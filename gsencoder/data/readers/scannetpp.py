@@ -55,12 +55,8 @@ def read_iphone(folder: Path, *, allow_outside: bool = False, depth_scale: float
     """Reads the extracted frames that have a pose.
 
     Args:
-        folder: iphone/ of a scene.
         allow_outside: let links in it lead out of it.
         depth_scale: metres for each step of a depth file; None = 0.001.
-
-    Raises:
-        InputError: frames are not extracted, or none has a pose, and as `read_colmap` and `read_transforms`.
 
     Warns:
         SceneWarning: depth is not extracted, or missing for some frames.
@@ -158,8 +154,7 @@ def _matrix(frame: dict[str, object], key: str, size: int, where: str) -> Float6
 
 
 def _with_files(image: PosedImage, folder: Path, scale: float, *, allow_outside: bool) -> PosedImage:
-    """A frame with its mask and depth. Depth has its own size: its camera is the photograph's, scaled, without
-    distortion."""
+    """A frame with its mask and depth."""
     mask, depth = (folder / name / f"{image.image.stem}.png" for name in (MASKS, DEPTHS))
     for file in (mask, depth):
         if file.is_file():
@@ -205,9 +200,6 @@ def read_scannetpp(root: Path, *, allow_outside: bool = False, depth_scale: floa
         root: of the scene, or its dslr/ or iphone/ folder.
         allow_outside: let links in it lead out of it.
         depth_scale: metres for each step of a depth file; None = 0.001.
-
-    Raises:
-        InputError: a video that is still to be extracted, and as `read_transforms` and `read_colmap`.
 
     Warns:
         SceneWarning: a depth stream that is still to be extracted.

@@ -74,11 +74,7 @@ def read_json(path: Path, *, unique_keys: bool = False) -> Any:
     """The content of a JSON file.
 
     Args:
-        path: of the file.
         unique_keys: refuse objects that have a key twice, of which JSON's readers take the last.
-
-    Raises:
-        InputError: unreadable, not UTF-8, not JSON, or a key is there twice.
     """
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -110,7 +106,6 @@ def read_transforms(
 
     Args:
         path: the JSON file; its folder is the scene folder, which paths in it may not leave.
-        allow_outside: let them.
         depth_scale: world units for each step of a depth file; None = what the file says, else millimetres.
         pictures: the folder that `file_path` is relative to; None = that of the file.
         masks: the folder that `mask_path` is relative to; None = that of the file.
@@ -118,10 +113,6 @@ def read_transforms(
     Returns:
         Posed pictures in OpenCV axes. The unit is the metre and up is +z where the file says so, or where it has
         depth with a `depth_unit_scale_factor`; otherwise both are unknown.
-
-    Raises:
-        InputError: no frame, a pose that is not rigid, intrinsics that are not finite, a repeated name, a path that
-            leaves the folder, an unknown camera model; the message names the frame.
     """
     data = read_json(path)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
@@ -256,8 +247,7 @@ def _find_image(root: Path, name: str, where: str, *, allow_outside: bool) -> Pa
 def _depth_sensor(
     values: dict[str, Any], depth: Path | None, where: str
 ) -> tuple[CameraModel | None, Float64[np.ndarray, "4 4"] | None]:
-    """The camera of the depth map and where it stands, from `depth_camera` and `depth_from_color`; None = as the
-    photograph's."""
+    """The camera of the depth map and where it stands, from `depth_camera` and `depth_from_color`."""
     camera = None
     camera_keys = values.get("depth_camera")
     if camera_keys is not None and depth is not None:
@@ -270,11 +260,7 @@ def _depth_sensor(
 
 
 def read_matrix(values: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "4 4"]:
-    """A matrix of 4 rows, or of the upper 3, of a JSON object; whether it is a pose is not asked.
-
-    Raises:
-        InputError: the key is missing, or its value is no such matrix of finite numbers; `where` starts the message.
-    """
+    """A matrix of 4 rows, or of the upper 3, of a JSON object; whether it is a pose is not asked."""
     value = values.get(key)
     rows = value if isinstance(value, list) else []
     good = len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)
@@ -383,11 +369,7 @@ DISTORTION = {
 
 
 def transforms_of(posed: PosedImages, folder: Path) -> dict[str, Any]:
-    """The content of a transforms.json in `folder` for posed images; points are part of it where a .ply holds them.
-
-    Raises:
-        InputError: a camera model that the format does not have.
-    """
+    """The content of a transforms.json in `folder` for posed images; points are part of it where a .ply holds them."""
     content: dict[str, Any] = {}
     if posed.metres_per_unit is not None:
         content["metres_per_unit"] = posed.metres_per_unit
@@ -452,9 +434,6 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
     """Reads a list of {id, name or null, aabb_min, aabb_max, placed, views, max_pixels}; boxes in world coordinates.
 
     Ids start at 1, since 0 stands for no object in an instance map.
-
-    Raises:
-        InputError: not such a list, a repeated id, or a box whose lower corner is not below the upper one.
     """
     rows = read_json(path)
     if not isinstance(rows, list):
@@ -522,15 +501,10 @@ def read_cameras(path: Path, origin: Float64[np.ndarray, "3"]) -> Cameras:
     """Reads the cameras of a JSON file.
 
     Args:
-        path: of the file.
         origin: of the scene, which is taken off the poses in float64.
 
     Returns:
         The cameras in the order of the file, relative to the origin.
-
-    Raises:
-        InputError: no such file, not JSON, no camera, a key that is missing or unknown, a pose that is not rigid,
-            values that are not finite, sizes or focal lengths that are not positive; the message names the camera.
     """
     data = read_json(path, unique_keys=True)
     entries = data if isinstance(data, list) else [data]

@@ -179,11 +179,7 @@ def _project(
 
 
 def pinhole_for(camera: CameraModel, where: str) -> Pinhole:
-    """The pinhole camera that stands for `camera` (see the head of this file).
-
-    Raises:
-        InputError: fewer than half of its pixels would have content; `where` begins the message.
-    """
+    """The pinhole camera that stands for `camera` (see the head of this file)."""
     check_camera(camera, where)
     fx, fy, cx, cy = camera.pinhole_params()
     w, h = camera.width, camera.height

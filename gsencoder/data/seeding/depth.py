@@ -193,10 +193,7 @@ def _sum_rows(group_of, values, groups):
 
 
 def _surfaces(voxel_of: np.ndarray, sums: np.ndarray, voxel: float) -> np.ndarray:
-    """Numbers the surfaces: rows of one voxel get one number if their normals and planes agree, directly or in a chain.
-
-    A plane at 45° to the axes, or on the border of two layers, is split by noise alone; here it grows together.
-    """
+    """A number for each row: one for all rows of a voxel whose normals and planes agree, directly or in a chain."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 
@@ -354,10 +351,7 @@ def _second_difference_noise(inverse: np.ndarray, valid: np.ndarray) -> float:
 @kernel
 @no_type_check
 def _smooth(inverse, valid, step):
-    """Mean over a window, taken in pairs of opposite pixels whose line passes the center within `step`.
-
-    Pairs keep a plane a plane however steep it is: what one side adds, the other takes off.
-    """
+    """Mean over a window, taken in pairs of opposite pixels whose line passes the center within `step`."""
     height, width = inverse.shape
     result = np.empty_like(inverse)
     weight = np.empty(width, inverse.dtype)
@@ -385,11 +379,7 @@ def _smooth(inverse, valid, step):
 @kernel
 @no_type_check
 def _gradient(inverse, valid, step):
-    """Gradient along the rows, [H, W], and the pixels that float between two surfaces or show beside a nearer one.
-
-    Central where the three pixels lie on a line within `step`; at an edge the smaller one-sided step, which stays on
-    the pixel's own surface; zero where the pixel is a peak between two edges.
-    """
+    """Gradient along the rows, [H, W], and the pixels that float between two surfaces or show beside a nearer one."""
     height, width = inverse.shape
     gradient, astray = np.zeros_like(inverse), np.zeros(inverse.shape, np.bool_)
     steps = np.zeros(width + 3, inverse.dtype)

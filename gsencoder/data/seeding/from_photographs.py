@@ -68,7 +68,6 @@ def interpolated_depths(
 
     Args:
         consistent: depths of plane sweeps, 0 = unknown.
-        photos: the views.
         poses: their cam_from_world.
         points: further points on surfaces, world units.
     """
@@ -91,7 +90,6 @@ def supported_depths(
     Args:
         interpolated: depth of each pixel of each view (`interpolated_depths`).
         consistent: depths of plane sweeps, 0 = unknown; pixels that have one are left out.
-        photos: the views.
         poses: their cam_from_world.
         neighbors: the other views that each is compared with.
 
@@ -167,8 +165,6 @@ def outside_hull(
 
     Args:
         points: world units relative to the scene's origin.
-        photographs: of all views.
-        training: those that may be looked at.
     """
     cameras, seen_empty = photographs.cameras, np.zeros(len(points), np.int64)
     for view in training:
@@ -273,13 +269,7 @@ def densify(
     photographs show empty space are removed.
 
     Args:
-        photographs: of all views.
-        training: the views that may be looked at.
-        points: from structure from motion.
-        colors: beside them.
-        config: settings.
         guide: points that tell which views to compare and at which depths, and are no seeds; None = `points`.
-        track: progress.
     """
     cameras = photographs.cameras
     guide = points if guide is None else guide
@@ -367,9 +357,7 @@ def carve(
 
     Args:
         points: world units.
-        colors: beside them.
         consistent: depths of each view, 0 = unknown.
-        photos: the views.
         poses: their cam_from_world.
         tolerance: relative difference of depths that agree; what lies in front by twice as much is seen through.
     """
@@ -466,14 +454,7 @@ def seeds_of_photographs(
     """Points on the surfaces that posed photographs show.
 
     Args:
-        photographs: of all views.
-        views: that may be looked at.
-        config: of the sweeps.
         training: their row numbers among the photographs; None = all.
-        track: progress.
-
-    Raises:
-        InputError: fewer than two photographs, or no two that show the same surface from different places.
     """
     rows = list(range(len(photographs))) if training is None else list(training)
     if len(rows) < 2:

@@ -140,14 +140,7 @@ def match_photographs(
     """Matched features of pairs of photographs, unverified; pairs without any are left out.
 
     Args:
-        views: with photographs.
         cameras: of the same views, at the size in which features are detected.
-        pairs: rows of two views each.
-        features: largest number of features of a photograph.
-        track: progress.
-
-    Raises:
-        InputError: pycolmap is missing or refuses the photographs.
     """
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
@@ -227,12 +220,7 @@ def nearest_distances(centers: Float64[np.ndarray, "V 3"]) -> Float64[np.ndarray
 
 
 def overlaps(cameras: Cameras, distance: float) -> Float64[np.ndarray, "V V"]:
-    """The share of points before view i that view j shows too, from directions up to 75° apart; 0 on the diagonal.
-
-    Args:
-        cameras: of the views.
-        distance: of `typical_distance`.
-    """
+    """The share of points before view i that view j shows too, from directions up to 75° apart; 0 on the diagonal."""
     count = len(cameras)
     steps = (np.arange(RAYS) + 0.5) / RAYS
     shares = np.zeros((count, count))
@@ -302,12 +290,6 @@ def triangulate(
     Args:
         views: posed photographs, without distortion; features on masked pixels are not used.
         size: longer side in pixels at which features are detected; smaller photographs keep theirs.
-        features: largest number of features of a photograph.
-        neighbors: other photographs that each is matched with.
-        track: progress.
-
-    Raises:
-        InputError: no photographs, fewer than two views, or pycolmap is missing or refuses.
 
     Warns:
         SceneWarning: hardly a match lies on the epipolar lines of the poses.

@@ -32,9 +32,6 @@ def seed_from_mesh(path: str | Path, *, voxel: float, origin: Float64[np.ndarray
         path: the file; its coordinates are world coordinates.
         voxel: edge of the grid in the file's units.
         origin: the scene's origin, which is taken off in float64.
-
-    Raises:
-        InputError: no such file, not a mesh, no triangles, positions that are not finite, far too large for the voxel.
     """
     if not 0 < voxel < np.inf:
         raise InputError(f"seeds: voxel must be a positive length, got {voxel}")
@@ -85,14 +82,10 @@ def seed_from_tsdf(
     frames is averaged away along the normal.
 
     Args:
-        views: posed depth and images.
         voxel: edge of the grid in world units; the signed distances are kept on one of half the size.
         truncation: how far the signed distance reaches, in voxels of that finer grid.
         max_depth: depths beyond are not used; None = all.
         min_weight: how many frames must agree on a voxel.
-
-    Raises:
-        InputError: open3d cannot be loaded, or the frames cannot be used.
     """
     if not len(views) or views.depths is None or views.images is None:
         raise InputError("seeds: source=tsdf needs posed views with depth and images; use source=points or source=mesh")

@@ -142,9 +142,6 @@ def seed_from_points(
         views: cameras, which orient the normals and limit the size of strays.
         voxel: edge of the grid in world units; None keeps every distinct point.
         largest_spacing: upper limit of a point's spacing, in median spacings of all points.
-
-    Raises:
-        InputError: no points, values that are not finite, colors of another length, a voxel that is not positive.
     """
     if not len(points):
         raise InputError("seeds: the scene has no points; seeds need points, depth images or a mesh")

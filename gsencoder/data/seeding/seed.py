@@ -48,9 +48,6 @@ def room_frame(views: Views) -> Float64[np.ndarray, "4 4"] | None:
     A grid of cubes is the same whichever axis comes first and whichever way it points. Each is the one nearest to the
     world's, so that rows that are sorted by cells come in the world's order.
 
-    Args:
-        views: with depth.
-
     Returns:
         The frame; None where no surface is seen, and without depth.
     """
@@ -164,11 +161,7 @@ class SeedConfig:
 
 
 def choose_source(scene: Scene, config: SeedConfig = SeedConfig()) -> Source:
-    """The source of seeds that `config` names or, for "auto", the first of depth, points and photographs there is.
-
-    Raises:
-        InputError: the source is "auto", and the scene has no photographs.
-    """
+    """The source of seeds that `config` names or, for "auto", the first of depth, points and photographs there is."""
     if config.source != "auto":
         return config.source
     if scene.views is not None and scene.views.depths is not None:
@@ -192,12 +185,7 @@ def seed(scene: Scene, config: SeedConfig = SeedConfig(), *, track: Track = untr
     as a few pixels (`gsencoder.data.seeding.from_photographs`).
 
     Args:
-        scene: to seed.
         config: the source, and how large the grid is.
-        track: progress, where the source is photographs.
-
-    Raises:
-        InputError: the scene does not hold what the source needs, or it cannot be used.
     """
     source, views = choose_source(scene, config), scene.views
     if source == "points":
@@ -241,9 +229,6 @@ def seed_from_depth(views: Views, *, voxel: float, min_cos: float = 0.1, max_dep
         voxel: edge of the grid, world units.
         min_cos: surfaces seen at a slant beyond arccos(min_cos) are not taken.
         max_depth: depths beyond are not used, world units; None = all.
-
-    Raises:
-        InputError: no views, no depth or images, sizes that differ, values that are not finite, no depth anywhere.
     """
     if not 0 < voxel < math.inf:
         raise InputError(f"seeds: voxel must be a positive length, got {voxel}")
@@ -272,11 +257,7 @@ def seed_from_depth(views: Views, *, voxel: float, min_cos: float = 0.1, max_dep
 
 
 def _voxel(scene: Scene, config: SeedConfig, estimate: Callable[[], float], how: str) -> float:
-    """The voxel in scene units.
-
-    Raises:
-        InputError: it is so small or large that float32 cannot count in it: a wrong unit.
-    """
+    """The voxel in scene units."""
     voxel = _voxel_in_units(scene, config, estimate, how)
     if not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
         raise InputError(
@@ -323,9 +304,5 @@ def _mesh_voxel(scene: Scene, path: str | Path) -> float:
 
 
 def with_gaussians(scene: Scene, config: SeedConfig = SeedConfig(), *, track: Track = untracked) -> Scene:
-    """The scene, with seeds where it has no splat; the arguments are those of `seed`.
-
-    Raises:
-        InputError: there is nothing to seed from.
-    """
+    """The scene, with seeds where it has no splat; the arguments are those of `seed`."""
     return scene if scene.gaussians is not None else replace(scene, gaussians=seed(scene, config, track=track))

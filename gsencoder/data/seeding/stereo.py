@@ -124,12 +124,10 @@ def sweep(
     """Depths of a view by comparing it with others.
 
     Args:
-        reference: the view.
         pose: its cam_from_world.
         sources: views to compare with, at least two, so that occluded pixels are recognized.
         source_poses: their cam_from_world.
         near: smallest depth, world units.
-        far: largest depth.
         max_planes: largest number of planes; a wide range of depths needs more.
     """
     rays = _points_at(torch.ones(reference.height, reference.width), reference)
@@ -253,10 +251,7 @@ def count_agreeing(
 
     Args:
         depth: of the view, 0 = unknown.
-        photo: the view.
         pose: its cam_from_world.
-        others: depth maps of other views.
-        tolerance: relative difference of depths.
     """
     points = world_points(depth, photo, pose).reshape(-1, 3)
     votes = torch.zeros(len(points), dtype=torch.int64)

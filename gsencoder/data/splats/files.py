@@ -70,10 +70,6 @@ def load_splat(path: str | Path, *, origin: Float64[np.ndarray, "3"] | None = No
         Gaussians relative to `origin`, in the axes and units of the file. Quaternions are normalized (INRIA files
         keep them at any length); nothing else is changed.
 
-    Raises:
-        InputError: the file is missing, damaged or of no known format, or it has rows that cannot be Gaussians
-            (counted; `gsencoder repair` mends those).
-
     Warns:
         SceneWarning: SH of degree 4 was cut, extensions were left out, positions lose precision without an origin, or
             values look as if they were stored otherwise (see `odd_values`).
@@ -139,9 +135,6 @@ def read_raw(path: str | Path) -> RawSplat:
 
     Unpacking is bounded: a packed file may claim 200 times its size, or 16 MiB, and counts are checked against the
     size of the file before memory is taken.
-
-    Raises:
-        InputError: no such file, not a regular file, no known format, truncated, damaged, or too large a claim.
     """
     path = Path(path)
     try:
@@ -189,15 +182,7 @@ def _read_file(path: Path, size: int) -> RawSplat:
 
 
 def load_property(path: str | Path, name: str) -> Float64[np.ndarray, " N"]:
-    """One value for each Gaussian that a .ply holds beside those of a splat (see `further` of `save_splat`).
-
-    Args:
-        path: a .ply file.
-        name: of the property.
-
-    Raises:
-        InputError: no such file or property, or it is damaged.
-    """
+    """One value for each Gaussian that a .ply holds beside those of a splat (see `further` of `save_splat`)."""
     path = Path(path)
     try:
         with open_foreign(path) as stream:
@@ -211,11 +196,7 @@ def load_property(path: str | Path, name: str) -> Float64[np.ndarray, " N"]:
 
 
 def check_splat_name(path: Path) -> None:
-    """Checks that `save_splat` knows a format by the name of a file.
-
-    Raises:
-        InputError: it does not.
-    """
+    """Checks that `save_splat` knows a format by the name of a file."""
     if not path.name.lower().endswith((".ply", ".spz")):
         raise InputError(f"{path}: cannot write {path.suffix or 'a name without suffix'}; expected {WRITABLE}")
 
@@ -233,7 +214,6 @@ def save_splat(
 
     Args:
         path: .ply (INRIA), .compressed.ply or .spz, in any case of letters.
-        gaussians: what to write.
         origin: added to the positions in float64. A .ply then has double x y z; .compressed.ply and .spz cannot
             hold coordinates far from zero and are refused or warn.
         spz_version: 4 (zstd), or 3 (gzip) for older readers.
@@ -247,9 +227,6 @@ def save_splat(
             half of a 255th of their range in a chunk, other SH ±1/64 in ±4, quaternion components 7e-4 (the left-out
             one 2e-3).
         .spz: see `gsencoder.data.splats.packed.write_spz`.
-
-    Raises:
-        InputError: a suffix that cannot be written, no Gaussians, a missing folder, or an error of the system.
 
     Warns:
         SceneWarning: values were clipped to the range of a packed format, or positions lose precision in it.

@@ -242,11 +242,7 @@ def _filtered(
 
 def read_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
     """Positions of the element `vertex` of a point cloud, and its colors if it has red, green and blue; those that are
-    no integers are taken for shares of 1.
-
-    Raises:
-        InputError: unreadable, not a .ply, truncated, or without x, y and z.
-    """
+    no integers are taken for shares of 1."""
     with readable(path), open_foreign(path) as stream:
         if stream.read(4)[:3] != b"ply":
             raise InputError(f"{path}: not a .ply file; expected a point cloud")
@@ -265,11 +261,7 @@ def read_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarra
 
 
 def read_property(path: Path, stream: BinaryIO, header: PlyHeader, size: int, name: str) -> Float64[np.ndarray, " N"]:
-    """One property of the element `vertex`.
-
-    Raises:
-        InputError: there is none of this name, or the file is truncated.
-    """
+    """One property of the element `vertex`."""
     vertex = header.element("vertex")
     if vertex is None or vertex.dtype is None or name not in (vertex.dtype.names or ()):
         raise InputError(f"{path}: the .ply has no property {name!r}")

@@ -159,9 +159,6 @@ def repair_splat(raw: RawSplat, fixes: Sequence[str]) -> tuple[RawSplat, RepairR
     """Mends what `fixes` names, or everything for "all", in the order of `FIXES`, and nothing else.
 
     Each fix sees what the ones before it left, so a dropped row is counted once.
-
-    Raises:
-        InputError: an unknown fix, or no row left.
     """
     unknown = [fix for fix in fixes if fix not in (*FIXES, "all")]
     if isinstance(fixes, str) or unknown or not fixes:
