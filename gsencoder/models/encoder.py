@@ -172,9 +172,6 @@ def encoder_inputs(
         device: the device of the tensors.
         scene_curves: patch boundaries of the full scene if the cloud is a part of one (`curves.cut_scene_curves`);
             None = the cloud is the full scene.
-
-    Raises:
-        InputError: the cloud spreads over too many cells.
     """
 
     def tensor(array: np.ndarray) -> Tensor:

@@ -44,9 +44,6 @@ def check_extent(extent: float, voxel: float) -> None:
     Args:
         extent: number of cells along the longest axis.
         voxel: edge length of a cell, world units.
-
-    Raises:
-        InputError: the extent is 2²⁰ cells or more.
     """
     if not extent < MAX_EXTENT:
         raise InputError(
@@ -184,7 +181,6 @@ def cut_scene_curves(
     Args:
         means: centers, world units; at least one.
         voxel: edge length of the finest grid's cells, world units; it doubles from level to level.
-        levels: number of levels.
         orders: the curves that attention follows.
         patch: largest number of tokens in a patch. T tokens make ⌈T / patch⌉ patches, and the k-th begins at token
             ⌊k·T / patches⌋.

@@ -99,11 +99,7 @@ def output_space_parts(outputs: OutputSpace) -> tuple[dict[str, np.ndarray], dic
 
 
 def read_output_space(file: Archive) -> OutputSpace:
-    """Reads an output space from a file.
-
-    Raises:
-        InputError: the file is damaged, or was not written by gsencoder.
-    """
+    """Reads an output space from a file."""
     space, mean, basis = read_space(file)
     switches = {name: bool(file.value(name, bool)) for name in ("centered", "scaled")}
     return OutputSpace(space=space, mean=mean, scale=file.value("scale", float, int), basis=basis, **switches)
@@ -182,9 +178,6 @@ def teacher_of_space(spaces: Mapping[str, FeatureSpace], name: str | None = None
         spaces: the feature spaces of an encoder, by the names of their teachers.
         name: of a teacher or a feature space; None = the only one.
         option: where the name comes from, for the message.
-
-    Raises:
-        InputError: there is no such space, or there are several and none is named.
     """
     names = [each.name for each in spaces.values()]
     teachers = {each.name: teacher for teacher, each in spaces.items() if names.count(each.name) == 1}
@@ -204,9 +197,6 @@ def name_of_space(spaces: Mapping[str, FeatureSpace], space: FeatureSpace, encod
         spaces: of the encoder, by teacher.
         space: that is wanted.
         encoder: in messages: the setting that names it.
-
-    Raises:
-        InputError: the encoder has no such teacher.
     """
     for name, each in spaces.items():
         if each == space:
@@ -219,11 +209,7 @@ def name_of_space(spaces: Mapping[str, FeatureSpace], space: FeatureSpace, encod
 
 
 def check_distinct(spaces: Mapping[str, FeatureSpace]) -> None:
-    """Checks that no two teachers have the same feature space.
-
-    Raises:
-        InputError: two have; both are named.
-    """
+    """Checks that no two teachers have the same feature space."""
     for number, (name, space) in enumerate(spaces.items()):
         for other in list(spaces)[:number]:
             if spaces[other] == space:
@@ -251,11 +237,7 @@ def output_spaces_parts(outputs: OutputSpaces) -> tuple[dict[str, np.ndarray], d
 
 
 def read_output_spaces(file: Archive) -> OutputSpaces:
-    """Reads the output spaces of an encoder from a file.
-
-    Raises:
-        InputError: the file is damaged, or was not written by gsencoder.
-    """
+    """Reads the output spaces of an encoder from a file."""
     if "outputs" not in file:
         return OutputSpaces(by_teacher={file.value("teacher", str): read_output_space(file)})
     by_teacher: dict[str, OutputSpace] = {}

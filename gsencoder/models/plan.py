@@ -36,9 +36,6 @@ def grid_coords(points: Tensor, voxel: float, corner: Tensor | None = None) -> I
         points: world units.
         voxel: edge length of a cell, world units.
         corner: lowest corner of the full scene, [3], world units; None = the lowest of the points.
-
-    Raises:
-        InputError: points that are not finite, or that spread over 2²⁰ cells or more along an axis.
     """
     if not len(points):
         return torch.zeros(0, 3, dtype=torch.int64, device=points.device)
@@ -163,15 +160,11 @@ def plan_cloud(
     Args:
         means: centers in world units.
         voxel: edge length of the finest grid's cells, world units; it doubles from level to level.
-        levels: number of levels.
         orders: the curves that attention follows, in turn.
         scene_curves: patch boundaries of the full scene, made with the same voxel, levels, orders and patch as here and
             in `join_plans`. The cloud is then cut where the scene is, so that its tokens share a patch exactly where
             they do in the scene. None = the cloud is the full scene.
         stem: edge of the neighborhood of the encoder's first convolution, cells.
-
-    Raises:
-        InputError: positions that are not finite, or that spread over too many cells.
     """
     cells = grid_coords(means, voxel, torch.from_numpy(scene_curves.corner) if scene_curves is not None else None)
     codes, members = torch.sort(morton_codes(cells), stable=True)

@@ -33,10 +33,6 @@ def find_weights(source: str, option: str = "weights") -> Path:
     Args:
         source: the path or name; `shipped:NAME` is never a path, and "" is DEFAULT_WEIGHTS.
         option: that gives it, for errors.
-
-    Raises:
-        InputError: there is no such file, or the name of an encoder that comes with the package is that of a file or
-            folder, too.
     """
     names = sorted(path.parent.name for path in SHIPPED_WEIGHTS.glob(f"*/{WEIGHTS_FILE}"))
     name = (source or SHIPPED + DEFAULT_WEIGHTS).removeprefix(SHIPPED)
@@ -88,15 +84,11 @@ def save_weights(
     """Writes parameters, configuration and output spaces; an existing file is replaced only by a complete new one.
 
     Args:
-        path: the file.
         encoder: the encoder to save.
         outputs: its output spaces.
         made_by: settings and results of the training, as JSON values.
         dtype: type of the stored parameters. float16 halves the file and keeps 3 decimal digits of the parameters,
             which are small numbers.
-
-    Raises:
-        InputError: a parameter is not finite, or the disk is full.
     """
     arrays, header = output_spaces_parts(outputs)
     for name, value in encoder.state_dict().items():
@@ -120,9 +112,6 @@ def load_weights(source: str | Path, option: str = "weights") -> tuple[GaussianE
 
     Returns:
         The encoder in evaluation mode, its output spaces, and settings and results of its training.
-
-    Raises:
-        InputError: the file is missing, damaged or of another version, or its parameters do not fit its configuration.
     """
     with open_archive(find_weights(str(source), option)) as file:
         config = _read_config(file.value("encoder", dict))

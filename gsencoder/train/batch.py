@@ -60,7 +60,6 @@ def restrict_rows(
 
     Args:
         view: rows over all Gaussians of the scene.
-        gaussians: number of Gaussians of the scene.
         selected: the Gaussians of the crop.
         remaining: those of them that the sample has after dropping some at random; they become columns 0, 1, ….
         config: the thresholds.
@@ -378,7 +377,6 @@ def choose_crop(
 
     Args:
         means: centers of all Gaussians of the scene.
-        cameras: all cameras of the scene.
         center_weights: for each Gaussian, its weight in drawing the center of a crop; 0 for those without a target.
         config: settings of sampling.
         size: largest number of Gaussians (`crop_size`); 0 = no limit.
@@ -386,9 +384,6 @@ def choose_crop(
 
     Returns:
         Distinct views, fewer than `config.views` if no more are suitable, and rows in ascending order.
-
-    Raises:
-        InputError: no Gaussian lies in the frustum of any view.
     """
     full_scene = config.scope == "scene"
     if not 0 < size < len(means):

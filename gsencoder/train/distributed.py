@@ -55,12 +55,8 @@ class Presence:
         """Waits until all processes have come.
 
         Args:
-            process: the rank of this process.
             init_method: as `rank_from_environment` gives it.
             wait: longest wait of an operation of `store`.
-
-        Raises:
-            InputError: a process does not come; it is named.
         """
         self._process, self._stopped = process, threading.Event()
         self._others = [rank for rank in range(process.world_size) if rank != process.rank]
@@ -258,10 +254,6 @@ def join_processes(
 
     Yields:
         The rank and the device of this process.
-
-    Raises:
-        InputError: there is no such device, the other processes cannot be reached or have other settings, or one of
-            them dies.
     """
     process, init_method = rank_from_environment(os.environ)
     chosen = choose_device(device, gpu_index(process, init_method))
@@ -311,12 +303,8 @@ def lost_processes(process: ProcessRank, minutes: float | None = None) -> Iterat
     """Turns the error of a collective operation whose other side has died, or does not answer, into one that says so.
 
     Args:
-        process: the rank of this process.
         minutes: longest wait for the others within the block; None = that of the group. NCCL has its own watch, which
             ends the process.
-
-    Raises:
-        InputError: another process is lost.
     """
     shorter = process.world_size > 1 and minutes is not None
     if minutes is not None and shorter:
@@ -428,9 +416,6 @@ def check_agreement(subject: str, value: str, advice: str = "give all processes 
         subject: what it is the value of, for the error.
         value: of this process; empty = it has none, and any fits.
         advice: what to do where they differ.
-
-    Raises:
-        InputError: in every process: two processes have different values; both are named.
     """
     stated = [(rank, each) for rank, each in enumerate(values_of_all(value)) if each]
     for rank, each in stated:
@@ -446,10 +431,6 @@ def fail_together() -> Iterator[None]:
     """Synchronizes processes at the end of a block that they run independently, or that one of them runs for all.
 
     If one process fails in the block, all fail, so that none waits forever.
-
-    Raises:
-        Exception: the error of this process.
-        InputError: another process failed.
     """
     failure: Exception | None = None
     try:

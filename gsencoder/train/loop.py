@@ -148,14 +148,10 @@ def save_checkpoint(
     """Writes a checkpoint; an existing one is replaced only by a complete new one.
 
     Args:
-        path: the file.
         model: the model in training.
         optimizer: AdamW over parameters of `model`.
         state: step, seconds and losses that are not logged yet.
         settings: the settings that a run must share to resume from here, as JSON values.
-
-    Raises:
-        InputError: the disk is full.
     """
     arrays = {f"model.{name}": value.detach().cpu().numpy() for name, value in trained_state(model).items()}
     for name, parameter in model.named_parameters():
@@ -182,12 +178,7 @@ def trained_state(model: torch.nn.Module) -> dict[str, torch.Tensor]:
 def load_checkpoint(
     path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, settings: dict[str, Any]
 ) -> TrainingState:
-    """Restores model and optimizer from a checkpoint.
-
-    Raises:
-        InputError: the file is damaged, or is of another network or of a run with other settings; the first setting
-            that differs is named.
-    """
+    """Restores model and optimizer from a checkpoint."""
     with advised(_begin_anew(path)), open_archive(path) as file:
         stored_settings = file.value("settings", dict)
         if stored_settings != settings:
@@ -218,9 +209,6 @@ def load_checkpoint(
 def check_same_teachers(path: Path, teachers: Sequence[str]) -> None:
     """Checks that a checkpoint, if there is one, is of a run with these teachers, which is known before anything is
     prepared for them.
-
-    Raises:
-        InputError: the file is damaged, or is of a run with other teachers or with these in another order.
     """
     if not path.is_file():
         return
@@ -304,9 +292,6 @@ def lost_workers() -> Iterator[None]:
 
     It may be raised anywhere in the block, also between a step and the record of it, so that nothing is to be saved
     on its account.
-
-    Raises:
-        InputError: a worker was ended.
     """
     try:
         yield
@@ -373,18 +358,12 @@ class Trainer:
             network: the network, trained in place and moved to `device`.
             dataset: the training samples, by number; an error of a sample is a value.
             objective: gives the loss of the network once it is compiled or wrapped for several processes.
-            config: settings of the loop.
             collate: joins samples to a batch, or returns the error of one of them.
             folder: existing folder for checkpoint and log.
             settings: the settings that a run must share with the one that it resumes, as JSON values.
-            process: rank of this process.
-            device: device of this process.
             tensorboard: whether to write TensorBoard events.
             validate: validates the network, which is given in evaluation mode; called in all processes, which may
                 share the work, and the result of the first one is logged.
-
-        Raises:
-            InputError: the folder holds a run with other settings.
         """
         self.config, self.dataset, self.process, self.device = config, dataset, process, device
         self.folder, self.settings, self.validate = folder, dict(settings), validate
@@ -425,10 +404,6 @@ class Trainer:
 
         Returns:
             Steps and seconds of the training.
-
-        Raises:
-            InputError: a sample cannot be made, or a loss or gradient is not finite; the error names the samples and
-                the loss term, and parameters are not changed. Or a data worker was ended.
         """
         with lost_workers():
             try:
@@ -518,7 +493,6 @@ class Trainer:
         """Computes the gradients of one optimizer step; returns the losses over all processes.
 
         Args:
-            step: number of the step.
             items: micro-batches of this process, or the errors of their samples.
         """
         self.optimizer.zero_grad(set_to_none=True)

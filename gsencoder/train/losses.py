@@ -114,9 +114,6 @@ class AdapterHead(nn.Module):
         body: network from features [n, D] to vectors [n, E].
         mean: mean of the outputs of `body` for the teacher's features.
         scale: root mean square distance of these outputs from their mean.
-
-        Raises:
-            InputError: the scale is not a positive number.
         """
         super().__init__()
         if not 0 < scale < float("inf"):
@@ -274,13 +271,9 @@ def sum_divisors(
     Args:
         objective: gives the divisors of a batch.
         items: micro-batches of this process, or the errors of their samples.
-        device: of this process.
 
     Returns:
         The batches, and for each term its divisor, at least `NO_WEIGHT`.
-
-    Raises:
-        InputError: a sample could not be made, here or on another process, or no term has a weight.
     """
     batches = [item for item in items if not isinstance(item, InputError)]
     lambdas = objective.lambdas
@@ -320,9 +313,6 @@ def finite_terms(
         micro_terms: what each micro-batch adds to each term.
         norm: norm of the gradient, which is summed over all processes.
         processes: their number.
-
-    Raises:
-        InputError: a loss of any process, or the gradient, is not finite.
     """
     bad_loss = bad_gradient = ""
     for batch, row in zip(batches, micro_terms.tolist(), strict=True):

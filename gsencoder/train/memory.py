@@ -112,11 +112,6 @@ def prepare_memory(
         predicted: features of the teacher's space that an encoder predicts for the scene; None = they are fused.
         sample: number of raw features that are stored beside the bank for `open_raw_sample`, or all if there are fewer.
         device: where B is made and multiplied.
-        track: wraps loops to show progress.
-
-    Raises:
-        InputError: features that are not standardized, a scene that cannot be fused, a bank that cannot be made, or a
-            folder that was prepared with other settings.
     """
     if not (prepare.center and prepare.scale):
         raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
@@ -157,9 +152,6 @@ def open_memory_scene(folder: Path, settings: Mapping[str, Any] | None = None) -
     Args:
         folder: of `prepare_memory`.
         settings: what the preparation depends on; None = anything.
-
-    Raises:
-        InputError: missing, damaged, or prepared with other settings.
     """
     with _advice(folder), open_archive(folder / BANK_FILE) as file:
         stored = file.value("made_with", dict)
@@ -175,11 +167,7 @@ def _advice(folder: Path) -> AbstractContextManager[None]:
 
 
 def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Writes what a preparation depends on before its first map and its sample, which do not say so themselves.
-
-    Raises:
-        InputError: the folder holds those of other settings, or cannot be used.
-    """
+    """Writes what a preparation depends on before its first map and its sample, which do not say so themselves."""
     path = folder / SETTINGS_FILE
     with _advice(folder):
         if not path.is_file():
@@ -200,11 +188,7 @@ def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
 
 
 def open_raw_sample(folder: Path) -> RawSample:
-    """The raw features that were stored beside the bank.
-
-    Raises:
-        InputError: none were, or they are damaged.
-    """
+    """The raw features that were stored beside the bank."""
     with advised(f"remove {folder} to prepare the scene again"), open_archive(folder / SAMPLE_FILE) as file:
         return RawSample(features=file.array("features", "float32", ("n", "D")), total=file.value("total", int))
 
@@ -458,11 +442,7 @@ def first_queries(
 
 
 def untrained_memory(scene: MemoryScene, config: MemoryConfig, seed: int = 0) -> QueryMemory:
-    """The memory of fused features without any training.
-
-    Raises:
-        InputError: no rows to compare with.
-    """
+    """The memory of fused features without any training."""
     check_rows({scene.bank.space.name: scene}, config.min_alpha)
     queries, projection = first_queries(scene, config, seed)
     return _memory_of(scene, config, queries, projection)
@@ -486,13 +466,6 @@ def train_memory(
         config: queries, attention and loss.
         training: settings of the loop; None = those of `memory_training`.
         work: existing folder for the checkpoint and the log.
-        process: rank of this process.
-        device: of this process.
-        track: wraps the loop to show progress.
-
-    Raises:
-        InputError: the scenes are of different Gaussians or views, `work` holds a run with other settings, or a loss or
-            gradient is not finite.
     """
     training = memory_training() if training is None else training
     network, state = _train(scenes, config, training, None, work, process, device, track)
@@ -520,12 +493,7 @@ def train_decoder(
         scene: prepared for one teacher.
         kind: of the decoder.
         config: queries and loss; what is said of attention is not used.
-        training: settings of the loop.
         work: existing folder for the checkpoint and the log.
-        track: wraps the loop to show progress.
-
-    Raises:
-        InputError: see `train_memory`.
     """
     network, _ = _train({"": scene}, config, training, kind, work, ProcessRank(), torch.device("cpu"), track)
     return network
@@ -582,11 +550,7 @@ def fingerprint_of(bank: MemoryBank) -> str:
 
 
 def check_rows(scenes: Mapping[str, MemoryScene], min_alpha: float) -> None:
-    """Checks that there is something to compare rendered features with.
-
-    Raises:
-        InputError: no view has a row of B that is opaque enough.
-    """
+    """Checks that there is something to compare rendered features with."""
     for name, scene in scenes.items():
         prepared = scene.prepared
         seen = prepared.weights > 0

@@ -111,16 +111,12 @@ def prepare_scene(
     """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of `config.render_views`.
 
     Args:
-        path: the file.
         scene: the scene, with Gaussians and views.
         teacher: a teacher of the space of `outputs`.
         outputs: output space of the dataset.
         config: settings of the preparation.
         source: the path that the scene was read from.
         device: where B is made and multiplied.
-
-    Raises:
-        InputError: the scene cannot be fused, or the disk is full.
     """
     assert scene.gaussians is not None
     assert scene.views is not None
@@ -300,10 +296,6 @@ class PreparedDataset:
         folder: the folder; created if it does not exist and settings are given.
         settings: everything that the preparation depends on, compared with the settings stored in the folder. None =
             open an existing dataset with any settings.
-
-        Raises:
-            InputError: the folder was prepared with other settings, cannot be read, or holds no prepared scenes and no
-                settings are given.
         """
         self.folder = folder
         path = folder / DATASET_SETTINGS_FILE
@@ -332,20 +324,13 @@ class PreparedDataset:
                 stream.write(json.dumps(expected, indent=1).encode())
 
     def fingerprint(self) -> str:
-        """A hash of the output space, by which a resumed training checks that its targets are the same.
-
-        Raises:
-            InputError: its file cannot be read.
-        """
+        """A hash of the output space, by which a resumed training checks that its targets are the same."""
         with readable(self.folder / SPACE_FILE):
             return hashlib.sha256(read_foreign(self.folder / SPACE_FILE)).hexdigest()[:16]
 
     def digest_of_scenes(self, names: Sequence[str]) -> str:
         """A hash of the headers of prepared scenes, which hold the checksums of all arrays, by which processes compare
         what they train on.
-
-        Raises:
-            InputError: a file is damaged.
         """
         digest = hashlib.sha256()
         for name in names:
@@ -358,9 +343,6 @@ class PreparedDataset:
     def load_kinds(self) -> tuple[str, ...]:
         """Loads the names of the things that the teacher tells apart; none for a teacher without names, and of datasets
         of earlier versions.
-
-        Raises:
-            InputError: the file is missing or damaged.
         """
         with advised("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
             kinds = file.value("kinds", list) if "kinds" in file else []
@@ -369,11 +351,7 @@ class PreparedDataset:
         return tuple(kinds)
 
     def load_space(self) -> tuple[OutputSpace, Float32[np.ndarray, "C channels"] | None]:
-        """Loads the output space, and for a coded teacher the vectors of its codes in standard units, else None.
-
-        Raises:
-            InputError: the file is missing or damaged.
-        """
+        """Loads the output space, and for a coded teacher the vectors of its codes in standard units, else None."""
         with advised("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
             outputs = read_output_space(file)
             codebook = file.array("codebook", "float32", ("C", outputs.channels)) if "codebook" in file else None
@@ -393,11 +371,7 @@ class PreparedDataset:
         return any((self.folder / "scenes").glob("*"))
 
     def has_scene(self, source: Path) -> bool:
-        """Whether the scene at this path is prepared, from this path or from another one with the same files.
-
-        Raises:
-            InputError: another scene with the same name is, or its targets are not of the precision of this dataset.
-        """
+        """Whether the scene at this path is prepared, from this path or from another one with the same files."""
         path = self.scene_path(source.name)
         if not path.is_file():
             return False
@@ -431,9 +405,6 @@ class PreparedDataset:
             config: settings of the preparation.
             source: the path that the scene was read from.
             device: where B is made and multiplied.
-
-        Raises:
-            InputError: the scene cannot be fused, or the disk is full.
         """
         outputs, _ = self.load_space()
         path = self.scene_path(scene.name)
@@ -445,9 +416,6 @@ class PreparedDataset:
     def check_kinds(self, teacher: Teacher) -> None:
         """Checks that a scene to train on has no names that the dataset's classes lack, such as those of labels that
         were added since. Dense teachers have no classes before their targets are clustered.
-
-        Raises:
-            InputError: it has.
         """
         if teacher.table is None:
             return
@@ -483,9 +451,6 @@ class PreparedDataset:
 
         All processes of a training call this: the first one clusters the classes of a dense teacher from a sample of
         the targets and writes the file, and each counts the targets of its share of the scenes.
-
-        Raises:
-            InputError: in any process, a scene is damaged, or the disk is full.
         """
         codebook = None
         with fail_together():
@@ -524,11 +489,7 @@ class PreparedDataset:
             return [str(name) for name in file.value("scenes", list)] if "scenes" in file else None
 
     def load_class_balance(self) -> ClassBalance:
-        """Loads the target classes and their frequencies, as stored by `count_classes`.
-
-        Raises:
-            InputError: the file is missing or damaged.
-        """
+        """Loads the target classes and their frequencies, as stored by `count_classes`."""
         channels = self.load_space()[0].channels
         path = self.folder / CLASS_BALANCE_FILE
         with advised("remove the file to count targets again"), open_archive(path) as file:

@@ -176,16 +176,10 @@ def prepare_scenes(
         voxel: edge length of the encoder's grid cells in metres, from which the unit of a splat is estimated if it is
             unknown.
         heads: names of the teacher's adapter heads that are measured over the dataset.
-        process: rank of this process.
         device: of this process, where B is made and multiplied.
-        track: wraps loops to show progress.
 
     Returns:
         The prepared dataset of each teacher, by its name.
-
-    Raises:
-        InputError: in any process, a scene cannot be used, a teacher has no scene or a scene no teacher, or the folder
-            cannot be used.
 
     Warns:
         SceneWarning: scenes that lack one of several teachers.
@@ -261,11 +255,7 @@ def _about_teacher(config: SourceConfig, name: str) -> Iterator[None]:
 
 
 def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
-    """The folder of the prepared scenes of each teacher: the given one, or one in it for each of several teachers.
-
-    Raises:
-        InputError: there are several teachers and the folder holds scenes that were prepared for one, or the reverse.
-    """
+    """The folder of the prepared scenes of each teacher: the given one, or one in it for each of several teachers."""
     if len(names) == 1:
         prepared = sorted(path.parent.name for path in folder.glob(f"*/{DATASET_SETTINGS_FILE}"))
         if prepared and not (folder / DATASET_SETTINGS_FILE).is_file():
@@ -393,15 +383,10 @@ def split_scenes(
     """Splits scenes into those to train on and those held out for validation.
 
     Args:
-        paths: all scenes.
         patterns: names of scenes to hold out, with * and ? as in file names.
         split: file of the names of the scenes to train on, one a line, such as scannetv2_train.txt; those that are
             neither in it nor held out are left out. None = all that are not held out.
         holdout_split: file of the names of the scenes to hold out, in place of patterns.
-
-    Raises:
-        InputError: a pattern matches no scene, a file names a scene that is not there, or one that the other file
-            names too, all scenes are held out, or two scenes have the same name.
     """
     names = [path.name for path in paths]
     if (repeated := first_repeated(names)) is not None:

@@ -83,7 +83,6 @@ def write_prepared(
     """Writes a prepared scene.
 
     Args:
-        path: the file.
         scene: the scene, with Gaussians and cameras.
         features: fused features, in the basis of `outputs`.
         outputs: output space of the dataset.
@@ -91,9 +90,6 @@ def write_prepared(
         source: the path that the scene was read from, by which the file is recognized; None if nobody looks for it.
         precision: of the targets, and of the teacher's vectors in the rows.
         projections: how well the basis represents the teacher's vectors in this scene; None without a basis.
-
-    Raises:
-        InputError: the features are of another space, or the disk is full.
     """
     assert scene.gaussians is not None
     assert scene.views is not None
@@ -162,9 +158,6 @@ def check_arrays(arrays: MappedArrays, views: int) -> None:
     """Checks the shapes of all arrays, and the values of those that are read for all Gaussians.
 
     Entries of B and targets are checked when they are read; checking them here would read the entire file.
-
-    Raises:
-        InputError: shapes or values are inconsistent.
     """
     shapes = {name: arrays.shape(name) for name in ARRAYS}
     sizes = {name: shape[0] for name, shape in shapes.items()}

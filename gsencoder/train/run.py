@@ -157,13 +157,8 @@ def encoder_trainer(
         encoder: the encoder, trained in place and moved to `device`.
         dataset: the training samples.
         losses: weights and parameters of the loss terms.
-        config: settings of the loop.
         heads: adapter heads of teachers, by name.
-        device: device of this process.
         settings: the other arguments of `Trainer`.
-
-    Raises:
-        InputError: see `Trainer`.
     """
     return Trainer(
         encoder,
@@ -275,11 +270,6 @@ def train(
         prepared: folder of prepared scenes, which runs with the same sources can share; None = a folder in `work`.
         device: the device on which scenes are prepared and the encoder is trained.
         validate: scores the encoder during training, for example `gsencoder.evaluate.validation.validate_names`.
-        track: wraps loops to show progress.
-
-    Raises:
-        InputError: a scene cannot be used; `work` or `prepared` holds a run with other settings; or a loss or gradient
-            is not finite.
     """
     folder = Path(work)
     training, validation = [Path(path) for path in scenes], [Path(path) for path in held_out]
@@ -331,11 +321,7 @@ def fit(
     validate: SceneValidator | None = None,
     track: Track = untracked,
 ) -> Training:
-    """Trains an encoder on prepared scenes, given by name; the other arguments are those of `train`.
-
-    Raises:
-        InputError: see `train`.
-    """
+    """Trains an encoder on prepared scenes, given by name; the other arguments are those of `train`."""
     # Samples are numbered by scene, so that the order in which scenes are given must not matter to a resumed run.
     training = sorted(training)
     spaces = {name: dataset.load_space() for name, dataset in datasets.items()}
@@ -409,11 +395,7 @@ def fit(
 
 
 def _check_trained(losses: LossConfig, weights: Sequence[float], with_contrast: Mapping[str, bool]) -> None:
-    """Warns of teachers on which no loss is computed, since the encoder offers their features all the same.
-
-    Raises:
-        InputError: none is computed on any.
-    """
+    """Warns of teachers on which no loss is computed, since the encoder offers their features all the same."""
     of_all = losses.field_weight + losses.render_weight > 0
     untrained = [
         name

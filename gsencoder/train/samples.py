@@ -115,9 +115,6 @@ def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float
         gaussians: world units.
         to_from: a rotation, or a rotation with a mirror: any orthonormal matrix.
         scale: > 0.
-
-    Raises:
-        InputError: not orthonormal, or a scale that is not positive.
     """
     if np.abs(to_from @ to_from.T - np.eye(3)).max() > 1e-6 or not 0 < scale < math.inf:
         raise InputError("turn: expected an orthonormal matrix and a positive scale")
@@ -175,9 +172,6 @@ class TrainingScene:
     def __init__(self, parts: Sequence[PreparedScene | None]) -> None:
         """Args:
         parts: see the class.
-
-        Raises:
-            InputError: the scene has no teacher.
         """
         present = [part for part in parts if part is not None]
         if not present:
@@ -186,11 +180,7 @@ class TrainingScene:
         self.name = self._first.name
 
     def check_consistent(self) -> None:
-        """Checks that all parts were prepared for the same Gaussians and views.
-
-        Raises:
-            InputError: they were not.
-        """
+        """Checks that all parts were prepared for the same Gaussians and views."""
         first = self._first
         for part in self.parts:
             same = part is None or (
@@ -309,9 +299,6 @@ class SampleDataset(Dataset[Sample]):
         """Args:
         scenes: the scenes to train on.
         recipe: settings of the samples.
-
-        Raises:
-            InputError: there are no scenes.
         """
         if not scenes:
             raise InputError("training: no scenes to train on")
@@ -326,11 +313,7 @@ class SampleDataset(Dataset[Sample]):
             return error
 
     def make(self, number: int) -> Sample:
-        """Makes sample `number`.
-
-        Raises:
-            InputError: its scene cannot be read, or no view of the scene sees a Gaussian.
-        """
+        """Makes sample `number`."""
         epoch, position = divmod(number, len(self.scenes))
         order = np.random.default_rng([self.recipe.seed, 0, epoch]).permutation(len(self.scenes))
         rng = np.random.default_rng([self.recipe.seed, 1, number])
@@ -368,7 +351,6 @@ class StepSampler(Sampler[list[int]]):
         last: step after the last one.
         batch: number of samples of a micro-batch.
         accumulate: number of micro-batches of a process in a step.
-        rank: rank of this process.
         world: number of processes.
         """
         self.steps = range(first, last)
@@ -389,9 +371,6 @@ def target_codes(scene: TrainingScene, recipe: SampleRecipe) -> Codes:
 
     Finding classes reads all targets of a scene, which may be a gigabyte. Where nothing depends on them, every target
     is of class 0.
-
-    Raises:
-        InputError: the scene was not prepared for the same Gaussians and views by all teachers.
     """
     scene.check_consistent()
     result: list[np.ndarray | None] = []
@@ -418,14 +397,10 @@ def make_sample(
     """Makes a sample: selects views and Gaussians of a scene, augments them and computes the encoder's inputs.
 
     Args:
-        scene: the scene.
         codes: target classes of its Gaussians for each teacher (`target_codes`).
         recipe: settings of the sample.
         size: largest number of Gaussians; 0 = all that the views see.
         rng: source of all random numbers.
-
-    Raises:
-        InputError: no view sees any of the scene's Gaussians.
     """
     # With the power 1 every class is equally often the center of a crop.
     first, first_codes = next((number, each) for number, each in enumerate(codes) if each is not None)

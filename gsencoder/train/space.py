@@ -220,13 +220,10 @@ def sampled_moments(
     Args:
         scenes: all scenes to train on.
         open_scene: reads a scene without making Gaussians, and builds its teacher.
-        space: the space of the teacher.
         views: number of maps.
         optional: leave out scenes that lack what the teacher needs.
         folder: of the files of blocks, which all processes share; blocks that are there already are not computed again.
             Removed by the caller. None = one process, which holds them in memory.
-        process: rank of this process.
-        track: wraps loops to show progress.
 
     Returns:
         The moments, and the names of the things that the teacher tells apart in the scenes.
@@ -362,11 +359,6 @@ def fit_space(
         open_scene: reads a scene without making Gaussians, and builds its teacher.
         config: settings of the preparation.
         optional: leave out scenes that lack what the teacher needs.
-        process: rank of this process.
-        track: wraps loops to show progress.
-
-    Raises:
-        InputError: the dataset's folder holds scenes without their space, or see `dataset_space`.
     """
     path, work = dataset.folder / SPACE_FILE, dataset.folder / MOMENTS_FOLDER
     if value_of_first(not path.is_file()):
@@ -426,8 +418,6 @@ def dataset_space(
         scale: divide targets by the root mean square distance from the mean.
         optional: leave out scenes that lack what the teacher needs, since they have other teachers.
         work: folder of intermediate results of a dense teacher; see `sampled_moments`.
-        process: rank of this process.
-        track: wraps loops to show progress.
 
     Raises:
         MissingInput: a scene lacks what the teacher needs, or with `optional` all do; then the message has that of
@@ -546,11 +536,7 @@ def _dense_space(moments: Moments, space: FeatureSpace, config: FuseConfig) -> O
 
 
 def _scale(variance: float, space: FeatureSpace) -> float:
-    """The root mean square distance from the mean, given the variance.
-
-    Raises:
-        InputError: the variance is 0: all features are equal.
-    """
+    """The root mean square distance from the mean, given the variance."""
     if not variance > 0:
         raise InputError(
             f"training: the teacher ({space.describe()}) gives the same features everywhere in these scenes; "

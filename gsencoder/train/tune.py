@@ -115,11 +115,7 @@ def chat(text: str, pictures: Sequence[Any], answer: str | None = None) -> list[
 
 
 def answer_frame(processor: Any) -> tuple[str, str]:
-    """What stands before and after an answer in the model's turn: blanks, and the token that ends it.
-
-    Raises:
-        InputError: neither the chat template nor the tokenizer says what ends an answer.
-    """
+    """What stands before and after an answer in the model's turn: blanks, and the token that ends it."""
     tokenizer, probe = processor.tokenizer, "answer"
     prompt = processor.apply_chat_template(chat("question", []), add_generation_prompt=True, tokenize=False)
     dialog = processor.apply_chat_template(chat("question", [], probe), add_generation_prompt=False, tokenize=False)
@@ -151,9 +147,6 @@ class PairSamples(Dataset[TuningSample]):
         processor: of the model.
         longest: tokens that the model takes; None = unknown.
         seed: of orders and answers.
-
-        Raises:
-            InputError: the model has no token that ends an answer.
         """
         self.pairs, self._store, self._processor = tuple(pairs), store, processor
         self._longest, self._seed = longest, seed
@@ -171,11 +164,7 @@ class PairSamples(Dataset[TuningSample]):
             return error
 
     def sample(self, pair: TuningPair, answer: str) -> TuningSample:
-        """A pair as tensors.
-
-        Raises:
-            InputError: pictures are gone, the processor refuses them, or there are more tokens than the model takes.
-        """
+        """A pair as tensors."""
         prompt = pair.prompt
         pictures = [Image.fromarray(self._store.picture(name)) for name in prompt.pictures]
         try:
@@ -372,11 +361,7 @@ class Tuned:
 
 
 def open_processor(model: Path, *, with_tokens: bool = False) -> tuple[Any, Any, TowerLayout | None]:
-    """Configuration and processor of a model, and the layout of its tower's output where features replace that.
-
-    Raises:
-        InputError: see `load_processor` and `tower_layout`.
-    """
+    """Configuration and processor of a model, and the layout of its tower's output where features replace that."""
     config, processor = load_processor(model)
     if not with_tokens:
         return config, processor, None
@@ -412,14 +397,7 @@ def tune(
             layer that is trained, too, leads from the features to the tower's channels; None = where their numbers
             differ.
         work: existing folder for the checkpoint and the log.
-        process: rank of this process.
-        device: of this process.
         tensorboard: whether to write TensorBoard events.
-        track: wraps the loop to show progress.
-
-    Raises:
-        InputError: no pairs, a model that cannot be used, `work` holds a run with other settings, or a loss or gradient
-            is not finite.
     """
     check_pairs(pairs)
     first = pairs[0].prompt.tokens
@@ -482,11 +460,7 @@ def _projected(channels: int, layout: TowerLayout, project: bool | None) -> int 
 
 
 def check_pairs(pairs: Sequence[TuningPair]) -> None:
-    """Checks that there is something to learn.
-
-    Raises:
-        InputError: no pairs, answers that are missing or empty, or tokens of several feature spaces.
-    """
+    """Checks that there is something to learn."""
     if not pairs:
         raise InputError("tune: there are no questions to train on")
     for pair in pairs:
@@ -509,11 +483,7 @@ def pairs_digest(pairs: Sequence[TuningPair]) -> str:
 
 
 def save_tuned(folder: Path, tuned: Tuned) -> None:
-    """Writes adapters as peft does, the processor, and a projection where there is one.
-
-    Raises:
-        InputError: the disk is full.
-    """
+    """Writes adapters as peft does, the processor, and a projection where there is one."""
     save_adapters(folder, tuned.network.adapted, tuned.processor)
     if tuned.network.projection is not None:
         arrays = {name: value.detach().cpu().numpy() for name, value in tuned.network.projection.state_dict().items()}
@@ -527,9 +497,6 @@ def open_tuned(folder: Path, model: Path, *, with_tokens: bool = False) -> Tuned
         folder: of the adapters.
         model: that they belong to.
         with_tokens: whether rendered features replace the tower's output, as in the training.
-
-    Raises:
-        InputError: peft is missing, or the files cannot be used.
     """
     check_peft()
     import peft

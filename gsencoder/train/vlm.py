@@ -83,12 +83,7 @@ def quiet_peft() -> Iterator[None]:
 
 
 def load_processor(folder: Path) -> tuple[Any, Any]:
-    """Configuration and processor of a vision-language model, without its weights.
-
-    Raises:
-        InputError: transformers is missing, the model takes no pictures, or there is no processor or no chat
-            template, or a damaged one.
-    """
+    """Configuration and processor of a vision-language model, without its weights."""
     config = read_config(folder, WHAT)
     from transformers import AutoProcessor
     from transformers.models.auto.modeling_auto import MODEL_FOR_IMAGE_TEXT_TO_TEXT_MAPPING
@@ -136,13 +131,9 @@ def load_adapted(
         folder: of the model.
         config: of the adapters.
         base: the type in which the weights of the model are kept.
-        seed: of A.
 
     Returns:
         A `peft.PeftModel`.
-
-    Raises:
-        InputError: peft is missing, the weights cannot be used, or no layer is called as asked.
     """
     check_peft()
     import peft
@@ -168,9 +159,6 @@ def check_targets(config: Any, targets: tuple[str, ...]) -> None:
     Args:
         config: of the model.
         targets: of `AdapterConfig`.
-
-    Raises:
-        InputError: no layer is called as asked.
     """
     if not targets:
         return
@@ -292,11 +280,7 @@ class TowerLayout:
 
 
 def tower_layout(config: Any, processor: Any) -> TowerLayout:
-    """What the tower of a model gives for a picture, by configuration and processor.
-
-    Raises:
-        InputError: a model of another kind, or with a preprocessing whose grid is not known.
-    """
+    """What the tower of a model gives for a picture, by configuration and processor."""
     kind, pictures = config.model_type, processor.image_processor
     if kind not in (*STRETCHED, *CROPPED):
         raise InputError(
