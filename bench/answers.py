@@ -17,6 +17,7 @@ picture: that of the choice of views, given the boxes, and no accuracy.
 
 import argparse
 import json
+import sys
 import time
 import warnings
 from collections import defaultdict
@@ -28,19 +29,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from gsencoder.app.inputs import stored_words, with_stored_features
-from gsencoder.app.scenes import load_words
-from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files import write_json
-from gsencoder.core.pretrained import find_file
-from gsencoder.data.labels.expressions import Expression
-from gsencoder.data.labels.made_questions import KINDS, QuestionsConfig, kind_of, make_expressions, make_questions
-from gsencoder.data.labels.questions import Question as TruthQuestion
-from gsencoder.data.labels.seen_objects import see_objects
-from gsencoder.data.scenes import load_scene
-from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.evaluate.boxes import aabb_iou
-from gsencoder.evaluate.stand_in_vlm import (
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from scripted_answerer import (
     LEAST_WEIGHT,
     MIN_PIXELS,
     MODEL,
@@ -55,6 +46,19 @@ from gsencoder.evaluate.stand_in_vlm import (
     request_pictures,
     serving,
 )
+
+from gsencoder.app.inputs import stored_words, with_stored_features
+from gsencoder.app.scenes import load_words
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files import write_json
+from gsencoder.core.pretrained import find_file
+from gsencoder.data.labels.expressions import Expression
+from gsencoder.data.labels.made_questions import KINDS, QuestionsConfig, kind_of, make_expressions, make_questions
+from gsencoder.data.labels.questions import Question as TruthQuestion
+from gsencoder.data.labels.seen_objects import see_objects
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.seeding.seed import with_gaussians
+from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.folder import load_features
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.ask.ask import Asker, Prompt, Question, chosen_mark, prompt_messages

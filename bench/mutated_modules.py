@@ -201,12 +201,6 @@ SCORE_FILES = {
         "tests/evaluate/test_class_scores.py",
         "tests/evaluate/test_labeled_points.py",
     ),
-    "evaluate/stand_in_vlm": (
-        "tests/evaluate/test_picture_truth.py",
-        "tests/evaluate/test_picture_laws.py",
-        "tests/evaluate/test_scripted_answerer.py",
-        "tests/evaluate/test_answer_sheets.py",
-    ),
     "evaluate/tables": (
         "tests/app/commands/test_score_limits.py",
         "tests/app/commands/test_score_scans.py",

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scripted_answerer import PictureTruth
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room
-from gsencoder.evaluate.stand_in_vlm import PictureTruth
 from gsencoder.types import Scene
 from gsencoder.types.checks import move_origin
 

@@ -8,11 +8,7 @@ import urllib.request
 from typing import Any
 
 import pytest
-
-from gsencoder.core.errors import InputError
-from gsencoder.data.labels.expressions import Expression
-from gsencoder.data.labels.questions import Question
-from gsencoder.evaluate.stand_in_vlm import (
+from scripted_answerer import (
     AnswerSheet,
     Fact,
     ScriptedAnswerer,
@@ -24,6 +20,10 @@ from gsencoder.evaluate.stand_in_vlm import (
     request_pictures,
     serving,
 )
+
+from gsencoder.core.errors import InputError
+from gsencoder.data.labels.expressions import Expression
+from gsencoder.data.labels.questions import Question
 
 
 def url(data: bytes) -> str:

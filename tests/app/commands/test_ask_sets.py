@@ -9,15 +9,7 @@ import numpy as np
 import pytest
 from command_runs import refusal, results_of
 from named_rooms import write_words
-
-from gsencoder.app import main as cli
-from gsencoder.data.labels.expressions import read_scanrefer
-from gsencoder.data.labels.questions import read_questions
-from gsencoder.data.scenes import load_scene
-from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.evaluate.benchmarks.answers import read_answer_predictions
-from gsencoder.evaluate.boxes import aabb_iou
-from gsencoder.evaluate.stand_in_vlm import (
+from scripted_answerer import (
     AnswerSheet,
     PictureTruth,
     ScriptedAnswerer,
@@ -26,6 +18,14 @@ from gsencoder.evaluate.stand_in_vlm import (
     add_questions,
     serving,
 )
+
+from gsencoder.app import main as cli
+from gsencoder.data.labels.expressions import read_scanrefer
+from gsencoder.data.labels.questions import read_questions
+from gsencoder.data.scenes import load_scene
+from gsencoder.data.synthetic import make_room, write_room
+from gsencoder.evaluate.benchmarks.answers import read_answer_predictions
+from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.ask.questions import read_answers
 from gsencoder.infer.views.photographs import with_photographs

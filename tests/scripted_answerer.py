@@ -1,25 +1,14 @@
 """A stand-in for a vision-language model, whose answers are right exactly where the pictures show enough.
 
-It sees a request as a model does, text and pictures, and looks up two things that a model would have to know: of each
-picture, by the digest of its bytes, how many pixels of each true object it shows; and the right answer of each
-question, with the objects that it is about. It answers rightly where some picture shows enough pixels of each of these,
-and else says "unknown". So it is the ceiling of what a choice of views, marks and scores can reach, with right and
-wrong known.
+It sees a request as a model does, text and pictures, and looks up how many pixels of each true object a picture shows,
+by the digest of its bytes, and the right answer of each question with the objects that it is about. It answers rightly
+where some picture shows enough pixels of each of these, and else says "unknown": the ceiling of what a choice of views,
+marks and scores can reach.
 
-What a scripted answerer needs to know, from the truth of a question set and a dry run of `ask` over it.
-
-A dry run (`dry_run=true`) writes the requests that a real one sends, picture by picture and bit by bit, since pictures
-are deterministic; so the truth of each picture can be computed before it is sent.
-
-How many pixels of each labeled object the pictures show that `ask` sends.
-
-Photographs and close-ups are counted in the instance maps of the scene, cut and resized as the picture was, by the
-nearest pixel. Renders are counted by the instances of the Gaussians, blended as the picture was: each pixel belongs to
+A dry run of `ask` (`dry_run=true`) writes the requests that a real one sends, bit by bit, so the labels of each picture
+can be computed before it is sent. Photographs and close-ups are counted in the instance maps of the scene, cut and
+resized as the picture was; renders by the instances of the Gaussians, blended as the picture was: each pixel belongs to
 the instance with most of its weight, or to none where that is below one half.
-
-Captions of rendered views: the best of a pool, and what a model says to features (M3 sec. 3.4, X = F_dec(R̂)).
-
-M3 renders the features of a vision-language model's own tower at any pose, and decodes them to text with that model.
 """
 
 import base64
@@ -35,17 +24,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32, Int64
+from jaxtyping import Bool, Int32
 from PIL import Image
-from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import read_foreign
-from gsencoder.core.pretrained import EXTRA, load_companion, load_pretrained, quiet_transformers
 from gsencoder.data.labels.expressions import Expression
 from gsencoder.data.labels.made_questions import kind_of
 from gsencoder.data.labels.questions import Question
-from gsencoder.evaluate.benchmarks.retrieval import Pooling, view_scores
 from gsencoder.infer.ask.batch import ANSWERS, REQUEST
 from gsencoder.infer.ask.questions import read_answers
 from gsencoder.infer.views.photographs import photograph_window
@@ -413,186 +399,3 @@ def add_pictures(sheet: AnswerSheet, dry: Path, truth: PictureTruth) -> None:
             sheet.pictures[digest] = SentPicture(scene=truth.scene.name, pixels=truth.pixels(view))
         instances = tuple(truth.instance_in(each["aabb_min"], each["aabb_max"]) for each in row["targets"])
         sheet.marks[request_digest(digests)] = instances
-
-
-WHAT = "captions"
-CONNECTORS = ("connector", "multi_modal_projector")
-"""Names that models of transformers give to the module between vision tower and language model."""
-MAX_TOKENS = 64
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RetrievedCaption:
-    """A caption of a pool, and its score with a view (see `gsencoder.evaluate.benchmarks.retrieval.view_scores`)."""
-
-    caption: str
-    score: float
-
-
-def retrieve_captions(
-    cells: Float32[np.ndarray, "n D"],
-    captions: Sequence[str],
-    vectors: Float32[np.ndarray, "C D"],
-    *,
-    count: int = 1,
-    pooling: Pooling = "max",
-) -> list[RetrievedCaption]:
-    """The captions of a pool that fit the rendered features of a view best, best first; of equal ones the first.
-
-    Args:
-        cells: rendered features of the view.
-        captions: the pool.
-        vectors: of the captions, in the space of the features.
-        count: captions that are returned, at most all.
-        pooling: over the cells.
-
-    Raises:
-        InputError: no captions, another number of vectors, or values that are not finite.
-    """
-    if not captions or len(captions) != len(vectors) or count < 1:
-        raise InputError(
-            f"{WHAT}: expected one or more captions with a vector each, and count from 1, got {len(captions)} "
-            f"captions, {len(vectors)} vectors and count {count}"
-        )
-    scores = view_scores(cells, vectors, pooling)
-    if not np.isfinite(scores).all():
-        raise InputError(f"{WHAT}: expected finite features and vectors of captions, got NaN or Inf")
-    order = np.argsort(-scores, kind="stable")[:count].tolist()
-    return [RetrievedCaption(caption=captions[row], score=float(scores[row])) for row in order]
-
-
-def generate_from_features(
-    model: Any,
-    inputs: Mapping[str, Tensor],
-    tokens: Float[Tensor, "pictures _tokens _D"],
-    *,
-    max_tokens: int = MAX_TOKENS,
-) -> Int64[Tensor, "B new"]:
-    """What a vision-language model generates, greedily, if its tower gives these features.
-
-    They take the place of what goes into the module between tower and language model (`connector` or
-    `multi_modal_projector`): the hidden states of the patches, of the layer that the model reads, without a summary
-    token where the model drops it. So they must be of that layer: the last one after the final norm for Idefics3,
-    SmolVLM, PaliGemma and Gemma 3, layer −2 for LLaVA. The tower runs on the pictures of `inputs`, and what it says of
-    them is dropped.
-
-    Args:
-        model: of transformers, such as `AutoModelForImageTextToText` loads.
-        inputs: of the model's processor, for pictures of any content and of the right size.
-        tokens: for each picture the tower's vectors of the patches, in lines from the top left.
-        max_tokens: most tokens that are generated.
-
-    Returns:
-        The ids of the generated tokens alone.
-
-    Raises:
-        InputError: the model has no such module or several, or takes features of another shape.
-    """
-    connectors = {name: each for name, each in model.named_modules() if name.rpartition(".")[2] in CONNECTORS}
-    if len(connectors) != 1:
-        raise InputError(
-            f"{WHAT}: expected a model with one module called {' or '.join(CONNECTORS)} between its tower and its "
-            f"language model, got {type(model).__name__} with {len(connectors)}"
-        )
-    replaced = 0
-
-    def replace(_: Any, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
-        nonlocal replaced
-        if not arguments or arguments[0].shape != tokens.shape:
-            expected = "none" if not arguments else str(tuple(arguments[0].shape))
-            raise InputError(
-                f"{WHAT}: {type(model).__name__} takes features [pictures, patches, channels] of {expected}, got "
-                f"{tuple(tokens.shape)}; render them on the grid of its tower"
-            )
-        replaced += 1
-        return (tokens.to(arguments[0].device, arguments[0].dtype), *arguments[1:])
-
-    handle = next(iter(connectors.values())).register_forward_pre_hook(replace)
-    try:
-        with torch.inference_mode(), quiet_transformers():
-            ids = model.generate(**inputs, max_new_tokens=max_tokens, do_sample=False, num_beams=1)
-    finally:
-        handle.remove()
-    if replaced != 1:
-        raise InputError(f"{WHAT}: {type(model).__name__} read its tower {replaced} times; expected once")
-    return ids[:, inputs["input_ids"].shape[1] :]
-
-
-class FeatureDecoder:
-    """M3's F_dec: a vision-language model that is given rendered features in place of its tower's.
-
-    Attributes:
-        model: of transformers.
-        processor: that belongs to it. A picture is one square: cutting it into parts is switched off.
-        side: pixels along the pictures that the tower takes.
-        grid: rows and columns of its patches, for `gsencoder.infer.views.pictures.token_blends`.
-    """
-
-    def __init__(self, folder: str | Path) -> None:
-        """Loads the model in float32; nothing is fetched from anywhere.
-
-        Args:
-            folder: of a vision-language model of transformers, with its processor.
-
-        Raises:
-            InputError: transformers is missing, or the folder holds no such model.
-        """
-        try:
-            import transformers
-        except ImportError as error:
-            raise InputError(f"{WHAT}: needs the package transformers ({EXTRA})") from error
-        path = Path(folder)
-        self.model = load_pretrained(transformers.AutoModelForImageTextToText, path, WHAT)
-        self.processor = load_companion(transformers.AutoProcessor, path, WHAT, "processor")
-        vision = getattr(self.model.config, "vision_config", None)
-        side, patch = getattr(vision, "image_size", None), getattr(vision, "patch_size", None)
-        if not isinstance(side, int) or not isinstance(patch, int):
-            raise InputError(
-                f"{WHAT}: {path}: expected a tower with square pictures and patches, whose sizes are stated"
-            )
-        self.side, self.grid = side, (side // patch, side // patch)
-        if hasattr(self.processor.image_processor, "do_image_splitting"):
-            self.processor.image_processor.do_image_splitting = False
-
-    def decode(
-        self,
-        tokens: Float[Tensor, "V tokens D"],
-        prompt: str = "Describe this picture.",
-        *,
-        max_tokens: int = MAX_TOKENS,
-    ) -> list[str]:
-        """What the model answers to each view, greedily.
-
-        Args:
-            tokens: of `gsencoder.infer.views.pictures.feature_tokens` on `grid`, of the layer that the model reads (see
-                `generate_from_features`).
-            prompt: what is asked about the view.
-            max_tokens: most tokens of an answer.
-
-        Raises:
-            InputError: features of another tower, or not finite.
-        """
-        if not torch.isfinite(tokens).all():
-            raise InputError(f"{WHAT}: expected finite features, got NaN or Inf")
-        inputs = self.inputs(prompt)
-        ids = [generate_from_features(self.model, inputs, view[None], max_tokens=max_tokens)[0] for view in tokens]
-        return [str(self.processor.tokenizer.decode(each, skip_special_tokens=True)).strip() for each in ids]
-
-    def inputs(self, prompt: str, picture: Any = None) -> dict[str, Tensor]:
-        """The model's inputs for a prompt about one picture.
-
-        Args:
-            prompt: the text.
-            picture: a Pillow image; None = a white one of the tower's size. Pixels that are 0 after normalization, as
-                gray ones nearly are, may count as no picture at all.
-        """
-        from PIL import Image
-
-        picture = Image.new("RGB", (self.side, self.side), "white") if picture is None else picture
-        if getattr(self.processor, "chat_template", None):
-            content = [{"type": "image"}, {"type": "text", "text": prompt}]
-            messages = [{"role": "user", "content": content}]
-            text = self.processor.apply_chat_template(messages, add_generation_prompt=True, tokenize=False)
-        else:
-            text = f"{self.processor.image_token}{prompt}"
-        return dict(self.processor(text=text, images=[picture], return_tensors="pt"))
