@@ -184,7 +184,6 @@ def scenes_of(config: EvaluateConfig, *, part: tuple[int, int] = (0, 1)) -> Iter
     """The scenes with their features where these are stored, and the seconds of loading.
 
     Args:
-        config: settings of the command.
         part: of the scenes every n-th from the k-th on, as (k, n).
     """
     first, step = part

@@ -58,13 +58,7 @@ BenchmarkProtocol = InstancesProtocol | SemanticsProtocol | RecognitionProtocol 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedScene:
-    """A scene whose predictions were written.
-
-    Attributes:
-        scene: its name.
-        gaussians: number of its Gaussians.
-        seconds: seconds of each step.
-    """
+    """A scene whose predictions were written."""
 
     scene: str
     gaussians: int
@@ -92,22 +86,16 @@ def write_predictions(
         scenes: labeled scenes and the seconds of loading, as `load_scenes` yields them.
         source: computes the features of a scene.
         words: turns names into the features' space.
-        classes: that can be predicted.
         folder: an existing one. Protocols on points make the folders `predictions` and `truth` in it, with a file for
             each scene; the others write lists, `predictions.PART.json` and `truth.PART.json`.
-        protocol: what is predicted.
         class_names: the class of each name that objects have, where these are not class names themselves.
         raw_ids: nyu40id of each raw name, which tells unique sentences of a file from multiple ones.
         labeled: of ScanNet++, raw names of the objects that a vertex can belong to; None = all.
         part: number of the process, where several have scenes of their own; `merge_lists` joins their files.
         seeds: how Gaussians are made for scenes without.
-        localization: settings of `localize`.
 
     Returns:
         What was done for each scene, in order.
-
-    Raises:
-        InputError: a scene without true objects, words of another space, or a class that `words` does not know.
     """
     predictions = []
     objects: list[NamedInstance] = []

@@ -16,8 +16,6 @@ class Hit:
     """The result of querying the name of one object.
 
     Attributes:
-        scene: name of the scene.
-        name: name of the object.
         iou: largest IoU of the first box for the name with any object of that name; 0 if there is no box.
         oracle_iou: the largest of these over all boxes for the name, as the paper has it; a user cannot know which box
             that is.
@@ -53,19 +51,12 @@ def queryable_objects(objects: Sequence[SceneObject], *, min_views: int = 5, min
         objects: all objects of a scene.
         min_views: smallest number of views in which an object is seen.
         min_pixels: smallest number of pixels that an object has in the view that shows it best.
-
-    Raises:
-        InputError: the views of an object were not counted.
     """
     return [o for o in objects if o.placed and o.name and is_seen(o, min_views=min_views, min_pixels=min_pixels)]
 
 
 def is_seen(scene_object: SceneObject, *, min_views: int, min_pixels: int) -> bool:
-    """Whether an object shows in enough views, and in one of them with enough pixels.
-
-    Raises:
-        InputError: its views were not counted.
-    """
+    """Whether an object shows in enough views, and in one of them with enough pixels."""
     if scene_object.views is None or scene_object.max_pixels is None:
         raise InputError(
             f"object {scene_object.id}: the views that show it were not counted; with_counted_views of "

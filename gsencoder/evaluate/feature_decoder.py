@@ -106,7 +106,6 @@ class FeatureDecoder:
     """M3's F_dec: a vision-language model that is given rendered features in place of its tower's.
 
     Attributes:
-        model: of transformers, in float32.
         processor: that belongs to it. A picture is one square: cutting it into parts is switched off.
         side: pixels along the pictures that the tower takes.
         grid: rows and columns of its patches, for `gsencoder.infer.views.pictures.token_blends`.
@@ -152,7 +151,6 @@ class FeatureDecoder:
         """The model's inputs for a prompt about one picture.
 
         Args:
-            prompt: the text.
             picture: a Pillow image; None = a white one of the tower's size. Pixels that are 0 after normalization, as
                 gray ones nearly are, may count as no picture at all.
         """

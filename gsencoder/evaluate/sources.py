@@ -45,9 +45,7 @@ def fusion_source(teacher: TeacherConfig, words: Words | None, config: FuseConfi
     """A source that fuses a teacher's maps.
 
     Args:
-        teacher: configuration of the teacher.
         words: text table of the teacher; None if it has none.
-        config: settings of fusion.
     """
 
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
@@ -61,8 +59,6 @@ def encoder_source(encoder: Encoder, config: EncodeConfig = EncodeConfig(), spac
     """A source that runs an encoder.
 
     Args:
-        encoder: the encoder.
-        config: settings of encoding.
         space: of an encoder with several teachers, the one whose features are evaluated; None = the only one.
     """
 
@@ -77,11 +73,7 @@ def encoder_source(encoder: Encoder, config: EncodeConfig = EncodeConfig(), spac
 
 
 def space_of_words(encoder: Encoder, words: Words) -> str | None:
-    """The teacher of an encoder in whose space words are; None if it has one teacher.
-
-    Raises:
-        InputError: of several teachers, none or more than one has this text encoder.
-    """
+    """The teacher of an encoder in whose space words are; None if it has one teacher."""
     if len(encoder.spaces) == 1:
         return None
     text_encoder = words.space.text_encoder
@@ -111,7 +103,6 @@ def head_source(source: FeatureSource, heads: HeadSet, head: MeasuredHead, text_
     Args:
         source: features of the backbone that the head takes.
         heads: of which the head is one.
-        head: which.
         text_encoder: what turns words into the head's space.
     """
 
@@ -130,10 +121,7 @@ def fused_head_source(
     """A source that fuses a teacher's maps, measures an adapter head over them, and applies it.
 
     Args:
-        teacher: configuration of the teacher.
-        head: of its backbone.
         text_encoder: what turns words into the head's space.
-        config: settings of fusion.
     """
 
     def outputs(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
@@ -154,15 +142,11 @@ def load_scenes(
 
     Args:
         paths: folders or files of the scenes.
-        data: how scenes are read.
         splat: file of the Gaussians of each scene, relative to its folder; empty = those that the scene has.
         track: wraps the loop to show progress.
 
     Yields:
         Each scene, and the seconds that loading took.
-
-    Raises:
-        InputError: a scene cannot be read.
     """
     for path in track([Path(path) for path in paths], "scenes"):
         start = time.perf_counter()
@@ -196,7 +180,6 @@ class LabeledPoints:
     """Points of a scene.
 
     Attributes:
-        scene: its name.
         objects: id of the object of each point, 0 = none.
         names: the class of each object that has one, by its id.
         gaussians: row of the Gaussian that each point takes predictions from, -1 = none is near.
@@ -242,9 +225,6 @@ def labeled_points(
         scene: with Gaussians; without a mesh, with views that have instance pictures, and objects.
         mesh: labeled, in the world of the scene, or None.
         max_distance: from a vertex to the nearest Gaussian, metres; world units where their length is not known.
-
-    Raises:
-        InputError: no Gaussians, or neither a mesh nor instance pictures and objects.
     """
     if scene.gaussians is None:
         raise InputError(f"scene {scene.name} has no Gaussians")
@@ -294,15 +274,10 @@ def nearest_class(features: GaussianFeatures, names: Sequence[str], text: TextEn
     """The class whose name has the largest centered cosine with each Gaussian's feature, of equal ones the first.
 
     Args:
-        features: of the Gaussians.
-        names: of the classes.
         text: turns them into vectors of the features' space.
 
     Returns:
         Number of the class in `names`; -1 for Gaussians without a feature.
-
-    Raises:
-        InputError: words of another space, or a name that `text` does not know.
     """
     check_space(features.space, text.space)
     vectors = text.encode(list(names))
@@ -325,16 +300,10 @@ def class_cosines(
     The mean of a set is over its Gaussians that were seen, each counting the same.
 
     Args:
-        features: of the Gaussians.
-        parts: rows of each set.
-        names: of the classes.
         text: turns them into vectors of the features' space.
 
     Returns:
         Cosines; NaN for sets in which no Gaussian was seen.
-
-    Raises:
-        InputError: words of another space, or a name that `text` does not know.
     """
     check_space(features.space, text.space)
     seen = features.seen
@@ -361,8 +330,6 @@ class RenderedErrors:
         cosine: of features as they are. M3 prints 1 − cosine.
         centered: after the mean of the space has been subtracted from both.
         l2: squared distance, averaged over channels.
-        cells: that were compared.
-        pictures: that were compared.
         not_finite: pictures that were left out because a feature in them was not finite.
     """
 

@@ -22,7 +22,6 @@ class ResultRow:
 
     Attributes:
         source: "measured" by this program, or "published": copied from a paper.
-        method: name of the method.
         group: heading that a paper gives the methods of a kind; empty = none.
         values: percent by column; a column that is missing or NaN was not measured or not printed.
     """
@@ -38,9 +37,7 @@ class ResultTable:
     """Rows under the same columns.
 
     Attributes:
-        title: of the table.
         columns: names of the figures, in order; all are percent.
-        rows: measured ones first.
         notes: what a reader must know, a sentence each, such as why a column is empty.
         by_class: those of the columns that are of one class each; Markdown has them as rows of a second table.
     """
@@ -101,12 +98,9 @@ def table_of(
     """A table of measured shares, with a paper's rows below.
 
     Args:
-        title: of the table.
         measured: for each method, its figures as shares, where 1 is shown as 100 percent.
         published: name of a file of `published/`, without its ending; empty = none.
         columns: in order; empty = those of the measured rows, in order of first appearance.
-        notes: see `ResultTable`.
-        by_class: see there.
     """
     rows = [
         ResultRow(source="measured", method=method, values={name: 100 * value for name, value in values.items()})
@@ -118,11 +112,7 @@ def table_of(
 
 
 def published_rows(name: str) -> tuple[ResultRow, ...]:
-    """The rows of a paper's table, in percent, as printed.
-
-    Raises:
-        InputError: there is no such table.
-    """
+    """The rows of a paper's table, in percent, as printed."""
     file = PUBLISHED / f"{name}.csv"
     if not file.is_file():
         tables = ", ".join(sorted(path.stem for path in PUBLISHED.glob("*.csv")))
@@ -186,7 +176,6 @@ def spread(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> dict[st
 
     Args:
         rows: one a scene; NaN and None are no values.
-        columns: which.
     """
     figures: dict[str, dict[str, float | int]] = {}
     for column in columns:

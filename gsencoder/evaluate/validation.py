@@ -88,10 +88,7 @@ def validate_encoder(
 
     Args:
         scenes: prepared scenes, with a part for each of the teachers that they have.
-        encoder: the encoder to validate.
-        outputs: its output spaces.
         codebooks: the target classes of each teacher, in standard units, in the order of the scenes' parts.
-        config: settings of encoding.
         pictured: number of scenes of which a view is drawn for each teacher.
         track: wraps the loop over scenes to show progress.
 

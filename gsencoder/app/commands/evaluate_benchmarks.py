@@ -101,11 +101,7 @@ def run_benchmark(
 
 
 def _check_names(protocol: BenchmarkProtocol, classes: ClassTable, words: Words) -> None:
-    """Checks, before any scene is read, that names in settings are classes and that the words know all classes.
-
-    Raises:
-        InputError: a name is no class, or no word of a table without a tower.
-    """
+    """Checks, before any scene is read, that names in settings are classes and that the words know all classes."""
     if isinstance(protocol, SemanticsProtocol):
         with about("protocol"):
             check_excluded(protocol.excluded, classes)
@@ -115,14 +111,7 @@ def _check_names(protocol: BenchmarkProtocol, classes: ClassTable, words: Words)
 
 
 def _other_sentences(protocol: BenchmarkProtocol, scenes: Collection[str], *, warn: bool) -> int:
-    """The number of sentences of a given file that are about scenes which are not evaluated.
-
-    Raises:
-        InputError: all of them are.
-
-    Warns:
-        SceneWarning: some are.
-    """
+    """The number of sentences of a given file that are about scenes which are not evaluated."""
     if not isinstance(protocol, ReferringProtocol) or not protocol.expressions:
         return 0
     sentences = read_expressions(Path(protocol.expressions))

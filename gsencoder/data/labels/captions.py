@@ -35,9 +35,7 @@ class ViewCaption:
     """What was written of a view.
 
     Attributes:
-        scene: name of the scene.
         view: name of the view in it, as transforms.json or its image file has it.
-        caption: the text.
     """
 
     scene: str
@@ -51,11 +49,7 @@ class ViewCaption:
 
 
 def read_view_captions(path: Path) -> tuple[ViewCaption, ...]:
-    """Reads captions of views.
-
-    Raises:
-        InputError: not such a file, no caption, or a view that is there twice.
-    """
+    """Reads captions of views."""
     captions = tuple(
         ViewCaption(
             scene=scene_name(entry.get("scene_id"), where),
@@ -76,11 +70,7 @@ def write_view_captions(path: Path, captions: Sequence[ViewCaption]) -> None:
 
 
 def read_texts(path: Path) -> tuple[str, ...]:
-    """The lines of a text file that are not blank, each once, such as captions of COCO's pictures.
-
-    Raises:
-        InputError: unreadable, a line that is too long, or no line.
-    """
+    """The lines of a text file that are not blank, each once, such as captions of COCO's pictures."""
     lines = [line.strip() for line in read_checked_text(path, max_bytes=MAX_LIST_BYTES).splitlines()]
     long = next((number for number, line in enumerate(lines, start=1) if len(line) > MAX_TEXT), None)
     if long is not None:

@@ -77,11 +77,7 @@ class ClassTable:
         return dict(zip(self.names, self.ids, strict=True))
 
     def check_instance_ids(self) -> None:
-        """Checks that files of instances can hold all ids: class id · 1000 + number, below 1000 = no instance.
-
-        Raises:
-            InputError: a class has the id 0.
-        """
+        """Checks that files of instances can hold all ids: class id · 1000 + number, below 1000 = no instance."""
         if 0 in self.ids:
             raise InputError(
                 f"classes: {self.name_of[0]!r} has the id 0, which files of instances cannot hold: a vertex has "
@@ -119,11 +115,7 @@ MAX_CLASS_LIST_BYTES = 4 << 20
 
 @cache
 def scannet_classes(name: str) -> ClassTable:
-    """The classes of scannet20 or scannet200.
-
-    Raises:
-        InputError: another name.
-    """
+    """The classes of scannet20 or scannet200."""
     with CLASSES.open(encoding="utf-8", newline="") as stream:
         rows = [row for row in csv.DictReader(stream) if row["set"] == name]
     if not rows:
@@ -139,11 +131,7 @@ def scannet_classes(name: str) -> ClassTable:
 
 
 def read_class_list(path: Path) -> ClassTable:
-    """The classes of a text file with one name a line, such as ScanNet++'s top100.txt; ids count the lines from 0.
-
-    Raises:
-        InputError: unreadable, too large, empty, or a name is there twice.
-    """
+    """The classes of a text file with one name a line, such as ScanNet++'s top100.txt; ids count the lines from 0."""
     lines = [line.strip() for line in read_checked_text(path, max_bytes=MAX_CLASS_LIST_BYTES).splitlines()]
     names = [line for line in lines if line]
     if not names:
@@ -158,10 +146,6 @@ def read_label_map(path: Path, column: str) -> dict[str, int]:
     Args:
         path: of that file, which comes with ScanNet.
         column: which ids, such as nyu40id or id; see `COLUMNS`.
-
-    Raises:
-        InputError: unreadable, too large, without the columns, an id that is no whole number, or a raw name with two
-            different ids; the line is named.
     """
     mapping: dict[str, int] = {}
     text = read_checked_text(path, max_bytes=MAX_MAP_BYTES)
@@ -193,7 +177,6 @@ def ids_of_names(names: Iterable[str], mapping: Mapping[str, int], classes: Clas
     Names are compared as they are written, as ScanNet's scripts do.
 
     Args:
-        names: raw names of objects.
         mapping: of `read_label_map`, or `ClassTable.id_of` for names that are those of classes.
         classes: where given, ids that are not among its own become 0, as in ScanNet200's script; without it they
             stay, as in the script of the 20 classes, whose evaluation leaves them out.
@@ -238,11 +221,7 @@ NO_TARGET = "None"
 
 
 def read_instance_classes(path: Path) -> ClassTable:
-    """The classes of a list that have instances, with the ids of the list: those of NAME_instance.txt beside NAME.txt.
-
-    Raises:
-        InputError: a list is wrong, the second one is missing, or it has a name that the first one lacks.
-    """
+    """Those classes of a list that NAME_instance.txt beside NAME.txt names too, with the ids of the list."""
     every, beside = read_class_list(path), path.with_name(f"{path.stem}_instance.txt")
     if not beside.is_file():
         raise InputError(
@@ -261,9 +240,6 @@ def read_benchmark_map(path: Path) -> dict[str, str]:
     """The class of each raw name in map_benchmark.csv; names without a class are left out.
 
     Of a name that is there several times the last line with a class counts, as in the toolkit.
-
-    Raises:
-        InputError: unreadable, too large, without the columns, or it maps no name.
     """
     rows = csv.DictReader(io.StringIO(read_checked_text(path, max_bytes=MAX_MAP_BYTES), newline=""), strict=True)
     try:
@@ -288,11 +264,7 @@ def read_benchmark_map(path: Path) -> dict[str, str]:
 
 
 def ids_of_benchmark(path: Path, classes: ClassTable) -> dict[str, int]:
-    """The class id of each raw name in map_benchmark.csv that leads to a class of a table.
-
-    Raises:
-        InputError: as `read_benchmark_map`, or no name leads to a class.
-    """
+    """The class id of each raw name in map_benchmark.csv that leads to a class of a table."""
     id_of = classes.id_of
     ids = {raw: id_of[target] for raw, target in read_benchmark_map(path).items() if target in id_of}
     if not ids:

@@ -62,11 +62,9 @@ class Expression:
     """What one annotator wrote of one object.
 
     Attributes:
-        scene: name of the scene.
         object_id: `objectId` of ScanNet's aggregation file, from 0.
         object_name: as the file writes it; ScanRefer has underscores between words.
         annotation: id of the expression among those of the object.
-        text: what was written.
         tokens: the words of the text as the data set cuts it, lower case in ScanRefer.
         aabb: lower and upper corner of the object's box, in the axes of the aligned scan and its unit; None where the
             file has none.
@@ -98,11 +96,7 @@ class Expression:
 
 
 def read_scanrefer(path: str | Path) -> tuple[Expression, ...]:
-    """Reads ScanRefer's JSON, with or without boxes.
-
-    Raises:
-        InputError: not such a file, two entries with one id, or two boxes or names of one object.
-    """
+    """Reads ScanRefer's JSON, with or without boxes."""
     file = Path(path)
     rows = read_benchmark_json(file)
     if isinstance(rows, dict):
@@ -117,11 +111,7 @@ def read_scanrefer(path: str | Path) -> tuple[Expression, ...]:
 
 
 def write_scanrefer(path: str | Path, expressions: Sequence[Expression]) -> None:
-    """Writes expressions as ScanRefer's files have them, with boxes, unique_multiple and others where these are known.
-
-    Raises:
-        InputError: two expressions have one id, or the file cannot be written.
-    """
+    """Writes expressions as ScanRefer's files have them, with boxes and kinds where these are known."""
     _refuse_repeated(Path(path), expressions)
     rows = [
         {
@@ -141,11 +131,7 @@ def write_scanrefer(path: str | Path, expressions: Sequence[Expression]) -> None
 
 
 def read_nr3d(path: str | Path) -> tuple[Expression, ...]:
-    """Reads Nr3D's CSV.
-
-    Raises:
-        InputError: not such a table, or two rows with one id.
-    """
+    """Reads Nr3D's CSV."""
     file = Path(path)
     expressions = tuple(_nr3d(row, where) for row, where in _csv_rows(file, NR3D_COLUMNS))
     _refuse_repeated(file, expressions)
@@ -266,14 +252,10 @@ def boxes_from_scans(expressions: Sequence[Expression], scans: Path) -> tuple[Ex
     """Gives expressions without a box that of their object; one scan is in memory at a time.
 
     Args:
-        expressions: of any scenes.
         scans: folder with a folder of each scene, which has the label files of its scan.
 
     Returns:
         The expressions, in order.
-
-    Raises:
-        InputError: a scan is missing or wrong, or has no such object.
     """
     lacking: dict[str, list[int]] = {}
     for row, each in enumerate(expressions):
@@ -297,9 +279,6 @@ def boxes_from_labels(expressions: Iterable[Expression], labels: MeshLabels) -> 
     """Gives expressions about one scene without a box that of their object in a ScanNet scan.
 
     An object whose vertices all belong to others has no box.
-
-    Raises:
-        InputError: an object that the labels do not have.
     """
     boxes = labels.boxes(aligned=True)
     ids = {number for number, _ in labels.objects}
@@ -333,9 +312,6 @@ def instance_truth(
         instances: the object of each vertex, 0 = none.
         names: the name of each object, such as `dict(MeshLabels.objects)`.
         class_of: class id of each name, as `ids_of_names` gives it.
-
-    Raises:
-        InputError: a class has 1000 objects or more, which the format cannot hold.
     """
     classes = vertex_classes(instances, names, class_of).astype(np.int64)
     objects, first, codes = np.unique(instances, return_index=True, return_inverse=True)
@@ -356,18 +332,10 @@ def instance_truth(
 
 
 def write_instance_truth(path: Path, labels: MeshLabels, class_of: Mapping[str, int]) -> None:
-    """Writes SCENE.txt of the instance task: `instance_truth`, one a line.
-
-    Raises:
-        InputError: as `instance_truth`, or the file cannot be written.
-    """
+    """Writes SCENE.txt of the instance task: `instance_truth`, one a line."""
     write_whole_numbers(path, instance_truth(labels.instances, dict(labels.objects), class_of))
 
 
 def write_semantic_truth(path: Path, labels: MeshLabels, class_of: Mapping[str, int]) -> None:
-    """Writes SCENE.txt of the semantic task: the class of each vertex, 0 = none.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Writes SCENE.txt of the semantic task: the class of each vertex, 0 = none."""
     write_whole_numbers(path, vertex_classes(labels.instances, dict(labels.objects), class_of))

@@ -27,11 +27,7 @@ PICKLE_SUFFIXES = (".p", ".pkl", ".pickle", ".pt", ".pth")
 
 
 def check_file(path: Path, *, max_bytes: int = SCENE_BYTES) -> None:
-    """Raises an error for a file that cannot be read as text or JSON; its first bytes are looked at.
-
-    Raises:
-        InputError: there is no such file, it is a folder, it is too large, or it is a pickle or an archive.
-    """
+    """Raises an error for a file that cannot be read as text or JSON; its first bytes are looked at."""
     try:
         with open_foreign(path) as stream:
             size = os.fstat(stream.fileno()).st_size
@@ -54,22 +50,14 @@ def check_file(path: Path, *, max_bytes: int = SCENE_BYTES) -> None:
 
 
 def read_checked(path: Path, *, max_bytes: int = SCENE_BYTES) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        InputError: as `check_file`, or the file cannot be read.
-    """
+    """The bytes of a file."""
     check_file(path, max_bytes=max_bytes)
     with readable(path):
         return read_foreign(path, max_bytes)
 
 
 def read_checked_text(path: Path, *, max_bytes: int = SCENE_BYTES) -> str:
-    """The text of a file in UTF-8, with or without a byte order mark.
-
-    Raises:
-        InputError: as `read_checked`, or the file is not UTF-8.
-    """
+    """The text of a file in UTF-8, with or without a byte order mark."""
     try:
         return read_checked(path, max_bytes=max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -86,21 +74,13 @@ def read_whole_numbers(path: Path, *, hint: str = "") -> Int64[np.ndarray, " n"]
     """The numbers of a file with one a line.
 
     Args:
-        path: of the file.
         hint: appended to the message about a line that is no whole number.
-
-    Raises:
-        InputError: unreadable, or a line that is no whole number.
     """
     return _parsed(path, read_checked(path).removeprefix(BOM_UTF8), hint)
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, " n"]:
-    """Which numbers of a file with one a line are not 0.
-
-    Raises:
-        InputError: as `read_whole_numbers`.
-    """
+    """Which numbers of a file with one a line are not 0."""
     data = read_checked(path).removeprefix(BOM_UTF8)
     # Lines of one digit, as nearly all masks have them, need no parser.
     codes = np.frombuffer(data if data.endswith(b"\n") else data + b"\n", np.uint8)
@@ -111,11 +91,7 @@ def read_mask(path: Path) -> Bool[np.ndarray, " n"]:
 
 
 def write_whole_numbers(path: Path, values: Int[np.ndarray, " n"]) -> None:
-    """Writes one number a line, atomically.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Writes one number a line, atomically."""
     with atomic_file(path) as stream:
         for start in range(0, len(values), CHUNK):
             stream.write("".join(f"{value}\n" for value in values[start : start + CHUNK].tolist()).encode())
@@ -169,11 +145,7 @@ _SIGNS = ((1, 1, 1), (1, 0, 1), (0, 0, 1), (0, 1, 1), (1, 1, 0), (1, 0, 0), (0, 
 
 
 def read_benchmark_json(path: Path) -> Any:
-    """The content of a JSON file, in which no object has a key twice.
-
-    Raises:
-        InputError: unreadable, a pickle, too large, not JSON, or a key is there twice.
-    """
+    """The content of a JSON file, in which no object has a key twice."""
     check_file(path, max_bytes=LIST_BYTES)
     return read_json(path, unique_keys=True)
 
@@ -183,12 +155,8 @@ def entries_of(rows: Any, path: Path, expected: str, *, key: str = "") -> tuple[
 
     Args:
         rows: the content of the file, or of one key of it.
-        path: of the file.
         expected: the keys of an entry.
         key: under which the list stands in the file; empty = the file is the list.
-
-    Raises:
-        InputError: no list, or an entry that is no object.
     """
     if not isinstance(rows, list):
         expectation = f"{key} must be" if key else "expected"
@@ -201,13 +169,7 @@ def refuse_repeated(path: Path, keys: Iterable[Hashable], name: Callable[[Any], 
     """Raises an error if two entries of a file have one key.
 
     Args:
-        path: of the file.
         keys: of the entries, in order.
-        name: a key in words.
-        what: what keys are.
-
-    Raises:
-        InputError: two entries have one key.
     """
     if repeated := first_repeated(keys):
         key, first, second = repeated
@@ -222,11 +184,7 @@ def shown(value: Any) -> str:
 
 
 def object_of(value: Any, where: str, expected: str) -> Mapping[str, Any]:
-    """The value, which must be a JSON object.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """The value, which must be a JSON object."""
     if not isinstance(value, dict):
         raise InputError(f"{where}: expected an object with {expected}, got {shown(value)}")
     return value
@@ -236,13 +194,7 @@ def text_value(value: Any, where: str, field: str, *, empty: bool = False) -> st
     """The value, which must be a text of at most `MAX_TEXT` characters.
 
     Args:
-        value: of the file.
-        where: file and entry.
-        field: name of the value.
         empty: whether a text without a character other than blanks is one.
-
-    Raises:
-        InputError: no text, an empty one, or one that is too long.
     """
     if not isinstance(value, str):
         raise InputError(f"{where}: {field} must be a text, got {shown(value)}")
@@ -256,22 +208,14 @@ def text_value(value: Any, where: str, field: str, *, empty: bool = False) -> st
 
 
 def text_list(value: Any, where: str, field: str, *, empty: bool = False) -> tuple[str, ...]:
-    """The value, which must be a list of texts; `empty` as in `text_value`, for each of them.
-
-    Raises:
-        InputError: no list, or a member that is no text.
-    """
+    """The value, which must be a list of texts; `empty` as in `text_value`, for each of them."""
     if not isinstance(value, list):
         raise InputError(f"{where}: {field} must be a list of texts, got {shown(value)}")
     return tuple(text_value(each, where, f"{field}[{index}]", empty=empty) for index, each in enumerate(value))
 
 
 def scene_name(value: Any, where: str) -> str:
-    """The name of a scene, such as scene0011_00.
-
-    Raises:
-        InputError: no text, or one that a folder cannot be called.
-    """
+    """The name of a scene, such as scene0011_00."""
     name = text_value(value, where, "the scene")
     if name in (".", "..") or "/" in name or len(name) > 255 or not name.isprintable():
         raise InputError(f"{where}: the scene must be a name that a folder can have, got {shown(name)}")
@@ -279,11 +223,7 @@ def scene_name(value: Any, where: str) -> str:
 
 
 def id_value(value: Any, where: str, field: str) -> str:
-    """An id as text; files write them as texts and as whole numbers.
-
-    Raises:
-        InputError: neither of both, empty, or with characters that cannot be printed on a line.
-    """
+    """An id as text; files write them as texts and as whole numbers."""
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
     if _is_name(value):
@@ -295,21 +235,13 @@ def id_value(value: Any, where: str, field: str) -> str:
 
 
 def annotation_id(value: Any, where: str, field: str = "ann_id") -> str:
-    """The number of an annotation about an object, as text: 7, "7" and "07" are the same.
-
-    Raises:
-        InputError: as `id_value`.
-    """
+    """The number of an annotation about an object, as text: 7, "7" and "07" are the same."""
     text = id_value(value, where, field)
     return str(int(text)) if text.isascii() and text.isdigit() else text
 
 
 def name_value(value: Any, where: str, field: str) -> str:
-    """The name of a class: a text of one line.
-
-    Raises:
-        InputError: something else.
-    """
+    """The name of a class: a text of one line."""
     if not _is_name(value):
         raise InputError(
             f"{where}: {field} must be a text of one line with 1 to {MAX_ID} characters, got {_shown_name(value)}"
@@ -318,11 +250,7 @@ def name_value(value: Any, where: str, field: str) -> str:
 
 
 def flag_value(value: Any, where: str, field: str) -> bool | None:
-    """0 or 1, or false or true; None if there is none.
-
-    Raises:
-        InputError: something else.
-    """
+    """0 or 1, or false or true; None if there is none."""
     if value is None:
         return None
     if not isinstance(value, int) or value not in (0, 1):
@@ -340,11 +268,7 @@ def _shown_name(value: Any) -> str:
 
 
 def object_id(value: Any, where: str, field: str = "object_id") -> int:
-    """The `objectId` of an object in ScanNet's aggregation file, from 0; files write it as a number and as a text.
-
-    Raises:
-        InputError: no whole number from 0.
-    """
+    """The `objectId` of an object in ScanNet's aggregation file, from 0; files write it as a number and as a text."""
     if isinstance(value, str) and value.isdecimal() and value.isascii() and len(value) < 10:
         return int(value)
     if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**31:
@@ -353,17 +277,7 @@ def object_id(value: Any, where: str, field: str = "object_id") -> int:
 
 
 def number(value: Any, where: str, field: str, *, largest: float = 1e15) -> float:
-    """A finite number.
-
-    Args:
-        value: of the file.
-        where: file and entry.
-        field: name of the value.
-        largest: largest absolute value.
-
-    Raises:
-        InputError: something else.
-    """
+    """A finite number."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"{where}: {field} must be a number, got {shown(value)}")
     if not abs(value) <= largest or not math.isfinite(value):
@@ -374,9 +288,6 @@ def number(value: Any, where: str, field: str, *, largest: float = 1e15) -> floa
 def corner_bounds(value: Any, where: str, field: str) -> tuple[Corner, Corner]:
     """Lower and upper corner of an axis-aligned box, which is written by its eight corners, as the official scripts
     take them and of which the lowest and highest coordinates count, or by its lower and its upper corner.
-
-    Raises:
-        InputError: other corners, coordinates that are no finite numbers, or a lower corner that is above the upper.
     """
     rows = value if isinstance(value, list) else []
     if len(rows) not in (2, 8):
@@ -406,11 +317,7 @@ MAX_BYTES = 16 << 20
 
 
 def read_split(path: Path) -> tuple[str, ...]:
-    """The names of the scenes of a split, in the order of the file; blank lines are left out.
-
-    Raises:
-        InputError: unreadable, too large, empty, a line that is no name of a folder, or a name that is there twice.
-    """
+    """The names of the scenes of a split, in the order of the file; blank lines are left out."""
     lines = read_checked_text(path, max_bytes=MAX_BYTES).splitlines()
     first: dict[str, int] = {}
     for number, line in enumerate(lines, start=1):

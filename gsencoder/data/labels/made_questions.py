@@ -104,9 +104,6 @@ def make_questions(scenes: Iterable[SeenScene], config: QuestionsConfig = Questi
 
     What is asked about a scene depends on the scene, its name and the seed alone; which of it is left out for balance
     depends on the other scenes. The order of the scenes does not matter.
-
-    Raises:
-        InputError: two scenes of one name, or nothing can be asked.
     """
     scenes = sorted(scenes, key=lambda scene: scene.name)
     if len({scene.name for scene in scenes}) < len(scenes):
@@ -141,7 +138,6 @@ def balanced(units: Mapping[str, Mapping[Kind, Sequence[Unit]]], equal: bool) ->
     """Questions with their ids, kind by kind, scene by scene.
 
     Args:
-        units: of each scene.
         equal: as many of each kind as of the rarest that there is at all, or one more where a pair is not to be torn
             apart; they are taken from all scenes in turn.
     """
@@ -288,11 +284,7 @@ MAX_TRIPLES = 50_000
 
 
 def make_situations(scenes: Iterable[SeenScene], *, seed: int = 0, per_kind: int = 10) -> tuple[Question, ...]:
-    """Questions of both kinds, at most `per_kind` of each a scene, as many to be answered with left as with right.
-
-    Raises:
-        InputError: a number out of range, or two scenes of one name.
-    """
+    """Questions of both kinds, at most `per_kind` of each a scene, as many to be answered with left as with right."""
     if per_kind < 2:
         raise InputError(f"situations: expected per_kind from 2, got {per_kind}")
     ordered = sorted(scenes, key=lambda scene: scene.name)
@@ -432,13 +424,9 @@ def make_expressions(
     """Expressions for all objects that are shown well enough and can be described.
 
     Args:
-        scenes: in any order.
         seed: of the order in which ways to describe an object are taken, and of the choice of objects.
         per_object: most expressions of an object.
         per_scene: most objects of a scene; 0 = all.
-
-    Raises:
-        InputError: numbers out of range, two scenes of one name, or no object can be described.
     """
     if per_object < 1 or per_scene < 0:
         raise InputError(f"expressions: expected per_object from 1 and per_scene from 0, got {per_object}, {per_scene}")

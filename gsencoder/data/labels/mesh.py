@@ -41,12 +41,7 @@ MAX_VERTICES = 100_000_000
 
 
 def read_mesh(path: Path) -> tuple[Float32[np.ndarray, "V 3"], Int32[np.ndarray, "F 3"] | None]:
-    """The vertices and triangles of a mesh; None in place of triangles where the file has no faces.
-
-    Raises:
-        InputError: missing, not a .ply, truncated, no vertices, vertices that are not finite, faces that are not
-            triangles or that name a vertex that is not there.
-    """
+    """The vertices and triangles of a mesh; None in place of triangles where the file has no faces."""
     with _opened(path) as stream:
         header, size = _header(path, stream)
         columns = [read_property(path, stream, header, size, name) for name in "xyz"]
@@ -69,11 +64,7 @@ def read_mesh(path: Path) -> tuple[Float32[np.ndarray, "V 3"], Int32[np.ndarray,
 
 
 def read_vertex_labels(path: Path) -> Int32[np.ndarray, " V"]:
-    """The property `label` of each vertex of a mesh, such as the nyu40 ids of ScanNet's _vh_clean_2.labels.ply.
-
-    Raises:
-        InputError: missing, not a .ply, truncated, without labels, or with labels that are not whole numbers.
-    """
+    """The property `label` of each vertex of a mesh, such as the nyu40 ids of ScanNet's _vh_clean_2.labels.ply."""
     with _opened(path) as stream:
         header, size = _header(path, stream)
         values = read_property(path, stream, header, size, "label")
@@ -156,9 +147,6 @@ class MeshInstances(Sequence[Int32[np.ndarray, "H W"]]):
             labels: of a mesh with faces, in metres.
             views: cameras, and depth where it is known, relative to `origin`.
             origin: that was taken off the world of the mesh.
-
-        Raises:
-            InputError: the mesh has no faces.
         """
         if labels.faces is None:
             raise InputError("instance maps: the labeled mesh has no faces; expected the mesh of the data set")
@@ -201,8 +189,6 @@ def draw_instances(
         labels: of a mesh with faces.
         cam_from_world: of the camera, in the world of the mesh.
         K: intrinsics, pixel centers at .5.
-        width: of the picture, pixels.
-        height: of the picture, pixels.
     """
     # numba is loaded when something is drawn, and not with every scene.
 
@@ -297,13 +283,8 @@ def labels_of_gaussians(
 
     Args:
         means: centers of the Gaussians, in the frame of the vertices (`Scene.origin` added back).
-        vertices: of the mesh.
-        labels: of the vertices.
         max_distance: largest distance, itself included, in the unit of both.
         none: label of Gaussians that are farther from every vertex.
-
-    Raises:
-        InputError: positions that are not finite, or a distance that is not positive.
     """
     _check(means, "Gaussians")
     _check(vertices, "vertices")
@@ -329,16 +310,11 @@ def labels_of_vertices(
     Labels `none` are among the k but do not count; a vertex whose nearest Gaussians all have it has none.
 
     Args:
-        vertices: to be labeled.
         means: centers of the Gaussians, in the frame of the vertices.
-        labels: of the Gaussians.
         k: number of Gaussians that vote; 1 = the nearest one. All vote where there are fewer.
         none: what means no label, in and out.
         voters: which Gaussians are looked at, such as those that were seen; None = all.
         max_distance: Gaussians farther than this do not vote.
-
-    Raises:
-        InputError: positions that are not finite, k below 1, or a distance that is not positive.
     """
     _check(means, "Gaussians")
     _check(vertices, "vertices")
@@ -372,11 +348,7 @@ def nearest_rows(
 
     Args:
         points: finite, in the frame of the targets.
-        targets: finite.
         max_distance: largest distance, itself included, in the unit of both.
-
-    Raises:
-        InputError: a distance that is not positive.
     """
     result = np.full(len(points), -1, np.int64)
     for part, rows in _neighbors(points, targets, 1, max_distance, CHUNK):

@@ -107,7 +107,6 @@ def color_word(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"
     other color there are more than 15 %.
 
     Args:
-        picture: sRGB.
         mask: the pixels of the thing.
     """
     pixels = picture[inner_pixels(mask)]

@@ -42,11 +42,8 @@ class Question:
     Attributes:
         dataset: whose files it comes from.
         id: of the file; numbers are written in decimal.
-        scene: name of the scene.
-        text: the question.
         answers: right ones; none in a test set.
         object_ids: the `objectId`s of ScanNet's aggregation file that the question is about; none where unknown.
-        object_names: their names.
         situation: where the one who asks stands, in words (SQA3D).
         position: the same in the axes of the scan, in metres from the center of its mesh's box; z is 0 (SQA3D).
         rotation: the quaternion of the situation as wxyz, a turn about z (SQA3D).
@@ -75,9 +72,6 @@ def read_questions(path: str | Path, *, answered: bool = True) -> tuple[Question
     Args:
         path: the file; SQA3D's annotations lie beside it.
         answered: whether answers are needed; without, SQA3D's annotations are not read.
-
-    Raises:
-        InputError: neither of both, doubled ids, or questions without answers where answers are needed.
     """
     file = Path(path)
     content = read_benchmark_json(file)
@@ -96,11 +90,7 @@ def read_scanqa(path: str | Path, *, answered: bool = True) -> tuple[Question, .
     """Reads a file of ScanQA.
 
     Args:
-        path: the file.
         answered: whether every question must have answers.
-
-    Raises:
-        InputError: not such a file, doubled ids, or questions without answers.
     """
     return _scanqa(read_benchmark_json(Path(path)), Path(path), answered)
 
@@ -111,12 +101,7 @@ def read_sqa3d(
     """Reads SQA3D's questions and their answers.
 
     Args:
-        questions: the file of questions.
         annotations: the file of answers; None = the one beside it whose name has `sqa_annotations` for `questions`.
-        answered: whether answers are read.
-
-    Raises:
-        InputError: not such files, doubled ids, or annotations that do not belong to the questions.
     """
     file = Path(questions)
     content = read_benchmark_json(file)
@@ -126,11 +111,7 @@ def read_sqa3d(
 
 
 def write_scanqa(path: str | Path, questions: Sequence[Question]) -> None:
-    """Writes questions as ScanQA's files have them.
-
-    Raises:
-        InputError: two questions have one id, or the file cannot be written.
-    """
+    """Writes questions as ScanQA's files have them."""
     _refuse_repeated(Path(path), [each.id for each in questions])
     rows = [
         {
@@ -272,9 +253,6 @@ def write_sqa3d(path: str | Path, questions: Sequence[Question]) -> Path:
 
     Returns:
         The file of annotations beside it, where `read_questions` looks for it.
-
-    Raises:
-        InputError: another name, a question without a situation, or a file cannot be written.
     """
     file = Path(path)
     annotations = file.with_name(file.name.replace("questions", SITUATED))

@@ -66,11 +66,7 @@ class SegmentGroup:
 
 
 def read_segments(path: Path) -> Int64[np.ndarray, " V"]:
-    """The segment of each vertex.
-
-    Raises:
-        InputError: unreadable, too large, or not a list `segIndices` of whole numbers.
-    """
+    """The segment of each vertex."""
     values = _read(path, "segIndices", "the segment of each vertex")
     numbers = _integers(values, f"{path}: segIndices")
     if not len(numbers):
@@ -83,11 +79,6 @@ def read_groups(path: Path, *, first_id: int) -> tuple[SegmentGroup, ...]:
 
     Args:
         path: ID.aggregation.json of ScanNet, or segments_anno.json of ScanNet++.
-        first_id: smallest objectId.
-
-    Raises:
-        InputError: unreadable, too large, not a list `segGroups`, a group without objectId, label or segments, or an
-            objectId that is there twice; the group is named.
     """
     groups: list[SegmentGroup] = []
     rows = _read(path, "segGroups", "the objects")
@@ -121,7 +112,6 @@ class SegmentVertices:
         """Sorts the vertices by segment.
 
         Args:
-            segments: of each vertex.
             path: of their file, for messages.
         """
         self._order = np.argsort(segments, kind="stable")
@@ -130,11 +120,7 @@ class SegmentVertices:
         self._path = path
 
     def of(self, group: SegmentGroup, path: Path) -> Int64[np.ndarray, " n"]:
-        """The vertices of an object of the annotation at `path`.
-
-        Raises:
-            InputError: it names a segment that no vertex of the mesh belongs to.
-        """
+        """The vertices of an object of the annotation at `path`."""
         rows = np.searchsorted(self._numbers, group.segments)
         unknown = self._numbers[np.minimum(rows, len(self._numbers) - 1)] != group.segments
         if unknown.any():
@@ -148,11 +134,7 @@ class SegmentVertices:
 
 
 def check_counts(segments: Int64[np.ndarray, " V"], vertices: np.ndarray, path: Path, mesh: Path) -> None:
-    """Checks that a file of segments and a mesh have as many vertices.
-
-    Raises:
-        InputError: they have not.
-    """
+    """Checks that a file of segments and a mesh have as many vertices."""
     if len(segments) != len(vertices):
         raise InputError(
             f"{path}: segIndices has {len(segments):,} entries, but {mesh} has {len(vertices):,} vertices; expected "
@@ -194,8 +176,6 @@ class ScanNetFiles:
     Attributes:
         name: of the scan, such as scene0000_00.
         aggregation: objects as groups of segments.
-        segments: segment of each vertex.
-        mesh: the vertices.
         meta: text that may state the alignment of axes, or None.
     """
 
@@ -215,9 +195,6 @@ def find_scannet_files(folder: Path) -> ScanNetFiles | None:
     """The label files of a scan in a folder, or of a scan of the folder's or its parent's name in the parent.
 
     The second is for frames that were exported to a folder inside the scan's. None where there is no annotation.
-
-    Raises:
-        InputError: the folder holds annotations of several scans, and none has its name.
     """
     folder = folder.absolute()
     # _vh_clean.aggregation.json belongs to the mesh of full resolution, which no benchmark uses.
@@ -259,10 +236,6 @@ def read_scannet_labels(source: Path | ScanNetFiles) -> MeshLabels:
 
     Args:
         source: folder of the scan, or its files.
-
-    Raises:
-        InputError: a file is missing or wrong; file and entry are named. See `read_groups`, `read_segments`,
-            `read_mesh` and `read_axis_alignment`.
     """
     files = source if isinstance(source, ScanNetFiles) else find_scannet_files(source)
     if files is None:
@@ -290,9 +263,6 @@ def read_axis_alignment(path: Path) -> Float64[np.ndarray, "4 4"] | None:
     """The transform aligned_from_world of a scan's ID.txt (`axisAlignment = ` and 16 numbers, row by row).
 
     None where the file has no such line, as those of test scans; the world is used as it is then.
-
-    Raises:
-        InputError: unreadable, or a line that is not a rigid transform.
     """
     lines = read_checked_text(path, max_bytes=MAX_META_BYTES).splitlines()
     entries = [words for words in (line.partition("=") for line in lines) if words[0].strip() == "axisAlignment"]
@@ -350,10 +320,6 @@ def read_scannetpp_labels(source: Path | ScanNetPPFiles, *, names: Collection[st
         source: folder of the scene, or its files.
         names: raw names of the objects that are labeled, as benchmarks take those of their classes only, which decides
             what a vertex with several objects belongs to; None = all. Others are left out.
-
-    Raises:
-        InputError: a file is missing or wrong; file and entry are named. See `read_groups`, `read_segments` and
-            `read_mesh`.
     """
     files = source if isinstance(source, ScanNetPPFiles) else find_scannetpp_files(source)
     if files is None:
@@ -406,11 +372,7 @@ def find_labels(folder: Path, *, names: Collection[str] | None = None) -> MeshLa
     """The labels of a scene's mesh in the files of ScanNet or ScanNet++; None where there is no annotation.
 
     Args:
-        folder: of the scene (`Scene.folder`).
         names: of ScanNet++, raw names of the objects that are labeled (`read_scannetpp_labels`); None = all.
-
-    Raises:
-        InputError: a file is missing or wrong.
     """
     scannet = find_scannet_files(folder)
     if scannet is not None:
@@ -423,11 +385,7 @@ def labels_of_layout(folder: Path, layout: str) -> MeshLabels | None:
     """The labels that lie beside the photographs of a scene, in the world of its poses.
 
     Args:
-        folder: of the scene.
         layout: name of its layout; only ScanNet's and ScanNet++'s have labels.
-
-    Raises:
-        InputError: a file of the labels is wrong.
 
     Warns:
         SceneWarning: there is an annotation, but not the files that it needs.
@@ -506,10 +464,6 @@ def with_archived_instances(views: Views, folder: Path) -> Views:
 
     Args:
         views: called as their color frames.
-        folder: of the scene.
-
-    Raises:
-        InputError: the archive is damaged.
 
     Warns:
         SceneWarning: the archive is not used, since it lacks frames or its pictures have another size.
@@ -541,9 +495,7 @@ def with_mesh_instances(views: Views, labels: MeshLabels, origin: Float64[np.nda
     """Views with instance maps drawn from a labeled mesh, where they have no pictures of instances of their own.
 
     Args:
-        views: relative to `origin`.
         labels: in the world of the views; without faces the views stay as they are.
-        origin: of the scene.
     """
     if views.instances is not None or labels.faces is None:
         return views
@@ -554,9 +506,6 @@ def with_counted_views(scene: Scene) -> Scene:
     """A scene whose objects state in how many views they show, and their largest area in one.
 
     They are counted in the instance maps, inside the masks of the views. A scene whose objects state it stays as it is.
-
-    Raises:
-        InputError: objects that do not state it, and no instance maps to count them in.
     """
     if all(each.views is not None and each.max_pixels is not None for each in scene.objects):
         return scene

@@ -20,9 +20,7 @@ class SeenObject:
 
     Attributes:
         id: its value in the instance maps.
-        name: in singular, or None.
         aabb_min: lower corner in world coordinates, meters.
-        aabb_max: upper corner.
         pixels: its largest area in a photograph; 0 where none shows it.
         color: its color word, where that is clear.
     """
@@ -44,7 +42,6 @@ class SeenScene:
     """A labeled scene as questions are made from it: in meters, with z up.
 
     Attributes:
-        name: of the scene.
         objects: all that its labels list, in the order of their ids.
         min_pixels: the area, in some photograph, from which an object may be asked about.
         metres_per_unit: of the scene's files, which boxes were multiplied with.
@@ -84,10 +81,6 @@ def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
 
     Args:
         scene: with labeled objects, instance maps and photographs, up = z.
-        min_pixels: see `SeenScene`.
-
-    Raises:
-        InputError: something of this is missing, no object is labeled, or the unit of length is unknown.
     """
     views = scene.views
     missing = [
@@ -228,10 +221,6 @@ def beside(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> lis
 
     Left out are what it stands on or carries, what it is in or around, and what is wholly above or below it, as a
     carpet is.
-
-    Args:
-        scene_object: one of `scene_objects`.
-        scene_objects: of `movables`.
     """
     others = [
         (gap(scene_object, other), other)

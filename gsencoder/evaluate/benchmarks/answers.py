@@ -94,14 +94,9 @@ class AnswerRow:
     """The scores of one question.
 
     Attributes:
-        question_id: of the question.
-        scene: it is about.
-        kind: of the question.
         predicted: whether there is an answer; if not, all scores are 0.
         em1: whether the first answer is right, letter for letter.
         em10: whether one of at most ten is.
-        em_cleaned: LEO's exact match.
-        em_refined: LEO's refined exact match.
         f_value: None where WordNet is missing.
     """
 
@@ -121,12 +116,8 @@ class AnswerMeans:
     """Means over some questions; fractions, NaN without questions.
 
     Attributes:
-        count: of the questions.
         missing: of them, those without an answer.
         em1: see `AnswerRow`, as all others.
-        em10: see there.
-        em_cleaned: see there.
-        em_refined: see there.
         f_value: None where WordNet is missing.
     """
 
@@ -145,7 +136,6 @@ class AnswerScores:
 
     Attributes:
         rows: one a question, in the order of the questions.
-        overall: means over all.
         by_kind: means over each kind of question, in the order of the kinds; kinds without questions are not there.
         by_scene: means over each scene, by name.
         blank: answers that are empty when cleaned, and count as right in the refined match.
@@ -231,16 +221,9 @@ def score_answers(
     """Scores the answers to all questions of a set.
 
     Args:
-        questions: with right answers.
         predictions: by the id of the question, one to ten answers, best first; a question that is missing scores 0.
         sentences: whether to compute BLEU, METEOR, ROUGE-L and CIDEr of the first answers.
-        tokens: of those, see `gsencoder.evaluate.benchmarks.text_metrics.Tokens`.
-        tools: for those, see `score_sentences`.
         lemmatize: of `wordnet_lemmatizer`, a reason for going without, or None = look for it.
-
-    Raises:
-        InputError: questions without answers or with one id, predictions for other questions, or none or more than ten
-            answers to one.
     """
     _check(questions, predictions)
     lemmatize = wordnet_lemmatizer() if lemmatize is None else lemmatize
@@ -336,10 +319,6 @@ def read_answer_predictions(path: str | Path, questions: Sequence[Question]) -> 
 
     Returns:
         One to ten answers, best first, by the id of the question. Questions without an entry are not there.
-
-    Raises:
-        InputError: not such a file, truth in its place, or an entry for another question or scene, for one that has an
-            entry already, or with something else than texts.
     """
     file = Path(path)
     rows = read_benchmark_json(file)
@@ -373,13 +352,9 @@ def write_answer_predictions(
     """Writes predicted answers as the data set's own scripts take them; SQA3D's entries have the question_id besides.
 
     Args:
-        path: the file.
         questions: of one data set; those without a prediction are left out.
         predictions: by the id of the question, one to ten answers, best first. SQA3D's files have the first alone.
         boxes: by the id of the question, of the object that ScanQA asks for, where there is one.
-
-    Raises:
-        InputError: predictions for other questions, none or more than ten answers, or the file cannot be written.
     """
     ids = {each.id for each in questions}
     wrong = next((name for name in [*predictions, *(boxes or {})] if name not in ids), None)

@@ -56,7 +56,6 @@ class CaptionedObject:
     """A true object and what was written of it.
 
     Attributes:
-        scene: name of the scene.
         object_id: `objectId` of ScanNet's aggregation file, from 0.
         object_name: as the file writes it.
         captions: wrapped in sos and eos, tokens with blanks between them.
@@ -75,9 +74,7 @@ class CaptionedBox:
     """A predicted box and its caption.
 
     Attributes:
-        scene: name of the scene.
         caption: with or without sos and eos.
-        aabb: lower and upper corner.
         objectness: probability that there is an object; it decides nothing here, and is kept in files.
         class_probabilities: of the detector; the same.
     """
@@ -94,8 +91,6 @@ class NamedCaption:
     """A predicted caption of a true object, where proposals are given and no boxes are predicted.
 
     Attributes:
-        scene: name of the scene.
-        object_id: of the object.
         caption: with or without sos and eos.
     """
 
@@ -110,8 +105,6 @@ class DenseCaptionScores:
 
     Attributes:
         min_iou: k, which the IoU must be above; None where captions belong to objects by their ids.
-        objects: the samples.
-        predictions: captions that were predicted.
         missing: objects whose caption counts as empty: no box overlaps them enough, or none is predicted for their id.
         ious: of each object and its best box, 0 without one; None where captions belong to objects by their ids.
         sentences: scores of the corpus and of each object, in this order.
@@ -136,7 +129,6 @@ def captioned_objects(
     """The objects of ScanRefer's or Nr3D's expressions with all their captions, in the order of the first ones.
 
     Args:
-        expressions: see there.
         max_tokens: tokens of a caption that are kept, as Scan2Cap's lib/eval_helper.py does; None = all, as its
             benchmark does.
     """
@@ -165,13 +157,7 @@ def score_box_captions(
     """m@kIoU of predicted boxes with captions.
 
     Args:
-        objects: with boxes.
         boxes: of the same scenes, any number a scene, in any order.
-        min_iou: k.
-        tools: see `score_sentences`.
-
-    Raises:
-        InputError: objects without boxes or twice, boxes of other scenes, or k outside [0, 1].
     """
     if not 0 <= min_iou <= 1:
         raise InputError(f"the smallest IoU must lie in [0, 1], got {min_iou}")
@@ -193,12 +179,7 @@ def score_named_captions(
     """The same scores where every caption says which object it is about, and none is dropped for its box.
 
     Args:
-        objects: with or without boxes.
         captions: at most one an object.
-        tools: see `score_sentences`.
-
-    Raises:
-        InputError: captions of other objects, or two of one.
     """
     _check(objects, {each.scene for each in captions})
     caption_of: dict[tuple[str, int], str] = {}
@@ -264,16 +245,7 @@ EXPECTED = (
 def read_caption_predictions(
     path: str | Path, objects: Sequence[CaptionedObject]
 ) -> tuple[CaptionedBox, ...] | tuple[NamedCaption, ...]:
-    """Reads predicted captions of boxes or of given objects, by what is in the file.
-
-    Args:
-        path: the file.
-        objects: of the truth.
-
-    Raises:
-        InputError: not such a file, truth in its place, captions of other scenes or objects, two captions of one
-            object, or something else than texts and finite numbers.
-    """
+    """Reads predicted captions of boxes or of given objects, by what is in the file."""
     file = Path(path)
     content = read_benchmark_json(file)
     if not isinstance(content, dict):
@@ -293,11 +265,7 @@ def read_caption_predictions(
 
 
 def write_box_captions(path: str | Path, boxes: Sequence[CaptionedBox]) -> None:
-    """Writes captions of boxes as Scan2Cap's benchmark takes them, wrapped in sos and eos.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Writes captions of boxes as Scan2Cap's benchmark takes them, wrapped in sos and eos."""
     scenes: dict[str, list[dict[str, Any]]] = {}
     for each in boxes:
         scenes.setdefault(each.scene, []).append(
@@ -314,11 +282,7 @@ def write_box_captions(path: str | Path, boxes: Sequence[CaptionedBox]) -> None:
 def write_named_captions(
     path: str | Path, objects: Sequence[CaptionedObject], captions: Sequence[NamedCaption]
 ) -> None:
-    """Writes captions of given objects as Scan2Cap's evaluation writes them, wrapped in sos and eos.
-
-    Raises:
-        InputError: captions of other objects, two of one, or the file cannot be written.
-    """
+    """Writes captions of given objects as Scan2Cap's evaluation writes them, wrapped in sos and eos."""
     names = {(each.scene, each.object_id): each.object_name for each in objects}
     captions_of: dict[str, list[str]] = {}
     for each in captions:

@@ -28,9 +28,6 @@ def load_classes(classes: str, *, instances: bool = False) -> ClassTable:
             list of names (.txt) such as ScanNet++'s top100.txt, whose ids count its lines from 0.
         instances: whether instances are scored: the benchmarks then leave out wall and floor, so that 18 and 198
             classes remain. Of a list those in NAME_instance.txt beside it; those of a CSV file are all scored.
-
-    Raises:
-        InputError: no such benchmark or file, one that is not such a table, or instances of a class with the id 0.
     """
     table = _table(classes, instances)
     if instances:
@@ -96,7 +93,6 @@ class SceneFiles:
 
     Attributes:
         scene: its name, that of both files without the suffix.
-        prediction: what is scored.
         truth: what it is held against: a file, or the folder of a scan.
     """
 
@@ -122,11 +118,7 @@ def scene_files(
         predictions: folder with SCENE.txt, or what `suffixes` allows.
         truth: folder with SCENE.txt, or of scans.
         scenes: those to score, such as the ones of a split; None = all of the truth.
-        suffixes: of prediction files.
         scans: whether `truth` has the folders of ScanNet's scans, each with the label files of its scene.
-
-    Raises:
-        InputError: no such folder, both are the same, a scene without prediction or truth, or with two predictions.
     """
     for folder in (predictions, truth):
         if not folder.is_dir():

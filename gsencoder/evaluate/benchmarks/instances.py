@@ -80,7 +80,6 @@ class InstanceTruth:
     """The instance of each vertex of a scene.
 
     Attributes:
-        scene: its name.
         ids: class id · 1000 + number of the instance; other ids, such as 0, are no instance.
     """
 
@@ -93,11 +92,8 @@ class InstancePrediction:
     """Masks of a scene, each with a class and a score; masks may overlap.
 
     Attributes:
-        scene: its name.
-        num_vertices: of the scene, V.
         vertices: of all masks, one mask after the other; ascending within a mask.
         offsets: where each mask begins in `vertices`, and at last their number.
-        labels: class ids.
         scores: finite; predictions are ranked by them.
     """
 
@@ -144,11 +140,7 @@ def prediction_of_masks(
     *,
     num_vertices: int,
 ) -> InstancePrediction:
-    """The prediction of masks that say for each vertex whether it belongs to them.
-
-    Raises:
-        InputError: masks of another length than `num_vertices`, or what `InstancePrediction` refuses.
-    """
+    """The prediction of masks that say for each vertex whether it belongs to them."""
     for index, mask in enumerate(masks):
         if len(mask) != num_vertices:
             raise InputError(f"{scene}: mask {index} has {len(mask):,} vertices, and the scene {num_vertices:,}")
@@ -176,17 +168,14 @@ class SceneMatches:
     """Which predictions of a scene are right, at each threshold: all that scores need of it.
 
     Attributes:
-        scene: its name.
         class_agnostic: whether classes were looked at.
         truths: numbers of truths by class (one class where they were not looked at).
         predictions: numbers of predictions that count, by class.
-        scores: of these predictions.
         shared: number of these predictions that are above the lowest threshold with several truths.
         other_classes: number of predictions whose class is not scored.
         rows: class of each outcome; those of ignored predictions are left out.
         thresholds: index in `OVERLAPS` of each outcome.
         hits: whether it is a match, or a false positive.
-        outcome_scores: its score.
     """
 
     scene: str
@@ -221,15 +210,10 @@ def match_instances(
     """Decides at each threshold which predictions of a scene match a truth, are wrong, or are ignored.
 
     Args:
-        truth: of the scene.
         prediction: of the same scene and vertices. The order of its masks matters where one of them lies on several
             truths (see the module).
-        classes: that are scored.
         class_agnostic: leave the classes out of account; labels of predictions are then not looked at.
         min_region: smallest number of vertices of a truth and of a prediction that count.
-
-    Raises:
-        InputError: two scenes, or numbers of vertices that differ.
     """
     if truth.scene != prediction.scene:
         raise InputError(f"the prediction is of the scene {prediction.scene!r}, and the truth of {truth.scene!r}")
@@ -349,13 +333,10 @@ class InstanceScores:
     """The scores of scenes.
 
     Attributes:
-        scenes: how many.
         overall: mean over the classes that have truths.
         classes: by name; the one class of a class-agnostic score is called "any".
         groups: mean over the classes of each group that have truths.
         recall: share of the truths that are matched, by class and threshold of `OVERLAPS`; NaN without truths.
-        truths: that count, by class.
-        predictions: that count, by class.
         equal_scores: whether there are several predictions, all with one score. Their ranking is then undefined, and AP
             is recall · (precision + 1) / 2 at each threshold.
         shared: predictions that are above 0.25 with several truths; AP25 depends on the order of the predictions where
@@ -399,9 +380,6 @@ def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> Ins
     Args:
         matches: of the scenes, in any order.
         classes: with which they were matched.
-
-    Raises:
-        InputError: no scene, a scene that is there twice, or matches with and without classes.
     """
     if not matches:
         raise InputError("instances: no scene to score")
@@ -458,12 +436,8 @@ def instances_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTa
     """The instance of each vertex of a scan's mesh; the scene is named as its folder.
 
     Args:
-        folder: of the scan.
         raw_ids: class id of each raw name, of `read_label_map`.
         classes: that are scored; objects of others do not count.
-
-    Raises:
-        InputError: label files that are missing or wrong, or a class with the id 0.
     """
     classes.check_instance_ids()
     labels = _labels(folder, raw_ids)
@@ -512,14 +486,10 @@ def match_instance_files(
     Args:
         predictions: folder of SCENE.txt or SCENE.npz.
         truth: folder of SCENE.txt, or of ScanNet's scans.
-        classes: that are scored.
         scenes: to score; None = all of the truth.
         raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
         class_agnostic: leave the classes out of account.
         min_region: smallest number of vertices that counts.
-
-    Raises:
-        InputError: files that cannot be used, or scenes that are in one folder only.
     """
     suffixes, scans = (".txt", ".npz"), raw_ids is not None
     for files in scene_files(predictions, truth, scenes=scenes, suffixes=suffixes, scans=scans):
@@ -534,11 +504,7 @@ def match_instance_files(
 
 
 def read_instance_truth(path: Path) -> InstanceTruth:
-    """Reads the instance of each vertex; the scene is named as the file.
-
-    Raises:
-        InputError: unreadable, empty, or a line that is no whole number.
-    """
+    """Reads the instance of each vertex; the scene is named as the file."""
     ids = read_whole_numbers(path, hint="; predictions and truth may be swapped")
     if not len(ids):
         raise InputError(f"{path}: no vertices; expected one whole number for each")
@@ -546,16 +512,7 @@ def read_instance_truth(path: Path) -> InstanceTruth:
 
 
 def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePrediction:
-    """Reads the masks of a scene, which is named as the file.
-
-    Args:
-        path: SCENE.txt or SCENE.npz.
-        num_vertices: of the scene.
-
-    Raises:
-        InputError: unreadable; a mask that is missing, listed twice, outside of the folder or of another length; a
-            class id that is no whole number; a score that is no finite number.
-    """
+    """Reads the masks of a scene, which is named as the file."""
     if path.suffix == ".npz":
         return _read_npz(path, num_vertices)
     lines = read_checked_text(path, max_bytes=MAX_LIST_BYTES).splitlines()
@@ -604,7 +561,6 @@ def write_instance_prediction(
 
     Args:
         folder: an existing one, for all scenes.
-        prediction: of one scene.
         form: "text" writes SCENE.txt and predicted_masks/SCENE_000.txt, …; "npz" writes SCENE.npz.
 
     Returns:
@@ -698,11 +654,7 @@ class InstancesProtocol:
 
 
 def true_instances(points: LabeledPoints, classes: ClassTable) -> InstanceTruth:
-    """The true instances of a scene.
-
-    Raises:
-        InputError: a class has a thousand objects or more, whose ids the benchmark's format cannot hold, or the id 0.
-    """
+    """The true instances of a scene."""
     classes.check_instance_ids()
     with about(f"scene {points.scene}"):
         return InstanceTruth(scene=points.scene, ids=instance_truth(points.objects, points.names, classes.id_of))
@@ -720,12 +672,7 @@ def predict_instances(
     """Masks of a scene's points, each with a class and a score.
 
     Args:
-        scene: with Gaussians.
-        points: of the scene.
-        features: of the Gaussians.
         classes: whose names are looked for.
-        text: turns names into vectors.
-        protocol: where masks come from.
         localization: settings of `localize`, for clusters.
     """
     ids = classes.id_of

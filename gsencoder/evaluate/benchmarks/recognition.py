@@ -40,13 +40,7 @@ from gsencoder.types import GaussianFeatures
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NamedInstance:
-    """An instance of the truth.
-
-    Attributes:
-        scene: name of its scene.
-        object: its id there.
-        name: its class.
-    """
+    """An instance of the truth."""
 
     scene: str
     object: str
@@ -62,8 +56,6 @@ class RankedNames:
     """What an instance is predicted to be.
 
     Attributes:
-        scene: name of its scene.
-        object: its id there.
         names: of classes, the likeliest first, each once; none where the method has no answer.
     """
 
@@ -81,9 +73,6 @@ class RecognizedInstance:
     """An instance with its place in the ranking.
 
     Attributes:
-        scene: name of its scene.
-        object: its id there.
-        name: its class.
         rank: of this class among the predicted names, from 1; 0 if it is not among them.
         first: the name predicted first; None without an answer.
     """
@@ -104,7 +93,6 @@ class RecognitionScores:
     """The scores of instances; NaN without any.
 
     Attributes:
-        instances: how many.
         unanswered: of them, those that have no prediction; they count as wrong.
         classes: for each k, accuracy by name of the class; NaN for classes without instances.
         mean: for each k, the mean over the classes that have instances.
@@ -130,16 +118,11 @@ def recognize(
     """Looks up every instance of the truth among the predictions.
 
     Args:
-        predictions: in any order.
-        truth: in any order.
         classes: that can be predicted. Instances of other classes are not scored, whether they are predicted or not.
         allow_missing: count instances without a prediction as wrong, instead of refusing them.
 
     Returns:
         The instances of the classes, in the order of the truth, and the number of instances of other classes.
-
-    Raises:
-        InputError: an instance that is there twice, is not in the truth, or has no prediction; a name that is no class.
     """
     _refuse_repeated([item.key for item in truth], "truth")
     _refuse_repeated([item.key for item in predictions], "predictions")
@@ -178,12 +161,8 @@ def recognition_scores(
     """The scores of instances of any scenes.
 
     Args:
-        instances: as `recognize` gives them.
         classes: all of them, in the order of the table.
         ks: numbers of names of which one has to be right.
-
-    Raises:
-        InputError: an instance that is there twice, one of another class, or a k below 1.
     """
     _refuse_repeated([item.key for item in instances], "instances")
     if min(ks, default=1) < 1:
@@ -222,22 +201,14 @@ def _refuse_repeated(keys: Sequence[tuple[str, str]], where: str) -> None:
 def recognize_files(
     predictions: Path, truth: Path, classes: Sequence[str], *, allow_missing: bool = False
 ) -> tuple[tuple[RecognizedInstance, ...], int]:
-    """Reads predictions and truth, and looks up every instance, as `recognize` does.
-
-    Raises:
-        InputError: a file that cannot be used, or what `recognize` refuses.
-    """
+    """Reads predictions and truth, and looks up every instance, as `recognize` does."""
     instances, names = read_recognition_truth(truth), read_recognition_predictions(predictions)
     with about(predictions):
         return recognize(names, instances, classes, allow_missing=allow_missing)
 
 
 def read_recognition_truth(path: Path) -> tuple[NamedInstance, ...]:
-    """Reads the class of each instance.
-
-    Raises:
-        InputError: not such a file, or an instance that is there twice.
-    """
+    """Reads the class of each instance."""
     instances = tuple(
         NamedInstance(
             scene=scene_name(entry.get("scene_id"), where),
@@ -251,11 +222,7 @@ def read_recognition_truth(path: Path) -> tuple[NamedInstance, ...]:
 
 
 def read_recognition_predictions(path: Path) -> tuple[RankedNames, ...]:
-    """Reads the names predicted for each instance.
-
-    Raises:
-        InputError: not such a file, or an instance that is there twice.
-    """
+    """Reads the names predicted for each instance."""
     predictions = tuple(
         RankedNames(
             scene=scene_name(entry.get("scene_id"), where),

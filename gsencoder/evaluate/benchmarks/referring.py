@@ -98,7 +98,6 @@ class Sentence:
     """Which sentence something is about.
 
     Attributes:
-        scene: name of its scene.
         object: id of the object that it means.
         annotation: number of the sentence about this object.
     """
@@ -134,7 +133,6 @@ class PredictedBoxes(Sentence):
     Attributes:
         boxes: lower and upper corners, the likeliest box first; none where there is none.
         multiple: what the prediction's file says of the truth's `multiple`, as ScanRefer's own files do.
-        others: the same of `others`.
     """
 
     boxes: Float64[np.ndarray, "K 2 3"]
@@ -175,9 +173,7 @@ class ReferringScores:
     """The scores of sentences.
 
     Attributes:
-        sentences: that are scored.
         without_box: of them, those without a predicted box.
-        top1: of the first box.
         best_of: of the best among the first k boxes, by k.
         best: of the best among all boxes.
     """
@@ -211,15 +207,10 @@ def compare_boxes(
 
     Args:
         predictions: in any order. What they say of `multiple` and `others` is taken where the truth does not say it.
-        truth: in any order.
         allow_missing: count sentences without a prediction as ones without a box; else they are refused.
 
     Returns:
         The sentences that are scored, in the order of the truth; and how many are not, by the reason.
-
-    Raises:
-        InputError: a sentence that is there twice, is not in the truth, or has no prediction; truth and prediction
-            that contradict each other about `multiple` or `others`.
     """
     _refuse_repeated([item.key for item in truth], "is there twice in the truth; expected each once")
     _refuse_repeated([item.key for item in predictions], "is predicted twice; expected each once")
@@ -255,11 +246,7 @@ def referring_scores(results: Sequence[ReferringResult], *, ks: Sequence[int] = 
     """The scores of sentences of any scenes. Those whose `multiple` or `others` is not known count in "overall" alone.
 
     Args:
-        results: as `compare_boxes` gives them.
         ks: numbers of boxes of which the best counts.
-
-    Raises:
-        InputError: a sentence that is there twice, or a k below 1.
     """
     _refuse_repeated([item.key for item in results], "is there twice; each is scored once")
     if min(ks, default=1) < 1:
@@ -391,13 +378,6 @@ def compare_box_files(
 
     Args:
         predictions: JSON of boxes by sentence.
-        truth: see `read_referring_truth`.
-        label_map: see there.
-        scans: see there.
-        allow_missing: see `compare_boxes`.
-
-    Raises:
-        InputError: a file that cannot be used, or what `compare_boxes` refuses.
     """
     boxes = read_referring_predictions(predictions)
     objects = read_referring_truth(truth, label_map=label_map, scans=scans)
@@ -415,9 +395,6 @@ def read_referring_truth(
         label_map: scannetv2-labels.combined.tsv, which gives raw names ScanRefer's classes where the file does not say
             unique_multiple; without it, sentences are neither unique nor multiple.
         scans: folder of ScanNet's scans, whose labels have the boxes that the file does not have.
-
-    Raises:
-        InputError: not such a file, or no sentence has a box.
     """
     expressions = read_scanrefer(path)
     if scans is not None:
@@ -434,11 +411,7 @@ def read_referring_truth(
 
 
 def read_referring_predictions(path: Path) -> tuple[PredictedBoxes, ...]:
-    """Reads the boxes predicted for each sentence.
-
-    Raises:
-        InputError: not such a file, a sentence that is there twice, or a box that is none.
-    """
+    """Reads the boxes predicted for each sentence."""
     boxes = []
     for row in entries_of(read_benchmark_json(path), path, EXPECTED):
         entry, where = row
@@ -516,15 +489,11 @@ def score_referring(
 
     Args:
         predictions: JSON of boxes by sentence.
-        truth: ScanRefer's JSON of sentences.
         method: name of the predictions' rows in the table.
         ks: numbers of boxes of which the best counts, besides the first and all.
         label_map: scannetv2-labels.combined.tsv, which tells unique from multiple where the truth does not.
         scans: folder of ScanNet's scans, whose labels have the boxes that the truth does not have.
         allow_missing: count sentences without a prediction as wrong, instead of refusing them.
-
-    Raises:
-        InputError: files that cannot be used or that do not belong together.
     """
     sentences, unscored = compare_box_files(
         predictions, truth, label_map=label_map, scans=scans, allow_missing=allow_missing
@@ -624,11 +593,7 @@ class ReferringProtocol:
 
 
 def read_expressions(path: Path) -> tuple[Expression, ...]:
-    """ScanRefer's JSON, or Nr3D's CSV by its ending.
-
-    Raises:
-        InputError: neither, or damaged.
-    """
+    """ScanRefer's JSON, or Nr3D's CSV by its ending."""
     return read_nr3d(path) if path.suffix.lower() == ".csv" else read_scanrefer(path)
 
 
@@ -662,12 +627,7 @@ def predict_referring(
     """The boxes of each sentence about a scene, the most probable first; none where no word of it is known or present.
 
     Args:
-        scene: with Gaussians.
-        features: of the Gaussians.
-        expressions: about this scene.
-        text: turns words into vectors.
         protocol: what of a sentence is looked for.
-        localization: settings of `localize`.
         aligned_from_world: rigid transform into the frame in which true boxes are axis-aligned; None = the world.
     """
     table = closed_table(text)

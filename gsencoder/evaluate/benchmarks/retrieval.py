@@ -70,7 +70,6 @@ class Retrieval:
 
     Attributes:
         ranks: rank of what belongs to each query in its pool, from 1, where it comes after all that score the same.
-        distractors: in each pool.
         not_finite: queries whose own score was not finite, which put them last.
     """
 
@@ -120,13 +119,7 @@ def retrieve(pairs: ScoredPairs, texts: Sequence[str], *, count: int = 0, seed: 
     queries. Views with the same text are no rivals of each other.
 
     Args:
-        pairs: scores.
-        texts: of the queries.
         count: distractors in a pool, drawn by the query's name; 0 = all.
-        seed: of the draws.
-
-    Raises:
-        InputError: another number of texts than of queries, or fewer distractors than `count`.
     """
     number = len(pairs.queries)
     if len(texts) != number:
@@ -171,13 +164,9 @@ def view_scores(
     Args:
         cells: rendered features; a view of one vector has one cell.
         texts: vectors of any length above 0.
-        pooling: over the cells.
 
     Returns:
         Scores in [−1, 1]; NaN where a cell is not finite.
-
-    Raises:
-        InputError: no cells, other channels, or an unknown pooling.
     """
     if not len(cells) or cells.shape[1] != texts.shape[1] or pooling not in ("max", "mean"):
         raise InputError(
@@ -211,13 +200,7 @@ def image_to_text(
             the same pool in any order of queries, and for any method.
         views: rendered features of each query's view.
         texts: the text of each view.
-        distractors: texts of other pictures.
-        count: distractors in a pool.
-        seed: of the draws.
         pooling: over the cells of a view.
-
-    Raises:
-        InputError: fewer distractors than `count`, distractors or texts that are not finite, or sizes that differ.
     """
     _check(names, len(views), texts, distractors, count)
     ranks, not_finite = [], 0
@@ -243,16 +226,10 @@ def text_to_image(
 
     Args:
         names: of the queries; see `image_to_text`.
-        texts: the queries.
         views: rendered features of the view that belongs to each text.
         distractors: other pictures: one vector each, as in M3, or the cells of each. The maximum over many cells is
             larger than the cosine of one vector, so that one vector each favors the views.
-        count: distractors in a pool.
-        seed: of the draws.
         pooling: over the cells of a picture.
-
-    Raises:
-        InputError: as in `image_to_text`.
     """
     pictures = distractors.reshape(len(distractors), math.prod(distractors.shape[1:-1]), distractors.shape[-1])
     _check(names, len(views), texts, pictures, count)
@@ -311,11 +288,7 @@ def read_scored_pairs(path: Path, *, pooling: Pooling = "max") -> ScoredPairs:
     """Reads scores, or computes them from features.
 
     Args:
-        path: the .npz.
         pooling: over the cells of a view, where there are features.
-
-    Raises:
-        InputError: not such a file, scores and features in one, or sizes that do not belong together.
     """
     if not path.is_file() or path.suffix.lower() in (".json", *PICKLE_SUFFIXES):
         fault = "no such file" if not path.exists() else "is none"
@@ -397,11 +370,7 @@ def score_retrieval(
         truth: JSON of captions of views.
         method: name of the predictions' row in the table.
         count: distractors in a query's pool; 0 = all.
-        seed: of their draw.
         pooling: over the cells of a view, where predictions are features.
-
-    Raises:
-        InputError: files that cannot be used or that do not belong together.
     """
     captions = read_view_captions(truth)
     pairs = read_scored_pairs(predictions, pooling=pooling)
@@ -513,11 +482,8 @@ class SceneRetrieval:
     """The result of the protocol on one scene.
 
     Attributes:
-        scene: name of the scene.
         captions: of its views, in the order of the file.
         scores: of these views with all texts.
-        gaussians: number of Gaussians.
-        seconds: seconds of each step.
     """
 
     scene: str
@@ -546,12 +512,8 @@ def evaluate_retrieval(
         words: turns texts into the features' space.
         captions: of views; those of other scenes are passed over.
         texts: that views are compared with.
-        protocol: how they are compared.
         seeds: how Gaussians are made for scenes without.
         memory_of: the memory that the features of a scene come from, or None where there is none.
-
-    Raises:
-        InputError: a scene without views or without a view that has a caption, or texts that `words` does not know.
     """
     directions = word_directions(words.encode(list(texts)), words.mean, protocol.mode)
     results = []
@@ -570,11 +532,7 @@ def evaluate_retrieval(
 
 
 def views_of(scene: Scene, captions: Collection[ViewCaption]) -> list[int]:
-    """The numbers of the views that captions are about.
-
-    Raises:
-        InputError: the scene has no views, there is no caption, or captions are about views that it does not have.
-    """
+    """The numbers of the views that captions are about."""
     names = [] if scene.views is None else list(scene.views.names)
     if not names or not captions:
         lacking = "views" if not names else "a caption of one of its views in protocol.captions="
@@ -599,11 +557,7 @@ def score_views(
     """The scores of views with texts; NaN of a view that shows no Gaussian with a feature.
 
     Args:
-        scene: Gaussians and views.
-        features: of the Gaussians.
-        views: their numbers.
         directions: of the texts, unit vectors (`word_directions`).
-        protocol: how they are compared.
         memory: that the features come from; its queries are rendered, and attend to its bank at each pixel.
     """
     assert scene.gaussians is not None

@@ -60,15 +60,11 @@ def score_instances(
     Args:
         predictions: folder of SCENE.txt or SCENE.npz.
         truth: folder of SCENE.txt, or of ScanNet's scans.
-        classes: that are scored.
         method: name of the predictions' row in the table.
         scenes: names of those to score; None = all of the truth.
         raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
         class_agnostic: leave the classes of masks out of account.
         min_region: smallest number of vertices of a true object and of a mask that count.
-
-    Raises:
-        InputError: files that cannot be used or that do not belong together.
     """
     classes.check_instance_ids()
     matches = list(
@@ -153,16 +149,11 @@ def score_semantics(
     """IoU and accuracy of the labels of vertices (`gsencoder.evaluate.benchmarks.semantics`).
 
     Args:
-        predictions: folder of SCENE.txt.
         truth: folder of SCENE.txt, or of ScanNet's scans.
-        classes: that are scored.
         method: name of the predictions' row in the table.
         scenes: names of those to score; None = all of the truth.
         raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
         excluded: classes that are not of the foreground.
-
-    Raises:
-        InputError: files that cannot be used or that do not belong together.
     """
     check_excluded(excluded, classes)
     counts = list(count_label_files(predictions, truth, classes, scenes=scenes, raw_ids=raw_ids))
@@ -219,9 +210,6 @@ def score_recognition(
         method: name of the predictions' row in the table.
         ks: numbers of names of which one has to be right.
         allow_missing: count objects without a prediction as wrong, instead of refusing them.
-
-    Raises:
-        InputError: files that cannot be used or that do not belong together.
     """
     names = list(classes) or sorted({each.name for each in read_recognition_truth(truth)})
     instances, skipped = recognize_files(predictions, truth, names, allow_missing=allow_missing)
@@ -288,9 +276,6 @@ def score_answer_files(
         method: name of the predictions' row in the table.
         java: whether Java's tokenizer and METEOR are used where they are there.
         allow_missing: count questions without a prediction as wrong, instead of refusing the file.
-
-    Raises:
-        InputError: files that cannot be used or that do not belong together.
     """
     questions = read_questions(truth)
     if not questions:
@@ -352,9 +337,6 @@ def score_caption_files(
         java: whether METEOR is computed where Java is there.
         allow_missing: count given objects without a caption, and the objects of scenes without any, as empty, instead
             of refusing the file.
-
-    Raises:
-        InputError: files that cannot be used or that do not belong together.
     """
     objects = captioned_objects(read_scanrefer(truth))
     if not objects:

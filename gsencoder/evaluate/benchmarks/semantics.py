@@ -57,7 +57,6 @@ class LabelCounts:
     """Vertices of one scene by true and predicted class.
 
     Attributes:
-        scene: its name.
         confusion: by row of the true class, and of the predicted one; the last column counts what is predicted as none.
         ignored: vertices whose true label is no class.
     """
@@ -74,7 +73,6 @@ class ClassScores:
     Attributes:
         iou: NaN if it is neither in truth nor predicted.
         accuracy: NaN if it is not in truth.
-        truths: vertices of the class.
         predictions: vertices predicted as the class, of those that are not ignored.
     """
 
@@ -90,7 +88,6 @@ class SemanticAverages:
 
     Attributes:
         miou: mean IoU of the classes in truth or predictions.
-        miou_present: of those in truth.
         macc: mean accuracy of the classes in truth.
         accuracy: share of the vertices of these classes that are right.
     """
@@ -106,12 +103,8 @@ class SemanticScores:
     """The scores of scenes.
 
     Attributes:
-        scenes: how many.
-        overall: over all classes.
         foreground: over those that are not excluded.
         excluded: names of the classes that are.
-        classes: by name.
-        vertices: that count.
         ignored: vertices whose true label is no class.
         unlabeled: vertices that count, and are predicted as no class.
     """
@@ -132,13 +125,8 @@ def count_labels(
     """Counts the vertices of a scene by true and predicted class.
 
     Args:
-        scene: its name.
         truth: class id of each vertex; others are ignored.
         predicted: class id of each vertex; others are no class.
-        classes: that are scored.
-
-    Raises:
-        InputError: numbers of vertices that differ.
     """
     if len(truth) != len(predicted):
         raise InputError(
@@ -156,11 +144,7 @@ def count_labels(
 
 
 def check_excluded(excluded: Collection[str], classes: ClassTable) -> None:
-    """Checks that what is to be left out of the foreground are classes. Names of `BACKGROUND` may be none.
-
-    Raises:
-        InputError: a name is no class.
-    """
+    """Checks that what is to be left out of the foreground are classes. Names of `BACKGROUND` may be none."""
     unknown = [name for name in excluded if name not in classes.names and name not in BACKGROUND]
     if unknown:
         near = get_close_matches(unknown[0], classes.names, n=1)
@@ -180,9 +164,6 @@ def semantic_scores(
         classes: with which they were counted.
         excluded: names of the classes that are not of the foreground. Of `BACKGROUND`, those that are no class are
             passed over.
-
-    Raises:
-        InputError: no scene, a scene that is there twice, counts of other classes, or an excluded name that is unknown.
     """
     if not counts:
         raise InputError("semantics: no scene to score")
@@ -243,14 +224,9 @@ def count_label_files(
     """Counts the labels of the predictions of a folder by the truth of another, one scene in memory at a time.
 
     Args:
-        predictions: folder of SCENE.txt.
         truth: folder of SCENE.txt, or of ScanNet's scans.
-        classes: that are scored.
         scenes: to score; None = all of the truth.
         raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
-
-    Raises:
-        InputError: files that cannot be used, scenes that are in one folder only, or numbers of vertices that differ.
     """
     for files in scene_files(predictions, truth, scenes=scenes, scans=raw_ids is not None):
         labels = _labels(files.truth, classes) if raw_ids is None else classes_of_scan(files.truth, raw_ids, classes)
@@ -320,15 +296,8 @@ def predict_semantics(
     """The predicted class id of each point; `id_of_none` where no Gaussian has a feature.
 
     Args:
-        points: of a scene.
-        gaussians: of the scene.
-        features: of the Gaussians.
-        classes: that can be predicted.
         text: turns their names into vectors.
         protocol: how many Gaussians vote for a vertex.
-
-    Raises:
-        InputError: words of another space, or a name that `text` does not know.
     """
     nearest = nearest_class(features, classes.names, text)
     none = id_of_none(classes)

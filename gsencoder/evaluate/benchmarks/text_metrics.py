@@ -125,9 +125,6 @@ def bleu(
     Returns:
         Scores in [0, 1]: of the corpus, NaN without samples, and one row a sample, of which that of the corpus is no
         mean.
-
-    Raises:
-        InputError: another number of references than of hypotheses, or a sample without references.
     """
     _check(hypotheses, references)
     correct, guessed = np.zeros((2, len(hypotheses), ORDER), np.int64)
@@ -248,12 +245,7 @@ _BREAKS = re.compile(r"[\r\n\v\f\x1c-\x1e\x85\u2028\u2029]+")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JavaTools:
-    """Where Java and the archives are.
-
-    Attributes:
-        java: the program.
-        folder: of the package.
-    """
+    """Where Java and the archives are."""
 
     java: str
     folder: Path
@@ -278,15 +270,8 @@ def ptb_tokens(texts: Sequence[str], tools: JavaTools) -> list[str]:
     Line breaks inside a text count as blanks. The package replaces \\n alone and reads other breaks as ends of a text,
     after which all later ones belong to the wrong samples.
 
-    Args:
-        texts: of all samples.
-        tools: of `find_java_tools`.
-
     Returns:
         The tokens of each text with one blank between them.
-
-    Raises:
-        InputError: Java fails, or takes too long.
     """
     lines = [" ".join(_BREAKS.sub(" ", text).split()) for text in texts]
     rows = [row for row, line in enumerate(lines) if line]
@@ -315,13 +300,9 @@ def meteor(
     Args:
         hypotheses: tokens of each sample with blanks between them.
         references: one or more such sentences for each sample.
-        tools: of `find_java_tools`.
 
     Returns:
         Scores in [0, 1]: of the corpus, NaN without samples, and of each sample.
-
-    Raises:
-        InputError: Java fails, or takes too long.
     """
     if not hypotheses:
         return float("nan"), np.zeros(0)
@@ -434,11 +415,9 @@ class SentenceScores:
         official: whether they are those of the official script. If not, `columns` names them in every head.
         bleu: BLEU-1 to 4 of the corpus.
         meteor: of the corpus; None where Java is missing.
-        rouge_l: mean of the samples.
         cider: mean of the samples, in [0, 10].
         bleu_each: BLEU-1 to 4 of each sample alone.
         meteor_each: of each sample; None where Java is missing.
-        rouge_l_each: of each sample.
         cider_each: of each sample, with the document frequencies of all.
         absent: why a column has no value.
     """
@@ -474,11 +453,7 @@ def score_sentences(
     Args:
         hypotheses: one a sample; empty where there is none, which scores 0 and counts as a sample.
         references: one or more for each sample.
-        tokens: see `Tokens`.
         tools: of `find_java_tools`, a reason for going without, or None = look for them.
-
-    Raises:
-        InputError: "ptb" without Java, or samples without references.
     """
     tools = find_java_tools() if tools is None else tools
     if tokens == "ptb" and isinstance(tools, str):
@@ -539,11 +514,6 @@ def f_value(answer: str, references: Sequence[str], lemmatize: Lemmatize) -> flo
     With the lemmas of the words between blanks, in the case they are written in: precision is the share of the answer's
     words that the reference has, recall that of the reference's words that the answer has; repeated words count
     repeatedly. It is 0 where one of both has no words, where the script ends with an error.
-
-    Args:
-        answer: the predicted one.
-        references: right ones.
-        lemmatize: of `wordnet_lemmatizer`.
     """
     if answer in references:
         return 1.0

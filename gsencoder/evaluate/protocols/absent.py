@@ -57,8 +57,6 @@ class AskedWord:
     """One word asked in one scene.
 
     Attributes:
-        scene: name of the scene.
-        word: the word.
         present: whether the scene has an object of this name.
         probability: that it does, as `localize` says.
         boxed: whether it was given a box.
@@ -115,13 +113,9 @@ def evaluate_absent(
         vocabulary: names that may be absent, such as those of `names_of`.
         protocol: which objects count as present.
         seeds: how Gaussians are made for scenes without.
-        localization: settings of `localize`.
 
     Returns:
         The words of each scene, in order.
-
-    Raises:
-        InputError: a scene cannot be used, or a name is unknown to `words`.
     """
     results = []
     for loaded_scene, load_seconds in scenes:
@@ -232,9 +226,6 @@ def absent_scores(scenes: Sequence[SceneWords]) -> dict[str, Any]:
         present and absent (numbers of words), auroc and auroc_se, calibration_error, brier (mean squared difference of
         probability and presence), boxed_present and boxed_absent (shares of the words that were given a box), and
         reliability.
-
-    Raises:
-        InputError: no word is present, or none is absent.
     """
     words = [word for scene in scenes for word in scene.words]
     present = np.array([word.present for word in words], bool)

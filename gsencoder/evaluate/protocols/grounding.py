@@ -42,8 +42,6 @@ class GroundedPair:
     """One phrase in one view.
 
     Attributes:
-        view: name of the view.
-        phrase: what was looked for.
         intersection: pixels of the mask that were found.
         union: pixels of the mask, and those that were found and are not of the mask.
         finite: whether the map was finite; nothing is found in one that was not.
@@ -65,7 +63,6 @@ class GroundingScores:
     """Scores of pairs of a view and a phrase; NaN without pairs.
 
     Attributes:
-        pairs: that were scored.
         not_finite: of them, those whose map was not finite. Their IoU is 0, so that no method gains by failing.
         miou: mean IoU of the pairs.
         ciou: sum of the intersections by the sum of the unions: each pixel counts the same, and large masks most.
@@ -88,14 +85,8 @@ def otsu_threshold(values: Float32[np.ndarray, "*shape"]) -> float:
     n₁(k) · n₂(k) · (m₁(k) − m₂(k))², with the numbers and mean values of both classes, where a bin stands for its
     center. The threshold is the center of bin k; of equal splits the first is taken.
 
-    Args:
-        values: finite, one or more.
-
     Returns:
         The threshold; values above it are the upper class. The value itself where all are equal, so that none is above.
-
-    Raises:
-        InputError: no values, or values that are not finite.
     """
     if not values.size or not np.isfinite(values).all():
         wrong = f"{int((~np.isfinite(values)).sum()):,} of {values.size:,} that are not" if values.size else "none"
@@ -121,11 +112,7 @@ def ground(
     Args:
         relevancy: of the phrase. With a value that is not finite, nothing is found, and the pair says so.
         truth: pixels of what the phrase means, one or more.
-        view: name of the view.
         phrase: that the map is of.
-
-    Raises:
-        InputError: sizes that differ, or a mask without pixels.
     """
     if relevancy.shape != truth.shape or not truth.any():
         raise InputError(
@@ -184,12 +171,8 @@ class SceneGrounding:
     """The result of the protocol on one scene.
 
     Attributes:
-        scene: name of the scene.
         pairs: of its views and the names of what they show.
         small: pairs that were left out because the objects of the name have too few pixels in the view.
-        views: number of views.
-        gaussians: number of Gaussians.
-        seconds: seconds of each step.
     """
 
     scene: str
@@ -225,9 +208,6 @@ def evaluate_grounding(
 
     Warns:
         SceneWarning: scenes have no pair.
-
-    Raises:
-        InputError: a scene cannot be used, a name is unknown to `words`, or no scene has a pair.
     """
     results = []
     for loaded_scene, load_seconds in scenes:
@@ -281,16 +261,12 @@ def ground_scene(
 
     Args:
         scene: Gaussians, views with instance maps, and objects.
-        features: of the Gaussians.
         words: turns names into the features' space.
         protocol: which names are looked for.
         memory: that the features come from; see `evaluate_grounding`.
 
     Returns:
         The pairs, view by view, and the number of pairs that were left out because they have too few pixels.
-
-    Raises:
-        InputError: the words are of another space, or do not have a name; features of other Gaussians.
     """
     assert scene.gaussians is not None
     assert scene.views is not None

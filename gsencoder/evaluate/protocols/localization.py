@@ -48,13 +48,9 @@ class SceneOutcome:
     """The result of the protocol on one scene.
 
     Attributes:
-        scene: name of the scene.
         hits: one for each queried object.
-        gaussians: number of Gaussians.
         seen: number of Gaussians that have features.
-        rank: columns of the features.
         boxless: number of queried names without any box.
-        seconds: seconds of each step.
     """
 
     scene: str
@@ -81,18 +77,13 @@ def evaluate_localization(
         scenes: scenes with labeled objects and the seconds of loading, as `load_scenes` yields them.
         source: computes the features of a scene.
         words: text table of the features' space.
-        protocol: which objects are queried.
         seeds: how Gaussians are made for scenes without.
-        localization: settings of `localize`.
 
     Returns:
         One outcome per scene, in order.
 
     Warns:
         SceneWarning: queried names have no box, or scenes have no object to query; each is counted over all scenes.
-
-    Raises:
-        InputError: no scene has an object to query, or a scene cannot be used.
     """
     outcomes = []
     for scene, load_seconds in scenes:

@@ -45,11 +45,9 @@ class NamingCounts:
     """Numbers of Gaussians of each name in one scene, and of those classified correctly.
 
     Attributes:
-        scene: name of the scene.
         total: for each name, the Gaussians whose fused feature is nearest to it.
         correct: for each name, those of them whose evaluated feature is nearest to it too.
         cosine: mean cosine of evaluated and fused features about the mean of the space; NaN between different spaces.
-        seconds: seconds of each step.
     """
 
     scene: str
@@ -78,9 +76,6 @@ def evaluate_naming(
 
     Returns:
         One result per scene, in order.
-
-    Raises:
-        InputError: a scene cannot be used, or the features are of a space that the text table does not belong to.
     """
     results = []
     for loaded_scene, load_seconds in scenes:
@@ -107,7 +102,6 @@ def compare_names(
     """Counts for which Gaussians the nearest word to the feature is the nearest word to the fused feature.
 
     Args:
-        name: name of the scene.
         truth: features fused from the teacher's maps; Gaussians not seen in them do not count.
         features: features to evaluate, of the same Gaussians.
         teacher: labels teacher of the scene.
@@ -142,9 +136,6 @@ def nearest_words(
 def naming_scores(scenes: Sequence[NamingCounts], protocol: NamingProtocol = NamingProtocol()) -> dict[str, Any]:
     """The metrics of the protocol: accuracy averaged over names including "other", over names of objects, and over
     Gaussians; mean cosine; and the accuracy of each name, in ascending order.
-
-    Raises:
-        InputError: no name has enough Gaussians.
     """
     total: dict[str, int] = {}
     correct: dict[str, int] = {}
