@@ -28,7 +28,221 @@ from pathlib import Path
 from queue import Queue
 from tempfile import TemporaryDirectory
 
-from mutated_modules import FOLDERS, MODULES, SCENE_FILES, SCORE_FILES, WORD_FILES
+MODULES = (
+    "geometry",
+    "fusion/lift",
+    "fusion/basis",
+    "infer/boxes",
+    "infer/relevancy",
+    "infer/views/choose",
+    "train/losses",
+    "train/samples",
+    "models/grid",
+    "models/plan",
+    "data/seeding/depth",
+    "data/readers/transforms_json",
+    "reconstruct/optimize",
+)
+FOLDERS = {"geometry": ("tests/test_geometry.py", "tests/render", "tests/data")}
+SCENE_FILES = {
+    "app/output": ("tests/app/test_scene_queue.py",),
+    "data/check/agreement": ("tests/data/check", "tests/app/commands/test_inspect_scene.py"),
+    "data/check/epipolar": ("tests/data/check",),
+    "data/check/findings": ("tests/data/check",),
+    "data/check/repair_scene": ("tests/data/check", "tests/app/commands/test_inspect_scene.py"),
+    "data/check/scene_check": ("tests/data/check",),
+    "data/readers/depth_images": ("tests/data/readers", "tests/data/test_layouts.py"),
+    "data/readers/layouts": (
+        "tests/data/readers",
+        "tests/data/test_layouts.py",
+        "tests/data/test_scenes.py",
+        "tests/data/test_transforms_json.py",
+        "tests/data/test_transforms_refusals.py",
+    ),
+    "data/readers/posed": (
+        "tests/data/readers",
+        "tests/data/test_layouts.py",
+        "tests/data/test_scenes.py",
+        "tests/data/test_transforms_json.py",
+        "tests/data/test_transforms_refusals.py",
+    ),
+    "data/readers/rgbd": ("tests/data/readers", "tests/data/test_layouts.py"),
+    "data/readers/scannetpp": ("tests/data/readers", "tests/data/test_layouts.py"),
+    "data/readers/transforms_json": ("tests/data/check", "tests/app/commands/test_inspect_scene.py"),
+    "data/seeding/from_photographs": ("tests/data/seeding", "tests/data/test_triangulate.py"),
+    "data/seeding/matches": ("tests/data/seeding", "tests/data/test_triangulate.py"),
+    "data/up": ("tests/data/test_up.py",),
+    "fusion/fit": ("tests/fusion/test_fit.py",),
+    "train/distributed": ("tests/train/test_presence.py",),
+    "types/scene": ("tests/test_types.py",),
+}
+"""Modules that read, check and seed scenes of others, drawn with `--scenes`, and the tests that belong to them."""
+WORD_FILES = {
+    "core/pretrained": (
+        "tests/core/test_pretrained.py",
+        "tests/text/test_transformers_tower.py",
+        "tests/fusion/test_radio.py",
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+    ),
+    "fusion/cameras": ("tests/fusion/test_interior_views.py",),
+    "fusion/checkpoint": (
+        "tests/fusion/test_teacher_maps.py",
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+    ),
+    "fusion/lift": (
+        "tests/fusion/test_lift.py",
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+        "tests/fusion/test_fuse.py",
+    ),
+    "infer/presence": ("tests/infer/test_presence.py",),
+    "infer/relevancy": ("tests/infer/test_presence.py", "tests/infer/test_relevancy.py"),
+    "reconstruct/exposure": ("tests/reconstruct/test_exposure_prediction.py",),
+    "reconstruct/plan": ("tests/reconstruct/test_budget.py", "tests/reconstruct/test_expected_time.py"),
+    "teachers/build": (
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+        "tests/fusion/test_teachers.py",
+    ),
+    "teachers/segmenter": (
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+        "tests/fusion/test_teachers.py",
+    ),
+    "text/models": ("tests/text",),
+    "text/table": ("tests/text",),
+    "text/vocabulary": ("tests/text",),
+    "types/features": (
+        "tests/test_types.py",
+        "tests/fusion/test_segmenter.py",
+        "tests/fusion/test_segmenter_settings.py",
+    ),
+}
+"""Modules of words, of cameras in bare splats and of times and exposures, drawn with `--words`, and their tests."""
+SCORE_FILES = {
+    "data/labels/classes": ("tests/data/truth/test_class_table.py", "tests/data/truth/test_label_sets.py"),
+    "data/labels/expressions": (
+        "tests/data/truth/test_expressions.py",
+        "tests/data/truth/test_expression_boxes.py",
+        "tests/data/truth/test_label_sets.py",
+    ),
+    "data/labels/files": (
+        "tests/evaluate/files/test_instance_files.py",
+        "tests/data/truth/test_number_files.py",
+        "tests/data/truth/test_expressions.py",
+        "tests/data/truth/test_entries.py",
+        "tests/data/truth/test_label_sets.py",
+    ),
+    "data/labels/made_expressions": ("tests/data/truth/test_made_expressions.py", "tests/data/truth/test_seen_laws.py"),
+    "data/labels/made_questions": (
+        "tests/data/truth/test_made_expressions.py",
+        "tests/data/truth/test_seen_laws.py",
+        "tests/data/truth/test_made_questions.py",
+    ),
+    "data/labels/mesh": (
+        "tests/data/truth/test_mesh_labels.py",
+        "tests/data/truth/test_mesh_limits.py",
+        "tests/data/truth/test_nearest_vertices.py",
+        "tests/data/truth/test_scene_labels.py",
+        "tests/data/truth/test_instance_maps.py",
+    ),
+    "data/labels/names": (
+        "tests/data/truth/test_made_questions.py",
+        "tests/data/truth/test_seen_laws.py",
+        "tests/data/truth/test_relations.py",
+    ),
+    "data/labels/questions": (
+        "tests/data/truth/test_made_expressions.py",
+        "tests/data/truth/test_seen_laws.py",
+        "tests/data/truth/test_questions.py",
+    ),
+    "data/labels/scans": (
+        "tests/data/truth/test_mesh_labels.py",
+        "tests/data/truth/test_mesh_limits.py",
+        "tests/data/truth/test_scene_labels.py",
+        "tests/data/truth/test_instance_maps.py",
+    ),
+    "data/labels/seen_objects": (
+        "tests/data/truth/test_made_questions.py",
+        "tests/data/truth/test_relations.py",
+        "tests/data/truth/test_seen_laws.py",
+    ),
+    "data/prompts": ("tests/data/test_prompt_store.py",),
+    "evaluate/benchmarks/answers": (
+        "tests/evaluate/scores/test_answers.py",
+        "tests/evaluate/scores/test_score_laws.py",
+        "tests/evaluate/files/test_answer_predictions.py",
+    ),
+    "evaluate/benchmarks/captions": (
+        "tests/evaluate/scores/test_dense_captions.py",
+        "tests/evaluate/scores/test_score_laws.py",
+        "tests/evaluate/files/test_caption_predictions.py",
+    ),
+    "evaluate/benchmarks/files": (
+        "tests/evaluate/files/test_instance_files.py",
+        "tests/evaluate/files/test_class_files.py",
+    ),
+    "evaluate/benchmarks/instances": (
+        "tests/evaluate/scores/test_instances.py",
+        "tests/evaluate/scores/test_instance_orders.py",
+        "tests/evaluate/scores/test_instance_refusals.py",
+        "tests/evaluate/scores/test_instance_laws.py",
+        "tests/evaluate/files/test_instance_files.py",
+        "tests/evaluate/files/test_class_files.py",
+    ),
+    "evaluate/benchmarks/recognition": (
+        "tests/evaluate/scores/test_recognition.py",
+        "tests/evaluate/scores/test_instance_laws.py",
+        "tests/evaluate/files/test_json_files.py",
+    ),
+    "evaluate/benchmarks/referring": (
+        "tests/app/commands/test_score_limits.py",
+        "tests/app/commands/test_score_scans.py",
+        "tests/evaluate/test_score_reports.py",
+        "tests/evaluate/scores/test_referring.py",
+        "tests/evaluate/scores/test_score_laws.py",
+        "tests/evaluate/files/test_json_files.py",
+    ),
+    "evaluate/benchmarks/score": (
+        "tests/app/commands/test_score_limits.py",
+        "tests/app/commands/test_score_scans.py",
+        "tests/evaluate/test_score_reports.py",
+        "tests/app/commands/test_score_texts.py",
+        "tests/evaluate/test_text_reports.py",
+    ),
+    "evaluate/benchmarks/semantics": (
+        "tests/evaluate/scores/test_semantics.py",
+        "tests/evaluate/scores/test_instance_laws.py",
+        "tests/evaluate/files/test_instance_files.py",
+        "tests/evaluate/files/test_class_files.py",
+    ),
+    "evaluate/benchmarks/text_metrics": (
+        "tests/evaluate/scores/test_answers.py",
+        "tests/evaluate/scores/test_score_laws.py",
+        "tests/evaluate/scores/test_java_metrics.py",
+        "tests/evaluate/scores/test_ngrams.py",
+    ),
+    "evaluate/sources": (
+        "tests/evaluate/test_semantics_protocol.py",
+        "tests/evaluate/test_class_scores.py",
+        "tests/evaluate/test_labeled_points.py",
+    ),
+    "evaluate/tables": (
+        "tests/app/commands/test_score_limits.py",
+        "tests/app/commands/test_score_scans.py",
+        "tests/evaluate/test_score_reports.py",
+        "tests/evaluate/scores/test_means.py",
+        "tests/evaluate/test_result_table.py",
+    ),
+    "infer/ask/batch": ("tests/infer/test_question_sets.py", "tests/infer/test_ask_predictions.py"),
+    "infer/ask/questions": ("tests/infer/test_question_sets.py", "tests/infer/test_ask_predictions.py"),
+    "train/tune": ("tests/train/test_tuning.py", "tests/train/test_tuning_laws.py"),
+    "train/vlm": ("tests/train/test_tuning.py", "tests/train/test_tuning_laws.py"),
+}
+"""Modules that read the truth of benchmarks, score, ask and tune, drawn with `--scores`, and the tests they have."""
+
 
 ROOT = Path(__file__).parents[1]
 LISTED_FILES = SCENE_FILES | WORD_FILES | SCORE_FILES

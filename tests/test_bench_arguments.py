@@ -109,16 +109,6 @@ def test_a_kind_that_no_room_has_is_refused_before_anything_is_copied(
         ("presence.py", ["HOUSE", "--known", "train_000"], "no room matches"),
         ("presence.py", ["HOUSE", "--known", "fused:abc"], "argument --known: 'fused:abc'"),
         ("presence.py", ["HOUSE", "--known", "fused:0"], "a number above 0"),
-        ("ablations.py", ["HOUSE", "--prepared", "OUT", "--only", "nope"], "recipe, render"),
-        (
-            "ablations.py",
-            ["HOUSE", "--prepared", "OUT", "--only", "patch", "--settings", "nope"],
-            "patch 32, patch 512",
-        ),
-        ("ablations.py", ["HOUSE", "--prepared", "OUT", "--seeds", "7"], "0, 1, 2"),
-        ("ablations.py", ["HOUSE", "--prepared", "OUT", "--settings", "patch 32", "--seeds", "0"], "--seeds 0"),
-        ("ablations.py", ["HOUSE", "--prepared", "OUT", "--processes", "0"], "a whole number from 1"),
-        ("ablations.py", ["HOUSE", "--prepared", "OUT", "--steps", "x"], "a whole number from 1"),
         ("mix.py", ["GONE", "OUT"], "no such folder"),
         ("mix.py", ["HOUSE", "OUT", "--names", "zzz"], "train_000, train_001"),
         ("mix.py", ["HOUSE", "OUT", "--names", ""], "not a pattern"),
@@ -137,25 +127,3 @@ def test_a_wrong_argument_is_refused_in_one_line(
     message = refusal(monkeypatch, capfd, script, *(paths.get(word, word) for word in words))
     assert expected.replace("HOUSE", str(house)) in message
     assert not (tmp_path / "out").exists()
-
-
-def test_a_failed_command_ends_with_its_own_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    script = tmp_path / "failing.py"
-    script.write_text("import sys\nprint('error: a good line', file=sys.stderr)\nraise ValueError('of torchrun')\n")
-    monkeypatch.syspath_prepend(str(BENCH))
-    ablations, errors = (runpy.run_path(str(BENCH / name)) for name in ("ablations.py", "errors.py"))
-    with pytest.raises(SystemExit) as stop, errors["one_line_errors"]():
-        ablations["run"]([sys.executable, str(script)])
-    assert stop.value.code == 2
-    assert capfd.readouterr().err == "error: a good line\n"
-
-
-@pytest.mark.parametrize("words", [(), ("room", "--unlabeled", "x"), ("--unlabeled", "x"), ("room", "--words", "a")])
-def test_answers_are_of_labeled_scenes_or_of_words_alone(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], words: tuple[str, ...]
-) -> None:
-    assert "give labeled scenes, or --unlabeled FEATURES with --words" in refusal(
-        monkeypatch, capfd, "answers.py", *words
-    )

@@ -8,6 +8,7 @@ import itertools
 import re
 import shlex
 import sys
+import textwrap
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -25,8 +26,10 @@ from gsencoder.core.pretrained import find_file
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "gsencoder"
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(
-    (ROOT / "docs").glob("*.md")
+    page for folder in ("docs", "docs/tasks") for page in (ROOT / folder).glob("*.md")
 )
+RESULTS = sorted((ROOT / "docs" / "results").glob("*.md"))
+"""Figures of the commits that measured them, which may name options and scripts that are gone."""
 HISTORY = ("CHANGELOG.md", "decisions.md", "measurements.md")
 """Pages that also speak of options and modules that are gone."""
 
@@ -78,7 +81,7 @@ def has_target(page: Path, link: str) -> bool:
     return target.is_file() and fragment in map(anchor_of, re.findall(r"^#+ (.*)$", prose_of(target), re.MULTILINE))
 
 
-@each_page
+@pytest.mark.parametrize("page", PAGES + RESULTS, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_to_files_and_headings(page: Path) -> None:
     assert [link for link in links_of(page) if not has_target(page, link)] == []
 
@@ -191,6 +194,15 @@ def test_python_blocks_import_and_call_what_is_there(page: Path) -> None:
         assert list(calls_that_do_not_bind(tree)) == []
 
 
+@pytest.mark.parametrize("page", sorted((ROOT / "docs" / "tasks").glob("*.md")), ids=lambda page: page.name)
+def test_code_of_the_task_pages_is_that_of_the_examples(page: Path) -> None:
+    examples = "\n".join(text_of(path) for path in sorted((ROOT / "examples").glob("*.py")))
+    blocks = blocks_of(page, "python")
+    assert blocks
+    for block in blocks:
+        assert textwrap.indent(block.rstrip(), "    ") in examples
+
+
 def test_a_call_that_does_not_bind_is_reported() -> None:
     source = "from gsencoder import load_splat\nload_splat('a.ply', 'b')\nload_splat('a.ply')\nload_splat(file='a.ply')"
     assert len(list(calls_that_do_not_bind(ast.parse(source)))) == 2
@@ -252,7 +264,7 @@ def models_of(line: str) -> Iterator[tuple[str, bool]]:
             yield from ((stated[name], group == "text") for name in ("model", "classes", "words") if name in stated)
 
 
-@pytest.mark.parametrize("name", ["README.md", "docs/tutorial.md", "docs/examples.md"])
+@pytest.mark.parametrize("name", ["README.md", "docs/tutorial.md"])
 def test_a_stranger_has_the_models_that_the_first_pages_use(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("GSENCODER_MODELS", raising=False)
     lines = [line for line in command_lines_of(ROOT / name) if not PLACEHOLDER.match(line)]
@@ -324,11 +336,12 @@ def test_the_reference_has_every_command_and_every_option() -> None:
 
 def test_every_document_is_in_the_navigation_of_the_site() -> None:
     listed = set(re.findall(r": ([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE))
-    assert {page.name for page in PAGES if page.parent.name == "docs"} <= listed
+    documents = [page.relative_to(ROOT / "docs") for page in PAGES + RESULTS if ROOT / "docs" in page.parents]
+    assert {page.as_posix() for page in documents} <= listed
 
 
 def test_the_documents_are_looked_at() -> None:
-    for contents, at_least in ((links_of, 20), (paths_of, 80), (dotted_names_of, 150), (command_lines_of, 30)):
+    for contents, at_least in ((links_of, 20), (paths_of, 60), (dotted_names_of, 100), (command_lines_of, 30)):
         assert sum(len(contents(page)) for page in PAGES) >= at_least  # type: ignore[operator]
     assert sum(len(blocks_of(page, "python")) for page in PAGES) >= 4
     assert {"fuse", "encode", "localize"} <= set(gsencoder.__all__)

@@ -35,7 +35,8 @@ HEAD = """\
 # Command line
 
 Every command, and every option with its type, default and meaning. `make cli` writes this page from the code;
-`gsencoder COMMAND --help` shows the same. What the options are good for is in the [guide](guide.md).
+`gsencoder COMMAND --help` shows the same. The task pages say what the options are for, [scenes](tasks/scenes.md)
+first.
 
 ```
 gsencoder COMMAND [PATH…] [key=value …] [flags]
