@@ -1,9 +1,10 @@
 """Small faults planted in core modules, one at a time: the share of them that the tests notice.
 
-    python bench/mutants.py [--seed 0] [--count 5] [--modules fusion/basis …] [--out mutants.jsonl] [--jobs 1]
+    python bench/mutants.py [--seed 0] [--count 5] [--modules 'data/readers/*' …] [--functions NAMES.txt] [--out mutants.jsonl]
 
 Faults are drawn from operators, comparisons and constants. A copy of the project is mutated, never the checkout. The
-test files that belong to a module run first (named like it, or importing it), then the rest of its folder. A fault that
+test files that belong to a module run first (named like it, or importing it), then the rest of its folder. With
+`--functions` faults lie in functions of these names alone, one a line, wherever they are. A fault that
 makes the first ones hang counts as killed; one that outlives them, and for which the folder takes longer than
 `--folder-seconds`, counts as survived. A run that was interrupted goes on where it stopped; with `--again` the
 survivors in the file are judged once more.
@@ -12,6 +13,7 @@ survivors in the file are judged once more.
 import argparse
 import ast
 import copy
+import fnmatch
 import json
 import os
 import random
@@ -43,209 +45,7 @@ MODULES = (
     "data/readers/transforms_json",
     "reconstruct/optimize",
 )
-FOLDERS = {"geometry": ("tests/test_geometry.py", "tests/render", "tests/data")}
-SCENE_FILES = {
-    "app/output": ("tests/app/test_scene_queue.py",),
-    "data/check/agreement": ("tests/data/check", "tests/app/commands/test_inspect_scene.py"),
-    "data/check/epipolar": ("tests/data/check",),
-    "data/check/findings": ("tests/data/check",),
-    "data/check/repair_scene": ("tests/data/check", "tests/app/commands/test_inspect_scene.py"),
-    "data/check/scene_check": ("tests/data/check",),
-    "data/readers/depth_images": ("tests/data/readers", "tests/data/test_layouts.py"),
-    "data/readers/layouts": (
-        "tests/data/readers",
-        "tests/data/test_layouts.py",
-        "tests/data/test_scenes.py",
-        "tests/data/test_transforms_json.py",
-        "tests/data/test_transforms_refusals.py",
-    ),
-    "data/readers/posed": (
-        "tests/data/readers",
-        "tests/data/test_layouts.py",
-        "tests/data/test_scenes.py",
-        "tests/data/test_transforms_json.py",
-        "tests/data/test_transforms_refusals.py",
-    ),
-    "data/readers/rgbd": ("tests/data/readers", "tests/data/test_layouts.py"),
-    "data/readers/scannetpp": ("tests/data/readers", "tests/data/test_layouts.py"),
-    "data/readers/transforms_json": ("tests/data/check", "tests/app/commands/test_inspect_scene.py"),
-    "data/seeding/from_photographs": ("tests/data/seeding", "tests/data/test_triangulate.py"),
-    "data/seeding/matches": ("tests/data/seeding", "tests/data/test_triangulate.py"),
-    "data/up": ("tests/data/test_up.py",),
-    "fusion/fit": ("tests/fusion/test_fit.py",),
-    "train/distributed": ("tests/train/test_presence.py",),
-    "types/scene": ("tests/test_types.py",),
-}
-"""Modules that read, check and seed scenes of others, drawn with `--scenes`, and the tests that belong to them."""
-WORD_FILES = {
-    "core/pretrained": (
-        "tests/core/test_pretrained.py",
-        "tests/text/test_transformers_tower.py",
-        "tests/fusion/test_radio.py",
-        "tests/fusion/test_segmenter.py",
-        "tests/fusion/test_segmenter_settings.py",
-    ),
-    "fusion/cameras": ("tests/fusion/test_interior_views.py",),
-    "fusion/checkpoint": (
-        "tests/fusion/test_teacher_maps.py",
-        "tests/fusion/test_segmenter.py",
-        "tests/fusion/test_segmenter_settings.py",
-    ),
-    "fusion/lift": (
-        "tests/fusion/test_lift.py",
-        "tests/fusion/test_segmenter.py",
-        "tests/fusion/test_segmenter_settings.py",
-        "tests/fusion/test_fuse.py",
-    ),
-    "infer/presence": ("tests/infer/test_presence.py",),
-    "infer/relevancy": ("tests/infer/test_presence.py", "tests/infer/test_relevancy.py"),
-    "reconstruct/exposure": ("tests/reconstruct/test_exposure_prediction.py",),
-    "reconstruct/plan": ("tests/reconstruct/test_budget.py", "tests/reconstruct/test_expected_time.py"),
-    "teachers/build": (
-        "tests/fusion/test_segmenter.py",
-        "tests/fusion/test_segmenter_settings.py",
-        "tests/fusion/test_teachers.py",
-    ),
-    "teachers/segmenter": (
-        "tests/fusion/test_segmenter.py",
-        "tests/fusion/test_segmenter_settings.py",
-        "tests/fusion/test_teachers.py",
-    ),
-    "text/models": ("tests/text",),
-    "text/table": ("tests/text",),
-    "text/vocabulary": ("tests/text",),
-    "types/features": (
-        "tests/test_types.py",
-        "tests/fusion/test_segmenter.py",
-        "tests/fusion/test_segmenter_settings.py",
-    ),
-}
-"""Modules of words, of cameras in bare splats and of times and exposures, drawn with `--words`, and their tests."""
-SCORE_FILES = {
-    "data/labels/classes": ("tests/data/truth/test_class_table.py", "tests/data/truth/test_label_sets.py"),
-    "data/labels/expressions": (
-        "tests/data/truth/test_expressions.py",
-        "tests/data/truth/test_expression_boxes.py",
-        "tests/data/truth/test_label_sets.py",
-    ),
-    "data/labels/files": (
-        "tests/evaluate/files/test_instance_files.py",
-        "tests/data/truth/test_number_files.py",
-        "tests/data/truth/test_expressions.py",
-        "tests/data/truth/test_entries.py",
-        "tests/data/truth/test_label_sets.py",
-    ),
-    "data/labels/made_expressions": ("tests/data/truth/test_made_expressions.py", "tests/data/truth/test_seen_laws.py"),
-    "data/labels/made_questions": (
-        "tests/data/truth/test_made_expressions.py",
-        "tests/data/truth/test_seen_laws.py",
-        "tests/data/truth/test_made_questions.py",
-    ),
-    "data/labels/mesh": (
-        "tests/data/truth/test_mesh_labels.py",
-        "tests/data/truth/test_mesh_limits.py",
-        "tests/data/truth/test_nearest_vertices.py",
-        "tests/data/truth/test_scene_labels.py",
-        "tests/data/truth/test_instance_maps.py",
-    ),
-    "data/labels/names": (
-        "tests/data/truth/test_made_questions.py",
-        "tests/data/truth/test_seen_laws.py",
-        "tests/data/truth/test_relations.py",
-    ),
-    "data/labels/questions": (
-        "tests/data/truth/test_made_expressions.py",
-        "tests/data/truth/test_seen_laws.py",
-        "tests/data/truth/test_questions.py",
-    ),
-    "data/labels/scans": (
-        "tests/data/truth/test_mesh_labels.py",
-        "tests/data/truth/test_mesh_limits.py",
-        "tests/data/truth/test_scene_labels.py",
-        "tests/data/truth/test_instance_maps.py",
-    ),
-    "data/labels/seen_objects": (
-        "tests/data/truth/test_made_questions.py",
-        "tests/data/truth/test_relations.py",
-        "tests/data/truth/test_seen_laws.py",
-    ),
-    "data/prompts": ("tests/data/test_prompt_store.py",),
-    "evaluate/benchmarks/answers": (
-        "tests/evaluate/scores/test_answers.py",
-        "tests/evaluate/scores/test_score_laws.py",
-        "tests/evaluate/files/test_answer_predictions.py",
-    ),
-    "evaluate/benchmarks/captions": (
-        "tests/evaluate/scores/test_dense_captions.py",
-        "tests/evaluate/scores/test_score_laws.py",
-        "tests/evaluate/files/test_caption_predictions.py",
-    ),
-    "evaluate/benchmarks/files": (
-        "tests/evaluate/files/test_instance_files.py",
-        "tests/evaluate/files/test_class_files.py",
-    ),
-    "evaluate/benchmarks/instances": (
-        "tests/evaluate/scores/test_instances.py",
-        "tests/evaluate/scores/test_instance_orders.py",
-        "tests/evaluate/scores/test_instance_refusals.py",
-        "tests/evaluate/scores/test_instance_laws.py",
-        "tests/evaluate/files/test_instance_files.py",
-        "tests/evaluate/files/test_class_files.py",
-    ),
-    "evaluate/benchmarks/recognition": (
-        "tests/evaluate/scores/test_recognition.py",
-        "tests/evaluate/scores/test_instance_laws.py",
-        "tests/evaluate/files/test_json_files.py",
-    ),
-    "evaluate/benchmarks/referring": (
-        "tests/app/commands/test_score_limits.py",
-        "tests/app/commands/test_score_scans.py",
-        "tests/evaluate/test_score_reports.py",
-        "tests/evaluate/scores/test_referring.py",
-        "tests/evaluate/scores/test_score_laws.py",
-        "tests/evaluate/files/test_json_files.py",
-    ),
-    "evaluate/benchmarks/score": (
-        "tests/app/commands/test_score_limits.py",
-        "tests/app/commands/test_score_scans.py",
-        "tests/evaluate/test_score_reports.py",
-        "tests/app/commands/test_score_texts.py",
-        "tests/evaluate/test_text_reports.py",
-    ),
-    "evaluate/benchmarks/semantics": (
-        "tests/evaluate/scores/test_semantics.py",
-        "tests/evaluate/scores/test_instance_laws.py",
-        "tests/evaluate/files/test_instance_files.py",
-        "tests/evaluate/files/test_class_files.py",
-    ),
-    "evaluate/benchmarks/text_metrics": (
-        "tests/evaluate/scores/test_answers.py",
-        "tests/evaluate/scores/test_score_laws.py",
-        "tests/evaluate/scores/test_java_metrics.py",
-        "tests/evaluate/scores/test_ngrams.py",
-    ),
-    "evaluate/sources": (
-        "tests/evaluate/test_semantics_protocol.py",
-        "tests/evaluate/test_class_scores.py",
-        "tests/evaluate/test_labeled_points.py",
-    ),
-    "evaluate/tables": (
-        "tests/app/commands/test_score_limits.py",
-        "tests/app/commands/test_score_scans.py",
-        "tests/evaluate/test_score_reports.py",
-        "tests/evaluate/scores/test_means.py",
-        "tests/evaluate/test_result_table.py",
-    ),
-    "infer/ask/batch": ("tests/infer/test_question_sets.py", "tests/infer/test_ask_predictions.py"),
-    "infer/ask/questions": ("tests/infer/test_question_sets.py", "tests/infer/test_ask_predictions.py"),
-    "train/tune": ("tests/train/test_tuning.py", "tests/train/test_tuning_laws.py"),
-    "train/vlm": ("tests/train/test_tuning.py", "tests/train/test_tuning_laws.py"),
-}
-"""Modules that read the truth of benchmarks, score, ask and tune, drawn with `--scores`, and the tests they have."""
-
-
 ROOT = Path(__file__).parents[1]
-LISTED_FILES = SCENE_FILES | WORD_FILES | SCORE_FILES
 NOT_COPIED = shutil.ignore_patterns(".git", ".venv", "outputs", "dist", "build", ".*_cache")
 
 SWAPS: dict[type[ast.AST], tuple[type[ast.AST], ...]] = {
@@ -335,10 +135,14 @@ def faulty(node: ast.expr) -> Iterator[ast.AST]:
                 yield ast.Constant(value)
 
 
-def draw(module: str, count: int, seed: int) -> list[Mutant]:
+def draw(module: str, count: int, seed: int, functions: frozenset[str] = frozenset()) -> list[Mutant]:
     """Some faults of a module, no two at one expression, in the order of the source."""
     tree = ast.parse((ROOT / "gsencoder" / f"{module}.py").read_text())
-    sites = [(node, versions) for node in expressions(tree) if (versions := list(faulty(node)))]
+    parts: list[ast.AST] = [tree]
+    if functions:
+        parts = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef) and node.name in functions]
+    found = {(node.lineno, node.col_offset, ast.unparse(node)): node for part in parts for node in expressions(part)}
+    sites = [(node, versions) for node in found.values() if (versions := list(faulty(node)))]
     rng = random.Random(f"{seed} {module}")
     drawn = [(node, rng.choice(versions)) for node, versions in rng.sample(sites, min(count, len(sites)))]
     mutants = [
@@ -349,21 +153,12 @@ def draw(module: str, count: int, seed: int) -> list[Mutant]:
 
 def test_files(project: Path, module: str) -> tuple[list[str], list[str]]:
     """Test files that belong to a module, and the rest of its folder."""
-    if module in LISTED_FILES:
-        named = [path for place in LISTED_FILES[module] for path in _tests_at(project / place)]
-        return [str(path.relative_to(project)) for path in named], []
-    folders = FOLDERS.get(module, (f"tests/{module.partition('/')[0]}",))
-    files = [path for folder in folders for path in _tests_at(project / folder)]
+    tests = sorted((project / "tests").glob("**/test_*.py"))
     name, stem = "gsencoder." + module.replace("/", "."), module.rpartition("/")[2]
-    named = [path for path in files if path.stem == f"test_{stem}"]
-    importing = [path for path in files if path not in named and re.search(rf"\b{name}\b", path.read_text())]
-    first = [*named, *importing]
-    relative = [[str(path.relative_to(project)) for path in part] for part in (first, files)]
-    return relative[0], [path for path in relative[1] if path not in relative[0]]
-
-
-def _tests_at(path: Path) -> list[Path]:
-    return [path] if path.suffix == ".py" else sorted(path.glob("**/test_*.py"))
+    folder = project / "tests" / module.partition("/")[0]
+    first = [path for path in tests if path.stem == f"test_{stem}" or re.search(rf"\b{name}\b", path.read_text())]
+    rest = [path for path in tests if folder in path.parents and path not in first]
+    return [str(path.relative_to(project)) for path in first], [str(path.relative_to(project)) for path in rest]
 
 
 def run_tests(folder: Path, files: list[str], limit: float) -> tuple[str, str]:
@@ -423,10 +218,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=5, help="faults of each module")
-    parser.add_argument("--modules", nargs="+", choices=(*MODULES, *LISTED_FILES), metavar="MODULE")
-    parser.add_argument("--scenes", action="store_true", help="modules that read, check and seed scenes of others")
-    parser.add_argument("--words", action="store_true", help="modules of words, cameras in bare splats and times")
-    parser.add_argument("--scores", action="store_true", help="modules of truth, scores, questions and tuning")
+    parser.add_argument(
+        "--modules", nargs="+", metavar="PATTERN", help="modules below gsencoder, as fusion/basis or infer/*"
+    )
+    parser.add_argument("--functions", type=Path, help="a file of function names, one a line")
     parser.add_argument("--out", type=Path, help="default: outputs/mutants_SEED.jsonl")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--again", action="store_true", help="judge the survivors once more")
@@ -440,13 +235,12 @@ def main() -> None:
     for line in out.read_text().splitlines() if out.exists() else []:
         row = json.loads(line)
         known[Mutant(*(row[name] for name in Mutant.__dataclass_fields__))] = row
-    groups = (
-        *(SCENE_FILES if chosen.scenes else ()),
-        *(WORD_FILES if chosen.words else ()),
-        *(SCORE_FILES if chosen.scores else ()),
-    )
-    modules = chosen.modules or groups or MODULES
-    mutants = [mutant for module in modules for mutant in draw(module, chosen.count, chosen.seed)]
+    package = ROOT / "gsencoder"
+    present = [path.relative_to(package).with_suffix("").as_posix() for path in sorted(package.glob("**/*.py"))]
+    patterns = chosen.modules or (["*"] if chosen.functions else MODULES)
+    modules = [each for each in present if any(fnmatch.fnmatch(each, pattern) for pattern in patterns)]
+    functions = frozenset(chosen.functions.read_text().split()) if chosen.functions else frozenset()
+    mutants = [mutant for module in modules for mutant in draw(module, chosen.count, chosen.seed, functions)]
     due = [each for each in mutants if each not in known or (chosen.again and not known[each]["killed"])]
     # Started in the background, this process ignores the signal that tests of stopping send, and so would they.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -477,7 +271,7 @@ def main() -> None:
                     sys.exit(f"{module}: without a fault its tests end with: {end} {test}")
             with ThreadPoolExecutor(chosen.jobs) as pool:
                 list(pool.map(work, faults))
-    for module in modules:
+    for module in dict.fromkeys(each.module for each in mutants):
         rows = [known[each] for each in mutants if each.module == module]
         print(f"{module:<22} {sum(row['killed'] for row in rows)} of {len(rows)}")
     print(f"killed: {sum(known[each]['killed'] for each in mutants) / len(mutants):.2f} of {len(mutants)}")
