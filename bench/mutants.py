@@ -1,6 +1,6 @@
 """Small faults planted in core modules, one at a time: the share of them that the tests notice.
 
-    python bench/mutants.py [--seed 0] [--count 5] [--modules 'data/readers/*' …] [--functions NAMES.txt] [--out mutants.jsonl]
+    python bench/mutants.py [--seed 0] [--count 5] [--modules 'data/*' …] [--functions NAMES.txt] [--out FILE]
 
 Faults are drawn from operators, comparisons and constants. A copy of the project is mutated, never the checkout. The
 test files that belong to a module run first (named like it, or importing it), then the rest of its folder. With
