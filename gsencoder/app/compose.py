@@ -199,11 +199,7 @@ def full_key(key: str, choices: Choices) -> str | None:
 
 
 def check_options_of_one(texts: Mapping[str, str], choices: Choices) -> None:
-    """Checks that with several members of a choice no options are given for the only one.
-
-    Raises:
-        InputError: there are such options, or no members.
-    """
+    """Checks that with several members of a choice no options are given for the only one."""
     for key, value in texts.items():
         several = choices.options[key].several if key in choices.options else ""
         unused = [name for name in texts if name == several or name.startswith(f"{several}.")] if several else []
@@ -216,11 +212,7 @@ def check_options_of_one(texts: Mapping[str, str], choices: Choices) -> None:
 
 
 def members_of(key: str, value: str, group: str, members: Sequence[str]) -> list[str]:
-    """Overrides that add several members of a choice, each below a name of its own.
-
-    Raises:
-        InputError: an unknown member, or a name that is given twice.
-    """
+    """Overrides that add several members of a choice, each below a name of its own."""
     pairs = named_members(value)
     names = [name for name, _ in pairs]
     for name, member in pairs:
@@ -240,11 +232,7 @@ def named_members(value: str) -> list[tuple[str, str]]:
 
 
 def check_single(data: Mapping[str, Any], texts: Mapping[str, str], choices: Choices) -> None:
-    """Checks that nothing was given for a single member of a choice of which an experiment gives several.
-
-    Raises:
-        InputError: it was.
-    """
+    """Checks that nothing was given for a single member of a choice of which an experiment gives several."""
     for key, option in choices.options.items():
         single = option.several
         unused = [name for name in texts if single and (name == single or name.startswith(f"{single}."))]
@@ -338,11 +326,7 @@ def open_hydra(command: str, cls: type[CommonConfig], conf: Path | None) -> Iter
 def read_words(
     words: Sequence[str], choices: Choices, *, sweep: bool = False
 ) -> tuple[tuple[str, ...], dict[str, str]]:
-    """Splits a command line into paths and settings, by the rules in the docstring of this module.
-
-    Raises:
-        InputError: a word that is neither, a setting given twice, or paths for a command without paths.
-    """
+    """Splits a command line into paths and settings, by the rules in the docstring of this module."""
     paths: list[str] = []
     texts: dict[str, str] = {}
     only_paths = False
@@ -403,11 +387,7 @@ def _unknown(word: str, key: str, choices: Choices) -> str:
 
 
 def overrides(texts: Mapping[str, str], choices: Choices, *, sweep: bool = False) -> list[str]:
-    """The settings in Hydra's grammar, with text encoded; each is parsed separately, so that errors name it.
-
-    Raises:
-        InputError: an unknown member of a choice, or a value of the wrong type.
-    """
+    """The settings in Hydra's grammar, with text encoded; each is parsed separately, so that errors name it."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 
@@ -459,11 +439,7 @@ def _is_list(option: Option) -> bool:
 def compose(
     command: str, cls: type[Config], words: Sequence[str], conf: Path | None = None, choices: Choices | None = None
 ) -> Config:
-    """Composes the settings of a run: defaults of the class, then chosen YAML files, then the command line.
-
-    Raises:
-        InputError: the words, or their combination, are not settings of this command.
-    """
+    """Composes the settings of a run: defaults of the class, then chosen YAML files, then the command line."""
     from hydra.errors import HydraException
     from hydra.types import RunMode
 
@@ -603,14 +579,9 @@ def run_many(
     """Calls `run(settings)` for every combination of the values given and returns the exit code: 2 if one failed.
 
     Args:
-        command: its name.
-        cls: the class of its settings.
         words: the command line after the command.
         run: does one run, prints its error and returns it; an empty text for none.
         conf: folder of YAML files; None = the package's.
-
-    Raises:
-        InputError: the words are not settings of this command, out= is missing, or the launcher fails.
     """
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException

@@ -85,6 +85,7 @@ def search_from_poses(
     """What each camera sees of the words.
 
     Args:
+        scene: the scene with one feature set.
         text: turns words into the features' space.
         absent: words that are not in the scene, with the probability that they are. They are not visible from anywhere,
             however relevant a pixel may be.

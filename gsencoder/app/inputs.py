@@ -62,8 +62,6 @@ def load_asker(settings: AskerSettings, folder: Path, photos: str) -> Asker:
     """The scene of a folder of features, and what is asked about it is looked up with.
 
     Args:
-        settings: settings.
-        folder: of the features.
         photos: the scene that was fused, whose photographs are shown; empty = renders are.
     """
     return asker_of(settings, shown_scene(folder, photos, settings.data), folder)
@@ -105,13 +103,8 @@ def stored_words(
 
     Args:
         features: their folder, or one with a folder for each scene.
-        scene: name of a scene.
         head: adapter head whose outputs are asked; empty = the features.
         space: name of the features where there are several.
-        text: a text tower.
-
-    Raises:
-        InputError: there are no such features or words.
     """
     folder = folder_of(features, scene)
     return queried_scene(load_features(folder), folder, head=head, space=space, text=text)[1]
@@ -129,9 +122,6 @@ def with_stored_features(
 
     The features may have been made from other views of the scene, such as all but those that are evaluated; the origin,
     which is the mean of the cameras, is then another one.
-
-    Raises:
-        InputError: features of another scene, or none.
     """
     for scene, seconds in scenes:
         folder = folder_of(features, scene.name)
@@ -159,11 +149,7 @@ def stored_memory(features: str, scene: Scene) -> QueryMemory | None:
 
 
 def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:
-    """The folders of features at paths: each path, or the folders in it that are called like one of the scenes.
-
-    Raises:
-        InputError: a path that is no folder, that holds neither features nor any such folder, or that is given twice.
-    """
+    """The folders of features at paths: each path, or the folders in it that are called like one of the scenes."""
     folders = DistinctPaths()
     for path in map(Path, paths):
         inner = [path] if holds_features(path) else []
@@ -185,9 +171,6 @@ def photos_of(photos: str, features: Path) -> str:
 
 def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[SetQuestion, ...]:
     """Questions for captions of the best boxes of names, `ask.boxes` for each; names that no table knows have none.
-
-    Raises:
-        InputError: no words lead into the features.
 
     Warns:
         SceneWarning: names that no table knows, or none of which has a box.
@@ -240,19 +223,11 @@ def load_fusable(
     """Loads a scene with Gaussians and views: seeds if it has no splat, orbit cameras if it has no views.
 
     Args:
-        path: of the scene.
         summary: takes the seconds of the steps.
         splat: file of the Gaussians, or empty.
-        data: how the scene is read.
-        seeds: how Gaussians are made.
         orbits: largest number of cameras placed in a bare splat.
-        cameras: where they stand.
         blend: how a bare splat is rendered.
         labels: whether a teacher needs labels, which a bare splat has not.
-        quiet: print nothing.
-
-    Raises:
-        InputError: the scene cannot be read, or has neither views nor what they would be rendered from.
     """
     with summary.step("load"):
         scene = load_scene(path, splat=splat or None, options=data)

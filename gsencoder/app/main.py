@@ -230,11 +230,7 @@ def _fault_of_system(error: OSError) -> str | None:
 
 @contextmanager
 def _impossible_sizes(values: Any) -> Iterator[None]:
-    """Turns the errors of sizes that no memory holds, and of links to themselves, into one line.
-
-    Raises:
-        InputError: in their place.
-    """
+    """Turns the errors of sizes that no memory holds, and of links to themselves, into one line."""
     try:
         yield
     except (MemoryError, OverflowError, RuntimeError, ValueError) as error:

@@ -234,8 +234,6 @@ def options_of(cls: type, prefix: str = "", member: str = "", defaults: Any = No
     """Every option of a settings class, sections included, in order of declaration.
 
     Args:
-        cls: the class.
-        prefix: of the keys.
         member: the member of a choice that the class is.
         defaults: an instance whose values are the defaults, as those of a section are; None = those of the class.
     """
@@ -344,7 +342,6 @@ def preset_values(cls: type, preset: str) -> dict[str, Any]:
 
     Args:
         cls: the settings class of the command.
-        preset: its name.
     """
     options = options_by_key(cls)
     values = {each.key: getattr(each, preset, None) for each in PRESET_OPTIONS}
@@ -449,9 +446,6 @@ def typed(cls: type[T], data: Mapping[str, Any], prefix: str = "") -> T:
     """Builds settings from plain dicts, lists and scalars; missing options have their defaults.
 
     Numbers must be numbers, not text, and NaN is refused, with what the class says of its range.
-
-    Raises:
-        InputError: an unknown key, a wrong type, or a value that the class refuses; the full key is named.
     """
     import dacite
     from dacite.exceptions import DaciteFieldError

@@ -31,11 +31,7 @@ from gsencoder.core.process import raise_dropped_stop
 
 
 def refuse_existing(path: str | Path, overwrite: bool) -> None:
-    """Checks, for commands whose result is one file, that it does not exist or may be replaced.
-
-    Raises:
-        InputError: it exists.
-    """
+    """Checks, for commands whose result is one file, that it does not exist or may be replaced."""
     if os.path.isdir(path):
         raise InputError(f"{path}: is a folder; give the name of a file to write")
     if os.path.lexists(path) and not overwrite:
@@ -44,11 +40,7 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
 
 def check_output_files(paths: Iterable[Path], overwrite: bool) -> None:
     """Checks files before the work whose results they will hold: none exists that may not be replaced, and all can be
-    written.
-
-    Raises:
-        InputError: one exists, its folder is missing, or the system refuses.
-    """
+    written."""
     for path in paths:
         refuse_existing(path, overwrite)
         check_writable(path)
@@ -63,11 +55,7 @@ def sole_writer(path: Path, *, overwrite: bool) -> Iterator[None]:
     for as long as the writing takes.
 
     Args:
-        path: the file.
         overwrite: whether a file that is there is replaced.
-
-    Raises:
-        InputError: another run has written the file meanwhile.
     """
     with ExitStack() as stack:
         # Where the folder is missing or refuses, whoever writes the file says so.
@@ -93,10 +81,6 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         overwrite: replace the output of an earlier run, recognized by its summary.json. Where the system can (Linux),
             old and new are exchanged in one step.
         summary: written into the folder at the end, as summary.json, with the checksums of files that have none.
-
-    Raises:
-        InputError: the folder exists, holds something else, is being written by another run, or cannot be written;
-            or the disk is full.
     """
     # Of a symbolic link the target is replaced, not the link.
     target = Path(os.path.realpath(path))
@@ -133,12 +117,7 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
 
 def _begin(path: str | Path, target: Path, overwrite: bool) -> tuple[Path, int | None]:
     """Creates and locks the hidden folder. Runs that start at the same moment do so one after the other: a folder that
-    is created and not yet locked would be mistaken for that of a killed run.
-
-    Raises:
-        BlockingIOError: another run is writing `target`.
-        InputError: results are there by now, and are not to be replaced.
-    """
+    is created and not yet locked would be mistaken for that of a killed run."""
     parent_lock = lock_folder(target.parent, wait=True)
     try:
         if _remove_stale(target):
@@ -180,11 +159,7 @@ def refuse_to_replace_inputs(out: Path | None, values: Mapping[str, Any]) -> Non
     """Checks that a folder that is about to be replaced holds none of the inputs, and that a file is none.
 
     Args:
-        out: the folder or file.
         values: the settings of the run; every text in them that names an existing file or folder is an input.
-
-    Raises:
-        InputError: it holds one, or is one.
     """
     if out is None or not os.path.exists(out):
         return
@@ -344,11 +319,7 @@ def folder_beside(out: Path, suffix: str) -> Path:
 
 
 def prepared_folder(prepared: Path | None, out: Path, work: Path) -> Path:
-    """Where a training finds what it has prepared, or prepares it: `prepared`, or OUT.prepared where that is None.
-
-    Raises:
-        InputError: it is in the output folder or in that of the state, which are replaced and removed.
-    """
+    """Where a training finds what it has prepared, or prepares it: `prepared`, or OUT.prepared where that is None."""
     prepared = prepared or folder_beside(out, "prepared")
     for name, folder in (("out", Path(os.path.realpath(out))), ("the state of the run", work)):
         if lies_in(prepared, folder):
@@ -380,9 +351,6 @@ class WorkFolder:
 
         Args:
             anew: whether to remove the state of an earlier run.
-
-        Raises:
-            InputError: it holds something else, another run uses it, or it cannot be created or emptied.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)

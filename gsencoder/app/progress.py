@@ -45,7 +45,6 @@ class Progress:
 
     def __init__(self, *, quiet: bool = False, stream: Any = None, every: float = 10.0) -> None:
         """Args:
-        quiet: show nothing.
         stream: the text stream to write to; None = standard error.
         every: seconds between lines if the stream is not a terminal; shorter loops print nothing.
         """

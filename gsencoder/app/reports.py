@@ -28,13 +28,7 @@ PAIR_CELL = 560
 
 
 def add_views(report: HtmlReport, scene: Scene, features: Mapping[str, GaussianFeatures]) -> None:
-    """Adds some views of a scene: photographs where it has them, Gaussians, depth, and features as colors.
-
-    Args:
-        report: of the page.
-        scene: Gaussians and cameras.
-        features: of the Gaussians, by title.
-    """
+    """Adds some views of a scene: photographs where it has them, Gaussians, depth, and features as colors."""
     gaussians = scene.gaussians
     assert gaussians is not None
     assert scene.views is not None
@@ -70,8 +64,6 @@ def add_features(report: HtmlReport, features: Mapping[str, GaussianFeatures], t
     """Adds a table of features.
 
     Args:
-        report: of the page.
-        features: by title.
         truncation: what the basis costs, as a centered cosine error, by title.
     """
     columns = ("features", "channels", "rank of the basis", "energy kept", "centered cosine error", "Gaussians seen")
@@ -95,9 +87,7 @@ def add_words(
     """Adds a picture of each word, with its relevancy and boxes, and a table of the words.
 
     Args:
-        report: of the page.
         scene: Gaussians, and cameras if there are to be pictures.
-        localization: of the words.
         ious: of the first box of each word with the true one; None = the truth is not known.
     """
     words, boxes = localization.queries, {word: [] for word in localization.queries}  # type: ignore[var-annotated]
@@ -229,12 +219,7 @@ def report_fusion(
     """Writes the page of a fusion.
 
     Args:
-        folder: of the results.
-        scene: Gaussians and views.
-        features: that were fused.
         truncation: what their basis costs, as a centered cosine error.
-        teacher: its name.
-        summary: of the command.
     """
     report = HtmlReport(f"Features of {scene.name}", f"Maps of the teacher {teacher}, lifted from all views.")
     assert scene.views is not None
@@ -250,10 +235,7 @@ def report_words(folder: Path, scene: Scene, localization: Localization, summary
     """Writes the page of words in a scene.
 
     Args:
-        folder: of the results.
         scene: Gaussians, and cameras if there are to be pictures.
-        localization: of the words.
-        summary: of the command.
     """
     report = HtmlReport(f"Words in {scene.name}", "Clusters of Gaussians whose features answer a word.")
     boxed = {box.query for box in localization.boxes}
@@ -269,7 +251,6 @@ def report_scores(folder: Path, summary: Summary) -> None:
     """Writes the page of an evaluation: its scores, of all scenes and names, and of each.
 
     Args:
-        folder: of the results.
         summary: of the command, with the results of a protocol.
     """
     results = summary.results
@@ -291,13 +272,7 @@ def report_scores(folder: Path, summary: Summary) -> None:
 
 
 def report_benchmark(folder: Path, scores: ScoreReport, summary: Summary) -> None:
-    """Writes the page of a benchmark: measured rows above those of papers, and the rows by scene and class.
-
-    Args:
-        folder: of the results.
-        scores: of one protocol.
-        summary: of the command.
-    """
+    """Writes the page of a benchmark: measured rows above those of papers, and the rows by scene and class."""
     table = scores.table.without_classes()
     report = HtmlReport(table.title, scores.line)
     _facts(report, {name: value for name, value in scores.results.items() if _is_figure(value)}, summary)

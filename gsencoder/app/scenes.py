@@ -41,11 +41,7 @@ MAX_QUERIES_BYTES = 1 << 20
 
 
 def query_words(query: Sequence[str], queries: str) -> list[str]:
-    """The words of query= and of the file queries=, stripped, without repetitions, in order.
-
-    Raises:
-        InputError: no words, or the file is not text.
-    """
+    """The words of query= and of the file queries=, stripped, without repetitions, in order."""
     lines = list(query)
     if queries:
         lines += _lines_of(Path(queries))
@@ -77,15 +73,9 @@ def queried_scene(
     """A scene with the one feature set that words are compared with, and the words.
 
     Args:
-        scene: of the folder.
-        folder: of the features.
         head: name of an adapter head; empty = the features themselves are asked.
         space: name of the feature set; empty where there is only one.
         words_file: a file of words; empty = those beside the features, or for a head those of `text`.
-        text: a text tower.
-
-    Raises:
-        InputError: there is no such feature set or head, or no words, or the words are not those of the head's space.
     """
     if head:
         # Heads need torch, which finding boxes does without.
@@ -98,11 +88,7 @@ def queried_scene(
 
 
 def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
-    """Loads a folder of features, with the photographs of the scene `photos` if one is given.
-
-    Raises:
-        InputError: a folder or a scene that cannot be read, or photographs of other cameras.
-    """
+    """Loads a folder of features, with the photographs of the scene `photos` if one is given."""
     scene = load_features(folder)
     return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
 
@@ -135,13 +121,9 @@ def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextCon
     """The text table that was given, or the one in the folder of the features, with the tower that made it.
 
     Args:
-        folder: of the features.
         space: of the features that are asked; folders with several may hold words for each.
         words_file: a file of words; empty = the one in the folder.
         text: a tower that is given; otherwise it is searched for when a phrase needs it.
-
-    Raises:
-        InputError: there are no words, or the tower is another than the one that made them.
     """
     if words_file:
         words = words_of_table(load_text_table(find_file(words_file, "words")), text)
@@ -211,18 +193,11 @@ def run_scenes(
     warnings, and those from before the first; that of the run has all, with the names of scenes.
 
     Args:
-        paths: the scenes.
-        out: the folder; None = outputs/NAME/PART.
         part: what the results are called there.
-        run: does one scene.
         summary: of the whole run; that of a single scene.
         overwrite: whether finished scenes are done again.
         worker: number of this process among several that share the scenes; each begins at another one.
         screen: for lines about scenes that are skipped.
-
-    Raises:
-        InputError: two scenes have one name, the error of the only scene, several processes for it, or some of several
-            scenes failed.
     """
     check_names(paths)
     if len(paths) == 1:
@@ -269,11 +244,7 @@ def _was_finished(target: Path, summary: Summary) -> bool:
 
 
 def _is_finished(target: Path, summary: Summary) -> bool:
-    """Whether a folder holds the results of this command with these settings.
-
-    Raises:
-        InputError: it holds results of others.
-    """
+    """Whether a folder holds the results of this command with these settings."""
     try:
         record = json.loads(read_foreign_text(target / SUMMARY_NAME))
     except FileNotFoundError:

@@ -91,8 +91,6 @@ class Summary:
         """The summary of one of several scenes, which has the warnings that the run gets in the block.
 
         Args:
-            name: of the scene.
-            path: of it.
             common: warnings of the run as a whole, which are about each scene.
         """
         summary = Summary(self.command, self.settings)
@@ -144,11 +142,7 @@ class Summary:
 
 
 def write_beside(file: Path, summary: Summary) -> None:
-    """Writes the summary of a run whose result is one file as FILE.summary.json, with the checksum of the file.
-
-    Raises:
-        InputError: the disk is full, or the system refuses.
-    """
+    """Writes the summary of a run whose result is one file as FILE.summary.json, with the checksum of the file."""
     files = {file.name: sha256_of(file)} if file.is_file() else {}
     write_json(f"{file}.{SUMMARY_NAME}", summary.to_dict() | {"files": files})
 
@@ -178,14 +172,9 @@ def report_choice(
     """Prints a setting that a budget chose, warns of what it does not keep, and adds both to the summary.
 
     Args:
-        summary: of the run.
-        scene: its name.
-        knobs: values of knobs.
         predicted: of the setting, by promise; None = not predicted.
         notes: what budgets in conflict do not keep.
-        quiet: see `CommonConfig`.
         of: what the values are of, on the screen.
-        more: further entries of `results.budget`.
     """
     summary.results["budget"] = {
         "chosen": dict(knobs),
@@ -202,8 +191,6 @@ def report_promises(summary: Summary, budget: Budget, realised: Mapping[str, flo
     """A line for each promise that is not broken; warns of those that are, and adds what became of all to the summary.
 
     Args:
-        summary: of the run, after `report_choice`.
-        budget: its promises.
         realised: what was measured, by promise; one that is missing was not.
     """
     promised = {name: budget.promise(name) for name in budget.promised}

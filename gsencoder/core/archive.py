@@ -63,8 +63,6 @@ def damaged_blocks(
     """Numbers of the blocks of an array that do not match their checksums.
 
     Args:
-        data: the bytes of the array.
-        checksums: of `block_checksums`.
         blocks: numbers of the blocks to verify; None = all.
     """
     count = -(-len(data) // BLOCK_BYTES)
@@ -78,7 +76,6 @@ def file_digest(header: Mapping[str, Any], entries: Mapping[str, tuple[str, tupl
     """The SHA-256 over a header (the checksums of all blocks included) and over the types and shapes of the arrays.
 
     Args:
-        header: JSON values.
         entries: type and shape of each array.
     """
     arrays = {name: [dtype, list(shape)] for name, (dtype, shape) in entries.items()}
@@ -110,9 +107,6 @@ def array_offsets(stream: BinaryIO) -> dict[str, tuple[int, int]]:
 
     Args:
         stream: of the file, whose header the library has accepted.
-
-    Raises:
-        InputError: the header is cut off, or is no longer what the library read.
     """
     length = int.from_bytes(read_bytes(stream, (0, 8)).tobytes(), "little")
     text = read_bytes(stream, (8, 8 + min(length, HEADER_LIMIT))).tobytes()
@@ -132,7 +126,6 @@ def read_bytes(stream: BinaryIO, span: tuple[int, int]) -> UInt8[np.ndarray, " b
     """The bytes of a part of a file; fewer where the file ends before.
 
     Args:
-        stream: of the file.
         span: its first byte, and the byte after its last.
     """
     first, last = span
@@ -203,13 +196,8 @@ class Archive:
 
     def __init__(self, path: Path, file: Any, stream: BinaryIO, header: dict[str, Any]) -> None:
         """Args:
-        path: of the file.
         file: the file, opened by safetensors, for names, types and shapes.
         stream: the file, from which arrays are read.
-        header: its JSON header.
-
-        Raises:
-            InputError: another version, or a header that does not match its digest.
         """
         self.path, self.sizes = path, dict[str, int]()
         self._file, self._header, self._names = file, header, frozenset(file.keys())
@@ -225,11 +213,7 @@ class Archive:
         self.checksums: Mapping[str, str] = checksums
 
     def array(self, name: str, dtype: str, shape: tuple[int | str, ...]) -> np.ndarray:
-        """Reads an array; a letter in its shape stands for the same size in all arrays of the file.
-
-        Raises:
-            InputError: missing, of another type or size, or not finite.
-        """
+        """Reads an array; a letter in its shape stands for the same size in all arrays of the file."""
         got_dtype, got = self._stored(name)
         expected = tuple(self.sizes.get(side, side) if isinstance(side, str) else side for side in shape)
         same = len(got) == len(expected) and all(
@@ -248,11 +232,7 @@ class Archive:
         return values
 
     def shape(self, name: str, dtype: str, axes: int) -> tuple[int, ...]:
-        """The shape of an array, without reading it.
-
-        Raises:
-            InputError: missing, of another type, or with another number of axes.
-        """
+        """The shape of an array, without reading it."""
         got_dtype, shape = self._stored(name)
         if got_dtype != dtype or len(shape) != axes:
             raise InputError(
@@ -287,11 +267,7 @@ class Archive:
         return DTYPES.get(stored.get_dtype(), stored.get_dtype()), tuple(stored.get_shape())
 
     def value(self, key: str, *kinds: type | None) -> Any:
-        """Reads a value of the header, which must be of one of these types.
-
-        Raises:
-            InputError: missing or of another type.
-        """
+        """Reads a value of the header, which must be of one of these types."""
         value = self._header.get(key)
         # JSON's true is a Python int, and no number here is meant to be one.
         good = (value is None and None in kinds) or isinstance(value, tuple(kind for kind in kinds if kind is not None))
@@ -304,11 +280,7 @@ class Archive:
         return value
 
     def verify(self) -> None:
-        """Verifies the checksums of all arrays.
-
-        Raises:
-            InputError: the file is damaged.
-        """
+        """Verifies the checksums of all arrays."""
         for name in sorted(self._names):
             self._read(name)
 
@@ -343,12 +315,8 @@ def write_archive(path: Path, arrays: Mapping[str, np.ndarray], header: Mapping[
     """Writes arrays and header with their checksums; an existing file is replaced once the new one is complete.
 
     Args:
-        path: the file.
         arrays: by name, of the types in `DTYPES`.
         header: JSON values, under other keys than `RESERVED_KEYS`.
-
-    Raises:
-        InputError: the disk is full, or the system refuses.
     """
     pieces = {name: _contiguous(array) for name, array in arrays.items()}
     assert not set(RESERVED_KEYS) & set(header)
@@ -389,11 +357,7 @@ def _contiguous(array: np.ndarray) -> np.ndarray:
 @contextmanager
 def open_archive(path: Path) -> Iterator[Archive]:
     """Opens the file at `path` for the block. An `InputError` in the block that does not name the file is prefixed with
-    its path, so that errors of validation say which file they are about.
-
-    Raises:
-        InputError: missing, damaged, or of another version.
-    """
+    its path, so that errors of validation say which file they are about."""
     from safetensors import SafetensorError, safe_open
 
     if not path.is_file():
@@ -413,11 +377,7 @@ def open_archive(path: Path) -> Iterator[Archive]:
 
 
 def verify_archive(path: Path) -> None:
-    """Reads an archive and verifies its checksums.
-
-    Raises:
-        InputError: missing, damaged, or of another version.
-    """
+    """Reads an archive and verifies its checksums."""
     with open_archive(path) as file:
         file.verify()
 
@@ -434,13 +394,9 @@ class MappedArrays:
         """Maps the file.
 
         Args:
-            path: of the file.
             types: dtype and number of axes of each array.
             earlier: a closed map of these arrays; blocks that it verified are not verified again if the file has not
                 been written since.
-
-        Raises:
-            InputError: missing, damaged, or without these arrays.
         """
         self.path = path
         with open_archive(path) as file:
@@ -473,26 +429,14 @@ class MappedArrays:
         return self._arrays[name].shape
 
     def array(self, name: str) -> np.ndarray:
-        """A complete array, verified; a view of the map.
-
-        Raises:
-            InputError: the file is damaged, or was cut off.
-        """
+        """A complete array, verified; a view of the map."""
         self._check_size()
         if name in self._unchecked:
             self._check(name, np.flatnonzero(self._unchecked[name]))
         return self._arrays[name]
 
     def rows(self, name: str, rows: Int[np.ndarray, " n"]) -> np.ndarray:
-        """Copies rows of an array.
-
-        Args:
-            name: of the array.
-            rows: indices.
-
-        Raises:
-            InputError: these rows are damaged, or the file was cut off.
-        """
+        """Copies rows of an array."""
         self._check_size()
         array = self._arrays[name]
         if name in self._unchecked and len(rows):
@@ -507,11 +451,7 @@ class MappedArrays:
         return values
 
     def row_range(self, name: str, first: int, last: int) -> np.ndarray:
-        """Rows `first` to `last`, exclusive, of an array; a view of the map.
-
-        Raises:
-            InputError: these rows are damaged, or the file was cut off.
-        """
+        """Rows `first` to `last`, exclusive, of an array; a view of the map."""
         self._check_size()
         array = self._arrays[name]
         if name in self._unchecked and last > first:
@@ -555,14 +495,10 @@ def read_npz(
     """Reads arrays of an .npz by name.
 
     Args:
-        file: the archive.
         required: kind of type ("U" text, "f" floating point, "b" bool, "i" and "u" integers) and number of axes of each
             array.
         optional: the same for arrays that may be missing.
         max_text: largest number of characters of an entry of text.
-
-    Raises:
-        InputError: damaged or hostile, or an array is missing or of another kind.
     """
     try:
         check_foreign(file)
@@ -628,11 +564,7 @@ class RowFile:
         self._file = TemporaryFile()  # noqa: SIM115
 
     def append(self, rows: Float32[np.ndarray, "n D"]) -> None:
-        """Adds rows after those that are there.
-
-        Raises:
-            InputError: rows of another length, or the disk is full.
-        """
+        """Adds rows after those that are there."""
         if rows.shape[1] != self._channels:
             raise InputError(f"rows: expected {self._channels} channels, got {rows.shape[1]}")
         try:
@@ -665,12 +597,7 @@ def copy_checked(source: Path, target: Path, check: Callable[[Path], object]) ->
     is replaced once the copy is complete and checked.
 
     Args:
-        source: the file.
-        target: its copy.
         check: reads the copy; raises InputError where it is damaged.
-
-    Raises:
-        InputError: the source cannot be read, the copy cannot be written, or is damaged; then the source is named.
     """
     with atomic_file(target) as stream:
         for block in _blocks(source):

@@ -13,11 +13,7 @@ def choose_device(name: Device, local_rank: int = 0) -> torch.device:
     """The device of a process: with "auto" a GPU if torch sees one, else the CPU.
 
     Args:
-        name: the option.
         local_rank: number of the process on its machine; each process takes another GPU.
-
-    Raises:
-        InputError: another name, or no GPU for this process.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise InputError(f"device: expected auto, cpu or cuda, got {name!r}")
@@ -61,11 +57,7 @@ def enough_memory(subject: str, remedy: str) -> Iterator[None]:
     """Turns a lack of GPU memory into an error that says what needs less.
 
     Args:
-        subject: who computes, for the message.
         remedy: the option that makes it need less.
-
-    Raises:
-        InputError: the GPU has not enough memory.
     """
     try:
         yield

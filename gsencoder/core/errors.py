@@ -74,11 +74,7 @@ def renamed_options(section: str, typed: str, options: Iterable[str]) -> Iterato
 
 @contextmanager
 def readable(path: str | Path) -> Iterator[None]:
-    """Turns an error of the system in the block into one that names the file: an error of reading does not.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
+    """Turns an error of the system in the block into one that names the file: an error of reading does not."""
     try:
         yield
     except OSError as error:

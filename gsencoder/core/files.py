@@ -34,12 +34,10 @@ def lock_folder(folder: str | Path, *, wait: bool = False) -> int | None:
     ends. None where folders cannot be locked (some network file systems).
 
     Args:
-        folder: an existing one.
         wait: whether to wait until another run releases its lock.
 
     Raises:
         BlockingIOError: another run holds the lock.
-        OSError: there is no such folder, or it may not be opened.
     """
     if fcntl is None:
         return None
@@ -93,9 +91,6 @@ def temporary_beside(target: Path) -> Iterator[Path]:
 
     The name is the same every time, so that the file that a killed run left is written over by the next and not left
     for good. The file is locked; a second run that writes the same target meanwhile gets a name of its own.
-
-    Raises:
-        OSError: the folder is missing, or the system refuses.
     """
     path = target.parent / f".{_short(target.name)}.tmp"
     descriptor = _locked_file(path)
@@ -158,10 +153,6 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
 
     It is written under a temporary name in the same folder, synced to disk and renamed, so that a kill or a full disk
     leaves an earlier file as it was.
-
-    Raises:
-        InputError: the folder is missing, or `target` is one.
-        WriteError: the disk is full, or the system refuses the write.
     """
     target = Path(path)
     with _named_errors(target):
@@ -175,12 +166,7 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def check_writable(path: str | Path) -> None:
-    """Checks that `atomic_file` could write a file, by opening its temporary file: before work that takes a while.
-
-    Raises:
-        InputError: the folder is missing, or `path` is one.
-        WriteError: the disk is full, or the system refuses the write.
-    """
+    """Checks that `atomic_file` could write a file, by opening its temporary file: before work that takes a while."""
     target = Path(path)
     with _named_errors(target):
         _check_folder(target)
@@ -258,11 +244,7 @@ def json_bytes(value: Any) -> tuple[bytes, list[str]]:
 
 
 def write_bytes(path: str | Path, data: bytes) -> None:
-    """Writes a file atomically; an existing one is replaced.
-
-    Raises:
-        InputError: the folder is missing, the disk is full, or the system refuses.
-    """
+    """Writes a file atomically; an existing one is replaced."""
     with atomic_file(path) as stream:
         stream.write(data)
 
@@ -271,9 +253,6 @@ def write_json(path: str | Path, value: Any) -> None:
     """Writes a JSON file atomically; values are converted as by `plain`.
 
     Numbers that are not finite become null, with one counted `SceneWarning` that names them.
-
-    Raises:
-        InputError: as `write_bytes`.
     """
     data, lost = json_bytes(value)
     if lost:
@@ -313,12 +292,8 @@ def write_picture(path: Path, picture: Image.Image | np.ndarray, **options: Any)
     over what it did not take.
 
     Args:
-        path: the file.
         picture: a picture, or an array of one that Pillow takes: uint8 [H, W, 3], uint8 [H, W] or uint16 [H, W].
         options: of Pillow's encoder; PNG files are compressed at `PNG_LEVEL` without one.
-
-    Raises:
-        InputError: the folder is missing, the disk is full, or the system refuses.
     """
     write_bytes(path, picture_bytes(picture, path.suffix, **options))
 
@@ -341,12 +316,7 @@ MODEL_BYTES = 16 << 30
 
 
 def open_foreign(path: str | Path, max_bytes: int | None = None) -> BinaryIO:
-    """Opens a regular file, or a link to one, for reading; a pipe does not block and a device is not read.
-
-    Raises:
-        OSError: as `open`.
-        InputError: it is a folder, a pipe, a socket or a device, or has more bytes.
-    """
+    """Opens a regular file, or a link to one, for reading; a pipe does not block and a device is not read."""
     # Opening a pipe waits for a writer, unless it is asked not to; what was opened is then looked at, not its name.
     flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0) | getattr(os, "O_NOCTTY", 0)
     descriptor = os.open(path, flags)
@@ -359,12 +329,7 @@ def open_foreign(path: str | Path, max_bytes: int | None = None) -> BinaryIO:
 
 
 def check_foreign(path: str | Path, max_bytes: int | None = None) -> None:
-    """Checks what `open_foreign` does, of a file that a library opens by its name.
-
-    Raises:
-        OSError: there is no such file, or the system refuses.
-        InputError: as `open_foreign`.
-    """
+    """Checks what `open_foreign` does, of a file that a library opens by its name."""
     _check(path, os.stat(path), max_bytes)
 
 
@@ -406,11 +371,7 @@ def sha256_of(path: Path) -> str:
 
 
 def checksums_of(folder: Path) -> dict[str, str]:
-    """The SHA-256 of each file below a folder that has no checksums of its own, by its path in the folder.
-
-    Raises:
-        InputError: a file cannot be read.
-    """
+    """The SHA-256 of each file below a folder that has no checksums of its own, by its path in the folder."""
     sums = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.name != SUMMARY_NAME:
@@ -476,11 +437,7 @@ def sealed(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def unsealed(row: Any) -> dict[str, Any]:
-    """A row without its checksum.
-
-    Raises:
-        ValueError: it is no object, has no checksum, or is not as it was written.
-    """
+    """A row without its checksum."""
     if not isinstance(row, dict):
         raise ValueError("the row is no object")
     plain = {name: value for name, value in row.items() if name != SUM}

@@ -28,9 +28,6 @@ class EventFile:
         Args:
             folder: of the files of all runs; created if it does not exist.
             purge_step: events of earlier files from this step on, which a killed run left, are hidden.
-
-        Raises:
-            InputError: TensorBoard is not installed, the disk is full, or the system refuses.
         """
         try:
             from tensorboard.compat.proto.event_pb2 import Event, SessionLog
@@ -53,20 +50,12 @@ class EventFile:
         self._write(Event(wall_time=time.time(), step=purge_step, session_log=start))
 
     def add(self, step: int, values: dict[str, float]) -> None:
-        """Adds scalars.
-
-        Raises:
-            InputError: the disk is full, or the system refuses.
-        """
+        """Adds scalars."""
         for name, value in values.items():
             self._write(self._event(wall_time=time.time(), step=step, summary=self._summary.scalar(name, value)))
 
     def picture(self, step: int, name: str, pixels: np.ndarray) -> None:
-        """Adds a picture, uint8 [H, W, 3].
-
-        Raises:
-            InputError: the disk is full, or the system refuses.
-        """
+        """Adds a picture, uint8 [H, W, 3]."""
         summary = self._summary.image(name, pixels, dataformats="HWC")
         self._write(self._event(wall_time=time.time(), step=step, summary=summary))
 
@@ -99,9 +88,6 @@ class Log:
 
         Warns:
             SceneWarning: an earlier run wrote rows, and the file is missing.
-
-        Raises:
-            InputError: TensorBoard is asked for and not installed, or the log cannot be written.
         """
         self.path = folder / LOG_FILE
         self._columns: list[str] = []
@@ -125,21 +111,13 @@ class Log:
         self._rewrite(rows)
 
     def add(self, step: int, values: Mapping[str, float]) -> None:
-        """Appends a row; every number is also a TensorBoard scalar.
-
-        Raises:
-            InputError: the disk is full.
-        """
+        """Appends a row; every number is also a TensorBoard scalar."""
         self._append({"step": step, **values})
         if self._events is not None:
             self._events.add(step, dict(values))
 
     def picture(self, step: int, name: str, pixels: np.ndarray) -> None:
-        """Writes a picture, uint8 [H, W, 3]: a file `NAME_STEP.png` beside the log, and for TensorBoard.
-
-        Raises:
-            InputError: the disk is full.
-        """
+        """Writes a picture, uint8 [H, W, 3]: a file `NAME_STEP.png` beside the log, and for TensorBoard."""
         path = self.path.parent / f"{name}_{step:06d}.png"
         try:
             path.parent.mkdir(parents=True, exist_ok=True)

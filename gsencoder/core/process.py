@@ -198,9 +198,6 @@ def rank_from_environment(environment: Mapping[str, str]) -> tuple[ProcessRank, 
 
     Returns:
         The rank, and the init_method for `torch.distributed`: "tcp://…" under SLURM, "env://" under torchrun, else "".
-
-    Raises:
-        InputError: the variables contradict each other.
     """
     if "RANK" in environment and "WORLD_SIZE" in environment:
         names = ("RANK", "WORLD_SIZE", "LOCAL_RANK")
@@ -228,11 +225,7 @@ def rank_from_environment(environment: Mapping[str, str]) -> tuple[ProcessRank, 
 
 
 def store_address(environment: Mapping[str, str], init_method: str) -> tuple[str, int]:
-    """The host and the port at which the processes of a launcher meet.
-
-    Raises:
-        InputError: the variables do not say it.
-    """
+    """The host and the port at which the processes of a launcher meet."""
     if init_method.startswith("tcp://"):
         host, _, port = init_method.removeprefix("tcp://").rpartition(":")
         environment = {"MASTER_ADDR": host, "MASTER_PORT": port}
@@ -249,10 +242,6 @@ def refuse_several(subject: str, advice: str) -> None:
 
     Args:
         subject: what runs in one process, for the error.
-        advice: what to do instead.
-
-    Raises:
-        InputError: in every process: there are several.
     """
     process, _ = rank_from_environment(os.environ)
     if process.world_size > 1:
@@ -263,11 +252,7 @@ def refuse_several(subject: str, advice: str) -> None:
 
 
 def first_host(nodes: str) -> str:
-    """The first host of a SLURM node list such as `a[03-07,9],b1`.
-
-    Raises:
-        InputError: the list is empty.
-    """
+    """The first host of a SLURM node list such as `a[03-07,9],b1`."""
     match = re.match(r"([^\[,\s]+)(?:\[([^\]]*)\])?([^\[,\s]*)", nodes)
     if not match:
         raise InputError("SLURM: the node list (SLURM_STEP_NODELIST) is empty; set MASTER_ADDR")
@@ -338,7 +323,6 @@ class Clock:
         seconds of all threads.
 
         Args:
-            seconds: of the wall clock.
             steps: the seconds of each thread by step, or of each piece of its work.
         """
         of_threads: dict[str, float] = {}

@@ -63,9 +63,6 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
     Args:
         settings: a frozen dataclass, sections of which are frozen dataclasses.
         values: by key, with dots between sections.
-
-    Raises:
-        InputError: no such key, or a value that the settings refuse.
     """
     assert is_dataclass(settings)
     assert not isinstance(settings, type)
@@ -86,11 +83,7 @@ def with_values(settings: Settings, values: Mapping[str, Any]) -> Settings:
 
 
 def with_knobs(settings: Settings, knobs: Sequence[Knob], values: Mapping[str, Any]) -> Settings:
-    """The settings with values of knobs, by the knobs' names.
-
-    Raises:
-        InputError: no such knob, or a value that the settings refuse; the knobs are named.
-    """
+    """The settings with values of knobs, by the knobs' names."""
     by_name = {knob.name: knob for knob in knobs}
     for name in values:
         if name not in by_name:
@@ -130,11 +123,7 @@ def changed_knobs(base: object, knobs: Iterable[Knob], values: Mapping[str, Any]
 
 
 def read_value(settings: object, knob: Knob, text: str) -> Any:
-    """A value of a knob from text, of the type that the settings declare.
-
-    Raises:
-        InputError: text of another type.
-    """
+    """A value of a knob from text, of the type that the settings declare."""
     *sections, name = knob.key.split(".")
     owner = value_at(settings, ".".join(sections)) if sections else settings
     annotation = typing.get_type_hints(type(owner))[name]
@@ -169,9 +158,6 @@ class Budget:
     """Promises: a frozen dataclass with fields `error`, `seconds` or `megabytes`, None where nothing is promised.
 
     A field `seed`, where there is one, is of what the choice draws.
-
-    Raises:
-        InputError: a promise that means nothing, or a negative seed.
     """
 
     __slots__ = ()
@@ -205,13 +191,7 @@ class Budget:
         return f"budget.{name}={shown_value(self.promise(name))}"
 
     def conflict(self, first: str, other: str, needed: float) -> str:
-        """What is said where a promise cannot be kept beside one that comes before it.
-
-        Args:
-            first: the promise that wins.
-            other: the one that is broken.
-            needed: what it becomes.
-        """
+        """What is said where a promise cannot be kept beside one that comes before it."""
         return (
             f"{self.shown(first)} takes about {needed:.3g}{PROMISES[other]}, more than {self.shown(other)}; "
             f"budget.{first} comes first"
@@ -222,14 +202,9 @@ def check_governed(budget: Budget, settings: object, default: object, keys: Iter
     """Refuses options that a budget chooses where they are set by hand.
 
     Args:
-        budget: any of its promises.
-        settings: of the stage.
         default: such settings with every option at its default.
         keys: of the options, with dots between sections.
         section: that the settings are on the command line.
-
-    Raises:
-        InputError: an option has another value than its default.
     """
     if not budget.promised:
         return
@@ -280,9 +255,6 @@ def within_seconds(
     """The best setting that keeps promised seconds; the fastest where none does. A promised error comes first.
 
     Args:
-        settings: to choose among.
-        best: `best_setting` of them.
-        budget: that promises seconds.
         seconds: that a setting takes, from the beginning of the choice.
 
     Returns:

@@ -293,11 +293,7 @@ def _encode_into(
 
 
 def requested_teachers(encoder: Encoder, names: tuple[str, ...]) -> list[str]:
-    """The teachers of an encoder that are named, by themselves or by their feature spaces, or all of them.
-
-    Raises:
-        InputError: the encoder has no such teacher.
-    """
+    """The teachers of an encoder that are named, by themselves or by their feature spaces, or all of them."""
     requested = [teacher_of_space(encoder.spaces, name, option="spaces") for name in names]
     return requested or list(encoder.spaces)
 
@@ -316,11 +312,7 @@ def _basis_figures(
 
 
 def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Encoder, count: int) -> dict[str, float]:
-    """How well the encoder's basis represents its teacher's maps of some of a scene's views.
-
-    Raises:
-        InputError: the scene has no views, or the teacher is not known or cannot be loaded.
-    """
+    """How well the encoder's basis represents its teacher's maps of some of a scene's views."""
     # Teachers need torch, which encoding with an exported graph does without.
     from gsencoder.fusion.errors import basis_fit
     from gsencoder.teachers.build import build_teacher, words_by_teacher

@@ -182,11 +182,7 @@ def run(config: ExportConfig, summary: Summary) -> None:
 
 
 def _export_memory(config: ExportConfig, out: Path, summary: Summary) -> None:
-    """Writes the attention of a memory.
-
-    Raises:
-        InputError: no memory, or several and none is named.
-    """
+    """Writes the attention of a memory."""
     with summary.step("load"):
         memories = load_memories(config.memory)
         memory = _memory_of(memories, config.space)
@@ -204,11 +200,7 @@ def _export_memory(config: ExportConfig, out: Path, summary: Summary) -> None:
 
 
 def _memory_of(memories: Mapping[str | None, QueryMemory], space: str) -> QueryMemory:
-    """The memory of a teacher, by its name in the folder or that of its feature space.
-
-    Raises:
-        InputError: there is none of this name, or there are several and none is named.
-    """
+    """The memory of a teacher, by its name in the folder or that of its feature space."""
     if not space and len(memories) == 1:
         return next(iter(memories.values()))
     by_name = {name or memory.space.name: memory for name, memory in memories.items()}

@@ -244,11 +244,7 @@ def load_weights_spaces(weights: str) -> OutputSpaces:
 
 
 def basis_for(space: FeatureSpace, outputs: OutputSpaces, weights: str) -> FeatureBasis:
-    """The basis in which an encoder gives features of a space.
-
-    Raises:
-        InputError: it gives none of them, or all their channels.
-    """
+    """The basis in which an encoder gives features of a space."""
     by_name = outputs.by_teacher
     name = name_of_space({each: output.space for each, output in by_name.items()}, space, f"basis={weights}")
     basis = by_name[name].basis

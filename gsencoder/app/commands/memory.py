@@ -227,11 +227,7 @@ def predicted_features(scene: Scene, config: MemoryCommandConfig) -> dict[str, G
 
 
 def in_space(predicted: Mapping[str, GaussianFeatures], space: FeatureSpace, weights: str) -> GaussianFeatures:
-    """The predicted features of a teacher's space.
-
-    Raises:
-        InputError: the encoder gives none.
-    """
+    """The predicted features of a teacher's space."""
     name = name_of_space({each: features.space for each, features in predicted.items()}, space, f"weights={weights}")
     return predicted[name]
 

@@ -75,12 +75,8 @@ def read_dataset(path: Path, split: str, scenes: Sequence[str]) -> tuple[TruthQu
     """Questions with answers of ScanQA or SQA3D, by their scenes, of one file or of the one in a folder.
 
     Args:
-        path: file or folder.
         split: a part of the file's name in a folder with several.
         scenes: names of scenes, with * and ?; empty = all.
-
-    Raises:
-        InputError: no such file, several, no questions about these scenes, or answers that are missing or empty.
     """
     questions = read_questions(_dataset_file(path, split))
     if scenes:
@@ -114,11 +110,7 @@ def _dataset_file(path: Path, split: str) -> Path:
 
 
 def scene_folders(questions: Sequence[TruthQuestion], folder: Path, option: str) -> dict[str, Path]:
-    """The folder of each scene that is asked about.
-
-    Raises:
-        InputError: scenes without one.
-    """
+    """The folder of each scene that is asked about."""
     if not folder.is_dir():
         raise InputError(f"{option}: {folder} is no folder; expected one with a folder for each scene")
     names = list(dict.fromkeys(each.scene for each in questions))
@@ -143,16 +135,9 @@ def prepare_prompts(
     """Writes the prompts that are not in the folder yet; it is locked meanwhile.
 
     Args:
-        questions: by their scenes.
         features: with a folder for each scene.
         photos: the same for photographs; empty = renders are shown.
-        recipe: how questions become prompts.
         folder: created if it does not exist.
-        track: progress.
-
-    Raises:
-        InputError: a scene or question that cannot be used, or the folder holds something else or is used by another
-            run.
 
     Warns:
         SceneWarning: questions that name nothing, once with their number.
@@ -192,11 +177,7 @@ def prepare_prompts(
 def tuning_pairs(
     questions: Sequence[TruthQuestion], features: Path, photos: str, recipe: PromptRecipe, store: PromptStore
 ) -> list[TuningPair]:
-    """Questions with their prompts and answers; arguments are those of `prepare_prompts`.
-
-    Raises:
-        InputError: a prompt is missing.
-    """
+    """Questions with their prompts and answers; arguments are those of `prepare_prompts`."""
     pairs = []
     for each, key in zip(questions, prompt_keys(questions, features, photos, recipe), strict=True):
         if key not in store.prompts:

@@ -90,11 +90,7 @@ def check_promises(
     config: BudgetOptions,
     summary: Summary,
 ) -> list[str]:
-    """Measures what was promised; returns a line for each promise, and warns of those that are broken.
-
-    Args:
-        targets: for which it was made.
-    """
+    """Measures what was promised; returns a line for each promise, and warns of those that are broken."""
     budget, realised = config.budget, dict[str, float]()
     if budget.error is not None and budget.check:
         with summary.step("check"):
