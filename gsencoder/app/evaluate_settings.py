@@ -10,6 +10,7 @@ from gsencoder.app.options import CommonConfig
 from gsencoder.app.progress import Progress
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import retain_freed_memory
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
@@ -54,36 +55,22 @@ from gsencoder.types import Scene
 class EvaluateConfig(CommonConfig):
     """Settings of `evaluate`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={"help": "labeled scenes, or folders of scenes", "metavar": "SCENE", "required": True},
+    paths: tuple[str, ...] = option((), "labeled scenes, or folders of scenes", metavar="SCENE", required=True)
+    weights: str = option(
+        "", "encoder whose features are evaluated (see encode); empty = the fused features of the teacher"
     )
-    weights: str = field(
-        default="",
-        metadata={
-            "help": "encoder whose features are evaluated (see encode); empty = the fused features of the teacher"
-        },
+    features: str = option(
+        "",
+        "features that are evaluated in place of those: a folder written by fuse, encode, pack or memory, "
+        "or one with such a folder for each scene",
     )
-    features: str = field(
-        default="",
-        metadata={
-            "help": "features that are evaluated in place of those: a folder written by fuse, encode, pack or memory, "
-            "or one with such a folder for each scene"
-        },
+    space: str = option(
+        "", "of an encoder or features of several teachers, the one that is evaluated; empty = that of the words"
     )
-    space: str = field(
-        default="",
-        metadata={
-            "help": "of an encoder or features of several teachers, the one that is evaluated; empty = that of the "
-            "words"
-        },
-    )
-    head: str = field(
-        default="",
-        metadata={
-            "help": "adapter head whose outputs are evaluated, such as siglip, with the words of text=; empty = the "
-            "features themselves"
-        },
+    head: str = option(
+        "",
+        "adapter head whose outputs are evaluated, such as siglip, with the words of text=; empty = the "
+        "features themselves",
     )
     protocol: (
         LocalizationProtocol
@@ -96,22 +83,18 @@ class EvaluateConfig(CommonConfig):
         | ReferringProtocol
         | RetrievalProtocol
     ) = field(default_factory=LocalizationProtocol)
-    classes: str = field(
-        default="",
-        metadata={
-            "help": "of recognition, instances and semantics: scannet20, scannet200, a CSV file with the columns id, "
-            "name and group, or ScanNet++'s top100.txt; empty = the names of the scenes' objects"
-        },
+    classes: str = option(
+        "",
+        "of recognition, instances and semantics: scannet20, scannet200, a CSV file with the columns id, "
+        "name and group, or ScanNet++'s top100.txt; empty = the names of the scenes' objects",
     )
-    label_map: str = field(
-        default="",
-        metadata={
-            "help": "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv, which gives the raw names of "
-            "objects a class of classes=, and of referring tells unique from multiple"
-        },
+    label_map: str = option(
+        "",
+        "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv, which gives the raw names of "
+        "objects a class of classes=, and of referring tells unique from multiple",
     )
-    splat: str = field(default="", metadata={"help": f"Gaussians of the scenes; empty = seeds. {READABLE}"})
-    report: bool = field(default=False, metadata={"help": "write report.html, a page with pictures and figures"})
+    splat: str = option("", f"Gaussians of the scenes; empty = seeds. {READABLE}")
+    report: bool = option(False, "write report.html, a page with pictures and figures")
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)

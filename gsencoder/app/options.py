@@ -25,13 +25,13 @@ import re
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import shown_value
+from gsencoder.core.settings import option, shown_value, value_at
 
 Kind = Literal["text", "list", "value"]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -271,8 +271,8 @@ def options_of(cls: type, prefix: str = "", member: str = "", defaults: Any = No
 def options_by_key(cls: type, prefix: str = "") -> Mapping[str, Option]:
     """The options of a class by full key; where members of a choice share a key, the option of the first."""
     options: dict[str, Option] = {}
-    for option in options_of(cls, prefix):
-        options.setdefault(option.key, option)
+    for each in options_of(cls, prefix):
+        options.setdefault(each.key, each)
     return options
 
 
@@ -385,17 +385,15 @@ class CommonConfig:
     has_experiments: ClassVar[bool] = False
     """Whether `experiment=NAME` takes options of several sections from `conf/experiment/NAME.yaml`."""
 
-    out: Path | None = field(default=None, metadata={"help": "where the results go", "metavar": "PATH"})
-    overwrite: bool = field(default=False, metadata={"help": "replace what an earlier run wrote to out="})
-    preset: Preset = field(
-        default=DEFAULT_PRESET,
-        metadata={
-            "like_group": True,
-            "help": "options that trade cost for accuracy, set together where settings are composed; the command line "
-            "and experiments go over it",
-        },
+    out: Path | None = option(None, "where the results go", metavar="PATH")
+    overwrite: bool = option(False, "replace what an earlier run wrote to out=")
+    preset: Preset = option(
+        DEFAULT_PRESET,
+        "options that trade cost for accuracy, set together where settings are composed; the command line "
+        "and experiments go over it",
+        like_group=True,
     )
-    quiet: bool = field(default=False, metadata={"help": "print nothing but warnings and errors"})
+    quiet: bool = option(False, "print nothing but warnings and errors")
 
 
 def _strict(target: type, accepted: tuple[type, ...]) -> Any:
@@ -498,15 +496,10 @@ def _named(message: str, prefix: str, names: Iterable[str]) -> str:
 
 def check_required(cls: type, config: object) -> None:
     """Raises an InputError about the first required option that is empty."""
-    for option in options_of(cls):
-        if option.required and not option.member:
-            value: Any = config
-            for name in option.key.split("."):
-                value = getattr(value, name)
-            if value is None or value == "" or value == ():
-                if option.key == "paths":
-                    raise InputError(f"{option.metavar or 'PATH'} is missing: {option.help}")
-                raise InputError(f"{option.key}= is missing: {option.help}")
+    for each in options_of(cls):
+        if each.required and not each.member and value_at(config, each.key) in (None, "", ()):
+            name = f"{each.metavar or 'PATH'}" if each.key == "paths" else f"{each.key}="
+            raise InputError(f"{name} is missing: {each.help}")
 
 
 def settings(config: object) -> dict[str, Any]:

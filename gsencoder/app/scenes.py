@@ -3,7 +3,7 @@
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from gsencoder.core.files import (
 )
 from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import refuse_several
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, check_names, load_scene, scene_name
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import WORDS_FILE, load_features, table_path
@@ -97,14 +98,12 @@ def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
 class WordsOptions(CommonConfig):
     """Which words are compared with which features. Without slots, as `CommonConfig`."""
 
-    words: str = field(default="", metadata={"help": "text table; empty = the one in the folder of the features"})
-    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
-    head: str = field(
-        default="",
-        metadata={
-            "help": "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
-            "features themselves are"
-        },
+    words: str = option("", "text table; empty = the one in the folder of the features")
+    space: str = option("", "name of the feature space, if the folder holds several")
+    head: str = option(
+        "",
+        "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
+        "features themselves are",
     )
 
 

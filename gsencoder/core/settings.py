@@ -1,23 +1,10 @@
-"""Values of settings: knobs, limits of budgets, choices, and the first difference between two sets of them.
+"""Settings: options with their limits, knobs that trade cost for accuracy, budgets, and differences between settings.
 
-Knobs: the values of a stage's settings that trade cost for accuracy, and how they are put into its frozen settings.
-
-Stages list their knobs (`gsencoder.fusion.package`, `gsencoder.evaluate.tradeoff.stages`), and whatever chooses
-settings, a sweep or a budget, needs no more than such a list.
-
-Budgets: what the section `budget` of a command may promise, and how promises are checked, ordered and worded.
-
-Each stage with budgets has a frozen dataclass of its promises beside its code (`gsencoder.reconstruct.plan`,
-`gsencoder.fusion.cost_model`, `gsencoder.fusion.package`, `gsencoder.infer.chunks`,
-`gsencoder.infer.views.budget`), with those fields of `PROMISES` that mean something there.
-
-Options that were added after settings had been stored in files, each with the value that says what was done before.
-
-Prepared scenes and checkpoints are used only with the settings that they were made with. Files that are older than an
-option do not have it, and are compared as if they had this value. Older ones also hold the path of each scene, where
-later ones say that it was trained on: a data set may have been moved since.
+Stages list their knobs (`gsencoder.fusion.package`, `gsencoder.evaluate.tradeoff.stages`); a sweep or a budget needs no
+more than such a list to choose settings.
 """
 
+import operator
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -25,6 +12,46 @@ from math import inf
 from typing import Any, Literal, Protocol, TypeVar, get_args, get_origin, runtime_checkable
 
 from gsencoder.core.errors import InputError
+
+LIMITS: Mapping[str, tuple[Callable[[Any, Any], bool], str]] = {
+    "ge": (operator.ge, "{} or more"),
+    "gt": (operator.gt, "above {}"),
+    "le": (operator.le, "at most {}"),
+    "lt": (operator.lt, "below {}"),
+}
+"""Limits of a number, by their names in the metadata of a field."""
+
+
+def option(default: Any, help: str, **metadata: Any) -> Any:
+    """A field of settings with its meaning and its limits, which `check_limits` checks.
+
+    Args:
+        default: its default, of a type that cannot be changed.
+        help: its meaning, one line, which `gsencoder COMMAND --help` shows.
+        metadata: limits `ge`, `gt`, `le`, `lt` of a number, or of each number of a tuple; `one`, what a tuple holds at
+            most one of; and what the command line knows (`gsencoder.app.options`).
+    """
+    return field(default=default, metadata={"help": help, **metadata})
+
+
+def check_limits(settings: Any) -> None:
+    """Checks the values of a settings dataclass against the limits at its fields; None is within all of them.
+
+    Raises:
+        InputError: a value is outside; the field is named.
+    """
+    for item in fields(settings):
+        value, limits = (
+            getattr(settings, item.name),
+            {name: item.metadata[name] for name in LIMITS.keys() & item.metadata},
+        )
+        if "one" in item.metadata and len(value) > 1:
+            raise InputError(f"{item.name}: expected one {item.metadata['one']}, got {len(value)}")
+        numbers = value if isinstance(value, tuple) else () if value is None else (value,)
+        if not all(LIMITS[name][0](number, limit) for number in numbers for name, limit in limits.items()):
+            expected = " and ".join(LIMITS[name][1].format(limits[name]) for name in LIMITS if name in limits)
+            raise InputError(f"{item.name}: expected {expected}, got {value}")
+
 
 Settings = TypeVar("Settings")
 

@@ -15,6 +15,7 @@ from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed, printable
 from gsencoder.core.files import write_json
 from gsencoder.core.process import Clock
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question, Task, check_question
 from gsencoder.infer.ask.batch import (
@@ -47,51 +48,36 @@ PREDICTIONS = "predictions.json"
 class AskCommandConfig(WordsOptions):
     """Settings of `ask`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "help": "a folder written by fuse, encode, pack or memory; for a question set several, or a folder that "
-            "has one for each scene",
-            "metavar": "FEATURES",
-            "required": True,
-        },
+    paths: tuple[str, ...] = option(
+        (),
+        "a folder written by fuse, encode, pack or memory; for a question set several, or a folder that "
+        "has one for each scene",
+        metavar="FEATURES",
+        required=True,
     )
-    question: str = field(default="", metadata={"help": "the question"})
-    questions: str = field(
-        default="",
-        metadata={
-            "help": "a file of questions: JSON lines with question and, optionally, id, task, query, aabb; or the JSON "
-            "of ScanQA, SQA3D, ScanRefer or Scan2Cap"
-        },
+    question: str = option("", "the question")
+    questions: str = option(
+        "",
+        "a file of questions: JSON lines with question and, optionally, id, task, query, aabb; or the JSON "
+        "of ScanQA, SQA3D, ScanRefer or Scan2Cap",
     )
-    proposals: str = field(
-        default="",
-        metadata={
-            "help": "for captions of a question set: a file of boxes as Scan2Cap has them, or localize = boxes of the "
-            "objects' names; empty = the boxes of the question set"
-        },
+    proposals: str = option(
+        "",
+        "for captions of a question set: a file of boxes as Scan2Cap has them, or localize = boxes of the "
+        "objects' names; empty = the boxes of the question set",
     )
-    task: Task = field(
-        default="answer",
-        metadata={"help": "answer a question, ground (say which of the marked objects is meant), or caption an object"},
+    task: Task = option(
+        "answer", "answer a question, ground (say which of the marked objects is meant), or caption an object"
     )
-    query: tuple[str, ...] = field(
-        default=(),
-        metadata={"help": "words to localize; empty = the names of the text table that the question contains"},
+    query: tuple[str, ...] = option(
+        (), "words to localize; empty = the names of the text table that the question contains"
     )
-    aabb: tuple[float, ...] = field(
-        default=(), metadata={"help": "a box to show instead of words: lower and upper corner in world coordinates"}
+    aabb: tuple[float, ...] = option((), "a box to show instead of words: lower and upper corner in world coordinates")
+    photos: str = option(
+        "", "the scene that was fused, or a folder of scenes; its photographs are shown instead of renders"
     )
-    photos: str = field(
-        default="",
-        metadata={
-            "help": "the scene that was fused, or a folder of scenes; its photographs are shown instead of renders"
-        },
-    )
-    dry_run: bool = field(default=False, metadata={"help": "write the prompt and the pictures without sending them"})
-    resume: bool = field(
-        default=True, metadata={"help": "continue an interrupted batch; false = ask every question again"}
-    )
+    dry_run: bool = option(False, "write the prompt and the pictures without sending them")
+    resume: bool = option(True, "continue an interrupted batch; false = ask every question again")
     ask: AskConfig = field(default_factory=AskConfig)
     vlm: VlmConfig = field(default_factory=VlmConfig)
     choose: ViewsConfig = field(default_factory=ViewsConfig)

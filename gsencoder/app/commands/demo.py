@@ -13,6 +13,7 @@ from gsencoder.app.reports import TeacherResult, write_report
 from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file, write_json
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats.files import save_splat
@@ -38,12 +39,10 @@ PAGE_OPTIONS = FileOptions(error=0.01, sh_degree=3, photographs=16, photograph_s
 class DemoConfig(CommonConfig):
     """Settings of `demo`."""
 
-    seed: int = field(default=0, metadata={"help": "seed of the random room"})
-    objects: int = field(default=8, metadata={"help": "number of named objects"})
-    views: int = field(default=16, metadata={"help": "number of views"})
-    width: int = field(
-        default=320, metadata={"help": "width of the views in pixels; the height is three quarters of it"}
-    )
+    seed: int = option(0, "seed of the random room")
+    objects: int = option(8, "number of named objects")
+    views: int = option(16, "number of views")
+    width: int = option(320, "width of the views in pixels; the height is three quarters of it")
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)

@@ -16,7 +16,7 @@ from gsencoder.app.summary import Summary, basis_figures, describe_basis, report
 from gsencoder.core.errors import InputError, SceneWarning, about, counted
 from gsencoder.core.pretrained import digest_files
 from gsencoder.core.process import retain_freed_memory
-from gsencoder.core.settings import MEGABYTE
+from gsencoder.core.settings import MEGABYTE, option
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -125,36 +125,20 @@ def check_promises(
 class EncodeCommandConfig(CommonConfig):
     """Settings of `encode`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={"help": "splats, scenes, or folders of scenes", "metavar": "SPLAT", "required": True},
+    paths: tuple[str, ...] = option((), "splats, scenes, or folders of scenes", metavar="SPLAT", required=True)
+    weights: str = option(
+        "",
+        "folder or file written by `train` or `export`, or the name of an encoder that comes with "
+        "gsencoder; empty = house_cpu, which does",
     )
-    weights: str = field(
-        default="",
-        metadata={
-            "help": "folder or file written by `train` or `export`, or the name of an encoder that comes with "
-            "gsencoder; empty = house_cpu, which does"
-        },
+    spaces: tuple[str, ...] = option(
+        (), "teachers whose features are written, of an encoder with several; empty = all of them", names=True
     )
-    spaces: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "names": True,
-            "help": "teachers whose features are written, of an encoder with several; empty = all of them",
-        },
+    splat: str = option("", f"Gaussians of a scene with views; empty = seeds. {READABLE}")
+    basis_views: int = option(
+        0, "views in which the encoder's teacher is run, to show what the basis keeps of its vectors there; 0 = none"
     )
-    splat: str = field(default="", metadata={"help": f"Gaussians of a scene with views; empty = seeds. {READABLE}"})
-    basis_views: int = field(
-        default=0,
-        metadata={
-            "help": "views in which the encoder's teacher is run, to show what the basis keeps of its vectors "
-            "there; 0 = none"
-        },
-    )
-    worker: int = field(
-        default=0,
-        metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
-    )
+    worker: int = option(0, "number of this process among several that share the scenes: -m worker=0,1,2 starts three")
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     encode: EncodeConfig = field(default_factory=EncodeConfig)

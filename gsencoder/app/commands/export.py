@@ -12,6 +12,7 @@ from gsencoder.app.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file
 from gsencoder.core.process import Stored
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -41,59 +42,41 @@ MAX_SIZE = 10_000_000
 class ExportConfig(CommonConfig):
     """Settings of `export`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "help": "splats or scenes for the comparison, in addition to random clouds",
-            "metavar": "SPLAT",
-        },
+    paths: tuple[str, ...] = option(
+        (), "splats or scenes for the comparison, in addition to random clouds", metavar="SPLAT"
     )
-    weights: str = field(
-        default="",
-        metadata={
-            "help": "folder or file written by `train`, or the name of an encoder that comes with gsencoder; empty = "
-            "house_cpu, which does"
-        },
+    weights: str = option(
+        "",
+        "folder or file written by `train`, or the name of an encoder that comes with gsencoder; empty = "
+        "house_cpu, which does",
     )
-    memory: str = field(
-        default="",
-        metadata={
-            "help": "folder written by `memory`, whose attention is exported, from queries to features, in place of an "
-            "encoder"
-        },
+    memory: str = option(
+        "", "folder written by `memory`, whose attention is exported, from queries to features, in place of an encoder"
     )
-    space: str = field(default="", metadata={"help": "teacher of the memory, if the folder holds several"})
-    out: Path | None = field(
-        default=None,
-        metadata={
-            "help": "the .onnx file; FILE.summary.json beside it holds the differences from torch",
-            "metavar": "FILE",
-            "required": True,
-        },
+    space: str = option("", "teacher of the memory, if the folder holds several")
+    out: Path | None = option(
+        None,
+        "the .onnx file; FILE.summary.json beside it holds the differences from torch",
+        metavar="FILE",
+        required=True,
     )
-    precision: Stored = field(
-        default="float32",
-        metadata={
-            "help": "what the graph computes in; int8_weights = stored in 8 bits, computed in float32; int8_dynamic = "
-            "products of 8-bit integers, whose ranges are computed for each splat"
-        },
+    precision: Stored = option(
+        "float32",
+        "what the graph computes in; int8_weights = stored in 8 bits, computed in float32; int8_dynamic = "
+        "products of 8-bit integers, whose ranges are computed for each splat",
     )
-    sizes: tuple[int, ...] = field(
-        default=(1, 2, 31, 1000, 20000),
-        metadata={"help": "numbers of Gaussians of the random clouds for the comparison"},
+    sizes: tuple[int, ...] = option(
+        (1, 2, 31, 1000, 20000), "numbers of Gaussians of the random clouds for the comparison"
     )
-    tolerance: float = field(
-        default=TOLERANCE,
-        metadata={"help": "largest difference of the float32 graph from torch, as a share of the largest output"},
+    tolerance: float = option(
+        TOLERANCE, "largest difference of the float32 graph from torch, as a share of the largest output"
     )
-    cosine: float = field(
-        default=COSINE,
-        metadata={
-            "help": "smallest mean centered cosine of another precision's features to float32's, on each SPLAT, or on "
-            "each random cloud where there is none"
-        },
+    cosine: float = option(
+        COSINE,
+        "smallest mean centered cosine of another precision's features to float32's, on each SPLAT, or on "
+        "each random cloud where there is none",
     )
-    splat: str = field(default="", metadata={"help": f"Gaussians of scenes; empty = seeds. {READABLE}"})
+    splat: str = option("", f"Gaussians of scenes; empty = seeds. {READABLE}")
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
 

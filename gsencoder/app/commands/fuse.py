@@ -20,7 +20,7 @@ from gsencoder.app.summary import Summary, describe_basis, report_choice, report
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.process import Device
-from gsencoder.core.settings import MEGABYTE
+from gsencoder.core.settings import MEGABYTE, option
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
@@ -117,36 +117,24 @@ def check_promises(fused: BudgetFusion, file: Path, config: BudgetOptions, summa
 class FuseCommandConfig(CommonConfig):
     """Settings of `fuse`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={"help": "scenes, or folders of scenes: views, or a bare splat", "metavar": "SCENE", "required": True},
+    paths: tuple[str, ...] = option(
+        (), "scenes, or folders of scenes: views, or a bare splat", metavar="SCENE", required=True
     )
-    splat: str = field(
-        default="",
-        metadata={
-            "help": f"Gaussians of a scene with views, where {{scene}} stands for the name of its folder; "
-            f"empty = seeds. {READABLE}"
-        },
+    splat: str = option(
+        "",
+        f"Gaussians of a scene with views, where {{scene}} stands for the name of its folder; "
+        f"empty = seeds. {READABLE}",
     )
-    orbits: int = field(default=24, metadata={"help": "largest number of cameras placed in a splat without views"})
-    cameras: CamerasOfSplat = field(
-        default="auto",
-        metadata={"help": "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"},
+    orbits: int = option(24, "largest number of cameras placed in a splat without views")
+    cameras: CamerasOfSplat = option(
+        "auto", "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"
     )
-    basis: str = field(
-        default="",
-        metadata={
-            "help": "weights in whose basis features are fused, as encoded ones are; empty = a basis of the scene"
-        },
+    basis: str = option(
+        "", "weights in whose basis features are fused, as encoded ones are; empty = a basis of the scene"
     )
-    worker: int = field(
-        default=0,
-        metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
-    )
-    device: Device = field(
-        default="auto", metadata={"help": "where maps are lifted, cuda or cpu; auto = cuda if torch sees a GPU"}
-    )
-    report: bool = field(default=False, metadata={"help": "write report.html, a page with pictures and figures"})
+    worker: int = option(0, "number of this process among several that share the scenes: -m worker=0,1,2 starts three")
+    device: Device = option("auto", "where maps are lifted, cuda or cpu; auto = cuda if torch sees a GPU")
+    report: bool = option(False, "write report.html, a page with pictures and figures")
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)

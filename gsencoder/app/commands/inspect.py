@@ -17,6 +17,7 @@ from gsencoder.app.summary import Summary
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, listed
 from gsencoder.core.files import write_picture
+from gsencoder.core.settings import option
 from gsencoder.data.check.agreement import agreement_map
 from gsencoder.data.check.epipolar import EpipolarCheck
 from gsencoder.data.check.findings import Finding
@@ -37,23 +38,14 @@ from gsencoder.types.orientation import turned
 class InspectConfig(CommonConfig):
     """Settings of `inspect`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={"help": f"scenes with posed views, or splats: {READABLE}", "metavar": "PATH", "required": True},
+    paths: tuple[str, ...] = option(
+        (), f"scenes with posed views, or splats: {READABLE}", metavar="PATH", required=True
     )
-    out: Path | None = field(
-        default=None,
-        metadata={
-            "help": "folder for a summary.json with the same facts, and a picture of each scene's check",
-            "metavar": "FOLDER",
-        },
+    out: Path | None = option(
+        None, "folder for a summary.json with the same facts, and a picture of each scene's check", metavar="FOLDER"
     )
-    check: bool = field(
-        default=True, metadata={"help": "hold the views of a scene against each other, which takes seconds"}
-    )
-    views: int = field(
-        default=0, metadata={"help": "largest number of views to hold against each other; 0 = 32 with depth, else 24"}
-    )
+    check: bool = option(True, "hold the views of a scene against each other, which takes seconds")
+    views: int = option(0, "largest number of views to hold against each other; 0 = 32 with depth, else 24")
     data: SceneConfig = field(default_factory=SceneConfig)
 
     def __post_init__(self) -> None:

@@ -19,6 +19,7 @@ from gsencoder.app.scenes import WordsOptions, queried_scene, query_words, shown
 from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, one_line
 from gsencoder.core.files import write_json, write_picture
+from gsencoder.core.settings import option
 from gsencoder.core.threads import import_ahead
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.up import with_up
@@ -33,28 +34,20 @@ from gsencoder.types import Localization
 class LocalizeCommandConfig(WordsOptions):
     """Settings of `localize`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={"help": "a folder written by fuse, encode, pack or memory", "metavar": "FEATURES", "required": True},
+    paths: tuple[str, ...] = option(
+        (), "a folder written by fuse, encode, pack or memory", metavar="FEATURES", required=True
     )
-    query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
-    queries: str = field(default="", metadata={"help": "a text file with one query a line"})
-    pose: str = field(
-        default="",
-        metadata={
-            "help": "a JSON file of cameras in world coordinates (cam_from_world or transform_matrix, fx, fy, cx, cy, "
-            "width, height); in each the pixel that answers a word best, and its position, are found"
-        },
+    query: tuple[str, ...] = option((), "one or several words, separated by commas")
+    queries: str = option("", "a text file with one query a line")
+    pose: str = option(
+        "",
+        "a JSON file of cameras in world coordinates (cam_from_world or transform_matrix, fx, fy, cx, cy, "
+        "width, height); in each the pixel that answers a word best, and its position, are found",
     )
-    view: tuple[str, ...] = field(
-        default=(), metadata={"help": "names of views of the scene, whose cameras are asked like those of pose="}
-    )
-    pictures: int = field(default=4, metadata={"help": "number of views drawn for each word; 0 = none"})
-    photos: str = field(
-        default="",
-        metadata={"help": "the scene that was fused; its photographs are drawn beside relevancy, not renders"},
-    )
-    report: bool = field(default=False, metadata={"help": "write report.html, a page with pictures and figures"})
+    view: tuple[str, ...] = option((), "names of views of the scene, whose cameras are asked like those of pose=")
+    pictures: int = option(4, "number of views drawn for each word; 0 = none")
+    photos: str = option("", "the scene that was fused; its photographs are drawn beside relevancy, not renders")
+    report: bool = option(False, "write report.html, a page with pictures and figures")
     data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)

@@ -18,6 +18,7 @@ from gsencoder.core.errors import InputError, about, advised, counted
 from gsencoder.core.files import write_picture
 from gsencoder.core.logs import LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import find_scenes
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.evaluate.sources import RenderedErrors, RenderedTally
@@ -53,37 +54,25 @@ DRAWN_FEATURES = 20_000
 class MemoryCommandConfig(SourceConfig, CommonConfig):
     """Settings of `memory`."""
 
-    paths: tuple[str, ...] = field(
-        default=(), metadata={"help": "a scene: views, or a bare splat", "metavar": "SCENE", "required": True}
-    )
+    paths: tuple[str, ...] = option((), "a scene: views, or a bare splat", metavar="SCENE", required=True)
     bank: BankConfig = field(default_factory=BankConfig)
     memory: MemoryConfig = field(default_factory=MemoryConfig)
     train: TrainerConfig = field(default_factory=memory_training)
-    weights: str = field(
-        default="",
-        metadata={
-            "help": "an encoder whose predictions take the place of fused features; with optimize=false the memory of "
-            "an unseen scene is made in one pass; empty = features are fused"
-        },
+    weights: str = option(
+        "",
+        "an encoder whose predictions take the place of fused features; with optimize=false the memory of "
+        "an unseen scene is made in one pass; empty = features are fused",
     )
-    optimize: bool = field(
-        default=True, metadata={"help": "optimize the queries; false = those of the fused features, without training"}
+    optimize: bool = option(True, "optimize the queries; false = those of the fused features, without training")
+    joint: bool = option(True, "optimize for all teachers at once; false = for one after the other")
+    pictures: int = option(
+        4,
+        "number of views, evenly spaced, of which a pixel and the components that it attends to are drawn, "
+        "beside a scatter plot of components and raw features; 0 = no pictures",
     )
-    joint: bool = field(
-        default=True, metadata={"help": "optimize for all teachers at once; false = for one after the other"}
-    )
-    pictures: int = field(
-        default=4,
-        metadata={
-            "help": "number of views, evenly spaced, of which a pixel and the components that it attends to are drawn, "
-            "beside a scatter plot of components and raw features; 0 = no pictures"
-        },
-    )
-    umap: bool = field(
-        default=False, metadata={"help": "draw the scatter plot by UMAP, too; needs the package umap-learn"}
-    )
-    resume: bool = field(default=True, metadata={"help": "continue an interrupted run; false = start again"})
-    device: Device = field(default="auto", metadata={"help": "where the scene is prepared and queries are optimized"})
+    umap: bool = option(False, "draw the scatter plot by UMAP, too; needs the package umap-learn")
+    resume: bool = option(True, "continue an interrupted run; false = start again")
+    device: Device = option("auto", "where the scene is prepared and queries are optimized")
 
     def __post_init__(self) -> None:
         SourceConfig.__post_init__(self)

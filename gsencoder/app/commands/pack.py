@@ -11,7 +11,7 @@ from gsencoder.app.progress import console
 from gsencoder.app.summary import Summary, report_choice, report_promises
 from gsencoder.core.archive import copy_checked
 from gsencoder.core.errors import InputError, counted
-from gsencoder.core.settings import MEGABYTE, check_governed
+from gsencoder.core.settings import MEGABYTE, check_governed, option
 from gsencoder.fusion.folder import HEADS_FILE, WORDS_FILE, copy_heads, load_features, table_path
 from gsencoder.fusion.package import (
     PACKAGE_FILE,
@@ -40,34 +40,24 @@ CODED = ("compact", "index")
 class PackConfig(CommonConfig):
     """Settings of `pack`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={"help": "a folder written by fuse, encode, pack or memory", "metavar": "FEATURES", "required": True},
+    paths: tuple[str, ...] = option(
+        (), "a folder written by fuse, encode, pack or memory", metavar="FEATURES", required=True
     )
-    space: str = field(default="", metadata={"help": "name of the feature space, if the folder holds several"})
-    head: str = field(
-        default="",
-        metadata={"help": "adapter head whose outputs are packed, such as siglip; empty = the features themselves"},
-    )
+    space: str = option("", "name of the feature space, if the folder holds several")
+    head: str = option("", "adapter head whose outputs are packed, such as siglip; empty = the features themselves")
     text: TextConfig = field(
         default_factory=TableTextConfig,
         metadata={"help": "text tower of the space of head=, whose words are packed with its outputs"},
     )
-    form: Form = field(
-        default="compact",
-        metadata={
-            "help": "compact = a few bytes a Gaussian, for gsencoder; index = one or two bytes, the number of a row in "
-            "a table; npz, safetensors = arrays; ply = a splat with the properties feature_0 …"
-        },
+    form: Form = option(
+        "compact",
+        "compact = a few bytes a Gaussian, for gsencoder; index = one or two bytes, the number of a row in "
+        "a table; npz, safetensors = arrays; ply = a splat with the properties feature_0 …",
     )
     index: IndexConfig = field(default_factory=IndexConfig)
     budget: PackBudget = field(default_factory=PackBudget)
-    decoded: bool = field(
-        default=False,
-        metadata={
-            "help": "write complete vectors instead of coordinates in a basis, for the other forms; float16, "
-            "float32 in ply"
-        },
+    decoded: bool = option(
+        False, "write complete vectors instead of coordinates in a basis, for the other forms; float16, float32 in ply"
     )
 
     def __post_init__(self) -> None:

@@ -11,6 +11,7 @@ from gsencoder.app.progress import Progress, console
 from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.process import Track
+from gsencoder.core.settings import option
 from gsencoder.data.labels.expressions import write_scanrefer
 from gsencoder.data.labels.made_questions import (
     KINDS,
@@ -31,16 +32,14 @@ QUESTIONS, EXPRESSIONS, SITUATED = "questions.json", "expressions.json", "situat
 class QuestionsCommandConfig(QuestionsConfig, CommonConfig):
     """Settings of `questions`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "help": "scenes with photographs, instance maps and objects.json, or folders of such",
-            "metavar": "SCENE",
-            "required": True,
-        },
+    paths: tuple[str, ...] = option(
+        (),
+        "scenes with photographs, instance maps and objects.json, or folders of such",
+        metavar="SCENE",
+        required=True,
     )
-    per_object: int = field(default=3, metadata={"help": "most expressions that mean one object"})
-    objects: int = field(default=0, metadata={"help": "most objects of a scene with expressions; 0 = all"})
+    per_object: int = option(3, "most expressions that mean one object")
+    objects: int = option(0, "most objects of a scene with expressions; 0 = all")
     data: SceneConfig = field(default_factory=SceneConfig)
 
     def __post_init__(self) -> None:

@@ -20,7 +20,7 @@ from gsencoder.core.errors import SceneWarning, counted
 from gsencoder.core.files import write_picture
 from gsencoder.core.logs import LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory
-from gsencoder.core.settings import MEGABYTE
+from gsencoder.core.settings import MEGABYTE, option
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splats.files import READABLE, save_splat
@@ -41,21 +41,16 @@ PLY_FILE, PICTURES_FILE, MODEL_FOLDER = "splat.ply", "held_out.png", "sparse/0"
 class ReconstructCommandConfig(ReconstructConfig, CommonConfig):
     """Settings of `reconstruct`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "help": "scenes with photographs and poses, folders of photographs alone, videos, or folders of these",
-            "metavar": "SCENE",
-            "required": True,
-        },
+    paths: tuple[str, ...] = option(
+        (),
+        "scenes with photographs and poses, folders of photographs alone, videos, or folders of these",
+        metavar="SCENE",
+        required=True,
     )
-    splat: str = field(default="", metadata={"help": f"Gaussians to refine; empty = seeds. {READABLE}"})
-    resume: bool = field(default=True, metadata={"help": "continue an interrupted run; false = start again"})
-    device: Device = field(default="auto", metadata={"help": "where to compute; on CUDA gsplat rasterizes"})
-    worker: int = field(
-        default=0,
-        metadata={"help": "number of this process among several that share the scenes: -m worker=0,1,2 starts three"},
-    )
+    splat: str = option("", f"Gaussians to refine; empty = seeds. {READABLE}")
+    resume: bool = option(True, "continue an interrupted run; false = start again")
+    device: Device = option("auto", "where to compute; on CUDA gsplat rasterizes")
+    worker: int = option(0, "number of this process among several that share the scenes: -m worker=0,1,2 starts three")
     data: SceneConfig = field(default_factory=SceneConfig)
     sfm: SfmConfig = field(default_factory=SfmConfig)
     video: VideoConfig = field(default_factory=VideoConfig)

@@ -16,6 +16,7 @@ from gsencoder.app.progress import Progress, console
 from gsencoder.app.summary import Summary, write_beside
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, has_views, load_scene, read_posed
 from gsencoder.data.splats.files import (
     READABLE,
@@ -36,31 +37,23 @@ Fix = Literal["activated", "nonfinite", "quats", "scales", "opacities", "huge", 
 class RepairConfig(CommonConfig):
     """Settings of `repair`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={"help": f"a scene with posed views, or one splat: {READABLE}", "metavar": "PATH", "required": True},
+    paths: tuple[str, ...] = option(
+        (), f"a scene with posed views, or one splat: {READABLE}", metavar="PATH", required=True
     )
-    out: Path | None = field(
-        default=None,
-        metadata={
-            "help": f"the file to write: of a scene .json (nerfstudio), of a splat {WRITABLE}; FILE.summary.json "
-            "beside "
-            "it holds the changes",
-            "metavar": "FILE",
-            "required": True,
-        },
+    out: Path | None = option(
+        None,
+        f"the file to write: of a scene .json (nerfstudio), of a splat {WRITABLE}; FILE.summary.json "
+        "beside "
+        "it holds the changes",
+        metavar="FILE",
+        required=True,
     )
-    fix: tuple[Fix, ...] = field(
-        default=("nonfinite", "quats", "scales", "opacities"),
-        metadata={
-            "help": "defects of a splat to repair: the four that prevent loading, activated (scales or opacities that "
-            "are no logarithms or logits), huge, duplicates, floaters, or all"
-        },
+    fix: tuple[Fix, ...] = option(
+        ("nonfinite", "quats", "scales", "opacities"),
+        "defects of a splat to repair: the four that prevent loading, activated (scales or opacities that "
+        "are no logarithms or logits), huge, duplicates, floaters, or all",
     )
-    views: int = field(
-        default=0,
-        metadata={"help": "largest number of a scene's views to hold against each other; 0 = 32 with depth, else 24"},
-    )
+    views: int = option(0, "largest number of a scene's views to hold against each other; 0 = 32 with depth, else 24")
     data: SceneConfig = field(default_factory=SceneConfig)
 
     def __post_init__(self) -> None:

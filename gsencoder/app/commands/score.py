@@ -1,7 +1,7 @@
 """`gsencoder score PROTOCOL predictions=… truth=…`: files of any method's predictions against a benchmark's truth."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.markdown import Markdown
@@ -12,6 +12,7 @@ from gsencoder.app.progress import console
 from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, write_bytes
+from gsencoder.core.settings import option
 from gsencoder.data.labels.classes import COLUMNS, DEFAULT_COLUMN, ids_of_benchmark, read_label_map
 from gsencoder.data.labels.files import read_split
 from gsencoder.evaluate.benchmarks.files import load_classes
@@ -39,91 +40,58 @@ DECIMALS = 6
 class ScoreConfig(CommonConfig):
     """Settings of `score`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "help": "what is scored: instances, semantics, recognition, referring, answers, captions or retrieval",
-            "metavar": "PROTOCOL",
-            "required": True,
-        },
+    paths: tuple[str, ...] = option(
+        (),
+        "what is scored: instances, semantics, recognition, referring, answers, captions or retrieval",
+        metavar="PROTOCOL",
+        required=True,
     )
-    predictions: str = field(
-        default="", metadata={"help": "file or folder of the predictions, in the benchmark's format", "required": True}
+    predictions: str = option("", "file or folder of the predictions, in the benchmark's format", required=True)
+    truth: str = option(
+        "",
+        "file or folder of the truth, in the benchmark's format; of instances and semantics also a folder "
+        "of scans of ScanNet or ScanNet++, with label_map=",
+        required=True,
     )
-    truth: str = field(
-        default="",
-        metadata={
-            "help": "file or folder of the truth, in the benchmark's format; of instances and semantics also a folder "
-            "of scans of ScanNet or ScanNet++, with label_map=",
-            "required": True,
-        },
+    method: str = option("predictions", "name of the predictions in the table")
+    classes: str = option(
+        "",
+        "of instances, semantics and recognition: scannet20, scannet200, a CSV file with the columns id, "
+        "name and, if there are any, group, or ScanNet++'s top100.txt; empty for recognition = all names of the "
+        "truth",
     )
-    method: str = field(default="predictions", metadata={"help": "name of the predictions in the table"})
-    classes: str = field(
-        default="",
-        metadata={
-            "help": "of instances, semantics and recognition: scannet20, scannet200, a CSV file with the columns id, "
-            "name and, if there are any, group, or ScanNet++'s top100.txt; empty for recognition = all names of the "
-            "truth"
-        },
+    label_map: str = option(
+        "",
+        "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv: of instances and semantics it "
+        "gives the objects of truth=SCANS a class, of referring it tells unique from multiple where "
+        "the truth does not",
     )
-    label_map: str = field(
-        default="",
-        metadata={
-            "help": "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv: of instances and semantics it "
-            "gives the objects of truth=SCANS a class, of referring it tells unique from multiple where "
-            "the truth does not"
-        },
+    scans: str = option("", "of referring: folder of ScanNet's scans, whose labels have the boxes that truth= has not")
+    scenes: str = option("", "of instances and semantics: a split, one scene a line; empty = all scenes of the truth")
+    class_agnostic: bool = option(False, "of instances: leave the classes of masks out of account")
+    min_region: int = option(
+        MIN_REGION, "of instances: smallest number of vertices of a true object and of a mask that count"
     )
-    scans: str = field(
-        default="",
-        metadata={"help": "of referring: folder of ScanNet's scans, whose labels have the boxes that truth= has not"},
+    excluded: tuple[str, ...] = option(BACKGROUND, "of semantics: classes that are not of the foreground", names=True)
+    ks: tuple[int, ...] = option(
+        (1, 5), "of recognition and referring: numbers of names or boxes of which the best counts"
     )
-    scenes: str = field(
-        default="",
-        metadata={"help": "of instances and semantics: a split, one scene a line; empty = all scenes of the truth"},
+    allow_missing: bool = option(
+        False,
+        "of recognition, referring, answers and captions: count what has no prediction as wrong, instead "
+        "of refusing the file",
     )
-    class_agnostic: bool = field(
-        default=False, metadata={"help": "of instances: leave the classes of masks out of account"}
+    min_iou: float = option(0.5, "of captions: IoU that a box must be above for its caption to count")
+    distractors: int = option(
+        0, "of retrieval: texts or pictures of others in a query's pool, drawn by its name; 0 = all"
     )
-    min_region: int = field(
-        default=MIN_REGION,
-        metadata={"help": "of instances: smallest number of vertices of a true object and of a mask that count"},
-    )
-    excluded: tuple[str, ...] = field(
-        default=BACKGROUND, metadata={"names": True, "help": "of semantics: classes that are not of the foreground"}
-    )
-    ks: tuple[int, ...] = field(
-        default=(1, 5),
-        metadata={"help": "of recognition and referring: numbers of names or boxes of which the best counts"},
-    )
-    allow_missing: bool = field(
-        default=False,
-        metadata={
-            "help": "of recognition, referring, answers and captions: count what has no prediction as wrong, instead "
-            "of refusing the file"
-        },
-    )
-    min_iou: float = field(
-        default=0.5, metadata={"help": "of captions: IoU that a box must be above for its caption to count"}
-    )
-    distractors: int = field(
-        default=0,
-        metadata={"help": "of retrieval: texts or pictures of others in a query's pool, drawn by its name; 0 = all"},
-    )
-    seed: int = field(default=0, metadata={"help": "of retrieval: of their draw"})
-    pooling: Pooling = field(
-        default="max", metadata={"help": "of retrieval, where predictions are features: over the cells of a view"}
-    )
-    java: bool = field(
-        default=True,
-        metadata={
-            "help": "of answers and captions: use Java's tokenizer and METEOR where they are there; without, columns "
-            "say so"
-        },
+    seed: int = option(0, "of retrieval: of their draw")
+    pooling: Pooling = option("max", "of retrieval, where predictions are features: over the cells of a view")
+    java: bool = option(
+        True, "of answers and captions: use Java's tokenizer and METEOR where they are there; without, columns say so"
     )
 
-    report: bool = field(default=False, metadata={"help": "write report.html, a page with tables"})
+    report: bool = option(False, "write report.html, a page with tables")
 
     def __post_init__(self) -> None:
         if not self.paths:

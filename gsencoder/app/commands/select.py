@@ -12,6 +12,7 @@ from gsencoder.app.scenes import WordsOptions, queried_scene, query_words
 from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, one_line
 from gsencoder.core.files import write_json
+from gsencoder.core.settings import option
 from gsencoder.core.threads import import_ahead
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.up import with_up
@@ -33,30 +34,23 @@ REST, HOLES = "rest", "holes.json"
 class SelectCommandConfig(WordsOptions):
     """Settings of `select`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={"help": "a folder written by fuse, encode, pack or memory", "metavar": "FEATURES", "required": True},
+    paths: tuple[str, ...] = option(
+        (), "a folder written by fuse, encode, pack or memory", metavar="FEATURES", required=True
     )
-    query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
-    queries: str = field(default="", metadata={"help": "a text file with one query a line"})
-    box: tuple[int, ...] = field(
-        default=(),
-        metadata={
-            "help": "numbers of the boxes of each word that are taken, best first from 0, as in boxes.json; empty = "
-            "the most probable one, and those nearly as probable"
-        },
+    query: tuple[str, ...] = option((), "one or several words, separated by commas")
+    queries: str = option("", "a text file with one query a line")
+    box: tuple[int, ...] = option(
+        (),
+        "numbers of the boxes of each word that are taken, best first from 0, as in boxes.json; empty = "
+        "the most probable one, and those nearly as probable",
     )
-    threshold: float | None = field(
-        default=None, metadata={"help": "all Gaussians from this relevancy on, instead of boxes"}
+    threshold: float | None = option(None, "all Gaussians from this relevancy on, instead of boxes")
+    write: tuple[Part, ...] = option(
+        ("objects", "rest", "labels"),
+        "objects = a splat of each word alone; rest = the scene without them, and the holes that they "
+        "leave; labels = the whole scene with the property label, and labels.json",
     )
-    write: tuple[Part, ...] = field(
-        default=("objects", "rest", "labels"),
-        metadata={
-            "help": "objects = a splat of each word alone; rest = the scene without them, and the holes that they "
-            "leave; labels = the whole scene with the property label, and labels.json"
-        },
-    )
-    format: Format = field(default="ply", metadata={"help": "of the objects and the rest: ply, compressed.ply or spz"})
+    format: Format = option("ply", "of the objects and the rest: ply, compressed.ply or spz")
     select: SelectConfig = field(default_factory=SelectConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)

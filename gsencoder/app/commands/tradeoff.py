@@ -15,6 +15,7 @@ from gsencoder.app.progress import Progress, console
 from gsencoder.app.summary import Summary
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, json_bytes, write_bytes
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol
@@ -63,12 +64,8 @@ SECTIONS = {
 class LimitConfig:
     """Limits of time and error; the best setting of fusion within them is reported."""
 
-    seconds: float | None = field(
-        default=None, metadata={"help": "largest time for fusing one scene without the teacher, seconds"}
-    )
-    error: float | None = field(
-        default=None, metadata={"help": "largest error against the reference, 1 − centered cosine"}
-    )
+    seconds: float | None = option(None, "largest time for fusing one scene without the teacher, seconds")
+    error: float | None = option(None, "largest error against the reference, 1 − centered cosine")
 
     def __post_init__(self) -> None:
         for name in ("seconds", "error"):
@@ -80,13 +77,9 @@ class LimitConfig:
 class TradeoffConfig(CommonConfig):
     """Settings of `tradeoff`."""
 
-    paths: tuple[str, ...] = field(
-        default=(), metadata={"help": "scenes, or folders of scenes", "metavar": "SCENE", "required": True}
-    )
-    stages: tuple[StageName, ...] = field(
-        default=("fusion",), metadata={"help": f"stages whose knobs are turned: {', '.join(STAGES)}"}
-    )
-    resume: bool = field(default=True, metadata={"help": "continue an interrupted sweep; false = start again"})
+    paths: tuple[str, ...] = option((), "scenes, or folders of scenes", metavar="SCENE", required=True)
+    stages: tuple[StageName, ...] = option(("fusion",), f"stages whose knobs are turned: {', '.join(STAGES)}")
+    resume: bool = option(True, "continue an interrupted sweep; false = start again")
     sweep: SweepConfig = field(default_factory=SweepConfig)
     halving: HalvingConfig = field(default_factory=HalvingConfig)
     scaling: ScalingConfig = field(default_factory=ScalingConfig)

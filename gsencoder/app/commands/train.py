@@ -4,7 +4,7 @@ teacher."""
 import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -40,39 +40,28 @@ class TrainCommandConfig(TrainConfig, CommonConfig):
 
     has_experiments: ClassVar[bool] = True
 
-    paths: tuple[str, ...] = field(
-        default=(), metadata={"help": "scenes, or folders of scenes", "metavar": "SCENE", "required": True}
+    paths: tuple[str, ...] = option((), "scenes, or folders of scenes", metavar="SCENE", required=True)
+    holdout: tuple[str, ...] = option(
+        (),
+        "names of scenes for validation, with * and ? as in file names; [] = none, where an experiment has some",
+        names=True,
     )
-    holdout: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "names": True,
-            "help": "names of scenes for validation, with * and ? as in file names; [] = none, where an experiment has "
-            "some",
-        },
+    split: Path | None = option(
+        None,
+        "file of the names of the scenes to train on, one a line, such as scannetv2_train.txt; empty = all "
+        "that are not held out",
+        metavar="PATH",
     )
-    split: Path | None = field(
-        default=None,
-        metadata={
-            "help": "file of the names of the scenes to train on, one a line, such as scannetv2_train.txt; empty = all "
-            "that are not held out",
-            "metavar": "PATH",
-        },
+    holdout_split: Path | None = option(
+        None, "file of the names of scenes for validation, in place of holdout=", metavar="PATH"
     )
-    holdout_split: Path | None = field(
-        default=None,
-        metadata={"help": "file of the names of scenes for validation, in place of holdout=", "metavar": "PATH"},
+    prepared: Path | None = option(
+        None, "folder of prepared scenes, created if missing; empty = OUT.prepared", metavar="PATH"
     )
-    prepared: Path | None = field(
-        default=None,
-        metadata={"help": "folder of prepared scenes, created if missing; empty = OUT.prepared", "metavar": "PATH"},
-    )
-    prepare_only: bool = field(default=False, metadata={"help": "prepare the scenes and stop"})
-    resume: bool = field(default=True, metadata={"help": "continue an interrupted run; false = start again"})
-    store: Literal["float16", "float32"] = field(
-        default="float16", metadata={"help": "type of the written weights and words"}
-    )
-    device: Device = field(default="auto", metadata={"help": "where scenes are prepared and the encoder computes"})
+    prepare_only: bool = option(False, "prepare the scenes and stop")
+    resume: bool = option(True, "continue an interrupted run; false = start again")
+    store: Literal["float16", "float32"] = option("float16", "type of the written weights and words")
+    device: Device = option("auto", "where scenes are prepared and the encoder computes")
 
 
 def run(config: TrainCommandConfig, summary: Summary) -> None:

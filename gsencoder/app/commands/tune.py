@@ -25,6 +25,7 @@ from gsencoder.core.files import lock_folder, plain
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE, read_log
 from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import Device, Track
+from gsencoder.core.settings import option
 from gsencoder.data.labels.questions import Question as TruthQuestion
 from gsencoder.data.labels.questions import read_questions
 from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
@@ -245,65 +246,40 @@ def _store(
 class TuneCommandConfig(TuneConfig, WordsOptions):
     """Settings of `tune`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "help": "ScanQA's or SQA3D's file of questions, or a folder that has it",
-            "metavar": "DATASET",
-            "required": True,
-        },
+    paths: tuple[str, ...] = option(
+        (), "ScanQA's or SQA3D's file of questions, or a folder that has it", metavar="DATASET", required=True
     )
-    model: str = field(
-        default="",
-        metadata={
-            "help": "folder of a vision-language model for transformers; also looked for in GSENCODER_MODELS",
-            "required": True,
-            "like_group": True,
-        },
+    model: str = option(
+        "",
+        "folder of a vision-language model for transformers; also looked for in GSENCODER_MODELS",
+        required=True,
+        like_group=True,
     )
-    features: str = field(
-        default="",
-        metadata={
-            "help": "a folder with a folder of features for each scene, written by fuse or encode",
-            "required": True,
-        },
+    features: str = option(
+        "", "a folder with a folder of features for each scene, written by fuse or encode", required=True
     )
-    photos: str = field(
-        default="", metadata={"help": "a folder of the scenes, whose photographs are shown in place of renders"}
+    photos: str = option("", "a folder of the scenes, whose photographs are shown in place of renders")
+    split: str = option("train", "which of the files of a DATASET folder, by its name")
+    scenes: tuple[str, ...] = option((), "scenes to train on, with * and ?; empty = all of DATASET", names=True)
+    tokens: str = option(
+        "",
+        "name of the feature space that is rendered on the grid of the model's vision tower and replaces "
+        "its output (Idefics3, SmolVLM, LLaVA); empty = the model looks at the pictures",
     )
-    split: str = field(default="train", metadata={"help": "which of the files of a DATASET folder, by its name"})
-    scenes: tuple[str, ...] = field(
-        default=(),
-        metadata={"names": True, "help": "scenes to train on, with * and ?; empty = all of DATASET"},
+    project: bool | None = option(
+        None,
+        "with tokens=: train a linear layer from the features to the tower's channels; left out: where "
+        "their numbers differ",
     )
-    tokens: str = field(
-        default="",
-        metadata={
-            "help": "name of the feature space that is rendered on the grid of the model's vision tower and replaces "
-            "its output (Idefics3, SmolVLM, LLaVA); empty = the model looks at the pictures"
-        },
+    image_side: int = option(768, "longer side of the pictures, as in the vlm.image_side of ask, pixels")
+    image_format: Literal["jpeg", "png"] = option("jpeg", "of the pictures, as in the vlm.image_format of ask")
+    prepared: Path | None = option(
+        None, "folder of prepared prompts, created if missing; empty = OUT.prepared", metavar="PATH"
     )
-    project: bool | None = field(
-        default=None,
-        metadata={
-            "help": "with tokens=: train a linear layer from the features to the tower's channels; left out: where "
-            "their numbers differ"
-        },
-    )
-    image_side: int = field(
-        default=768, metadata={"help": "longer side of the pictures, as in the vlm.image_side of ask, pixels"}
-    )
-    image_format: Literal["jpeg", "png"] = field(
-        default="jpeg", metadata={"help": "of the pictures, as in the vlm.image_format of ask"}
-    )
-    prepared: Path | None = field(
-        default=None,
-        metadata={"help": "folder of prepared prompts, created if missing; empty = OUT.prepared", "metavar": "PATH"},
-    )
-    prepare_only: bool = field(default=False, metadata={"help": "prepare the prompts and stop"})
-    resume: bool = field(default=True, metadata={"help": "continue an interrupted run; false = start again"})
-    tensorboard: bool = field(default=False, metadata={"help": "write TensorBoard events in addition to log.csv"})
-    device: Device = field(default="auto", metadata={"help": "where the model computes"})
+    prepare_only: bool = option(False, "prepare the prompts and stop")
+    resume: bool = option(True, "continue an interrupted run; false = start again")
+    tensorboard: bool = option(False, "write TensorBoard events in addition to log.csv")
+    device: Device = option("auto", "where the model computes")
     ask: AskConfig = field(default_factory=AskConfig)
     choose: ViewsConfig = field(default_factory=ViewsConfig)
     data: SceneConfig = field(default_factory=SceneConfig)

@@ -13,6 +13,7 @@ from gsencoder.app.summary import Summary, write_beside
 from gsencoder.core.errors import InputError, printable
 from gsencoder.core.files import atomic_file
 from gsencoder.core.process import accept_stop
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import DistinctPaths, SceneConfig, load_scene
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
@@ -32,46 +33,29 @@ SUFFIX = ".html"
 class ViewConfig(WordsOptions):
     """Settings of `view`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "help": "a folder written by fuse, encode, pack or memory; two folders of one scene are shown side by side",
-            "metavar": "FEATURES",
-            "required": True,
-        },
+    paths: tuple[str, ...] = option(
+        (),
+        "a folder written by fuse, encode, pack or memory; two folders of one scene are shown side by side",
+        metavar="FEATURES",
+        required=True,
     )
-    out: Path | None = field(
-        default=None,
-        metadata={
-            "help": "an .html file that holds page and scene, and opens without a server; empty = serve the page",
-            "metavar": "FILE",
-        },
+    out: Path | None = option(
+        None,
+        "an .html file that holds page and scene, and opens without a server; empty = serve the page",
+        metavar="FILE",
     )
-    photos: str = field(
-        default="", metadata={"help": "the scene that was fused; its photographs and labeled objects are shown"}
+    photos: str = option("", "the scene that was fused; its photographs and labeled objects are shown")
+    max_gaussians: int = option(
+        1_000_000, "of more Gaussians so many are drawn and searched, evenly chosen and enlarged"
     )
-    max_gaussians: int = field(
-        default=1_000_000,
-        metadata={"help": "of more Gaussians so many are drawn and searched, evenly chosen and enlarged"},
+    port: int = option(0, "of the server; 0 = any that is free")
+    host: str = option("127.0.0.1", "address that the server listens on; others than 127.0.0.1 open it to a network")
+    open: bool | None = option(None, "open a browser; empty = if standard output is a terminal")
+    megabytes: float = option(
+        25.0, "largest size of out=; spherical harmonics, then Gaussians are left out, and the page says so"
     )
-    port: int = field(default=0, metadata={"help": "of the server; 0 = any that is free"})
-    host: str = field(
-        default="127.0.0.1",
-        metadata={"help": "address that the server listens on; others than 127.0.0.1 open it to a network"},
-    )
-    open: bool | None = field(
-        default=None, metadata={"help": "open a browser; empty = if standard output is a terminal"}
-    )
-    megabytes: float = field(
-        default=25.0,
-        metadata={
-            "help": "largest size of out=; spherical harmonics, then Gaussians are left out, and the page says so"
-        },
-    )
-    error: float = field(
-        default=0.01, metadata={"help": "largest mean loss of centered cosine of the quantized features in out="}
-    )
-    photographs: int = field(default=24, metadata={"help": "largest number of photographs in out="})
+    error: float = option(0.01, "largest mean loss of centered cosine of the quantized features in out=")
+    photographs: int = option(24, "largest number of photographs in out=")
     data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)

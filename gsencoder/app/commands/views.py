@@ -13,7 +13,7 @@ from gsencoder.app.summary import Summary, report_choice, report_promises
 from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
-from gsencoder.core.settings import MEGABYTE
+from gsencoder.core.settings import MEGABYTE, option
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.folder import check_heads_space
 from gsencoder.fusion.measured_heads import find_head, head_space, head_tokens
@@ -110,32 +110,21 @@ VIEWS, TOKENS = "views.json", "tokens.safetensors"
 class ViewsCommandConfig(WordsOptions):
     """Settings of `views`."""
 
-    paths: tuple[str, ...] = field(
-        default=(),
-        metadata={"help": "a folder written by fuse, encode, pack or memory", "metavar": "FEATURES", "required": True},
+    paths: tuple[str, ...] = option(
+        (), "a folder written by fuse, encode, pack or memory", metavar="FEATURES", required=True
     )
-    query: tuple[str, ...] = field(default=(), metadata={"help": "one or several words, separated by commas"})
-    queries: str = field(default="", metadata={"help": "a text file with one query a line"})
-    token_head: str = field(
-        default="",
-        metadata={
-            "help": "adapter head that rendered features of grid= are put through, such as siglip.features; empty = "
-            "that of head="
-        },
+    query: tuple[str, ...] = option((), "one or several words, separated by commas")
+    queries: str = option("", "a text file with one query a line")
+    token_head: str = option(
+        "",
+        "adapter head that rendered features of grid= are put through, such as siglip.features; empty = that of head=",
     )
-    photos: str = field(
-        default="", metadata={"help": "the scene that was fused; its photographs are shown instead of renders"}
+    photos: str = option("", "the scene that was fused; its photographs are shown instead of renders")
+    boxes: int = option(1, "number of boxes of each word that are shown, best first")
+    grid: tuple[int, ...] = option(
+        (), "rows and columns of the patches of a vision tower, on which features are rendered in addition"
     )
-    boxes: int = field(default=1, metadata={"help": "number of boxes of each word that are shown, best first"})
-    grid: tuple[int, ...] = field(
-        default=(),
-        metadata={
-            "help": "rows and columns of the patches of a vision tower, on which features are rendered in addition"
-        },
-    )
-    fit: Fit = field(
-        default="stretch", metadata={"help": "how the preprocessing of the tower fits a picture to its input size"}
-    )
+    fit: Fit = option("stretch", "how the preprocessing of the tower fits a picture to its input size")
     choose: ViewsConfig = field(default_factory=ViewsConfig)
     budget: ViewsBudget = field(default_factory=ViewsBudget)
     data: SceneConfig = field(default_factory=SceneConfig)
