@@ -3,8 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.output import output_folder
-from gsencoder.app.summary import Summary
+from gsencoder.app.output import Summary, output_folder
 
 
 def names(folder: Path) -> list[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from gsencoder.app.heads import words_of_head
 from gsencoder.app.inputs import stored_source, stored_words, with_stored_features
 from gsencoder.app.options import CommonConfig
-from gsencoder.app.progress import Progress
+from gsencoder.app.run import Progress
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.core.settings import option

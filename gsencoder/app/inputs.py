@@ -8,10 +8,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from gsencoder.app.from_poses import memory_of
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.scenes import load_words, queried_scene, shown_scene, with_reported_up
-from gsencoder.app.summary import Summary
+from gsencoder.app.run import Run
+from gsencoder.app.scenes import load_words, memory_of, queried_scene, shown_scene, with_reported_up
 from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import DistinctPaths, SceneConfig, kind_of_path, load_scene
@@ -209,7 +207,7 @@ def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[SetQuestion,
 
 def load_fusable(
     path: Path,
-    summary: Summary,
+    run: Run,
     *,
     splat: str,
     data: SceneConfig,
@@ -218,20 +216,23 @@ def load_fusable(
     cameras: CamerasOfSplat,
     blend: BlendConfig,
     labels: bool,
-    quiet: bool,
 ) -> Scene:
     """Loads a scene with Gaussians and views: seeds if it has no splat, orbit cameras if it has no views.
 
     Args:
-        summary: takes the seconds of the steps.
+        path: of the scene.
+        run: takes the seconds of the steps.
         splat: file of the Gaussians, or empty.
+        data: how the scene is read.
+        seeds: how Gaussians are made.
         orbits: largest number of cameras placed in a bare splat.
+        cameras: where they stand.
         blend: how a bare splat is rendered.
         labels: whether a teacher needs labels, which a bare splat has not.
     """
-    with summary.step("load"):
+    with run.step("load"):
         scene = load_scene(path, splat=splat or None, options=data)
-    with summary.step("check"):
+    with run.step("check"):
         warn_of_faults(scene)
         scene = with_fitting_splat(scene, splat, data)
     if scene.views is None and labels:
@@ -240,17 +241,15 @@ def load_fusable(
             "such as teacher=mosaic text=minilm, or teacher=palette"
         )
     if scene.gaussians is None:
-        with summary.step("seeds"):
-            scene = with_gaussians(scene, seeds, track=Progress(quiet=quiet))
-    scene = with_reported_up(scene, summary, quiet=quiet)
+        with run.step("seeds"):
+            scene = with_gaussians(scene, seeds, track=run.track)
+    scene = with_reported_up(scene, run)
     if scene.views is not None:
         return scene
-    with summary.step("cameras"):
+    with run.step("cameras"):
         scene, reason = with_explained_views(scene, orbits, blend, cameras=cameras)
     assert scene.views is not None
     where = "inside" if scene.views.names[0].startswith(INSIDE) else "around"
-    summary.results["cameras"] = where
-    console(quiet).print(
-        f"{scene.name}: a bare splat; rendered from {len(scene.views)} cameras {where} it, because {reason}"
-    )
+    run.results["cameras"] = where
+    run.print(f"{scene.name}: a bare splat; rendered from {len(scene.views)} cameras {where} it, because {reason}")
     return scene

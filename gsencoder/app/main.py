@@ -340,20 +340,19 @@ def _dispatch(words: Sequence[str], began: float) -> int:
 
 def _run(command: Command, config: Any, debug: bool, began: float | None = None) -> None:
     """Runs a command; what it took to load it counts from `began`."""
-    from gsencoder.app.options import check_required, settings
+    from gsencoder.app.options import check_required
     from gsencoder.app.output import refuse_to_replace_inputs
-    from gsencoder.app.summary import Summary
+    from gsencoder.app.run import Run
 
     if not command.several:
         together = ", ".join(each.name for each in COMMANDS.values() if each.several)
         refuse_several(command.name, f"start it once; {together} are the commands that processes run together")
-    cls, run = command.load()
+    cls, run_command = command.load()
     check_required(cls, config)
-    values = settings(config)
-    refuse_to_replace_inputs(config.out, values)
-    summary = Summary(command.name, values, began)
-    with _collected_warnings(summary.add_warning, debug), _impossible_sizes(values):
-        run(config, summary)
+    run = Run(command.name, config, began)
+    refuse_to_replace_inputs(config.out, run.settings)
+    with _collected_warnings(run.add_warning, debug), _impossible_sizes(run.settings):
+        run_command(config, run)
 
 
 def _run_one(command: Command, config: Any, debug: bool) -> str:

@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, TypeVar, Union, cast, get_args, get_origin
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import option, shown_value, value_at
+from gsencoder.core.settings import check_limits, option, shown_value, value_at
 
 Kind = Literal["text", "list", "value"]
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -394,6 +394,46 @@ class CommonConfig:
         like_group=True,
     )
     quiet: bool = option(False, "print nothing but warnings and errors")
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SharedScenesConfig(CommonConfig):
+    """The options of commands whose scenes several processes may share."""
+
+    worker: int = option(
+        0, "number of this process among several that share the scenes: -m worker=0,1,2 starts three", ge=0
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeaturesConfig(CommonConfig):
+    """The options of commands that read one folder of features."""
+
+    paths: tuple[str, ...] = option(
+        (),
+        "a folder written by fuse, encode, pack or memory",
+        metavar="FEATURES",
+        required=True,
+        one="folder of features",
+    )
+    words: str = option("", "text table; empty = the one in the folder of the features")
+    space: str = option("", "name of the feature space, if the folder holds several")
+    head: str = option(
+        "",
+        "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the features "
+        "themselves are",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class QueriesConfig(FeaturesConfig):
+    """The options of commands that look words up in features."""
+
+    query: tuple[str, ...] = option((), "one or several words, separated by commas")
+    queries: str = option("", "a text file with one query a line")
 
 
 def _strict(target: type, accepted: tuple[type, ...]) -> Any:

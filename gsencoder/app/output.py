@@ -1,19 +1,23 @@
-"""Outputs of a run: a file or a folder, and the folder of unfinished work."""
+"""Where a run writes: its record in summary.json, the output file or folder, and the folder of its unfinished work."""
 
 import ctypes
 import errno
+import math
 import os
+import platform
 import re
 import secrets
 import shutil
+import sys
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from hashlib import sha1
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from gsencoder.app.summary import Summary
+import gsencoder
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.core.files import (
     SUMMARY_NAME,
@@ -25,44 +29,141 @@ from gsencoder.core.files import (
     json_bytes,
     lock_folder,
     locked,
+    plain,
+    sha256_of,
+    short_name,
     write_bytes,
+    write_json,
 )
-from gsencoder.core.process import raise_dropped_stop
+from gsencoder.core.threads import available_cores
+
+LIBRARIES = {
+    **{name: name for name in ("numpy", "torch", "numba", "scipy", "open3d", "trimesh", "pycolmap", "onnxruntime")},
+    **{name: name for name in ("gsply", "safetensors", "transformers", "gsplat", "triton")},
+    "sklearn": "scikit-learn",
+}
+"""Module and distribution of the libraries whose versions are recorded, if the run imported them."""
 
 
-def refuse_existing(path: str | Path, overwrite: bool) -> None:
-    """Checks, for commands whose result is one file, that it does not exist or may be replaced."""
-    if os.path.isdir(path):
-        raise InputError(f"{path}: is a folder; give the name of a file to write")
-    if os.path.lexists(path) and not overwrite:
-        raise InputError(f"{path}: exists; give another out= or overwrite=true")
+def peak_memory_mb() -> float:
+    """Peak resident memory of this process, MiB; NaN where the system does not say it."""
+    # On Linux ru_maxrss starts from the size of the parent at the fork; VmHWM is that of the process alone.
+    with suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1024
+    try:
+        import resource
+    except ImportError:
+        return math.nan
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 2**20
+
+
+class Summary:
+    """Collects the settings of a run, the seconds of each step, warnings and results.
+
+    Attributes:
+        results: figures and file names; filled by the command.
+        warnings: one line each, in order; see `add_warning`.
+        timings: seconds by step, in order of first start.
+        began: when the run began, by `time.perf_counter`.
+    """
+
+    def __init__(self, command: str, settings: Mapping[str, Any], began: float | None = None) -> None:
+        self.command = command
+        self.settings = dict(settings)
+        self.results: dict[str, Any] = {}
+        self.warnings: list[str] = []
+        self.timings: dict[str, float] = {}
+        self.began = time.perf_counter() if began is None else began
+        self._scene: tuple[str, Path, Summary] | None = None
+
+    def add_warning(self, text: str) -> str:
+        """Adds a warning; the command line adds every `SceneWarning` of the run. Returns it as the run shows it: with
+        the name of the scene, if there are several and it names none."""
+        if self._scene is not None:
+            name, path, of_scene = self._scene
+            of_scene.warnings.append(text)
+            if not text.startswith(f"{name}: ") and str(path) not in text:
+                text = f"{name}: {text}"
+        self.warnings.append(text)
+        return text
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        """Adds the seconds of the block to the step, also if it fails."""
+        start = time.perf_counter()
+        self.timings.setdefault(name, 0.0)
+        try:
+            yield
+        finally:
+            self.timings[name] += time.perf_counter() - start
+
+    def add_seconds(self, steps: Mapping[str, float]) -> None:
+        """Adds the seconds of steps that were timed elsewhere."""
+        for name, seconds in steps.items():
+            self.timings[name] = self.timings.get(name, 0.0) + seconds
+
+    def to_dict(self) -> dict[str, Any]:
+        """The record as JSON values. `non_finite` lists the results that were not finite and are null."""
+        lost: list[str] = []
+        results = plain(self.results, "results", lost)
+        total = time.perf_counter() - self.began
+        record = {
+            "command": self.command,
+            "version": gsencoder.__version__,
+            "settings": plain(self.settings, "settings", lost),
+            "timings": {name: round(seconds, 4) for name, seconds in (*self.timings.items(), ("total", total))},
+            "peak_memory_mb": plain(round(peak_memory_mb(), 1)),
+            "warnings": list(self.warnings),
+            "results": results,
+            "versions": _versions(),
+            "platform": {
+                "system": platform.system(),
+                "machine": platform.machine(),
+                "processors": available_cores(),
+            },
+        }
+        return record | ({"non_finite": lost} if lost else {})
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for module in (name for name in LIBRARIES if name in sys.modules):
+        with suppress(PackageNotFoundError):
+            versions[module] = version(LIBRARIES[module])
+    return versions
 
 
 def check_output_files(paths: Iterable[Path], overwrite: bool) -> None:
     """Checks files before the work whose results they will hold: none exists that may not be replaced, and all can be
     written."""
     for path in paths:
-        refuse_existing(path, overwrite)
+        _refuse_existing(path, overwrite)
         check_writable(path)
 
 
+def _refuse_existing(path: Path, overwrite: bool) -> None:
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; give the name of a file to write")
+    if os.path.lexists(path) and not overwrite:
+        raise InputError(f"{path}: exists; give another out= or overwrite=true")
+
+
 @contextmanager
-def sole_writer(path: Path, *, overwrite: bool) -> Iterator[None]:
-    """Lets one run at a time write a file and what belongs beside it.
+def output_file(path: Path, *, overwrite: bool, summary: Summary) -> Iterator[None]:
+    """Lets one run at a time write a file, and writes the summary beside it, as FILE.summary.json with its checksum.
 
-    Two runs of one out= would otherwise leave the file of one beside the summary of the other, and the second would
-    replace what the first has written since it began. Runs that write into the same folder wait for each other here,
-    for as long as the writing takes.
-
-    Args:
-        overwrite: whether a file that is there is replaced.
+    Two runs of one out= would otherwise leave the file of one beside the summary of the other. Runs that write into the
+    same folder wait for each other here, for as long as the writing takes.
     """
     with ExitStack() as stack:
         # Where the folder is missing or refuses, whoever writes the file says so.
         with suppress(OSError):
             stack.enter_context(locked(path.resolve().parent, wait=True))
-        refuse_existing(path, overwrite)
+        _refuse_existing(path, overwrite)
         yield
+        write_json(f"{path}.{SUMMARY_NAME}", summary.to_dict() | {"files": {path.name: sha256_of(path)}})
 
 
 AT_FDCWD, RENAME_EXCHANGE = -100, 2
@@ -81,6 +182,10 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
         overwrite: replace the output of an earlier run, recognized by its summary.json. Where the system can (Linux),
             old and new are exchanged in one step.
         summary: written into the folder at the end, as summary.json, with the checksums of files that have none.
+
+    Raises:
+        InputError: the folder exists, holds something else, is being written by another run, or cannot be written;
+            or the disk is full.
     """
     # Of a symbolic link the target is replaced, not the link.
     target = Path(os.path.realpath(path))
@@ -101,7 +206,6 @@ def output_folder(path: str | Path, *, overwrite: bool = False, summary: Summary
             write_bytes(partial / SUMMARY_NAME, json_bytes(record)[0])
         _sync(partial)
         _check_target(path, target, overwrite)
-        raise_dropped_stop()
         _move_into_place(partial, target)
     except Exception as error:
         message = _refusal(error, partial, target, path)
@@ -122,10 +226,14 @@ def _begin(path: str | Path, target: Path, overwrite: bool) -> tuple[Path, int |
     try:
         if _remove_stale(target):
             raise BlockingIOError
-        _put_back(target)
+        aside = _aside(target)
+        if aside.is_dir() and not os.path.lexists(target):
+            # A run that was replacing these results was killed between two names.
+            os.rename(aside, target)
+        shutil.rmtree(aside, ignore_errors=True)
         # Another run may have written the folder since it was looked at.
         _check_target(path, target, overwrite)
-        partial = target.parent / f".{_short(target.name)}.partial-{secrets.token_hex(4)}"
+        partial = target.parent / f".{short_name(target.name)}.partial-{secrets.token_hex(4)}"
         partial.mkdir()
         return partial, lock_folder(partial)
     finally:
@@ -156,20 +264,17 @@ def _check_target(path: str | Path, target: Path, overwrite: bool) -> None:
 
 
 def refuse_to_replace_inputs(out: Path | None, values: Mapping[str, Any]) -> None:
-    """Checks that a folder that is about to be replaced holds none of the inputs, and that a file is none.
-
-    Args:
-        values: the settings of the run; every text in them that names an existing file or folder is an input.
-    """
+    """Checks that a folder or file that is about to be replaced is none of the inputs and holds none: every text of the
+    settings `values` that names an existing file or folder is an input."""
     if out is None or not os.path.exists(out):
         return
     for key, name in _texts({key: value for key, value in values.items() if key != "out"}):
-        if os.path.exists(name) and lies_in(name, out):
+        if os.path.exists(name) and is_within(name, out):
             holds = "holds" if os.path.isdir(out) else "is"
             raise InputError(f"{out}: {holds} the input {key}={name}, so it cannot be replaced; give another out=")
 
 
-def lies_in(path: str | Path, folder: str | Path) -> bool:
+def is_within(path: str | Path, folder: str | Path) -> bool:
     """Whether a path is in a folder or is the folder, with symbolic links resolved."""
     inner, outer = os.path.realpath(path), os.path.realpath(folder)
     return os.path.commonpath([inner, outer]) == outer
@@ -187,18 +292,10 @@ def _texts(value: Any, key: str = "") -> Iterator[tuple[str, str]]:
             yield from _texts(item, key)
 
 
-def _short(name: str) -> str:
-    """The name, or a digest of it if the temporary name would be longer than file systems allow."""
-    raw = os.fsencode(name)
-    return name if len(raw) <= 200 else sha1(raw).hexdigest()
-
-
 def _remove_stale(target: Path) -> bool:
-    """Removes the hidden folders of killed runs beside `target`; returns whether another run is writing it now.
-
-    Where folders cannot be locked (some network file systems) nothing is removed and no run is detected.
-    """
-    pattern = re.compile(re.escape(f".{_short(target.name)}.partial-") + "[0-9a-f]{8}")
+    """Removes the hidden folders of killed runs beside `target`; returns whether another run is writing it now. Where
+    folders cannot be locked (some network file systems) nothing is removed and no run is detected."""
+    pattern = re.compile(re.escape(f".{short_name(target.name)}.partial-") + "[0-9a-f]{8}")
     for entry in list(os.scandir(target.parent)):
         if not pattern.fullmatch(entry.name) or not entry.is_dir(follow_symlinks=False):
             continue
@@ -238,35 +335,19 @@ def _sync_one(path: str | Path) -> None:
 def _move_into_place(partial: Path, target: Path) -> None:
     """Renames `partial` to `target`; an existing `target` is renamed to `partial`."""
     old = target.is_dir() and any(target.iterdir())
-    if not old:
-        os.rename(partial, target)
-    elif not _exchange(partial, target):
-        # Not the name of a hidden folder that the next run removes: a kill between the two would lose the old results.
+    if old and not _exchange(partial, target):
         aside = _aside(target)
         os.rename(target, aside)
-        try:
-            os.rename(partial, target)
-        except BaseException:
-            os.rename(aside, target)
-            raise
+        os.rename(partial, target)
         os.rename(aside, partial)
+    elif not old:
+        os.rename(partial, target)
     _sync_one(target.parent)
 
 
 def _aside(target: Path) -> Path:
-    """Where earlier results lie for a moment while new ones take their name, if the system cannot exchange names."""
-    return target.parent / f".{_short(target.name)}.earlier"
-
-
-def _put_back(target: Path) -> None:
-    """Gives earlier results their name back that a run was replacing when it was killed."""
-    aside = _aside(target)
-    if not aside.is_dir():
-        return
-    if os.path.lexists(target):
-        shutil.rmtree(aside, ignore_errors=True)
-    else:
-        os.rename(aside, target)
+    """Where earlier results lie for a moment while new ones take their name, if names cannot be exchanged."""
+    return target.parent / f".{short_name(target.name)}.earlier"
 
 
 def _exchange(first: Path, second: Path) -> bool:
@@ -312,17 +393,21 @@ MARKER_FILE, DISCARDED_FILE = UNFINISHED_FILE, "discarded.txt"
 _PARTIAL_MARKER = re.compile(re.escape(f".{MARKER_FILE}.") + "([0-9a-f]+[.])?tmp")
 
 
-def folder_beside(out: Path, suffix: str) -> Path:
+def sibling_folder(out: Path, suffix: str) -> Path:
     """The folder OUT.suffix beside an output folder; behind a symbolic link, beside the folder that it leads to."""
     target = Path(os.path.realpath(out))
     return target.with_name(f"{target.name}.{suffix}")
 
 
-def prepared_folder(prepared: Path | None, out: Path, work: Path) -> Path:
-    """Where a training finds what it has prepared, or prepares it: `prepared`, or OUT.prepared where that is None."""
-    prepared = prepared or folder_beside(out, "prepared")
-    for name, folder in (("out", Path(os.path.realpath(out))), ("the state of the run", work)):
-        if lies_in(prepared, folder):
+def prepared_folder(prepared: Path | None, out: Path) -> Path:
+    """Where a training finds what it has prepared, or prepares it: `prepared`, or OUT.prepared where that is None. It
+    cannot be in the output folder or in that of the state, which are replaced and removed."""
+    prepared = prepared or sibling_folder(out, "prepared")
+    for name, folder in (
+        ("out", Path(os.path.realpath(out))),
+        ("the state of the run", sibling_folder(out, "training")),
+    ):
+        if is_within(prepared, folder):
             raise InputError(f"prepared={prepared}: is in the folder of {name}, {folder}; give another folder")
     return prepared
 
@@ -339,26 +424,21 @@ class WorkFolder:
     """
 
     def __init__(self, path: Path) -> None:
-        """Args:
-        path: the folder, which may not exist yet.
-        """
         self.path = Path(os.path.realpath(path))
         self._descriptor: int | None = None
         self._taken = False
 
-    def take(self, *, anew: bool) -> None:
-        """Creates and locks the folder, or that of an interrupted run; a folder without the marker is never changed.
+    def take(self, *, resume: bool) -> None:
+        """Creates and locks the folder, or that of an interrupted run, whose state is removed without `resume`.
 
-        Args:
-            anew: whether to remove the state of an earlier run.
+        Raises:
+            InputError: it holds something else, another run uses it, or it cannot be created or emptied.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             names = [entry.name for entry in self.path.iterdir()]
             # A run that was killed at its start may have left an incomplete marker file alone.
-            if not {MARKER_FILE, DISCARDED_FILE} & {*names} and not all(
-                _PARTIAL_MARKER.fullmatch(name) for name in names
-            ):
+            if not {MARKER_FILE, DISCARDED_FILE} & {*names} and not all(map(_PARTIAL_MARKER.fullmatch, names)):
                 raise InputError(
                     f"{self.path}: this run would save its state here, and the folder holds something else "
                     f"(no {MARKER_FILE}); give another out="
@@ -369,7 +449,7 @@ class WorkFolder:
                 raise BusyError(
                     f"{self.path}: another run saves its state here now; wait for it or give another out="
                 ) from None
-            stale = anew or DISCARDED_FILE in names
+            stale = not resume or DISCARDED_FILE in names
             if stale:
                 self._discard()
             with atomic_file(self.path / MARKER_FILE) as stream:
@@ -432,8 +512,7 @@ class WorkFolder:
         except OSError as failure:
             raise InputError(
                 f"{self.path}: the run is finished and its results are written, but the state that it saved here "
-                "cannot be "
-                f"removed: {failure.strerror or failure}; remove it"
+                f"cannot be removed: {failure.strerror or failure}; remove it"
             ) from failure
         finally:
             self._release()

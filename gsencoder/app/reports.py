@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsencoder.app.summary import Summary, peak_memory_mb
+from gsencoder.app.output import Summary, peak_memory_mb
 from gsencoder.core.arrays import even_indices
 from gsencoder.evaluate.tables import ScoreReport
 from gsencoder.fusion.fuse import Fusion

@@ -1,29 +1,16 @@
-"""Scenes and words that commands read without torch: the queue of scenes, which way is up, what is asked for."""
+"""Scenes and words that commands read without torch: features, which way is up, and what is asked for."""
 
-import json
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from rich.console import Console
-
-from gsencoder.app.options import CommonConfig
-from gsencoder.app.progress import console
-from gsencoder.app.summary import Summary
-from gsencoder.core.errors import BusyError, InputError, listed, one_line
-from gsencoder.core.files import (
-    SUMMARY_NAME,
-    plain,
-    read_foreign_text,
-)
+from gsencoder.app.run import Run
+from gsencoder.core.errors import InputError
+from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import find_file
-from gsencoder.core.process import refuse_several
-from gsencoder.core.settings import option
-from gsencoder.data.scenes import SceneConfig, check_names, load_scene, scene_name
+from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.up import with_up
-from gsencoder.fusion.folder import WORDS_FILE, load_features, table_path
+from gsencoder.fusion.folder import MEMORY_FILE, WORDS_FILE, load_features, load_memories, table_path, teachers_in
 from gsencoder.infer.localize import select_features
 from gsencoder.infer.views.photographs import with_photographs
 from gsencoder.text.table import TextTable, load_text_table
@@ -35,7 +22,7 @@ from gsencoder.text.vocabulary import (
     vocabulary_of,
     words_of_table,
 )
-from gsencoder.types import FeatureSpace, Scene
+from gsencoder.types import FeatureSpace, QueryMemory, Scene
 
 MAX_QUERIES_BYTES = 1 << 20
 """Largest size of a file of queries, bytes."""
@@ -94,26 +81,21 @@ def shown_scene(folder: Path, photos: str, options: SceneConfig) -> Scene:
     return with_photographs(scene, load_scene(photos, options=options)) if photos else scene
 
 
-@dataclass(frozen=True, kw_only=True)
-class WordsOptions(CommonConfig):
-    """Which words are compared with which features. Without slots, as `CommonConfig`."""
-
-    words: str = option("", "text table; empty = the one in the folder of the features")
-    space: str = option("", "name of the feature space, if the folder holds several")
-    head: str = option(
-        "",
-        "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the "
-        "features themselves are",
-    )
-
-
-def with_reported_up(scene: Scene, summary: Summary, *, quiet: bool) -> Scene:
+def with_reported_up(scene: Scene, run: Run) -> Scene:
     """The scene with `up`, which the summary records; an estimate is printed."""
     scene, up = with_up(scene)
-    summary.results["up"] = None if up is None else up.to_dict()
+    run.results["up"] = None if up is None else up.to_dict()
     if up is not None and up.source != "stated":
-        console(quiet).print(f"up of {scene.name}: {up.describe()} (data.up= states it)")
+        run.print(f"up of {scene.name}: {up.describe()} (data.up= states it)")
     return scene
+
+
+def memory_of(folder: Path, scene: Scene) -> QueryMemory | None:
+    """The memory that the one feature set of a scene was decoded from; None where features are stored themselves."""
+    if not (folder / MEMORY_FILE).is_file() and not teachers_in(folder, MEMORY_FILE):
+        return None
+    (features,) = scene.features.values()
+    return next((memory for memory in load_memories(folder).values() if memory.space == features.space), None)
 
 
 def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextConfig = TableTextConfig()) -> Words:
@@ -148,118 +130,3 @@ def _table_beside(folder: Path, space: FeatureSpace) -> TextTable | None:
     except InputError:
         return None
     return table if table is not None and table.space.text_encoder == space.text_encoder else None
-
-
-NOT_COMPARED = ("paths", "out", "overwrite", "quiet", "worker", "resume", "device", "preset")
-"""Settings in which two runs with the same results may differ; what a preset sets is compared."""
-
-
-GOLDEN = 0.6180339887
-"""Workers begin at the fractional parts of its multiples, which are spread evenly however many there are."""
-
-
-class ScenesFailedError(InputError):
-    """Some of several scenes failed, each of which was said when it did.
-
-    Attributes:
-        reasons: one line a scene.
-    """
-
-    def __init__(self, message: str, reasons: tuple[str, ...]) -> None:
-        super().__init__(message)
-        self.reasons = reasons
-
-
-RunOne = Callable[[Path, Path, Summary], None]
-"""Does one scene: its path, the folder for its results, and the summary that goes into it."""
-
-
-def run_scenes(
-    paths: Sequence[Path],
-    out: Path | None,
-    part: str,
-    run: RunOne,
-    summary: Summary,
-    *,
-    overwrite: bool,
-    worker: int,
-    screen: Console,
-) -> None:
-    """Runs a command for one scene into `out`, or for each of several into the folder OUT/NAME.
-
-    Of several scenes those are skipped whose folder holds the results of the same settings, and those that another
-    process is writing now. An error in one does not stop the others. The summary of each has its own
-    warnings, and those from before the first; that of the run has all, with the names of scenes.
-
-    Args:
-        part: what the results are called there.
-        summary: of the whole run; that of a single scene.
-        overwrite: whether finished scenes are done again.
-        worker: number of this process among several that share the scenes; each begins at another one.
-        screen: for lines about scenes that are skipped.
-    """
-    check_names(paths)
-    if len(paths) == 1:
-        refuse_several(f"{paths[0]}", "start it once, or give several scenes, which processes share")
-        name = scene_name(paths[0])
-        run(paths[0], out or Path("outputs") / name / part, summary)
-        return
-    first = int(len(paths) * ((worker * GOLDEN) % 1))
-    failures: dict[Path, str] = {}
-    common = tuple(summary.warnings)
-    skipped = 0
-    for path in (*paths[first:], *paths[:first]):
-        name = scene_name(path)
-        target = out / name if out is not None else Path("outputs") / name / part
-        try:
-            if not overwrite and _is_finished(target, summary):
-                skipped += 1
-                continue
-            with summary.of_scene(name, path, common) as summary_of_scene:
-                run(path, target, summary_of_scene)
-        except BusyError:
-            screen.print(f"{target}: another run is writing it now")
-        except InputError as error:
-            if not overwrite and _was_finished(target, summary):
-                continue
-            failures[path] = str(error) if str(error).startswith(f"{path}: ") else f"{path}: {error}"
-            print(one_line(f"failed: {failures[path]}"), file=sys.stderr)
-    if skipped:
-        screen.print(f"{skipped} of {len(paths)} scenes were finished before")
-    if failures:
-        raise ScenesFailedError(
-            f"{len(failures)} of {len(paths)} scenes failed, and the same command tries them again: "
-            f"{listed([str(path) for path in failures])}",
-            tuple(failures.values()),
-        )
-
-
-def _was_finished(target: Path, summary: Summary) -> bool:
-    """Whether another process has finished the scene in the meantime."""
-    try:
-        return _is_finished(target, summary)
-    except InputError:
-        return False
-
-
-def _is_finished(target: Path, summary: Summary) -> bool:
-    """Whether a folder holds the results of this command with these settings."""
-    try:
-        record = json.loads(read_foreign_text(target / SUMMARY_NAME))
-    except FileNotFoundError:
-        return False
-    except (OSError, ValueError) as error:
-        raise InputError(f"{target / SUMMARY_NAME}: cannot be read ({type(error).__name__})") from error
-    now = {"command": summary.command, **_compared(json.loads(json.dumps(plain(summary.settings))))}
-    before = {"command": record.get("command"), **_compared(record.get("settings", {}))}
-    differing = sorted(key for key in {*now, *before} if now.get(key) != before.get(key))
-    if differing:
-        raise InputError(
-            f"{target}: holds the results of other settings ({', '.join(differing[:5])}); give another out= or "
-            "overwrite=true"
-        )
-    return True
-
-
-def _compared(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in settings.items() if key not in NOT_COMPARED}

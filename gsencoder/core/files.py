@@ -92,10 +92,10 @@ def temporary_beside(target: Path) -> Iterator[Path]:
     The name is the same every time, so that the file that a killed run left is written over by the next and not left
     for good. The file is locked; a second run that writes the same target meanwhile gets a name of its own.
     """
-    path = target.parent / f".{_short(target.name)}.tmp"
+    path = target.parent / f".{short_name(target.name)}.tmp"
     descriptor = _locked_file(path)
     if descriptor is None:
-        path = path.with_name(f".{_short(target.name)}.{secrets.token_hex(6)}.tmp")
+        path = path.with_name(f".{short_name(target.name)}.{secrets.token_hex(6)}.tmp")
     try:
         yield path
     finally:
@@ -117,7 +117,7 @@ def _is_file_of(path: Path, descriptor: int) -> bool:
     return (here.st_dev, here.st_ino) == (own.st_dev, own.st_ino)
 
 
-def _short(name: str) -> str:
+def short_name(name: str) -> str:
     """The name, or a part and a digest of it if the temporary name would be longer than file systems allow."""
     raw = os.fsencode(name)
     return name if len(raw) <= 200 else f"{name[:40]}.{sha1(raw).hexdigest()}"

@@ -18,7 +18,6 @@ import math
 import os
 import re
 import signal
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -58,32 +57,16 @@ def stop_of(error: BaseException) -> Stopped | KeyboardInterrupt | None:
     return inner if isinstance(inner, Stopped | KeyboardInterrupt) else None
 
 
-_received: int | None = None
-"""The last signal that a command received; None where `stopping_signals` is not entered, as in a library."""
-
-
 @contextmanager
 def stopping_signals() -> Iterator[None]:
-    """Signals that end the process raise an exception within the block, and are remembered; for the main thread of a
-    command, others are left as they are.
-
-    An exception that a handler raises does not always get through: in a destructor, a weakref's callback (the import
-    system has one) or a callback of compiled code Python prints and drops it, and libraries have `except:` clauses.
-    `raise_dropped_stop` raises it again. Signals that are ignored (nohup) remain so.
-    """
-    global _received
+    """Signals that end the process raise an exception within the block, for the main thread of a command; signals that
+    are ignored (nohup) remain so."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def stop(number: int, _: FrameType | None) -> None:
-        global _received
-        _received = number
-        raise _stop(number)
-
-    def report(dropped: Any) -> None:
-        if not isinstance(dropped.exc_value, Stopped | KeyboardInterrupt):
-            report_before(dropped)
+        raise Interrupted() if number == signal.SIGINT else Stopped(number)
 
     replaced = {number: signal.getsignal(number) for number in SIGNALS}
     replaced = {
@@ -91,50 +74,13 @@ def stopping_signals() -> Iterator[None]:
         for number, handler in replaced.items()
         if handler in (signal.SIG_DFL, signal.default_int_handler)
     }
-    report_before, sys.unraisablehook = sys.unraisablehook, report
     try:
         for number in replaced:
             signal.signal(number, stop)
         yield
-        raise_dropped_stop()
-    except Exception as error:
-        if _received is None:
-            raise
-        # What a library, or a line that names its errors, made of the exception.
-        stopped = _stop(_received)
-        stopped.__notes__ = getattr(error, "__notes__", [])
-        raise stopped from error
     finally:
         for number, handler in replaced.items():
             signal.signal(number, handler)
-        sys.unraisablehook, _received = report_before, None
-
-
-def raise_dropped_stop() -> None:
-    """Raises the exception of a signal that the command has received, unless it is on its way: commands call this
-    between steps, and before results appear.
-
-    Raises:
-        Stopped, KeyboardInterrupt: the signal has not ended the command.
-    """
-    if _received is None or threading.current_thread() is not threading.main_thread():
-        return
-    handled = sys.exc_info()[1]
-    while handled is not None:
-        if stop_of(handled) is not None:
-            return
-        handled = handled.__context__
-    raise _stop(_received)
-
-
-def accept_stop() -> None:
-    """Forgets the signal that was received, where it ends what a command does in the usual way."""
-    global _received
-    _received = None
-
-
-def _stop(number: int) -> Stopped | KeyboardInterrupt:
-    return Interrupted() if number == signal.SIGINT else Stopped(number)
 
 
 @contextmanager

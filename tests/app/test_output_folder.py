@@ -12,10 +12,9 @@ import pytest
 from output_folders import fill, names, write_and_raise
 
 from gsencoder.app import output as outputs
-from gsencoder.app.output import output_folder, refuse_existing
-from gsencoder.app.summary import SUMMARY_NAME
+from gsencoder.app.output import check_output_files, output_folder
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import write_bytes
+from gsencoder.core.files import SUMMARY_NAME, write_bytes
 
 
 def test_a_folder_appears_whole_when_the_block_ends(tmp_path: Path) -> None:
@@ -209,11 +208,11 @@ def test_of_runs_that_begin_in_one_moment_one_gets_the_folder(tmp_path: Path) ->
 def test_single_files_are_replaced_only_if_allowed(tmp_path: Path) -> None:
     write_bytes(tmp_path / "a", b"1")
     with pytest.raises(InputError, match="exists; give another out= or overwrite=true"):
-        refuse_existing(tmp_path / "a", overwrite=False)
-    refuse_existing(tmp_path / "a", overwrite=True)
-    refuse_existing(tmp_path / "b", overwrite=False)
+        check_output_files([tmp_path / "a"], overwrite=False)
+    check_output_files([tmp_path / "a"], overwrite=True)
+    check_output_files([tmp_path / "b"], overwrite=False)
     with pytest.raises(InputError, match="is a folder"):
-        refuse_existing(tmp_path, overwrite=True)
+        check_output_files([tmp_path], overwrite=True)
     write_bytes(tmp_path / "a", b"2")
     assert (tmp_path / "a").read_bytes() == b"2"
     assert names(tmp_path) == ["a"]

@@ -5,8 +5,8 @@ import io
 import pytest
 from rich.table import Table
 
-from gsencoder.app import progress
-from gsencoder.app.progress import Progress, console
+from gsencoder.app import run as progress
+from gsencoder.app.run import Progress, console
 
 
 class Stream(io.StringIO):

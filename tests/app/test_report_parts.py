@@ -12,8 +12,8 @@ from selected_rooms import SPACE, selected_room, with_more, words
 from gsencoder.app import reports as demo
 from gsencoder.app import reports as parts
 from gsencoder.app import reports as results
+from gsencoder.app.output import Summary
 from gsencoder.app.reports import TeacherResult
-from gsencoder.app.summary import Summary
 from gsencoder.fusion.fuse import Fusion
 from gsencoder.infer.localize import localize
 from gsencoder.infer.page.report import HtmlReport

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from gsencoder.app.summary import Summary, report_choice, report_promises
+from gsencoder.app.output import Summary
+from gsencoder.app.summary import report_choice, report_promises
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.settings import Budget
 

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,15 +12,19 @@ from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app import main as cli
 from gsencoder.app.commands import fuse
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import console
-from gsencoder.app.scenes import run_scenes
-from gsencoder.app.summary import Summary, report_choice, report_promises
+from gsencoder.app.options import SharedScenesConfig
+from gsencoder.app.output import Summary, output_folder
+from gsencoder.app.run import Run
+from gsencoder.app.summary import report_choice, report_promises
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.data.scenes import find_scenes, listed_paths
 from gsencoder.reconstruct.sfm import find_photographed
 
-SETTINGS = {"voxel": 0.02, "paths": ["a"], "out": "somewhere", "quiet": False}
+
+@dataclass(frozen=True, kw_only=True)
+class QueueConfig(SharedScenesConfig):
+    paths: tuple[str, ...] = ("a",)
+    voxel: float = 0.02
 
 
 class Work:
@@ -39,13 +44,10 @@ class Work:
 
 
 def queue(tmp_path: Path, work: Work, names: str = "abcd", **options: Any) -> None:
-    settings = SETTINGS | options.pop("settings", {})
-    options = {"overwrite": False, "worker": 0} | options
     paths = [tmp_path / "scenes" / name for name in names]
     for path in paths:
         path.mkdir(parents=True, exist_ok=True)
-    summary = Summary("fuse", settings)
-    run_scenes(paths, tmp_path / "out", "features", work, summary, screen=console(), **options)
+    Run("fuse", QueueConfig(out=tmp_path / "out", **options)).scenes(paths, "features", work)
 
 
 def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(
@@ -58,14 +60,14 @@ def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(
     said = capsys.readouterr().err.splitlines()
     assert said == [f"failed: {tmp_path / 'scenes' / name}: no photographs" for name in "bd"]
     second = Work()
-    queue(tmp_path, second, settings={"quiet": True, "out": "elsewhere"})
+    queue(tmp_path, second, quiet=True)
     assert second.done == ["b", "d"]
     assert "2 of 4 scenes were finished before" in capsys.readouterr().out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == list("abcd")
 
 
 def test_each_of_several_scenes_has_its_own_warnings_in_its_summary(tmp_path: Path) -> None:
-    summary = Summary("fuse", SETTINGS)
+    summary = Run("fuse", QueueConfig(out=tmp_path / "out"))
     assert summary.add_warning("weights: old") == "weights: old"
     shown, given = list[str](), list[Summary]()
 
@@ -76,8 +78,7 @@ def test_each_of_several_scenes_has_its_own_warnings_in_its_summary(tmp_path: Pa
         given.append(one)
 
     texts = {"a": "dark", "b": f"{tmp_path / 'b'}/depth: dark", "c": "c: dark"}
-    paths, options = [tmp_path / name for name in texts], {"overwrite": False, "worker": 0, "screen": console()}
-    run_scenes(paths, tmp_path / "out", "features", run, summary, **options)
+    summary.scenes([tmp_path / name for name in texts], "features", run)
     # The run shows and keeps all, with the name of the scene where a warning does not say it.
     assert shown == ["a: dark", texts["b"], texts["c"]]
     assert summary.warnings == ["weights: old", *shown]
@@ -97,9 +98,8 @@ def test_a_broken_promise_of_one_of_several_scenes_names_it_on_the_screen_and_st
             report_choice(one, path.name, {}, predicted={}, notes=[], quiet=True)
             report_promises(one, fuse.BudgetConfig(seconds=1.0), {"seconds": 1.5 if path.name == "one" else 2.5})
 
-    def run(config: fuse.FuseCommandConfig, summary: Summary) -> None:
-        paths, options = [*map(Path, config.paths)], {"overwrite": False, "worker": 0, "screen": console()}
-        run_scenes(paths, config.out, "features", run_one, summary, **options)
+    def run(config: fuse.FuseCommandConfig, run: Run) -> None:
+        run.scenes([*map(Path, config.paths)], "features", run_one)
 
     monkeypatch.setattr(fuse, "run", run)
     out = tmp_path / "out"
@@ -116,7 +116,7 @@ def test_results_of_other_settings_are_neither_taken_nor_replaced(
     queue(tmp_path, Work())
     other = Work()
     with pytest.raises(InputError, match="4 of 4 scenes failed"):
-        queue(tmp_path, other, settings={"voxel": 0.01})
+        queue(tmp_path, other, voxel=0.01)
     assert capsys.readouterr().err.count("results of other settings (voxel)") == 4
     assert other.done == []
     again = Work()
@@ -148,8 +148,7 @@ def test_without_an_output_folder_results_lie_in_outputs(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     paths = [tmp_path / name for name in names]
-    options = {"overwrite": False, "worker": 0, "screen": console()}
-    run_scenes(paths, None, "features", Work(), Summary("fuse", SETTINGS), **options)
+    Run("fuse", QueueConfig()).scenes(paths, "features", Work())
     for name in names:
         assert (Path("outputs") / name / "features" / "name.txt").read_text() == name
 

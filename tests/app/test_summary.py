@@ -12,7 +12,7 @@ import pytest
 from output_folders import names
 
 from gsencoder.app.output import output_folder
-from gsencoder.app.summary import SUMMARY_NAME, Summary, peak_memory_mb
+from gsencoder.app.output import SUMMARY_NAME, Summary, peak_memory_mb
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.files import write_json
 

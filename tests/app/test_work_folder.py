@@ -11,7 +11,7 @@ from gsencoder.core.errors import InputError
 
 def run(path: Path, inside: Callable[[Path], None] = lambda path: None, *, anew: bool = False) -> None:
     with WorkFolder(path) as work:
-        work.take(anew=anew)
+        work.take(resume=not anew)
         inside(work.path)
 
 
@@ -39,7 +39,7 @@ def test_state_is_kept_when_a_run_is_cut_off_and_goes_when_it_ends(tmp_path: Pat
     cut_off(path, "state")
     assert contents(path) == ["state", MARKER_FILE]
     with WorkFolder(path) as work:
-        work.take(anew=False)
+        work.take(resume=True)
         assert contents(path) == ["state", MARKER_FILE]
     assert not path.exists()
 
@@ -49,7 +49,7 @@ def test_a_run_that_begins_anew_forgets_what_there_was(tmp_path: Path) -> None:
     (tmp_path / "run" / "folder").mkdir()
     (tmp_path / "run" / "folder" / "deep").touch()
     with WorkFolder(tmp_path / "run") as work:
-        work.take(anew=True)
+        work.take(resume=False)
         assert contents(tmp_path / "run") == [MARKER_FILE]
 
 
@@ -88,13 +88,13 @@ def test_a_folder_that_was_not_taken_is_left_alone(tmp_path: Path) -> None:
 def test_a_folder_that_no_run_made_is_never_taken_or_removed(tmp_path: Path, *, anew: bool) -> None:
     (tmp_path / "notes.txt").touch()
     with pytest.raises(InputError, match="holds something else"), WorkFolder(tmp_path) as work:
-        work.take(anew=anew)
+        work.take(resume=not anew)
     assert (tmp_path / "notes.txt").is_file()
     with (
         pytest.raises(InputError, match="cannot save the state of this run here.*give another out="),
         WorkFolder(tmp_path / "notes.txt") as work,
     ):
-        work.take(anew=anew)
+        work.take(resume=not anew)
 
 
 @pytest.mark.parametrize(("message", "noted"), [("no labels", True), ("{path} has other settings", False)])
@@ -105,7 +105,7 @@ def test_an_error_that_is_not_about_the_state_says_that_it_can_be_continued(
 
     def fail() -> None:
         with WorkFolder(path) as work:
-            work.take(anew=False)
+            work.take(resume=True)
             (path / "half.bin").touch()
             raise InputError(message.format(path=path))
 
@@ -120,7 +120,7 @@ def test_a_run_that_was_killed_in_its_first_moments_does_not_block_the_next(tmp_
     path.mkdir()
     (path / f".{MARKER_FILE}.0123456789ab.tmp").touch()
     with WorkFolder(path) as work:
-        work.take(anew=anew)
+        work.take(resume=not anew)
     assert not path.exists()
 
 
@@ -147,13 +147,13 @@ def test_a_kill_while_the_folder_is_removed_leaves_one_that_is_known(
 @pytest.mark.parametrize("anew", [True, False])
 def test_two_runs_do_not_share_a_folder(tmp_path: Path, *, anew: bool) -> None:
     with WorkFolder(tmp_path / "run") as first:
-        first.take(anew=False)
+        first.take(resume=True)
         (first.path / "state").touch()
         with pytest.raises(InputError, match="another run saves its state here now"), WorkFolder(first.path) as second:
-            second.take(anew=anew)
+            second.take(resume=not anew)
         assert contents(first.path) == ["state", MARKER_FILE]
     with WorkFolder(tmp_path / "run") as third:
-        third.take(anew=False)
+        third.take(resume=True)
 
 
 def test_behind_a_link_the_folder_itself_is_emptied(tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_an_error_before_anything_was_computed_speaks_of_no_state_and_leaves_non
     def fail() -> None:
         with WorkFolder(path) as work:
             if taken:
-                work.take(anew=False)
+                work.take(resume=True)
             raise InputError("no labels")
 
     with pytest.raises(InputError) as caught:

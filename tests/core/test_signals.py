@@ -2,19 +2,15 @@
 
 import os
 import signal
-import sys
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
 
 import pytest
 
 from gsencoder.core.process import (
     SIGNALS,
     Stopped,
-    accept_stop,
     defer_signals,
-    raise_dropped_stop,
     stop_of,
     stopping_signals,
 )
@@ -125,157 +121,28 @@ def test_a_stop_is_known_by_itself_and_within_what_compiled_code_raises() -> Non
     assert stop_of(other) is None
 
 
-def interrupt(number: int = signal.SIGTERM) -> None:
-    """Sends a signal and drops what its handler raises, as a library may."""
-    with suppress(Stopped, KeyboardInterrupt):
-        os.kill(os.getpid(), number)
+def test_signals_raise_within_the_block_of_a_command_and_handlers_are_given_back() -> None:
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in SIGNALS if number != signal.SIGINT}
+    try:
+        for number in before:
+            with pytest.raises(Stopped) as stop, stopping_signals():
+                os.kill(os.getpid(), number)
+            assert stop.value.number == number
+            assert signal.getsignal(number) == signal.SIG_DFL
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-def test_a_dropped_stop_is_raised_again_each_time_it_is_asked_for_and_at_the_end() -> None:
-    before, hook = {number: signal.getsignal(number) for number in SIGNALS}, sys.unraisablehook
-    raised = []
-
-    def work() -> None:
-        raise_dropped_stop()
-        interrupt()
-        for _ in range(2):
-            try:
-                raise_dropped_stop()
-            except Stopped as stop:
-                raised.append(stop.number)
-
-    with pytest.raises(Stopped), stopping_signals():
-        work()
-    assert raised == [signal.SIGTERM] * 2
-    assert {number: signal.getsignal(number) for number in SIGNALS} == before
-    assert sys.unraisablehook is hook
-    raise_dropped_stop()
-
-
-def test_other_errors_that_python_drops_are_still_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Subject:
-        def __del__(self) -> None:
-            raise ValueError("of something else")
-
-    reported = []
-    monkeypatch.setattr(sys, "unraisablehook", lambda dropped: reported.append(str(dropped.exc_value)))
-    with stopping_signals():
-        Subject()
-    assert reported == ["of something else"]
-
-
-@pytest.mark.parametrize("wrapped", [False, True])
-def test_a_stop_that_is_being_handled_is_not_raised_again(wrapped: bool) -> None:
-    stop, cleaned = Stopped(signal.SIGTERM), []
-    error = SystemError("<function> returned a result with an exception set")
-    error.__cause__ = stop
-
-    def work() -> None:
-        interrupt()
-        try:
-            raise error if wrapped else stop
-        finally:
-            raise_dropped_stop()
-            cleaned.append("all of it")
-
-    with pytest.raises(Stopped) as raised, stopping_signals():
-        work()
-    assert cleaned == ["all of it"]
-    assert (raised.value is stop) != wrapped
-
-
-def test_a_dropped_stop_is_raised_while_another_error_is_handled() -> None:
-    after = []
-
-    def work() -> None:
-        interrupt()
-        try:
-            raise OSError("of something else")
-        except OSError:
-            raise_dropped_stop()
-            after.append("went on")
-
-    with pytest.raises(Stopped), stopping_signals():
-        work()
-    assert after == []
-
-
-def test_an_error_that_was_made_of_a_stop_is_its_cause_and_gives_it_its_notes() -> None:
-    error = ValueError("the model cannot be run")
-    error.add_note("a folder is left behind")
-
-    def work() -> None:
-        interrupt()
-        raise error
-
-    with pytest.raises(Stopped) as stop, stopping_signals():
-        work()
-    assert stop.value.__cause__ is error
-    assert stop.value.__notes__ == ["a folder is left behind"]
-
-
-def test_a_dropped_stop_is_raised_in_the_main_thread_alone() -> None:
-    raised = []
-
-    def elsewhere() -> None:
-        try:
-            raise_dropped_stop()
-        except Stopped as stop:
-            raised.append(stop)
-
-    def work() -> None:
-        interrupt()
-        thread = threading.Thread(target=elsewhere)
-        thread.start()
-        thread.join()
-
-    with pytest.raises(Stopped), stopping_signals():
-        work()
-    assert raised == []
-
-
-@pytest.mark.usefixtures("interrupts")
-def test_a_second_signal_is_raised_where_the_first_is_being_handled_and_the_first_is_not_raised_twice() -> None:
-    cleaned = []
-
-    def work() -> None:
-        try:
-            os.kill(os.getpid(), signal.SIGTERM)
-        finally:
-            try:
-                raise OSError("in the cleanup")
-            except OSError:
-                raise_dropped_stop()
-            cleaned.append("first")
-            try:
-                os.kill(os.getpid(), signal.SIGINT)
-            except KeyboardInterrupt:
-                cleaned.append("second")
-
-    with pytest.raises(Stopped), stopping_signals():
-        work()
-    assert cleaned == ["first", "second"]
-
-
-def test_a_stop_that_was_accepted_is_over() -> None:
-    with stopping_signals():
-        interrupt(signal.SIGINT)
-        accept_stop()
-        raise_dropped_stop()
-
-
-def test_a_library_has_the_handlers_of_its_program_and_nothing_is_remembered() -> None:
+def test_a_library_has_the_handlers_of_its_program() -> None:
     received = []
     before = signal.signal(signal.SIGINT, lambda number, _: received.append(number))
     try:
-        os.kill(os.getpid(), signal.SIGINT)
-        raise_dropped_stop()
         with stopping_signals():
             os.kill(os.getpid(), signal.SIGINT)
-            raise_dropped_stop()
     finally:
         signal.signal(signal.SIGINT, before)
-    assert received == [signal.SIGINT] * 2
+    assert received == [signal.SIGINT]
 
 
 def test_in_another_thread_nothing_is_installed() -> None:
@@ -284,7 +151,6 @@ def test_in_another_thread_nothing_is_installed() -> None:
     def work() -> None:
         with stopping_signals():
             seen.append(signal.getsignal(signal.SIGTERM))
-            raise_dropped_stop()
 
     thread = threading.Thread(target=work)
     thread.start()

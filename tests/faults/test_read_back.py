@@ -22,9 +22,9 @@ from scene_files import write_transforms
 from splats import random_gaussians
 from tuning_pairs import png
 
-from gsencoder.app.output import output_folder
-from gsencoder.app.scenes import _is_finished
-from gsencoder.app.summary import Summary, write_beside
+from gsencoder.app.options import SharedScenesConfig
+from gsencoder.app.output import Summary, output_file, output_folder
+from gsencoder.app.run import Run, _is_finished
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import check_written, checksums_of, sealed, write_bytes, write_json, write_picture
 from gsencoder.data.labels.files import read_checked
@@ -75,10 +75,10 @@ def dataset(folder: Path) -> Made:
 
 
 def finished(folder: Path) -> Made:
-    summary = Summary("fuse", SETTINGS)
-    with output_folder(folder / "out", summary=summary) as out:
+    run = Run("fuse", SharedScenesConfig())
+    with output_folder(folder / "out", summary=run) as out:
         (out / "a.txt").write_text("x")
-    return folder / "out" / "summary.json", lambda: _is_finished(folder / "out", summary)
+    return folder / "out" / "summary.json", lambda: _is_finished(folder / "out", run)
 
 
 def frames(folder: Path) -> Made:
@@ -103,8 +103,8 @@ def written(name: str, write: Callable[[Path], Any], read: Callable[[Path], Any]
 
 
 def beside(folder: Path) -> Made:
-    save_splat(folder / "new.ply", random_gaussians(20))
-    write_beside(folder / "new.ply", Summary("repair", {}))
+    with output_file(folder / "new.ply", overwrite=False, summary=Summary("repair", {})):
+        save_splat(folder / "new.ply", random_gaussians(20))
     return folder / "new.ply", lambda: _arrays(load_splat(folder / "new.ply"))
 
 

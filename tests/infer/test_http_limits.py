@@ -242,7 +242,7 @@ def test_connections_end_with_their_server() -> None:
 MEASURED = """
 import sys
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
-from gsencoder.app.summary import peak_memory_mb
+from gsencoder.app.output import peak_memory_mb
 config = VlmConfig(base_url=sys.argv[1], model="m", retries=0, stream=sys.argv[2] == "True")
 server = VlmServer(config)
 before = peak_memory_mb()

@@ -7,11 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.app.inputs import load_asker, localized_captions, photos_of, scene_folders
-from gsencoder.app.options import settings
-from gsencoder.app.output import WorkFolder, folder_beside, output_folder
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.scenes import WordsOptions
-from gsencoder.app.summary import Summary
+from gsencoder.app.options import FeaturesConfig, settings
+from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed, printable
 from gsencoder.core.files import write_json
 from gsencoder.core.process import Clock
@@ -45,7 +42,7 @@ PREDICTIONS = "predictions.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AskCommandConfig(WordsOptions):
+class AskCommandConfig(FeaturesConfig):
     """Settings of `ask`."""
 
     paths: tuple[str, ...] = option(
@@ -86,6 +83,7 @@ class AskCommandConfig(WordsOptions):
     text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
+        FeaturesConfig.__post_init__(self)
         if len(self.paths) > 1 and not self.questions:
             raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
         if self.proposals and not self.questions:
@@ -100,12 +98,12 @@ class AskCommandConfig(WordsOptions):
         return Question(text=self.question, task=self.task, query=self.query, aabb=self.aabb)
 
 
-def run(config: AskCommandConfig, summary: Summary) -> None:
+def run(config: AskCommandConfig, run: Run) -> None:
     """Localizes the words of the question, chooses and renders views, asks the VLM, and writes everything."""
     server = None if config.dry_run else VlmServer(config.vlm)
     request_body([], config.vlm, named=server is not None)
     if config.questions and is_question_set(Path(config.questions)):
-        ask_set(config, read_question_set(Path(config.questions), config.task, config.proposals), server, summary)
+        ask_set(config, read_question_set(Path(config.questions), config.task, config.proposals), server, run)
         return
     if len(config.paths) > 1 or config.proposals:
         raise InputError(
@@ -116,21 +114,20 @@ def run(config: AskCommandConfig, summary: Summary) -> None:
     questions = read_questions(Path(config.questions), config.task) if config.questions else ()
     if not questions:
         check_question(config.task, config.question)
-    with summary.step("load"):
+    with run.step("load"):
         asker = load_asker(config, folder, config.photos)
-    out = config.out or Path("outputs") / asker.scene.name / ("answers" if questions else "answer")
+    out = run.out(asker.scene.name, "answers" if questions else "answer")
     if questions:
-        ask_file(out, questions, asker, server, config, summary)
+        ask_file(out, questions, asker, server, config, run)
         return
     clock = Clock()
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
+    with run.folder(out) as target:
         row = ask_question(config.single_question(), asker, server, target, clock)
-        summary.add_seconds(clock.seconds)
-        summary.results.update(row)
-    screen = console(config.quiet)
+        run.add_seconds(clock.seconds)
+        run.results.update(row)
     if server is not None:
-        screen.print(printable(row["answer"]), soft_wrap=True)
-    screen.print(
+        run.print(printable(row["answer"]), soft_wrap=True)
+    run.print(
         f"{out}: {counted(len(row['views']), 'picture')}, {PROMPT}, {REQUEST}" + (f", {ANSWER}" if server else "")
     )
 
@@ -147,30 +144,25 @@ def ask_file(
     asker: Asker,
     server: VlmServer | None,
     config: AskCommandConfig,
-    summary: Summary,
+    run: Run,
 ) -> None:
     """Asks the questions of a file; the answers of an interrupted run stay in a folder beside out=."""
     clock = Clock()
-    with (
-        WorkFolder(folder_beside(out, "answers")) as work,
-        output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
-    ):
-        work.take(anew=not config.resume)
-        track = Progress(quiet=config.quiet)
-        rows = ask_questions(questions, asker, server, work.path, made_from=made_from(config), clock=clock, track=track)
-        write_answers(folder, work.path, rows)
-        summary.add_seconds(clock.seconds)
-        summary.results.update(questions=len(questions), answers=ANSWERS)
-    console(config.quiet).print(f"{out}: {counted(len(questions), 'question')}, {ANSWERS}")
+    with run.resumable(out, "answers", resume=config.resume) as (folder, work):
+        rows = ask_questions(questions, asker, server, work, made_from=made_from(config), clock=clock, track=run.track)
+        write_answers(folder, work, rows)
+        run.add_seconds(clock.seconds)
+        run.results.update(questions=len(questions), answers=ANSWERS)
+    run.print(f"{out}: {counted(len(questions), 'question')}, {ANSWERS}")
 
 
-def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServer | None, summary: Summary) -> None:
+def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServer | None, run: Run) -> None:
     """Asks the questions of a benchmark about each scene that there are features of, and writes predictions.
 
     The features of one scene are in memory at a time. Questions that have no answer are counted and named, and so are
     scenes without features.
     """
-    out = config.out or Path("outputs") / question_set.benchmark
+    out = run.out(question_set.benchmark)
     question_counts = question_set.scenes()
     folders = scene_folders(config.paths, question_counts)
     if not folders:
@@ -179,18 +171,14 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
             f"({listed(sorted(question_counts), 3)}), and none of "
             f"them has features in {', '.join(config.paths)}"
         )
-    clock, screen = Clock(), console(config.quiet)
+    clock = Clock()
     answered: list[tuple[SetQuestion, dict[str, Any]]] = []
     silent: list[SetQuestion] = []
     unanswered: dict[str, str] = {}
     counts: dict[str, int] = {}
-    with (
-        WorkFolder(folder_beside(out, "answers")) as work,
-        output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
-    ):
-        work.take(anew=not config.resume)
+    with run.resumable(out, "answers", resume=config.resume) as (folder, work):
         for path in folders:
-            with summary.step("load"):
+            with run.step("load"):
                 asker = load_asker(config, path, photos_of(config.photos, path))
             name = asker.scene.name
             if name in counts:
@@ -203,7 +191,7 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
                 if question_set.names
                 else question_set.of_scene(name)
             )
-            state = work.path / name
+            state = work / name
             state.mkdir(exist_ok=True)
             rows = ask_questions(
                 [each.question for each in questions],
@@ -213,7 +201,7 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
                 made_from=made_from(config),
                 unanswered=unanswered,
                 clock=clock,
-                track=Progress(quiet=config.quiet),
+                track=run.track,
             )
             (folder / name).mkdir()
             write_answers(folder / name, state, rows)
@@ -221,8 +209,8 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
             answered += [(each, by_id[each.question.id]) for each in questions if each.question.id in by_id]
             silent += [each for each in questions if each.question.id not in by_id]
             counts[name] = len(questions)
-            screen.print(f"{name}: {len(rows)} of {len(questions)} questions")
-        summary.add_seconds(clock.seconds)
+            run.print(f"{name}: {len(rows)} of {len(questions)} questions")
+        run.add_seconds(clock.seconds)
         if not any(counts.values()):
             raise InputError(
                 f"questions: {config.questions} asks about {counted(len(question_counts), 'scene')} "
@@ -238,7 +226,7 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
                 SceneWarning,
                 stacklevel=2,
             )
-        summary.results.update(
+        run.results.update(
             benchmark=question_set.benchmark,
             questions=sum(counts.values()),
             answered=len(answered),
@@ -251,7 +239,7 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
             entries = predictions(question_set.benchmark, answered, silent)
             write_json(folder / PREDICTIONS, entries)
             predicted = sum(map(len, entries.values())) if isinstance(entries, dict) else len(entries)
-            summary.results.update(predictions=PREDICTIONS, predicted=predicted)
+            run.results.update(predictions=PREDICTIONS, predicted=predicted)
     if unanswered:
         first = next(iter(unanswered.values()))
         warnings.warn(
@@ -260,12 +248,12 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
             stacklevel=2,
         )
     if others:
-        screen.print(
+        run.print(
             f"not asked, for want of features: {counted(sum(others.values()), 'question')} about "
             f"{counted(len(others), 'scene')}: "
             f"{listed(sorted(others), 3)}"
         )
-    screen.print(
+    run.print(
         f"{out}: "
         + (
             f"{counted(len(answered), 'answer')}, {PREDICTIONS}"

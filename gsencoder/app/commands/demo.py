@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.app.options import CommonConfig, settings
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import Progress, console
 from gsencoder.app.reports import TeacherResult, write_report
-from gsencoder.app.summary import Summary
+from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import atomic_file, write_json
+from gsencoder.core.files import write_bytes, write_json
 from gsencoder.core.settings import option
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
@@ -39,32 +37,26 @@ PAGE_OPTIONS = FileOptions(error=0.01, sh_degree=3, photographs=16, photograph_s
 class DemoConfig(CommonConfig):
     """Settings of `demo`."""
 
-    seed: int = option(0, "seed of the random room")
-    objects: int = option(8, "number of named objects")
-    views: int = option(16, "number of views")
-    width: int = option(320, "width of the views in pixels; the height is three quarters of it")
+    seed: int = option(0, "seed of the random room", ge=0)
+    objects: int = option(8, "number of named objects", ge=1)
+    views: int = option(16, "number of views", ge=1)
+    width: int = option(320, "width of the views in pixels; the height is three quarters of it", ge=16)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
-    def __post_init__(self) -> None:
-        for name, minimum in (("seed", 0), ("objects", 1), ("views", 1), ("width", 16)):
-            if getattr(self, name) < minimum:
-                raise InputError(f"{name}: expected {minimum} or more, got {getattr(self, name)}")
 
-
-def run(config: DemoConfig, summary: Summary) -> None:
+def run(config: DemoConfig, run: Run) -> None:
     """Makes a room, reads it back, seeds Gaussians, fuses two teachers, localizes words, and writes OUT/report.html."""
-    out = config.out or Path("outputs") / "demo"
-    screen = console(config.quiet)
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
-        scene = photographed_room(config, folder, summary)
-        screen.print(f"scene: {len(scene.objects)} objects in {config.views} views with depth")
-        with summary.step("seeds"):
+    out = run.out("demo")
+    with run.folder(out) as folder:
+        scene = photographed_room(config, folder, run)
+        run.print(f"scene: {len(scene.objects)} objects in {config.views} views with depth")
+        with run.step("seeds"):
             scene = replace(scene, gaussians=seed(scene, config.seeds))
         assert scene.gaussians is not None
         save_splat(folder / "splat.ply", scene.gaussians, origin=scene.origin)
-        screen.print(f"seeds: {len(scene.gaussians):,} Gaussians, no optimization")
+        run.print(f"seeds: {len(scene.gaussians):,} Gaussians, no optimization")
         scene_objects = [scene_object for scene_object in scene.objects if scene_object.placed and scene_object.name]
         names = room_words(scene)
         labels = LabelsTeacher(scene.objects, names.names, names.embeddings, text_encoder=names.space.text_encoder)
@@ -74,28 +66,28 @@ def run(config: DemoConfig, summary: Summary) -> None:
         by_name = [(scene_object.name, scene_object) for scene_object in scene_objects if scene_object.name]
         by_color = [(hues[scene_object.id], scene_object) for scene_object in scene_objects]
         results = (
-            search(scene, labels, names, by_name, config, folder / "names", summary),
-            search(scene, palette, colors, unrepeated(by_color), config, folder / "colors", summary),
+            search(scene, labels, names, by_name, config, folder / "names", run),
+            search(scene, palette, colors, unrepeated(by_color), config, folder / "colors", run),
         )
         for result in results:
-            screen.print(
+            run.print(
                 f"{result.title}: features of {result.features.features.shape[1]} of "
                 f"{result.features.space.channels} channels; {result.num_localized} of {len(result.words)} words "
                 f"localized (IoU ≥ 0.5), mean IoU {result.mean_iou:.2f}"
             )
-        summary.results.update(
+        run.results.update(
             gaussians=len(scene.gaussians),
             views=config.views,
             report="report.html",
             **{result.title: result.to_dict() for result in results},
         )
-        with summary.step("page"):
+        with run.step("page"):
             problem = write_page(folder / PAGE, scene, results[0], names, config.localize)
         if problem:
-            screen.print(f"{PAGE} is left out: {problem}")
-        with summary.step("report"):
-            write_report(folder / "report.html", scene, results, summary, page="" if problem else PAGE)
-    screen.print(f"{out}/report.html is the report; {out}/room is a scene folder for the other commands")
+            run.print(f"{PAGE} is left out: {problem}")
+        with run.step("report"):
+            write_report(folder / "report.html", scene, results, run, page="" if problem else PAGE)
+    run.print(f"{out}/report.html is the report; {out}/room is a scene folder for the other commands")
 
 
 def write_page(path: Path, scene: Scene, result: TeacherResult, words: TextTable, config: LocalizeConfig) -> str:
@@ -114,18 +106,17 @@ def write_page(path: Path, scene: Scene, result: TeacherResult, words: TextTable
         max_gaussians=10**6,
         max_bytes=25 * 10**6,
     )
-    with atomic_file(path) as stream:
-        stream.write(page.page)
+    write_bytes(path, page.page)
     return ""
 
 
-def photographed_room(config: DemoConfig, folder: Path, summary: Summary) -> Scene:
+def photographed_room(config: DemoConfig, folder: Path, run: Run) -> Scene:
     """Makes a room, writes it as files like those of a capture, and reads these."""
-    with summary.step("make the scene"):
+    with run.step("make the scene"):
         height = config.width * 3 // 4
         room = make_room(config.seed, objects=config.objects, views=config.views, width=config.width, height=height)
         write_room(room, folder / "room")
-    with summary.step("read it"):
+    with run.step("read it"):
         return load_scene(folder / "room")
 
 
@@ -148,14 +139,14 @@ def search(
     pairs: list[tuple[str, SceneObject]],
     config: DemoConfig,
     folder: Path,
-    summary: Summary,
+    run: Run,
 ) -> TeacherResult:
     """Fuses a teacher, stores the features, reads them back, localizes words, and compares boxes with the true ones."""
     title = folder.name
-    fusion = fuse(scene, teacher, config.fusion, track=Progress(quiet=config.quiet))
-    summary.timings[f"fuse {title}"] = sum(fusion.seconds.values())
+    fusion = fuse(scene, teacher, config.fusion, track=run.track)
+    run.timings[f"fuse {title}"] = sum(fusion.seconds.values())
     folder.mkdir()
-    with summary.step("store"):
+    with run.step("store"):
         save_features(
             folder, scene, fusion.features, {"fusion": settings(config.fusion), "teacher": teacher.settings()}
         )
@@ -163,7 +154,7 @@ def search(
         stored = load_features(folder)
     start = time.perf_counter()
     localization = localize(stored, [word for word, _ in pairs], words, config.localize)
-    summary.timings[f"localize {title}"] = time.perf_counter() - start
+    run.timings[f"localize {title}"] = time.perf_counter() - start
     write_json(folder / "boxes.json", localization_to_json(localization))
     write_boxes_ply(folder / "boxes.ply", stored, localization)
     ious = []

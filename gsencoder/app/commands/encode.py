@@ -8,11 +8,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from gsencoder.app.options import CommonConfig, settings, typed
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.scenes import run_scenes, with_reported_up
-from gsencoder.app.summary import Summary, basis_figures, describe_basis, report_choice, report_promises
+from gsencoder.app.options import SharedScenesConfig, settings, typed
+from gsencoder.app.output import Summary
+from gsencoder.app.run import Progress, Run
+from gsencoder.app.scenes import with_reported_up
+from gsencoder.app.summary import basis_figures, describe_basis, report_choice, report_promises
 from gsencoder.core.errors import InputError, SceneWarning, about, counted
 from gsencoder.core.pretrained import digest_files
 from gsencoder.core.process import retain_freed_memory
@@ -122,7 +122,7 @@ def check_promises(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class EncodeCommandConfig(CommonConfig):
+class EncodeCommandConfig(SharedScenesConfig):
     """Settings of `encode`."""
 
     paths: tuple[str, ...] = option((), "splats, scenes, or folders of scenes", metavar="SPLAT", required=True)
@@ -136,89 +136,82 @@ class EncodeCommandConfig(CommonConfig):
     )
     splat: str = option("", f"Gaussians of a scene with views; empty = seeds. {READABLE}")
     basis_views: int = option(
-        0, "views in which the encoder's teacher is run, to show what the basis keeps of its vectors there; 0 = none"
+        0,
+        "views in which the encoder's teacher is run, to show what the basis keeps of its vectors there; 0 = none",
+        ge=0,
     )
-    worker: int = option(0, "number of this process among several that share the scenes: -m worker=0,1,2 starts three")
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     encode: EncodeConfig = field(default_factory=EncodeConfig)
     budget: EncodeBudget = field(default_factory=EncodeBudget)
 
     def __post_init__(self) -> None:
+        SharedScenesConfig.__post_init__(self)
         check_encode_budget(self.budget, self.encode)
-        if self.basis_views < 0:
-            raise InputError(f"basis_views: expected 0 or more, got {self.basis_views}")
 
 
-def run(config: EncodeCommandConfig, summary: Summary) -> None:
+def run(config: EncodeCommandConfig, run: Run) -> None:
     """Encodes one scene into out=, or each of several into the folder OUT/NAME."""
     retain_freed_memory()
     paths = find_scenes(config.paths)
-    with summary.step("weights"):
-        encoder = load_encoder(config.weights, config.encode.device)
-        file = file_of_encoder(config.weights)
+    with run.step("weights"):
+        encoder, file = load_encoder(config.weights, config.encode.device), file_of_encoder(config.weights)
         heads = heads_beside(file)
-        trained_with = encoder.made_by.get("settings", {}).get("heads") or ()
-        if heads is None and trained_with:
-            warnings.warn(
-                f"weights: the adapter heads {', '.join(trained_with)} that the encoder was trained with do not lie "
-                f"beside {file}; head= will not work with its features",
-                SceneWarning,
-                stacklevel=2,
-            )
-        for name in requested_teachers(encoder, config.spaces):
-            if encoder.spaces[name].text_encoder and name not in encoder.tables:
-                warnings.warn(
-                    f"weights: no words of {encoder.spaces[name].text_encoder} lie beside {file}, so the features of "
-                    f"{name} have none; `localize` needs words= or text=",
-                    SceneWarning,
-                    stacklevel=2,
-                )
+        _warn_of_missing(encoder, file, heads, config.spaces)
     made_with = {"weights": str(file), "weights_digest": digest_files(file)}
-    screen = console(config.quiet)
 
-    def run_one(path: Path, out: Path, scene_summary: Summary) -> None:
-        with output_folder(out, overwrite=config.overwrite, summary=scene_summary) as folder:
-            with scene_summary.step("load"):
+    def one(path: Path, out: Path, run: Run) -> None:
+        with run.folder(out) as folder:
+            with run.step("load"):
                 scene = load_scene(path, splat=config.splat or None, options=config.data)
                 if config.splat and scene.views is not None:
                     from gsencoder.fusion.fit import with_fitting_splat  # with torch
 
                     scene = with_fitting_splat(scene, config.splat, config.data)
             if scene.gaussians is None:
-                with scene_summary.step("seeds"):
-                    scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
-            scene = with_reported_up(scene, scene_summary, quiet=config.quiet)
+                with run.step("seeds"):
+                    scene = with_gaussians(scene, config.seeds, track=run.track)
+            scene = with_reported_up(scene, run)
             assert scene.gaussians is not None
             count, chunk = len(scene.gaussians), config.encode.chunk
             if chunk and count > chunk:
                 # Before they are cut, which takes a while where there are thousands.
                 least = counted(math.ceil(count / chunk), "chunk")
-                screen.print(f"{out}: {count:,} Gaussians in {least} or more (encode.chunk={chunk})")
+                run.print(f"{out}: {count:,} Gaussians in {least} or more (encode.chunk={chunk})")
             with about(scene.name):
-                spaces, promises = _encode_into(folder, scene, encoder, config, made_with, scene_summary)
+                spaces, lines = _encode_into(folder, scene, encoder, config, made_with, run)
             if heads is not None:
                 others = [space for space in encoder.spaces.values() if space not in spaces]
                 copy_heads(heads, folder / HEADS_FILE, spaces, left_out=others)
-        gaussians = counted(scene_summary.results["gaussians"], "Gaussian")
-        screen.print(f"{out}: features of {gaussians} in {scene_summary.timings['encode']:.1f} s")
+        gaussians = counted(run.results["gaussians"], "Gaussian")
+        run.print(f"{out}: features of {gaussians} in {run.timings['encode']:.1f} s")
         where = "this scene" if config.basis_views else "the scenes held out of the training"
-        for name, figures in scene_summary.results.get("teachers", {"": scene_summary.results}).items():
+        for name, figures in run.results.get("teachers", {"": run.results}).items():
             of = f" for {name}" if name else ""
-            screen.print(f"{out}: basis of the encoder{of}: {describe_basis(figures['basis'], where)}")
-        for line in promises:
-            screen.print(f"{out}: {line}")
+            run.print(f"{out}: basis of the encoder{of}: {describe_basis(figures['basis'], where)}")
+        run.print(*(f"{out}: {line}" for line in lines))
 
-    run_scenes(
-        paths,
-        config.out,
-        "features",
-        run_one,
-        summary,
-        overwrite=config.overwrite,
-        worker=config.worker,
-        screen=screen,
-    )
+    run.scenes(paths, "features", one)
+
+
+def _warn_of_missing(encoder: Encoder, file: Path, heads: Path | None, spaces: tuple[str, ...]) -> None:
+    """Warns of adapter heads and words that do not lie beside the weights that were trained with them."""
+    trained_with = encoder.made_by.get("settings", {}).get("heads") or ()
+    if heads is None and trained_with:
+        warnings.warn(
+            f"weights: the adapter heads {', '.join(trained_with)} that the encoder was trained with do not lie "
+            f"beside {file}; head= will not work with its features",
+            SceneWarning,
+            stacklevel=2,
+        )
+    for name in requested_teachers(encoder, spaces):
+        if encoder.spaces[name].text_encoder and name not in encoder.tables:
+            warnings.warn(
+                f"weights: no words of {encoder.spaces[name].text_encoder} lie beside {file}, so the features of "
+                f"{name} have none; `localize` needs words= or text=",
+                SceneWarning,
+                stacklevel=2,
+            )
 
 
 def _encode_into(

@@ -13,9 +13,7 @@ from gsencoder.app.evaluate_settings import (
     teacher_or_encoder,
 )
 from gsencoder.app.inputs import stored_memory
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import console
-from gsencoder.app.summary import Summary
+from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError, about, counted
 from gsencoder.core.files import csv_text, write_bytes
 from gsencoder.core.process import refuse_several
@@ -57,12 +55,12 @@ def localization(
     source: FeatureSource,
     words: Words,
     folder: Path,
-    summary: Summary,
+    run: Run,
 ) -> None:
     outcomes = evaluate_localization(
         scenes_of(config), source, words, protocol=protocol, seeds=config.seeds, localization=config.localize
     )
-    record(outcomes, summary)
+    record(outcomes, run)
     hits = [hit for outcome in outcomes for hit in outcome.hits]
     rows = [{"scene": h.scene, "name": h.name, "iou": h.iou, "oracle_iou": h.oracle_iou} for h in hits]
     write_bytes(folder / "hits.csv", csv_text(rows).encode())
@@ -76,18 +74,18 @@ def naming(
     source: FeatureSource,
     words: Words,
     folder: Path,
-    summary: Summary,
+    run: Run,
 ) -> None:
     scenes = evaluate_naming(scenes_of(config), source, words, seeds=config.seeds, fusion=config.fusion)
     scores = naming_scores(scenes, protocol)
     for scene in scenes:
-        summary.add_seconds(scene.seconds)
+        run.add_seconds(scene.seconds)
     each = []
     for scene in scenes:
         totals = {name: count for name, count in scene.total.items() if name in scores["names"]}
         scene_scores = naming_scores([replace(scene, total=totals)]) if totals else {}
         each.append({"scene": scene.scene, "gaussians": sum(scene.total.values()), **scene_scores})
-    summary.results.update(protocol="naming", **scores, names_table="names.csv", scenes=each)
+    run.results.update(protocol="naming", **scores, names_table="names.csv", scenes=each)
     rows = [{"name": name, **row} for name, row in scores["names"].items()]
     write_bytes(folder / "names.csv", csv_text(rows).encode())
 
@@ -98,7 +96,7 @@ def absent(
     source: FeatureSource,
     words: Words,
     folder: Path,
-    summary: Summary,
+    run: Run,
 ) -> None:
     with about("protocol.vocabulary"):
         check_known(words, protocol.vocabulary)
@@ -113,8 +111,8 @@ def absent(
         localization=config.localize,
     )
     for scene in scenes:
-        summary.add_seconds(scene.seconds)
-    summary.results.update(
+        run.add_seconds(scene.seconds)
+    run.results.update(
         protocol="absent",
         **absent_scores(scenes),
         names=probabilities_by_word(scenes),
@@ -135,7 +133,7 @@ def grounding(
     source: FeatureSource,
     words: Words,
     folder: Path,
-    summary: Summary,
+    run: Run,
 ) -> None:
     def memory_of(scene: Scene) -> QueryMemory | None:
         # Outputs of a head are features of their own; the memory holds those of the teacher.
@@ -145,10 +143,10 @@ def grounding(
         scenes_of(config), source, words, protocol=protocol, seeds=config.seeds, memory_of=memory_of
     )
     for scene in scenes:
-        summary.add_seconds(scene.seconds)
+        run.add_seconds(scene.seconds)
     pairs = [pair for scene in scenes for pair in scene.pairs]
     names = scores_by_phrase(pairs)
-    summary.results.update(
+    run.results.update(
         protocol="grounding",
         **asdict(grounding_scores(pairs)),
         miou_names=phrase_mean(names),
@@ -176,12 +174,12 @@ def grounding(
     write_bytes(folder / "names.csv", csv_text([{"name": name, **row} for name, row in names.items()]).encode())
 
 
-def record(outcomes: list[SceneOutcome], summary: Summary) -> None:
-    """Adds scores, scenes and seconds to the summary."""
+def record(outcomes: list[SceneOutcome], run: Run) -> None:
+    """Adds scores, scenes and seconds to the run."""
     hits = [hit for outcome in outcomes for hit in outcome.hits]
     for outcome in outcomes:
-        summary.add_seconds(outcome.seconds)
-    summary.results.update(
+        run.add_seconds(outcome.seconds)
+    run.results.update(
         protocol="localization",
         **scores(hits),
         boxless=sum(outcome.boxless for outcome in outcomes),
@@ -273,7 +271,7 @@ def names_table(results: dict) -> Table:
 __all__ = ["EvaluateConfig", "run"]
 
 
-def run(config: EvaluateConfig, summary: Summary) -> None:
+def run(config: EvaluateConfig, run: Run) -> None:
     """Evaluates, prints the scores, and writes them with one row for each object, name or class."""
     if not isinstance(config.protocol, BenchmarkProtocol):
         advice = "start it once; recognition, instances, semantics and referring are what processes share the scenes of"
@@ -285,30 +283,28 @@ def run(config: EvaluateConfig, summary: Summary) -> None:
         source, words = stored_features(config)
     else:
         source, words = source_of_head(config) if config.head else teacher_or_encoder(config)
-    out = config.out or Path("outputs") / "evaluate" / config.protocol.name
+    out = run.out("evaluate", config.protocol.name)
     if isinstance(config.protocol, BenchmarkProtocol):
         from gsencoder.app.commands.evaluate_benchmarks import run_benchmark
 
-        run_benchmark(config, config.protocol, source, words, out, summary)
+        run_benchmark(config, config.protocol, source, words, out, run)
         return
     if isinstance(config.protocol, RetrievalProtocol):
         from gsencoder.app.commands.evaluate_benchmarks import run_retrieval
 
-        run_retrieval(config, config.protocol, source, words, out, summary)
+        run_retrieval(config, config.protocol, source, words, out, run)
         return
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
+    with run.folder(out) as folder:
         if isinstance(config.protocol, NamingProtocol):
-            naming(config, config.protocol, source, words, folder, summary)
+            naming(config, config.protocol, source, words, folder, run)
         elif isinstance(config.protocol, AbsentProtocol):
-            absent(config, config.protocol, source, words, folder, summary)
+            absent(config, config.protocol, source, words, folder, run)
         elif isinstance(config.protocol, GroundingProtocol):
-            grounding(config, config.protocol, source, words, folder, summary)
+            grounding(config, config.protocol, source, words, folder, run)
         else:
-            localization(config, config.protocol, source, words, folder, summary)
+            localization(config, config.protocol, source, words, folder, run)
         if config.report:
             from gsencoder.app.reports import report_scores
 
-            report_scores(folder, summary)
-    screen = console(config.quiet)
-    screen.print(names_table(summary.results))
-    screen.print(f"{out}: {scores_line(summary.results)}")
+            report_scores(folder, run)
+    run.print(names_table(run.results), f"{out}: {scores_line(run.results)}")

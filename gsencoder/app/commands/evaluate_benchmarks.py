@@ -5,7 +5,6 @@ Several processes (torchrun, SLURM) share the scenes: each writes the files of i
 
 import warnings
 from collections.abc import Collection
-from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +12,7 @@ import numpy as np
 from gsencoder.app.commands.score import print_report, write_report
 from gsencoder.app.evaluate_settings import EvaluateConfig, method_name, scenes_of
 from gsencoder.app.inputs import stored_memory
-from gsencoder.app.options import settings
-from gsencoder.app.output import output_folder
-from gsencoder.app.summary import Summary
+from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError, SceneWarning, about, advised, counted, listed
 from gsencoder.data.labels.captions import read_texts, read_view_captions, write_view_captions
 from gsencoder.data.labels.classes import COLUMNS, DEFAULT_COLUMN, ClassTable, ids_of_benchmark, read_label_map
@@ -41,7 +38,7 @@ from gsencoder.evaluate.benchmarks.semantics import SemanticsProtocol, check_exc
 from gsencoder.evaluate.protocols.absent import names_of
 from gsencoder.evaluate.sources import FeatureSource
 from gsencoder.text.vocabulary import Words, check_known
-from gsencoder.train.distributed import fail_together, join_processes, value_of_first, values_of_all
+from gsencoder.train.distributed import fail_together, value_of_first, values_of_all
 from gsencoder.types import QueryMemory, Scene
 
 CLASS_IDS = "class_ids.csv"
@@ -54,14 +51,13 @@ def run_benchmark(
     source: FeatureSource,
     words: Words,
     out: Path,
-    summary: Summary,
+    run: Run,
 ) -> None:
     """Predicts the scenes of this process, and in the first process scores those of all and prints the scores."""
-    with join_processes("cpu", settings=settings(config)) as (process, _), ExitStack() as results:
-        folder = None
+    with run.processes("cpu", out) as group:
+        process, folder = group.process, None
         with fail_together():
-            if process.is_first:
-                folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
+            folder = group.folder()
             classes, class_names, labeled = _classes(config)
             _check_names(protocol, classes, words)
             scene_names = {scene_name(path) for path in find_scenes(config.paths)}
@@ -91,13 +87,13 @@ def run_benchmark(
         merge_lists(folder, protocol, parts=process.world_size)
         write_classes(folder / CLASS_IDS, classes)
         for scene in every:
-            summary.add_seconds(scene.seconds)
+            run.add_seconds(scene.seconds)
         report = score_written(folder, protocol, classes, method_name(config))
-        write_report(folder, report, summary, page=config.report)
+        write_report(folder, report, run, page=config.report)
         if others:
-            summary.results["other_scenes"] = others
-        summary.results["gaussians"] = {scene.scene: scene.gaussians for scene in every}
-    print_report(out, report, quiet=config.quiet)
+            run.results["other_scenes"] = others
+        run.results["gaussians"] = {scene.scene: scene.gaussians for scene in every}
+    print_report(out, report, run)
 
 
 def _check_names(protocol: BenchmarkProtocol, classes: ClassTable, words: Words) -> None:
@@ -163,7 +159,7 @@ def run_retrieval(
     source: FeatureSource,
     words: Words,
     out: Path,
-    summary: Summary,
+    run: Run,
 ) -> None:
     """Compares the views of all scenes with all texts, and scores what it wrote."""
     if not protocol.captions:
@@ -201,7 +197,7 @@ def run_retrieval(
         # Outputs of a head are features of their own; the memory holds those of the teacher.
         return stored_memory(config.features, scene) if config.features and not config.head else None
 
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
+    with run.folder(out) as folder:
         scenes = evaluate_retrieval(
             scenes_of(config),
             source,
@@ -213,7 +209,7 @@ def run_retrieval(
             memory_of=memory_of,
         )
         for scene in scenes:
-            summary.add_seconds(scene.seconds)
+            run.add_seconds(scene.seconds)
         pairs = ScoredPairs(
             queries=tuple(each.name for scene in scenes for each in scene.captions),
             scores=np.concatenate([scene.scores for scene in scenes]),
@@ -224,6 +220,6 @@ def run_retrieval(
         report = score_retrieval(
             folder / PREDICTIONS, folder / TRUTH, method=method_name(config), count=protocol.count, seed=protocol.seed
         )
-        write_report(folder, report, summary, page=config.report)
-        summary.results["gaussians"] = {scene.scene: scene.gaussians for scene in scenes}
-    print_report(out, report, quiet=config.quiet)
+        write_report(folder, report, run, page=config.report)
+        run.results["gaussians"] = {scene.scene: scene.gaussians for scene in scenes}
+    print_report(out, report, run)

@@ -6,12 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.app.options import CommonConfig
-from gsencoder.app.output import check_output_files, sole_writer
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.summary import Summary, write_beside
+from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import atomic_file
-from gsencoder.core.process import Stored
+from gsencoder.core.files import write_bytes
+from gsencoder.core.process import Stored, Track
 from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.points import unit_of
@@ -66,27 +64,26 @@ class ExportConfig(CommonConfig):
         "products of 8-bit integers, whose ranges are computed for each splat",
     )
     sizes: tuple[int, ...] = option(
-        (1, 2, 31, 1000, 20000), "numbers of Gaussians of the random clouds for the comparison"
+        (1, 2, 31, 1000, 20000), "numbers of Gaussians of the random clouds for the comparison", ge=1, le=MAX_SIZE
     )
     tolerance: float = option(
-        TOLERANCE, "largest difference of the float32 graph from torch, as a share of the largest output"
+        TOLERANCE, "largest difference of the float32 graph from torch, as a share of the largest output", gt=0, lt=1
     )
     cosine: float = option(
         COSINE,
         "smallest mean centered cosine of another precision's features to float32's, on each SPLAT, or on "
         "each random cloud where there is none",
+        ge=-1,
+        le=1,
     )
     splat: str = option("", f"Gaussians of scenes; empty = seeds. {READABLE}")
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
 
     def __post_init__(self) -> None:
-        if not self.sizes or min(self.sizes) < 1 or max(self.sizes) > MAX_SIZE:
-            raise InputError(f"sizes: expected one or more numbers from 1 to {MAX_SIZE:,}, got {list(self.sizes)}")
-        if not 0 < self.tolerance < 1:
-            raise InputError(f"tolerance: expected a share between 0 and 1, got {self.tolerance}")
-        if not -1 <= self.cosine <= 1:
-            raise InputError(f"cosine: expected -1 to 1, got {self.cosine}")
+        CommonConfig.__post_init__(self)
+        if not self.sizes:
+            raise InputError("sizes: expected one or more numbers of Gaussians, got none")
         if self.memory and self.weights:
             raise InputError("memory, weights: expected one of the two, a memory or an encoder")
         if self.space and not self.memory:
@@ -97,47 +94,44 @@ class ExportConfig(CommonConfig):
             raise InputError(f"precision: expected float32 with memory=, got {self.precision}")
 
 
-def run(config: ExportConfig, summary: Summary) -> None:
+def run(config: ExportConfig, run: Run) -> None:
     """Exports, compares with torch, and writes the file if it agrees."""
     assert config.out is not None
     if config.out.suffix.lower() != SUFFIX:
         raise InputError(f"out: expected a file that ends in {SUFFIX}, got {config.out.name}")
     if config.weights.lower().endswith(SUFFIX):
         raise InputError(f"weights: {config.weights} is an exported graph already; give the encoder that `train` wrote")
-    files = (config.out, Path(f"{config.out}.summary.json"), heads_of_graph(config.out))
-    check_output_files(files, config.overwrite)
+    run.check_files(config.out, heads_of_graph(config.out))
     if config.memory:
-        _export_memory(config, config.out, summary)
+        _export_memory(config, config.out, run)
         return
-    track = Progress(quiet=config.quiet)
-    with summary.step("load"):
+    with run.step("load"):
         encoder = TorchEncoder(config.weights)
         heads = heads_beside(file_of_encoder(config.weights))
         clouds = [Cloud(f"{size} random Gaussians", random_cloud(size, encoder.voxel)) for size in config.sizes]
-        scenes = _scenes(config, encoder.voxel)
-    screen = console(config.quiet)
-    screen.print("translating the graph, which takes about a minute")
-    with summary.step("export"):
+        scenes = _scenes(config, encoder.voxel, run.track)
+    run.print("translating the graph, which takes about a minute")
+    with run.step("export"):
         lowered = lower(encoder)
         exact = model = export_onnx(encoder, lowered)
-    with summary.step("compare"):
-        parity = check_parity(exact, encoder, [*clouds, *scenes], tolerance=config.tolerance, track=track)
+    with run.step("compare"):
+        parity = check_parity(exact, encoder, [*clouds, *scenes], tolerance=config.tolerance, track=run.track)
     agreement = f"within {max(parity.values()):.1g} of torch's largest output"
     cosines: dict[str, float] = {}
     if config.precision != "float32":
-        with summary.step("convert"):
+        with run.step("convert"):
             if config.precision == "float16":
                 lowered = lower(encoder, half=True)
             model = export_onnx(encoder, lowered, config.precision)
-        with summary.step("judge"):
-            cosines = check_cosines(model, exact, scenes or clouds, cosine=config.cosine, track=track)
+        with run.step("judge"):
+            cosines = check_cosines(model, exact, scenes or clouds, cosine=config.cosine, track=run.track)
         agreement = (
             f"{config.precision}, {len(model) / len(exact):.2f} of float32's size, mean centered cosine to it "
             f"{min(cosines.values()):.4f} or more"
         )
     sizes = {cloud.name: len(cloud.gaussians) for cloud in (*clouds, *scenes)}
     compared = [sizes[name] for name in cosines or parity]
-    summary.results.update(
+    run.results.update(
         onnx=str(config.out),
         precision=config.precision,
         bytes=len(model),
@@ -147,36 +141,33 @@ def run(config: ExportConfig, summary: Summary) -> None:
         gaussians=sizes,
         **space_figures(encoder),
     )
-    with sole_writer(config.out, overwrite=config.overwrite):
-        with summary.step("write"), atomic_file(config.out) as stream:
-            stream.write(model)
-        write_beside(config.out, summary)
+    with run.file(config.out):
+        with run.step("write"):
+            write_bytes(config.out, model)
         if heads is None:
             # Those of a file that was replaced.
             heads_of_graph(config.out).unlink(missing_ok=True)
         else:
             copy_heads(heads, heads_of_graph(config.out), list(encoder.spaces.values()))
     if heads is not None:
-        screen.print(f"{heads_of_graph(config.out)}: the adapter heads that take its features; keep it beside the file")
-    screen.print(
+        run.print(f"{heads_of_graph(config.out)}: the adapter heads that take its features; keep it beside the file")
+    run.print(
         f"{config.out}: {len(model) / 1e6:.1f} MB; {agreement} on {len(compared)} clouds of {min(compared):,} to "
         f"{max(compared):,} Gaussians"
     )
 
 
-def _export_memory(config: ExportConfig, out: Path, summary: Summary) -> None:
+def _export_memory(config: ExportConfig, out: Path, run: Run) -> None:
     """Writes the attention of a memory."""
-    with summary.step("load"):
+    with run.step("load"):
         memories = load_memories(config.memory)
         memory = _memory_of(memories, config.space)
-    with summary.step("export"):
+    with run.step("export"):
         model = export_memory(memory)
-    summary.results.update(onnx=str(out), bytes=len(model), components=len(memory.bank), space=memory.space.describe())
-    with sole_writer(out, overwrite=config.overwrite):
-        with summary.step("write"), atomic_file(out) as stream:
-            stream.write(model)
-        write_beside(out, summary)
-    console(config.quiet).print(
+    run.results.update(onnx=str(out), bytes=len(model), components=len(memory.bank), space=memory.space.describe())
+    with run.file(out), run.step("write"):
+        write_bytes(out, model)
+    run.print(
         f"{out}: {len(model) / 1e6:.1f} MB; features of {memory.space.channels} channels from queries of "
         f"{memory.channels}, by attention to {len(memory.bank):,} components"
     )
@@ -210,13 +201,13 @@ def space_figures(encoder: TorchEncoder) -> dict[str, Any]:
     return next(iter(figures.values())) if len(figures) == 1 else {"teachers": figures}
 
 
-def _scenes(config: ExportConfig, voxel: float) -> list[Cloud]:
+def _scenes(config: ExportConfig, voxel: float, track: Track) -> list[Cloud]:
     """The splats that the user gave, for the comparison."""
     clouds = []
     for path in find_scenes(config.paths) if config.paths else ():
         scene = load_scene(path, splat=config.splat or None, options=config.data)
         if scene.gaussians is None:
-            scene = with_gaussians(scene, config.seeds, track=Progress(quiet=config.quiet))
+            scene = with_gaussians(scene, config.seeds, track=track)
         assert scene.gaussians is not None
         clouds.append(Cloud(scene.name, scene.gaussians, unit_of(scene, voxel)))
     return clouds

@@ -11,12 +11,10 @@ import numpy as np
 
 from gsencoder.app.heads import describe_heads, head_figures
 from gsencoder.app.inputs import load_fusable
-from gsencoder.app.options import CommonConfig, settings
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.reports import report_fusion
-from gsencoder.app.scenes import run_scenes
-from gsencoder.app.summary import Summary, describe_basis, report_choice, report_promises
+from gsencoder.app.options import SharedScenesConfig, settings
+from gsencoder.app.output import Summary
+from gsencoder.app.run import Progress, Run
+from gsencoder.app.summary import describe_basis, report_choice, report_promises
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.process import Device
@@ -114,7 +112,7 @@ def check_promises(fused: BudgetFusion, file: Path, config: BudgetOptions, summa
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FuseCommandConfig(CommonConfig):
+class FuseCommandConfig(SharedScenesConfig):
     """Settings of `fuse`."""
 
     paths: tuple[str, ...] = option(
@@ -132,7 +130,6 @@ class FuseCommandConfig(CommonConfig):
     basis: str = option(
         "", "weights in whose basis features are fused, as encoded ones are; empty = a basis of the scene"
     )
-    worker: int = option(0, "number of this process among several that share the scenes: -m worker=0,1,2 starts three")
     device: Device = option("auto", "where maps are lifted, cuda or cpu; auto = cuda if torch sees a GPU")
     report: bool = option(False, "write report.html, a page with pictures and figures")
     data: SceneConfig = field(default_factory=SceneConfig)
@@ -149,27 +146,27 @@ class FuseCommandConfig(CommonConfig):
     text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
+        SharedScenesConfig.__post_init__(self)
         check_orbits(self.orbits)
         check_budget(self.budget, self.fusion, basis=bool(self.basis))
 
 
-def run(config: FuseCommandConfig, summary: Summary) -> None:
+def run(config: FuseCommandConfig, run: Run) -> None:
     """Fuses one scene into out=, or each of several into the folder OUT/NAME."""
     choose_device(config.device)  # A missing device is an error before anything is read.
     paths = find_scenes(config.paths)
-    with summary.step("teacher"):
+    with run.step("teacher"):
         words_once, heads = cache(words_of), list[Head]()
         if not isinstance(config.teacher, AutoConfig):
             words_once(config.teacher, config.text)  # What cannot be read is an error before any scene is.
             heads = heads_of(config.teacher, stored_heads(config.teacher), "teacher.heads")
     outputs = load_weights_spaces(config.basis) if config.basis else None
-    screen = console(config.quiet)
 
-    def run_one(path: Path, out: Path, scene_summary: Summary) -> None:
-        with output_folder(out, overwrite=config.overwrite, summary=scene_summary) as folder:
+    def one(path: Path, out: Path, run: Run) -> None:
+        with run.folder(out) as folder:
             scene = load_fusable(
                 path,
-                scene_summary,
+                run,
                 splat=config.splat,
                 data=config.data,
                 seeds=config.seeds,
@@ -177,51 +174,50 @@ def run(config: FuseCommandConfig, summary: Summary) -> None:
                 cameras=config.cameras,
                 blend=config.fusion.blend,
                 labels=isinstance(config.teacher, LabelsConfig),
-                quiet=config.quiet,
             )
-            with scene_summary.step("teacher"):
+            with run.step("teacher"):
                 chosen = choose_teacher(config.teacher, config.text, scene, words_once)
                 teacher = build_teacher(chosen.teacher, scene, chosen.words)
             if chosen.reason:
-                scene_summary.results.update(teacher=settings(chosen.teacher), text=settings(chosen.text))
-                screen.print(f"{scene.name}: {chosen.reason}; {chosen.describe()}")
+                run.results.update(teacher=settings(chosen.teacher), text=settings(chosen.text))
+                run.print(f"{scene.name}: {chosen.reason}; {chosen.describe()}")
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
             in_budget: BudgetFusion | None = None
             if config.budget.promised:
-                in_budget = fuse_in_budget(
-                    scene, teacher, config, scene_summary, work_folder(out), sample_cells=bool(heads)
-                )
+                in_budget = fuse_in_budget(scene, teacher, config, run, work_folder(out), sample_cells=bool(heads))
                 fusion = in_budget.fusion
             else:
-                fusion = fuse_scene(scene, teacher, config, scene_summary, out, basis=basis, sample_cells=bool(heads))
-            write_features(folder, scene, fusion, words_beside(teacher, chosen.words), chosen.teacher, scene_summary)
-            promises = []
+                fusion = fuse(
+                    scene,
+                    teacher,
+                    config.fusion,
+                    basis=basis,
+                    work=None if teacher.cheap else work_folder(out),
+                    sample_cells=bool(heads),
+                    device=config.device,
+                    track=run.track,
+                )
+                run.add_seconds(fusion.seconds)
+            write_features(folder, scene, fusion, words_beside(teacher, chosen.words), chosen.teacher, run)
+            lines = []
             if in_budget is not None:
-                promises = check_promises(in_budget, folder / FEATURES_FILE, config, scene_summary)
-            lines = write_heads(folder, heads, fusion, scene_summary)
+                lines = check_promises(in_budget, folder / FEATURES_FILE, config, run)
+            lines += write_heads(folder, heads, fusion, run)
             if config.report:
-                with scene_summary.step("report"):
-                    report_fusion(folder, scene, fusion.features, fusion.truncation, chosen.teacher.name, scene_summary)
-        shutil.rmtree(work_folder(out), ignore_errors=True)
-        with_features, total = scene_summary.results["seen"], scene_summary.results["gaussians"]
-        screen.print(
-            f"{out}: {with_features:,} of {counted(total, 'Gaussian')} have features, "
-            f"{scene_summary.results['channels']} channels ({describe_basis(scene_summary.results, 'this scene')}), "
-            f"from {counted(scene_summary.results['views'], 'view')}"
-        )
-        for line in (*promises, *lines):
-            screen.print(f"{out}: {line}")
+                from gsencoder.app.reports import report_fusion
 
-    run_scenes(
-        paths,
-        config.out,
-        "features",
-        run_one,
-        summary,
-        overwrite=config.overwrite,
-        worker=config.worker,
-        screen=screen,
-    )
+                with run.step("report"):
+                    report_fusion(folder, scene, fusion.features, fusion.truncation, chosen.teacher.name, run)
+        shutil.rmtree(work_folder(out), ignore_errors=True)
+        figures = run.results
+        run.print(
+            f"{out}: {figures['seen']:,} of {counted(figures['gaussians'], 'Gaussian')} have features, "
+            f"{figures['channels']} channels ({describe_basis(figures, 'this scene')}), from "
+            f"{counted(figures['views'], 'view')}",
+            *(f"{out}: {line}" for line in lines),
+        )
+
+    run.scenes(paths, "features", one)
 
 
 def load_weights_spaces(weights: str) -> OutputSpaces:
@@ -244,33 +240,6 @@ def basis_for(space: FeatureSpace, outputs: OutputSpaces, weights: str) -> Featu
 def work_folder(out: Path) -> Path:
     """The folder for the maps and sums of an unfinished fusion."""
     return out.parent / f".{out.name}.fusing"
-
-
-def fuse_scene(
-    scene: Scene,
-    teacher: Teacher,
-    config: FuseCommandConfig,
-    summary: Summary,
-    out: Path,
-    *,
-    basis: FeatureBasis | None = None,
-    sample_cells: bool = False,
-) -> Fusion:
-    """Fuses, in a given basis or in one of the scene's own, and adds the seconds of the steps to the summary."""
-    work = None if teacher.cheap else work_folder(out)
-    track = Progress(quiet=config.quiet)
-    fusion = fuse(
-        scene,
-        teacher,
-        config.fusion,
-        basis=basis,
-        work=work,
-        sample_cells=sample_cells,
-        device=config.device,
-        track=track,
-    )
-    summary.add_seconds(fusion.seconds)
-    return fusion
 
 
 def write_features(

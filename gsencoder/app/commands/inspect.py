@@ -11,9 +11,7 @@ from PIL import Image, ImageDraw
 from rich.table import Table
 
 from gsencoder.app.options import CommonConfig
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.summary import Summary
+from gsencoder.app.run import Run
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, listed
 from gsencoder.core.files import write_picture
@@ -45,31 +43,26 @@ class InspectConfig(CommonConfig):
         None, "folder for a summary.json with the same facts, and a picture of each scene's check", metavar="FOLDER"
     )
     check: bool = option(True, "hold the views of a scene against each other, which takes seconds")
-    views: int = option(0, "largest number of views to hold against each other; 0 = 32 with depth, else 24")
+    views: int = option(0, "largest number of views to hold against each other; 0 = 32 with depth, else 24", ge=0)
     data: SceneConfig = field(default_factory=SceneConfig)
 
     def __post_init__(self) -> None:
-        if self.views < 0 or self.views == 1:
-            raise InputError(f"views: expected 0 or at least 2, got {self.views}")
+        CommonConfig.__post_init__(self)
+        if self.views == 1:
+            raise InputError("views: expected 0 or at least 2, got 1")
 
 
-def run(config: InspectConfig, summary: Summary) -> None:
+def run(config: InspectConfig, run: Run) -> None:
     """Reads each splat or scene, prints one table for each, and writes the summary if asked to."""
-    screen = console(config.quiet)
-
-    def show(lines: list[Table | str]) -> None:
-        for line in lines:
-            screen.print(line, highlight=False)
-
     if config.out is None:
         for path in _paths(config.paths):
-            show(_inspect(path, config, summary, None))
+            run.print(*_inspect(path, config, run, None), highlight=False)
         return
-    with output_folder(config.out, overwrite=config.overwrite, summary=summary) as folder:
-        reports = [_inspect(path, config, summary, folder) for path in _paths(config.paths)]
+    with run.folder(config.out) as folder:
+        reports = [_inspect(path, config, run, folder) for path in _paths(config.paths)]
     # What was written stays, also if nobody reads what is printed.
     for lines in reports:
-        show(lines)
+        run.print(*lines, highlight=False)
 
 
 def _paths(words: tuple[str, ...]) -> tuple[Path, ...]:
@@ -83,37 +76,37 @@ def _paths(words: tuple[str, ...]) -> tuple[Path, ...]:
     return chosen.paths
 
 
-def _inspect(path: Path, config: InspectConfig, summary: Summary, folder: Path | None) -> list[Table | str]:
+def _inspect(path: Path, config: InspectConfig, run: Run, folder: Path | None) -> list[Table | str]:
     """What there is to say about a splat or a scene."""
     if path.exists() and has_views(path):
-        return _inspect_scene(path, config, summary, folder)
+        return _inspect_scene(path, config, run, folder)
     refuse_video(path)
     source = find_splat(path) if path.is_dir() else path
-    with summary.step("read"):
+    with run.step("read"):
         raw = read_raw(source)
-    with summary.step("inspect"):
+    with run.step("inspect"):
         report = inspect_splat(raw)
-    summary.results.setdefault("splats", []).append({"path": str(path), **report.to_dict()})
+    run.results.setdefault("splats", []).append({"path": str(path), **report.to_dict()})
     return [report_table(str(path), report)]
 
 
-def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: Path | None) -> list[Table | str]:
+def _inspect_scene(path: Path, config: InspectConfig, run: Run, folder: Path | None) -> list[Table | str]:
     # Only scenes need Pillow and, for some depth sensors, torch.
     from gsencoder.data.check.scene_check import check_scene, findings_of, is_decided
     from gsencoder.data.facts import scene_facts
 
-    with summary.step("read"):
+    with run.step("read"):
         scene = load_scene(path, options=config.data)
         posed, _, layout = read_posed(path.absolute(), config.data)
         assert scene.views is not None
         assert posed is not None
-    with summary.step("facts"):
+    with run.step("facts"):
         facts = scene_facts(scene, posed, layout)
     lines: list[Table | str] = [str(path), scene_table(facts)]
     results: dict[str, Any] = {"path": str(path), **facts.to_dict()}
     if config.check:
-        with summary.step("check"):
-            depth, matches = check_scene(scene.views, limit=config.views, track=Progress(quiet=config.quiet))
+        with run.step("check"):
+            depth, matches = check_scene(scene.views, limit=config.views, track=run.track)
         findings = findings_of(scene.views, depth, matches)
         lines += check_lines(facts, depth, matches)
         lines += [f"wrong: {finding_line(finding)}" for finding in findings]
@@ -128,7 +121,7 @@ def _inspect_scene(path: Path, config: InspectConfig, summary: Summary, folder: 
             picture = f"{scene_name(path)}.png"
             if save_check_picture(folder / picture, scene.views, depth, matches):
                 results["picture"] = picture
-    summary.results.setdefault("scenes", []).append(results)
+    run.results.setdefault("scenes", []).append(results)
     return lines
 
 

@@ -1,7 +1,7 @@
 """`gsencoder memory SCENE teacher=…`: principal queries of Gaussians and the banks that they attend to (M3)."""
 
 from collections.abc import Mapping
-from contextlib import ExitStack, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from shutil import copyfile
@@ -11,9 +11,7 @@ import torch
 
 from gsencoder.app.inputs import load_fusable
 from gsencoder.app.options import CommonConfig, settings
-from gsencoder.app.output import WorkFolder, output_folder, refuse_to_replace_inputs
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.summary import Summary
+from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError, about, advised, counted
 from gsencoder.core.files import write_picture
 from gsencoder.core.logs import LOG_FILE
@@ -31,7 +29,7 @@ from gsencoder.teachers.build import build_teacher, words_beside, words_by_teach
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.table import TextTable
 from gsencoder.train.batch import sample_rows
-from gsencoder.train.distributed import fail_together, join_processes
+from gsencoder.train.distributed import fail_together
 from gsencoder.train.loop import TrainerConfig
 from gsencoder.train.memory import (
     MemoryConfig,
@@ -54,7 +52,7 @@ DRAWN_FEATURES = 20_000
 class MemoryCommandConfig(SourceConfig, CommonConfig):
     """Settings of `memory`."""
 
-    paths: tuple[str, ...] = option((), "a scene: views, or a bare splat", metavar="SCENE", required=True)
+    paths: tuple[str, ...] = option((), "a scene: views, or a bare splat", metavar="SCENE", required=True, one="scene")
     bank: BankConfig = field(default_factory=BankConfig)
     memory: MemoryConfig = field(default_factory=MemoryConfig)
     train: TrainerConfig = field(default_factory=memory_training)
@@ -69,17 +67,15 @@ class MemoryCommandConfig(SourceConfig, CommonConfig):
         4,
         "number of views, evenly spaced, of which a pixel and the components that it attends to are drawn, "
         "beside a scatter plot of components and raw features; 0 = no pictures",
+        ge=0,
     )
     umap: bool = option(False, "draw the scatter plot by UMAP, too; needs the package umap-learn")
     resume: bool = option(True, "continue an interrupted run; false = start again")
     device: Device = option("auto", "where the scene is prepared and queries are optimized")
 
     def __post_init__(self) -> None:
+        CommonConfig.__post_init__(self)
         SourceConfig.__post_init__(self)
-        if len(self.paths) > 1:
-            raise InputError(f"paths: expected one scene, got {len(self.paths)}")
-        if self.pictures < 0:
-            raise InputError(f"pictures: expected 0 or more, got {self.pictures}")
         if self.umap:
             if not self.pictures:
                 raise InputError("umap: expected pictures=1 or more with umap=true; there is no scatter plot without")
@@ -90,75 +86,75 @@ class MemoryCommandConfig(SourceConfig, CommonConfig):
             raise InputError("optimize=false: random queries mean nothing without training; give memory.init=fused")
 
 
-def run(config: MemoryCommandConfig, summary: Summary) -> None:
+def run(config: MemoryCommandConfig, run: Run) -> None:
     """Prepares a scene for each teacher, optimizes its queries, and writes memories that other commands take as
     features."""
     retain_freed_memory()
     (path,) = find_scenes(config.paths)
-    out = config.out or Path("outputs") / path.name / "memory"
+    out = run.out(path.name, "memory")
     words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
-    with (
-        WorkFolder(out.with_name(f"{out.name}.training")) as state,
-        join_processes(config.device, settings=settings(config)) as (process, device),
-        ExitStack() as results,
-    ):
-        track = Progress(quiet=config.quiet or not process.is_first)
+    with run.processes(config.device, out, state="training") as group:
+        process, device, work = group.process, group.device, group.work.path
         tables: dict[str, TextTable] = {}
         folder, scene = None, None
         with fail_together():
-            if process.is_first:
-                folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
-                refuse_to_replace_inputs(state.path, settings(config))
-                state.take(anew=not config.resume)
-                unfinished = [path for path in state.path.glob("queries*") if path.is_dir()]
+            folder = group.folder()
+            if folder is not None:
+                group.take(resume=config.resume)
+                unfinished = [path for path in work.glob("queries*") if path.is_dir()]
                 if unfinished and not config.optimize:
                     raise InputError(
                         f"optimize=false: {unfinished[0]} holds an optimization that is not finished and would be "
                         "lost; leave optimize=false out to continue it, or give resume=false to start again"
                     )
-                scene = _load(path, config, summary)
-                tables = _prepare(scene, words, config, state.path, device, summary, track)
-        scenes = {name: open_memory_scene(state.path / name) for name in config.teachers_by_name}
-        with summary.step("train"):
+                scene = _load(path, config, run)
+                tables = _prepare(scene, words, config, work, device, run)
+        scenes = {name: open_memory_scene(work / name) for name in config.teachers_by_name}
+        with run.step("train"):
             memories: dict[str, QueryMemory] = {}
             groups = [list(scenes)] if config.joint else [[name] for name in scenes]
             for names in groups if config.optimize else []:
-                work = state.path / ("queries" if config.joint else f"queries.{names[0]}")
-                work.mkdir(exist_ok=True)
+                state = work / ("queries" if config.joint else f"queries.{names[0]}")
+                state.mkdir(exist_ok=True)
                 group_scenes = {name: scenes[name] for name in names}
                 optimized, training = train_memory(
-                    group_scenes, config.memory, config.train, work=work, process=process, device=device, track=track
+                    group_scenes,
+                    config.memory,
+                    config.train,
+                    work=state,
+                    process=process,
+                    device=device,
+                    track=run.track,
                 )
                 memories |= optimized
-                summary.results["steps"] = training.step
+                run.results["steps"] = training.step
                 if folder is not None:
-                    copyfile(work / LOG_FILE, folder / (LOG_FILE if config.joint else f"log.{names[0]}.csv"))
+                    copyfile(state / LOG_FILE, folder / (LOG_FILE if config.joint else f"log.{names[0]}.csv"))
         if folder is None or scene is None:
             return
         if not config.optimize:
             memories = {name: untrained_memory(each, config.memory, config.train.seed) for name, each in scenes.items()}
-        with summary.step("score"):
+        with run.step("score"):
             errors = {name: fit_errors(memories[name], each, config.memory.min_alpha) for name, each in scenes.items()}
-        with summary.step("write"):
+        with run.step("write"):
             save_memories(folder, scene, memories, settings(config))
             save_tables(folder, tables, memories)
         if config.pictures:
             advice = "give pictures=0 to write the memory without pictures"
-            with summary.step("pictures"), advised(advice):
+            with run.step("pictures"), advised(advice):
                 for name, memory in memories.items():
-                    _draw(folder, scene, name, memory, open_raw_sample(state.path / name), config)
+                    _draw(folder, scene, name, memory, open_raw_sample(work / name), config)
         files = {name: file_of_teacher(MEMORY_FILE, name if len(memories) > 1 else None) for name in memories}
         figures = {name: _figures(folder / files[name], each, errors[name]) for name, each in memories.items()}
-        summary.results.update(gaussians=len(next(iter(memories.values()))), teachers=figures)
-    screen = console(config.quiet)
+        run.results.update(gaussians=len(next(iter(memories.values()))), teachers=figures)
     for name, each in memories.items():
-        screen.print(f"{out}: {name}: {_describe(each, errors[name], figures[name]['bytes'])}")
+        run.print(f"{out}: {name}: {_describe(each, errors[name], figures[name]['bytes'])}")
 
 
-def _load(path: Path, config: MemoryCommandConfig, summary: Summary) -> Scene:
+def _load(path: Path, config: MemoryCommandConfig, run: Run) -> Scene:
     return load_fusable(
         path,
-        summary,
+        run,
         splat=config.splat,
         data=config.data,
         seeds=config.seeds,
@@ -166,7 +162,6 @@ def _load(path: Path, config: MemoryCommandConfig, summary: Summary) -> Scene:
         cameras=config.cameras,
         blend=config.prepare.fusion.blend,
         labels=any(isinstance(each, LabelsConfig) for each in config.teachers_by_name.values()),
-        quiet=config.quiet,
     )
 
 
@@ -176,20 +171,19 @@ def _prepare(
     config: MemoryCommandConfig,
     work: Path,
     device: torch.device,
-    summary: Summary,
-    track: Progress,
+    run: Run,
 ) -> dict[str, TextTable]:
     """Prepares a scene for all teachers in folders of their own; the tables of words that lead into their features."""
     tables, spaces = {}, {}
-    with summary.step("encode"):
+    with run.step("encode"):
         predicted = predicted_features(scene, config) if config.weights else {}
     for name, teacher_config in config.teachers_by_name.items():
         with about(f"teacher {name}") if config.teachers else nullcontext(), config.typed_options(name):
-            with summary.step("teacher"):
+            with run.step("teacher"):
                 teacher = build_teacher(teacher_config, scene, words.get(name))
             spaces[name] = teacher.space
             check_distinct(spaces)
-            with summary.step("prepare"):
+            with run.step("prepare"):
                 features = in_space(predicted, teacher.space, config.weights) if config.weights else None
                 prepare_memory(
                     scene,
@@ -200,7 +194,7 @@ def _prepare(
                     predicted=features,
                     sample=DRAWN_FEATURES if config.pictures else 0,
                     device=device,
-                    track=track,
+                    track=run.track,
                 )
             if (table := words_beside(teacher, words.get(name))) is not None:
                 tables[name] = table

@@ -6,9 +6,8 @@ from functools import partial
 from pathlib import Path
 
 from gsencoder.app.options import CommonConfig
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import console
-from gsencoder.app.summary import Summary, report_choice, report_promises
+from gsencoder.app.run import Run
+from gsencoder.app.summary import report_choice, report_promises
 from gsencoder.core.archive import copy_checked
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.settings import MEGABYTE, check_governed, option
@@ -41,7 +40,11 @@ class PackConfig(CommonConfig):
     """Settings of `pack`."""
 
     paths: tuple[str, ...] = option(
-        (), "a folder written by fuse, encode, pack or memory", metavar="FEATURES", required=True
+        (),
+        "a folder written by fuse, encode, pack or memory",
+        metavar="FEATURES",
+        required=True,
+        one="folder of features",
     )
     space: str = option("", "name of the feature space, if the folder holds several")
     head: str = option("", "adapter head whose outputs are packed, such as siglip; empty = the features themselves")
@@ -61,8 +64,7 @@ class PackConfig(CommonConfig):
     )
 
     def __post_init__(self) -> None:
-        if len(self.paths) > 1:
-            raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
+        CommonConfig.__post_init__(self)
         if self.budget.promised and self.form not in CODED:
             raise InputError(
                 f"{self.budget.names}: form={self.form} writes features as they are; take form=compact or index, or "
@@ -75,31 +77,31 @@ class PackConfig(CommonConfig):
             raise InputError(f"decoded=true: form={self.form} holds codes; use form=npz, safetensors or ply")
 
 
-def run(config: PackConfig, summary: Summary) -> None:
+def run(config: PackConfig, run: Run) -> None:
     """Reads features and writes them with their splat into out=."""
     if not config.head and not isinstance(config.text, TableTextConfig):
         raise InputError("text=: is for the outputs of an adapter head; give head= as well, or leave it out")
     source = Path(config.paths[0])
-    with summary.step("load"):
+    with run.step("load"):
         scene = load_features(source)
     words = None
     if config.head:
         # Heads need torch, which packing does without.
         from gsencoder.app.heads import packed_through_head
 
-        with summary.step("head"):
+        with run.step("head"):
             scene, words = packed_through_head(scene, source, config.head, config.text, space=config.space)
     _, features = select_features(scene, None if config.head else config.space or None)
-    out = config.out or Path("outputs") / scene.name / "package"
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
-        with summary.step("pack"):
-            message = _write(folder, scene, features, config, summary)
+    out = run.out(scene.name, "package")
+    with run.folder(out) as folder:
+        with run.step("pack"):
+            message = _write(folder, scene, features, config, run)
         if config.head:
             if words is not None:
                 save_text_table(folder / WORDS_FILE, words, dtype="float16" if config.form in CODED else "float32")
         else:
             _write_beside(folder, source, scene, features, config.form)
-    console(config.quiet).print(f"{out}: {message}")
+    run.print(f"{out}: {message}")
 
 
 def _write_beside(folder: Path, source: Path, scene: Scene, features: GaussianFeatures, form: Form) -> None:
@@ -114,15 +116,13 @@ def _write_beside(folder: Path, source: Path, scene: Scene, features: GaussianFe
         copy_heads(source / HEADS_FILE, folder / HEADS_FILE, [features.space], left_out=others)
 
 
-def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
+def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, run: Run) -> str:
     with_features = int(features.seen.sum())
-    summary.results.update(
-        form=config.form, gaussians=len(features), seen=with_features, space=features.space.describe()
-    )
+    run.results.update(form=config.form, gaussians=len(features), seen=with_features, space=features.space.describe())
     if config.form == "compact":
-        return _write_compact(folder, scene, features, config, summary)
+        return _write_compact(folder, scene, features, config, run)
     if config.form == "index":
-        return _write_index(folder, scene, features, config, summary)
+        return _write_index(folder, scene, features, config, run)
     if config.form == "ply":
         save_ply(folder, scene, features, decoded=config.decoded)
     else:
@@ -130,7 +130,7 @@ def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackC
     return f"the splat, and features of {with_features:,} of its {len(features):,} Gaussians as {config.form}"
 
 
-def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
+def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, run: Run) -> str:
     budget = config.budget
     if budget.error is None and budget.megabytes is not None:
         compacted = save_package_within(folder, scene, features, megabytes=budget.megabytes)
@@ -138,7 +138,7 @@ def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, confi
         compacted = save_package(folder, scene, features, error=budget.error or DEFAULT_ERROR)
     size = (folder / PACKAGE_FILE).stat().st_size
     share = size / (2 * features.space.channels * len(features))
-    summary.results.update(
+    run.results.update(
         bytes=size,
         row_bytes=compacted.row_bytes,
         rank=compacted.basis.rank,
@@ -147,9 +147,7 @@ def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, confi
         weight_error=(compacted.heaviest / compacted.lightest) ** (1 / 510) - 1,
         share_of_float16=share,
     )
-    _report(
-        scene, {"rank": compacted.basis.rank, "row_bytes": compacted.row_bytes}, compacted.error, size, config, summary
-    )
+    _report(scene, {"rank": compacted.basis.rank, "row_bytes": compacted.row_bytes}, compacted.error, size, config, run)
     return (
         f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / MEGABYTE:.3g} MB, "
         f"{_ratio(share)} of float16 vectors: {counted(compacted.basis.rank, 'coordinate')} in "
@@ -158,7 +156,7 @@ def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, confi
     )
 
 
-def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, summary: Summary) -> str:
+def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, run: Run) -> str:
     if config.budget.promised:
         indexed, error = index_within(features, config.budget, partial(index_bytes, scene, features))
     else:
@@ -166,7 +164,7 @@ def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config:
         error = indexed.error
     save_index_package(folder, scene, indexed.features, error=indexed.error)
     rows, size = len(indexed.features.features), (folder / PACKAGE_FILE).stat().st_size
-    summary.results.update(
+    run.results.update(
         bytes=size,
         rows=rows,
         row_bytes=1 if rows < 256 else 2,
@@ -175,7 +173,7 @@ def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config:
         lowest=indexed.lowest,
         share_of_float16=size / (2 * features.space.channels * len(features)),
     )
-    _report(scene, {"rows": rows, "threshold": indexed.threshold}, error, size, config, summary)
+    _report(scene, {"rows": rows, "threshold": indexed.threshold}, error, size, config, run)
     return (
         f"features of {int(features.seen.sum()):,} of {len(features):,} Gaussians in {size / MEGABYTE:.3g} MB: the "
         f"number of one of {rows:,} rows in {'one byte' if rows < 256 else 'two bytes'}; centered cosines lose "
@@ -184,7 +182,7 @@ def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config:
 
 
 def _report(
-    scene: Scene, knobs: Mapping[str, int | float], error: float, size: int, config: PackConfig, summary: Summary
+    scene: Scene, knobs: Mapping[str, int | float], error: float, size: int, config: PackConfig, run: Run
 ) -> None:
     """Says what a budget chose and what became of it: both are measured over all Gaussians, of the file as it is."""
     budget, megabytes = config.budget, size / MEGABYTE
@@ -192,10 +190,9 @@ def _report(
         return
     over_budget = budget.error is not None and budget.megabytes is not None and megabytes > budget.megabytes
     notes = [budget.conflict("error", "megabytes", megabytes)] if over_budget else []
-    report_choice(summary, scene.name, knobs, predicted={}, notes=notes, quiet=config.quiet)
+    report_choice(run, scene.name, knobs, predicted={}, notes=notes, quiet=config.quiet)
     realised = {name: value for name, value in (("error", error), ("megabytes", megabytes)) if name in budget.promised}
-    for line in report_promises(summary, budget, realised):
-        console(config.quiet).print(f"{scene.name}: {line}")
+    run.print(*(f"{scene.name}: {line}" for line in report_promises(run, budget, realised)))
 
 
 def _ratio(share: float) -> str:

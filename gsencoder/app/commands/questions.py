@@ -3,13 +3,10 @@
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from gsencoder.app.options import CommonConfig
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.summary import Summary
-from gsencoder.core.errors import InputError, counted
+from gsencoder.app.run import Run
+from gsencoder.core.errors import counted
 from gsencoder.core.process import Track
 from gsencoder.core.settings import option
 from gsencoder.data.labels.expressions import write_scanrefer
@@ -38,25 +35,22 @@ class QuestionsCommandConfig(QuestionsConfig, CommonConfig):
         metavar="SCENE",
         required=True,
     )
-    per_object: int = option(3, "most expressions that mean one object")
-    objects: int = option(0, "most objects of a scene with expressions; 0 = all")
+    per_object: int = option(3, "most expressions that mean one object", ge=1)
+    objects: int = option(0, "most objects of a scene with expressions; 0 = all", ge=0)
     data: SceneConfig = field(default_factory=SceneConfig)
 
     def __post_init__(self) -> None:
+        CommonConfig.__post_init__(self)
         QuestionsConfig.__post_init__(self)
-        for name, least in (("per_object", 1), ("objects", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
 
 
-def run(config: QuestionsCommandConfig, summary: Summary) -> None:
+def run(config: QuestionsCommandConfig, run: Run) -> None:
     """Reads the labels of all scenes and writes what can be asked as ScanQA, SQA3D and ScanRefer write it."""
-    out = config.out or Path("outputs") / "questions"
-    screen = console(config.quiet)
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
-        with summary.step("labels"):
-            scenes = list(_seen(config, Progress(quiet=config.quiet)))
-        with summary.step("make"):
+    out = run.out("questions")
+    with run.folder(out) as folder:
+        with run.step("labels"):
+            scenes = list(_seen(config, run.track))
+        with run.step("make"):
             questions = make_questions(scenes, config)
             situations = make_situations(scenes, seed=config.seed, per_kind=config.per_kind)
             expressions = make_expressions(
@@ -69,7 +63,7 @@ def run(config: QuestionsCommandConfig, summary: Summary) -> None:
         kinds = {kind: counts[kind] for kind in KINDS}
         situated = Counter(each.id.rsplit("-", 2)[1] for each in situations)
         unique = sum(each.unique for each in expressions)
-        summary.results.update(
+        run.results.update(
             scenes=[scene.name for scene in scenes],
             questions=len(questions),
             kinds=kinds,
@@ -82,8 +76,8 @@ def run(config: QuestionsCommandConfig, summary: Summary) -> None:
             files=[QUESTIONS, SITUATED, EXPRESSIONS],
         )
     for kind, count in (kinds | dict(situated)).items():
-        screen.print(f"{kind:>10}: {counted(count, 'question')}")
-    screen.print(
+        run.print(f"{kind:>10}: {counted(count, 'question')}")
+    run.print(
         f"{out}: {counted(len(questions), 'question')}, {len(situations)} situated, "
         f"{counted(len(expressions), 'expression')}"
     )

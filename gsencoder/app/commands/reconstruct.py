@@ -8,13 +8,11 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
-from gsencoder.app.options import CommonConfig, settings
-from gsencoder.app.output import WorkFolder, folder_beside, output_folder, refuse_to_replace_inputs
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.scenes import run_scenes
-from gsencoder.app.summary import Summary, report_choice, report_promises
+from gsencoder.app.options import SharedScenesConfig, settings
+from gsencoder.app.output import Summary
+from gsencoder.app.run import Run
+from gsencoder.app.summary import report_choice, report_promises
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import SceneWarning, counted
 from gsencoder.core.files import write_picture
@@ -38,7 +36,7 @@ PLY_FILE, PICTURES_FILE, MODEL_FOLDER = "splat.ply", "held_out.png", "sparse/0"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReconstructCommandConfig(ReconstructConfig, CommonConfig):
+class ReconstructCommandConfig(ReconstructConfig, SharedScenesConfig):
     """Settings of `reconstruct`."""
 
     paths: tuple[str, ...] = option(
@@ -50,55 +48,41 @@ class ReconstructCommandConfig(ReconstructConfig, CommonConfig):
     splat: str = option("", f"Gaussians to refine; empty = seeds. {READABLE}")
     resume: bool = option(True, "continue an interrupted run; false = start again")
     device: Device = option("auto", "where to compute; on CUDA gsplat rasterizes")
-    worker: int = option(0, "number of this process among several that share the scenes: -m worker=0,1,2 starts three")
     data: SceneConfig = field(default_factory=SceneConfig)
     sfm: SfmConfig = field(default_factory=SfmConfig)
     video: VideoConfig = field(default_factory=VideoConfig)
 
     def __post_init__(self) -> None:
+        SharedScenesConfig.__post_init__(self)
         ReconstructConfig.__post_init__(self)
 
 
-def run(config: ReconstructCommandConfig, summary: Summary) -> None:
+def run(config: ReconstructCommandConfig, run: Run) -> None:
     """Reconstructs one scene into out=, or each of several into the folder OUT/NAME."""
     retain_freed_memory()
     choose_device(config.device)  # A missing device is an error before anything is read.
-    run_scenes(
-        find_photographed(config.paths),
-        config.out,
-        "reconstruction",
-        lambda path, out, scene_summary: _reconstruct_one(path, out, config, scene_summary),
-        summary,
-        overwrite=config.overwrite,
-        worker=config.worker,
-        screen=console(config.quiet),
-    )
+    paths = find_photographed(config.paths)
+    run.scenes(paths, "reconstruction", lambda path, out, run: _reconstruct_one(path, out, config, run))
 
 
-def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, summary: Summary) -> None:
+def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, run: Run) -> None:
     """Reads a scene or registers photographs, reconstructs, and writes splat, log and pictures into `out`."""
-    screen = console(config.quiet)
 
     def spent() -> float:
-        return time.perf_counter() - summary.began
+        return time.perf_counter() - run.began
 
-    with (
-        WorkFolder(folder_beside(out, "reconstruction")) as work,
-        output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
-    ):
-        refuse_to_replace_inputs(work.path, settings(config))
-        work.take(anew=not config.resume)
-        opened = _open(path, work.path, config, config.data, spent)
-        scale = _affordable_scale(opened, work.path, config, spent=spent())
+    with run.resumable(out, "reconstruction", resume=config.resume) as (folder, work):
+        opened = _open(path, work, config, config.data, spent, run)
+        scale = _affordable_scale(opened, work, config, spent=spent())
         full = opened
-        opened = _at_scale(full, scale, path, work.path, config, screen)
-        summary.add_seconds(opened.seconds)
-        with summary.step("check"):
+        opened = _at_scale(full, scale, path, work, config, run)
+        run.add_seconds(opened.seconds)
+        with run.step("check"):
             warn_of_faults(opened.scene)
             opened = replace(opened, scene=with_fitting_splat(opened.scene, config.splat, config.data))
         if opened.sfm is not None:
             sfm = opened.sfm
-            summary.results.update(placed=len(sfm.placed), missing=list(sfm.missing), sfm_error=sfm.error)
+            run.results.update(placed=len(sfm.placed), missing=list(sfm.missing), sfm_error=sfm.error)
         parts = ("data", "sfm", "video") if opened.is_video else ("data", "sfm")
         reading = {name: settings(getattr(config, name)) for name in parts}
         made_from = {"scene": str(path.resolve()), "splat": config.splat, **reading}
@@ -108,36 +92,36 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
                 scene,
                 ReconstructConfig(**{item.name: getattr(config, item.name) for item in fields(ReconstructConfig)}),
                 device=config.device,
-                work=work.path,
+                work=work,
                 made_from={**made_from, IMAGE_SCALE: scale},
                 spent=spent(),
                 may_shrink=may_shrink,
-                track=Progress(quiet=config.quiet),
-                report=screen.print,
+                track=run.track,
+                report=run.print,
             )
 
         try:
             result = fitted(opened.scene, scale, may_shrink=config.data.image_scale == 1 and not config.splat)
         except PhotographsTooLargeError as found:
             scale = round(scale * float(found.args[0]), 3)
-            opened = _at_scale(full, scale, path, work.path, config, screen)
+            opened = _at_scale(full, scale, path, work, config, run)
             result = fitted(opened.scene, scale, may_shrink=False)
         ended = time.perf_counter()
-        summary.add_seconds(result.seconds)
+        run.add_seconds(result.seconds)
         origin = opened.scene.origin
         save_splat(folder / PLY_FILE, result.gaussians, origin=origin if origin.any() else None)
         if opened.sfm is not None:
             # Without its poses the splat could not be fused.
             shutil.copytree(opened.sfm.model, folder / MODEL_FOLDER)
-            summary.results["model"] = MODEL_FOLDER
+            run.results["model"] = MODEL_FOLDER
         if opened.is_video and opened.photographs is not None:
             shutil.copytree(opened.photographs, folder / FRAMES_FOLDER, ignore=shutil.ignore_patterns(RECORD_FILE))
-            summary.results["images"] = FRAMES_FOLDER
-        shutil.copy(work.path / LOG_FILE, folder / LOG_FILE)
+            run.results["images"] = FRAMES_FOLDER
+        shutil.copy(work / LOG_FILE, folder / LOG_FILE)
         draw(folder / PICTURES_FILE, result.comparisons)
         last: LogRow = result.log[-1] if result.log else {}
-        summary.results.update(result.seeding)
-        summary.results.update(
+        run.results.update(result.seeding)
+        run.results.update(
             gaussians=len(result.gaussians),
             steps=result.steps,
             views=len(result.training),
@@ -151,21 +135,20 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, su
         seconds = result.elapsed + time.perf_counter() - ended
         # A scene without poses of its own has the name of the folder of its state.
         name = opened.scene.name if opened.sfm is None else path.name
-        promises = _report_budget(summary, name, scale, result, folder / PLY_FILE, seconds, config)
-    for line in promises:
-        screen.print(f"{out}: {line}")
+        promises = _report_budget(run, name, scale, result, folder / PLY_FILE, seconds, config)
+    run.print(*(f"{out}: {line}" for line in promises))
     scores = f"; {describe(last)} on {counted(len(result.held_out), 'held-out photograph')}" if last else ""
-    screen.print(f"{out / PLY_FILE}: {counted(len(result.gaussians), 'Gaussian')}{scores}")
+    run.print(f"{out / PLY_FILE}: {counted(len(result.gaussians), 'Gaussian')}{scores}")
     if opened.sfm is not None:
         images = "" if opened.is_video else f" data.images={opened.photographs}"
-        screen.print(
+        run.print(
             f"{out} holds the poses of the photographs, as a COLMAP scene: gsencoder fuse {out} "
             f"splat={PLY_FILE}{images}"
         )
 
 
 def _open(
-    path: Path, work: Path, config: ReconstructCommandConfig, data: SceneConfig, spent: Callable[[], float]
+    path: Path, work: Path, config: ReconstructCommandConfig, data: SceneConfig, spent: Callable[[], float], run: Run
 ) -> OpenedScene:
     subject, advice = "registering the photographs", "more seconds, fewer photographs, or a smaller sfm.size"
     return open_scene(
@@ -175,7 +158,7 @@ def _open(
         data=data,
         sfm=config.sfm,
         video=config.video,
-        track=Progress(quiet=config.quiet),
+        track=run.track,
         in_time=lambda: refuse_late(config.budget, spent(), subject, advice),
     )
 
@@ -230,7 +213,7 @@ def _affordable_scale(opened: OpenedScene, work: Path, config: ReconstructComman
 
 
 def _at_scale(
-    opened: OpenedScene, scale: float, path: Path, work: Path, config: ReconstructCommandConfig, screen: Console
+    opened: OpenedScene, scale: float, path: Path, work: Path, config: ReconstructCommandConfig, run: Run
 ) -> OpenedScene:
     """The scene with photographs that are so many times as large."""
     views = opened.scene.views
@@ -240,11 +223,11 @@ def _at_scale(
     with warnings.catch_warnings():
         # They were shown when the scene was read at its full size.
         warnings.simplefilter("ignore", SceneWarning)
-        smaller = _open(path, work, config, data, lambda: 0.0)
+        smaller = _open(path, work, config, data, lambda: 0.0, run)
     width, height = (int(np.median(sizes)) for sizes in (views.cameras.widths, views.cameras.heights))
     budget = config.budget
     option = f"budget.minutes={budget.minutes:g}" if budget.seconds is None else budget.shown("seconds")
-    screen.print(
+    run.print(
         f"photographs of {width}×{height} are looked at {scale:g} times as large, because of {option} "
         "(data.image_scale= states another size)"
     )

@@ -11,9 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.app.options import CommonConfig
-from gsencoder.app.output import check_output_files, sole_writer
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.summary import Summary, write_beside
+from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
 from gsencoder.core.settings import option
@@ -38,7 +36,11 @@ class RepairConfig(CommonConfig):
     """Settings of `repair`."""
 
     paths: tuple[str, ...] = option(
-        (), f"a scene with posed views, or one splat: {READABLE}", metavar="PATH", required=True
+        (),
+        f"a scene with posed views, or one splat: {READABLE}",
+        metavar="PATH",
+        required=True,
+        one="splat file or scene",
     )
     out: Path | None = option(
         None,
@@ -53,19 +55,20 @@ class RepairConfig(CommonConfig):
         "defects of a splat to repair: the four that prevent loading, activated (scales or opacities that "
         "are no logarithms or logits), huge, duplicates, floaters, or all",
     )
-    views: int = option(0, "largest number of a scene's views to hold against each other; 0 = 32 with depth, else 24")
+    views: int = option(
+        0, "largest number of a scene's views to hold against each other; 0 = 32 with depth, else 24", ge=0
+    )
     data: SceneConfig = field(default_factory=SceneConfig)
 
     def __post_init__(self) -> None:
-        if len(self.paths) > 1:
-            raise InputError(f"paths: expected one splat file or scene, got {len(self.paths)}")
-        if self.views < 0 or self.views == 1:
-            raise InputError(f"views: expected 0 or at least 2, got {self.views}")
+        CommonConfig.__post_init__(self)
+        if self.views == 1:
+            raise InputError("views: expected 0 or at least 2, got 1")
         if not self.fix:
             raise InputError("fix: expected the name of a defect, got none (gsencoder inspect lists them)")
 
 
-def run(config: RepairConfig, summary: Summary) -> None:
+def run(config: RepairConfig, run: Run) -> None:
     """Reads, repairs and writes a splat or the poses of a scene, and prints each change."""
     assert config.out is not None
     path = Path(config.paths[0])
@@ -74,30 +77,26 @@ def run(config: RepairConfig, summary: Summary) -> None:
         raise InputError(f"out={config.out}: the repaired poses of a scene are a nerfstudio file; give a name in .json")
     if not is_scene:
         check_splat_name(config.out)
-    check_output_files((config.out, Path(f"{config.out}.summary.json")), config.overwrite)
+    run.check_files(config.out)
     if is_scene:
-        _repair_scene(path, config, summary)
+        _repair_scene(path, config, run)
         return
-    with summary.step("read"):
+    with run.step("read"):
         raw = read_raw(config.paths[0])
-    with summary.step("repair"):
+    with run.step("repair"):
         repaired, report = repair_splat(raw, config.fix)
         origin = float64_origin(repaired)
         gaussians = gaussians_from_raw(
             repaired, origin=origin, where=f"{config.paths[0]} after fix={','.join(config.fix)}"
         )
-    with sole_writer(config.out, overwrite=config.overwrite):
-        with summary.step("write"):
-            save_splat(config.out, gaussians, origin=origin)
-        summary.results.update(report.to_dict(), path=str(config.out))
-        write_beside(config.out, summary)
-    screen = console(config.quiet)
-    for change in report.changes:
-        screen.print(f"{change.fix}: {change.count:,} rows {change.action}")
-    screen.print(f"{config.out}: {report.rows_after:,} of {report.rows_before:,} Gaussians")
+    run.results.update(report.to_dict(), path=str(config.out))
+    with run.file(config.out), run.step("write"):
+        save_splat(config.out, gaussians, origin=origin)
+    run.print(*(f"{change.fix}: {change.count:,} rows {change.action}" for change in report.changes))
+    run.print(f"{config.out}: {report.rows_after:,} of {report.rows_before:,} Gaussians")
 
 
-def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
+def _repair_scene(path: Path, config: RepairConfig, run: Run) -> None:
     """Writes a transforms.json whose poses, depth and cameras fit, and checks that they do."""
     # Only scenes need Pillow and, for some depth sensors, torch.
     from gsencoder.data.check.repair_scene import repair_posed
@@ -105,14 +104,13 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
     from gsencoder.data.readers.transforms_json import transforms_of
 
     assert config.out is not None
-    track, screen = Progress(quiet=config.quiet), console(config.quiet)
-    with summary.step("read"):
+    with run.step("read"):
         scene = load_scene(path, options=config.data)
         posed, _, _ = read_posed(path.absolute(), config.data)
         assert scene.views is not None
         assert posed is not None
-    with summary.step("check"):
-        depth, matches = check_scene(scene.views, limit=config.views, track=track)
+    with run.step("check"):
+        depth, matches = check_scene(scene.views, limit=config.views, track=run.track)
     findings = findings_of(scene.views, depth, matches)
     if not findings and not is_decided(depth, matches):
         raise InputError(f"{path}: too little to tell whether something is wrong, so there is nothing to repair")
@@ -122,30 +120,26 @@ def _repair_scene(path: Path, config: RepairConfig, summary: Summary) -> None:
         repair = repair_posed(repaired, findings, depth.registration if depth is not None else None)
         repaired, changes = repair.posed, [*changes, *repair.changes]
         content = transforms_of(repaired, config.out.parent)
-        with summary.step("check"):
+        with run.step("check"):
             again = _load_back(content, config.out)
             assert again.views is not None
-            depth, matches = check_scene(again.views, limit=config.views, track=track)
+            depth, matches = check_scene(again.views, limit=config.views, track=run.track)
         findings = findings_of(again.views, depth, matches)
         if wrong := [finding for finding in findings if finding.view is None]:
             raise InputError(f"{path}: still wrong once repaired: {wrong[0].message}; nothing was written")
         if not findings:
             break
     after = fit_of(depth, matches)
-    summary.results.update(path=str(config.out), changes=changes, agreement_before=before, agreement_after=after)
-    with sole_writer(config.out, overwrite=config.overwrite):
-        with summary.step("write"):
-            write_json(config.out, content)
-        write_beside(config.out, summary)
-    for change in changes:
-        screen.print(change, highlight=False)
+    run.results.update(path=str(config.out), changes=changes, agreement_before=before, agreement_after=after)
+    with run.file(config.out), run.step("write"):
+        write_json(config.out, content)
+    run.print(*changes)
     outside = (
         "" if config.out.resolve().parent == path.resolve() else "; its files lie elsewhere: data.allow_outside=true"
     )
-    screen.print(
+    run.print(
         f"{config.out}: {len(again.views):,} of {len(posed.images):,} views; {before:.0%} of what views share agreed, "
-        f"{after:.0%} do{outside}",
-        highlight=False,
+        f"{after:.0%} do{outside}"
     )
 
 

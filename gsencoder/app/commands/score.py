@@ -7,9 +7,8 @@ from pathlib import Path
 from rich.markdown import Markdown
 
 from gsencoder.app.options import CommonConfig
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import console
-from gsencoder.app.summary import Summary
+from gsencoder.app.output import Summary
+from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, write_bytes
 from gsencoder.core.settings import option
@@ -70,20 +69,20 @@ class ScoreConfig(CommonConfig):
     scenes: str = option("", "of instances and semantics: a split, one scene a line; empty = all scenes of the truth")
     class_agnostic: bool = option(False, "of instances: leave the classes of masks out of account")
     min_region: int = option(
-        MIN_REGION, "of instances: smallest number of vertices of a true object and of a mask that count"
+        MIN_REGION, "of instances: smallest number of vertices of a true object and of a mask that count", ge=1
     )
     excluded: tuple[str, ...] = option(BACKGROUND, "of semantics: classes that are not of the foreground", names=True)
     ks: tuple[int, ...] = option(
-        (1, 5), "of recognition and referring: numbers of names or boxes of which the best counts"
+        (1, 5), "of recognition and referring: numbers of names or boxes of which the best counts", ge=1
     )
     allow_missing: bool = option(
         False,
         "of recognition, referring, answers and captions: count what has no prediction as wrong, instead "
         "of refusing the file",
     )
-    min_iou: float = option(0.5, "of captions: IoU that a box must be above for its caption to count")
+    min_iou: float = option(0.5, "of captions: IoU that a box must be above for its caption to count", ge=0, le=1)
     distractors: int = option(
-        0, "of retrieval: texts or pictures of others in a query's pool, drawn by its name; 0 = all"
+        0, "of retrieval: texts or pictures of others in a query's pool, drawn by its name; 0 = all", ge=0
     )
     seed: int = option(0, "of retrieval: of their draw")
     pooling: Pooling = option("max", "of retrieval, where predictions are features: over the cells of a view")
@@ -94,18 +93,13 @@ class ScoreConfig(CommonConfig):
     report: bool = option(False, "write report.html, a page with tables")
 
     def __post_init__(self) -> None:
+        CommonConfig.__post_init__(self)
         if not self.paths:
             return
         if len(self.paths) > 1 or self.paths[0] not in PROTOCOLS:
             raise InputError(f"score: expected one protocol, {', '.join(PROTOCOLS)}; got {', '.join(self.paths)}")
-        if self.min_region < 1:
-            raise InputError(f"min_region: expected 1 or more, got {self.min_region}")
-        if not self.ks or min(self.ks) < 1:
-            raise InputError(f"ks: expected numbers from 1, got {', '.join(map(str, self.ks)) or 'none'}")
-        if not 0 <= self.min_iou <= 1:
-            raise InputError(f"min_iou: expected a share in [0, 1], got {self.min_iou}")
-        if self.distractors < 0:
-            raise InputError(f"distractors: expected 0 or more, got {self.distractors}")
+        if not self.ks:
+            raise InputError("ks: expected numbers from 1, got none")
         options = TAKEN[self.paths[0]]
         defaults = type(self).__dataclass_fields__
         for name in dict.fromkeys(each for names in TAKEN.values() for each in names):
@@ -113,15 +107,15 @@ class ScoreConfig(CommonConfig):
                 raise InputError(f"{name}: {self.paths[0]} has no such setting; it takes {', '.join(options)}")
 
 
-def run(config: ScoreConfig, summary: Summary) -> None:
+def run(config: ScoreConfig, run: Run) -> None:
     """Scores the predictions, prints the table, and writes it with rows by scene and class."""
     (protocol,) = config.paths
-    with summary.step("score"):
+    with run.step("score"):
         report = PROTOCOLS[protocol](config)
-    out = config.out or Path("outputs") / "score" / protocol
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as folder:
-        write_report(folder, report, summary, page=config.report)
-    print_report(out, report, quiet=config.quiet)
+    out = run.out("score", protocol)
+    with run.folder(out) as folder:
+        write_report(folder, report, run, page=config.report)
+    print_report(out, report, run)
 
 
 def write_report(folder: Path, report: ScoreReport, summary: Summary, *, page: bool) -> None:
@@ -143,17 +137,16 @@ def write_report(folder: Path, report: ScoreReport, summary: Summary, *, page: b
         report_benchmark(folder, report, summary)
 
 
-def print_report(out: Path, report: ScoreReport, *, quiet: bool) -> None:
+def print_report(out: Path, report: ScoreReport, run: Run) -> None:
     """Prints the measured rows and the main figures."""
-    screen = console(quiet)
     table = report.table.measured().without_classes()
     if report.table.by_class:
-        screen.print(f"The figures of {counted(len(report.table.by_class), 'class', 'classes')} are in {TABLE}.")
+        run.print(f"The figures of {counted(len(report.table.by_class), 'class', 'classes')} are in {TABLE}.")
     if len(table.columns) > MOST_COLUMNS:
         table = replace(table, columns=table.columns[:MOST_COLUMNS])
-        screen.print(f"The first {MOST_COLUMNS} of {len(report.table.columns)} columns; all are in {TABLE}.")
-    screen.print(Markdown(table.markdown()))
-    screen.print(f"{out}: {report.line}")
+        run.print(f"The first {MOST_COLUMNS} of {len(report.table.columns)} columns; all are in {TABLE}.")
+    run.print(Markdown(table.markdown()))
+    run.print(f"{out}: {report.line}")
 
 
 def _instances(config: ScoreConfig) -> ScoreReport:

@@ -2,20 +2,18 @@
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.scenes import WordsOptions, queried_scene, query_words
-from gsencoder.app.summary import Summary
-from gsencoder.core.errors import InputError, one_line
+from gsencoder.app.options import QueriesConfig
+from gsencoder.app.run import Progress, Run
+from gsencoder.app.scenes import queried_scene, query_words
+from gsencoder.core.errors import InputError, counted, one_line
 from gsencoder.core.files import write_json
 from gsencoder.core.settings import option
 from gsencoder.core.threads import import_ahead
 from gsencoder.data.splats.files import save_splat
-from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.boxes import words_to_json
 from gsencoder.infer.localize import LocalizeConfig, describe_absent
@@ -25,67 +23,49 @@ from gsencoder.infer.selection import SelectConfig, Selection
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Scene
 
-Part = Literal["objects", "rest", "labels"]
-Format = Literal["ply", "compressed.ply", "spz"]
 REST, HOLES = "rest", "holes.json"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SelectCommandConfig(WordsOptions):
+class SelectCommandConfig(QueriesConfig):
     """Settings of `select`."""
 
-    paths: tuple[str, ...] = option(
-        (), "a folder written by fuse, encode, pack or memory", metavar="FEATURES", required=True
-    )
-    query: tuple[str, ...] = option((), "one or several words, separated by commas")
-    queries: str = option("", "a text file with one query a line")
     box: tuple[int, ...] = option(
         (),
-        "numbers of the boxes of each word that are taken, best first from 0, as in boxes.json; empty = "
-        "the most probable one, and those nearly as probable",
+        "numbers of the boxes of each word that are taken, best first from 0, as in boxes.json; empty = the most "
+        "probable one, and those nearly as probable",
+        ge=0,
     )
-    threshold: float | None = option(None, "all Gaussians from this relevancy on, instead of boxes")
-    write: tuple[Part, ...] = option(
+    threshold: float | None = option(None, "all Gaussians from this relevancy on, instead of boxes", ge=-1, le=1)
+    write: tuple[Literal["objects", "rest", "labels"], ...] = option(
         ("objects", "rest", "labels"),
-        "objects = a splat of each word alone; rest = the scene without them, and the holes that they "
-        "leave; labels = the whole scene with the property label, and labels.json",
+        "objects = a splat of each word alone; rest = the scene without them, and the holes that they leave; labels = "
+        "the whole scene with the property label, and labels.json",
     )
-    format: Format = option("ply", "of the objects and the rest: ply, compressed.ply or spz")
+    format: Literal["ply", "compressed.ply", "spz"] = option("ply", "of the objects and the rest")
     select: SelectConfig = field(default_factory=SelectConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
-        if len(self.paths) > 1:
-            raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
-        if not self.write or not set(self.write) <= set(get_args(Part)):
-            raise InputError(
-                f"write: expected some of {', '.join(get_args(Part))}, got {', '.join(self.write) or 'none'}"
-            )
-        if self.format not in get_args(Format):
-            raise InputError(f"format: expected one of {', '.join(get_args(Format))}, got {self.format!r}")
+        QueriesConfig.__post_init__(self)
+        if not self.write:
+            raise InputError("write: expected some of objects, rest, labels, got none")
         if self.box and self.threshold is not None:
             raise InputError("box= and threshold= are two ways to choose where a selection starts; give one of them")
-        if self.threshold is not None and not -1 <= self.threshold <= 1:
-            raise InputError(f"threshold: expected a relevancy in [-1, 1], got {self.threshold}")
-        if any(number < 0 for number in self.box):
-            raise InputError(f"box: expected numbers from 0, got {', '.join(map(str, self.box))}")
 
 
-def run(config: SelectCommandConfig, summary: Summary) -> None:
+def run(config: SelectCommandConfig, run: Run) -> None:
     """Finds the Gaussians of each word and writes them, what is left, and the labels."""
     folder = Path(config.paths[0])
     words = query_words(config.query, config.queries)
     import_ahead("torch")
-    with summary.step("load"):
+    with run.step("load"):
         scene = load_features(folder)
-        # Features of earlier versions may lie in a scene whose up nobody estimated.
-        scene, _ = with_up(scene)
         queried, table = queried_scene(
             scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
         )
-    track = Progress(quiet=config.quiet)
-    with summary.step("select"):
+    with run.step("select"):
         selection, localization = select(
             queried,
             words,
@@ -94,11 +74,10 @@ def run(config: SelectCommandConfig, summary: Summary) -> None:
             boxes=config.box,
             threshold=config.threshold,
             localization=config.localize,
-            track=track,
+            track=run.track,
         )
-    out = config.out or Path("outputs") / scene.name / "selection"
-    files = _files(selection, config)
-    summary.results.update(
+    out, files = run.out(scene.name, "selection"), _files(selection, config)
+    run.results.update(
         space=next(iter(queried.features.values())).space.describe(),
         metres_per_unit=scene.metres_per_unit,
         words=words_to_json(localization),
@@ -107,17 +86,20 @@ def run(config: SelectCommandConfig, summary: Summary) -> None:
         placed_cameras=selection.placed,
         selection=labels_to_json(scene, selection, files),
     )
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
-        with summary.step("write"):
-            _write(target, scene, selection, files, config)
+    with run.folder(out) as target:
+        with run.step("write"):
+            assert scene.gaussians is not None
+            for label, name in files.items():
+                save_splat(target / name, scene.gaussians.select(selection.labels == label), origin=scene.origin)
+            if "labels" in config.write:
+                write_labels(target, scene, selection, files)
         if "rest" in config.write and scene.views is not None and config.select.views:
-            with summary.step("holes"):
-                summary.results["holes"] = _holes(scene, selection, config.select, track)
-            write_json(target / HOLES, summary.results["holes"])
-    screen = console(config.quiet)
+            with run.step("holes"):
+                run.results["holes"] = _holes(scene, selection, config.select, run.track)
+            write_json(target / HOLES, run.results["holes"])
     for number, word in enumerate(words):
-        screen.print(f"{one_line(word)}: {_describe(selection, number, localization.absent, files)}")
-    screen.print(f"{out}: {_listing(selection, config, files, summary.results.get('holes'))}")
+        run.print(f"{one_line(word)}: {_describe(selection, number, localization.absent, files)}")
+    run.print(f"{out}: {_listing(selection, config, files, run.results.get('holes'))}")
 
 
 def _files(selection: Selection, config: SelectCommandConfig) -> dict[int, str]:
@@ -131,16 +113,6 @@ def _files(selection: Selection, config: SelectCommandConfig) -> dict[int, str]:
             number + 1: f"{stem}.{config.format}" for number, stem in enumerate(stems) if len(selection.rows(number))
         }
     return names
-
-
-def _write(
-    target: Path, scene: Scene, selection: Selection, files: dict[int, str], config: SelectCommandConfig
-) -> None:
-    assert scene.gaussians is not None
-    for label, name in files.items():
-        save_splat(target / name, scene.gaussians.select(selection.labels == label), origin=scene.origin)
-    if "labels" in config.write:
-        write_labels(target, scene, selection, files)
 
 
 def _holes(scene: Scene, selection: Selection, config: SelectConfig, track: Progress) -> dict[str, Any]:
@@ -179,8 +151,7 @@ def _listing(
 ) -> str:
     parts = []
     if "objects" in config.write:
-        objects = sum(label > 0 for label in files)
-        parts.append("1 object" if objects == 1 else f"{objects} objects")
+        parts.append(counted(sum(label > 0 for label in files), "object"))
     if "rest" in config.write:
         parts.append(f"{files[0]} of {int(selection.rest.sum()):,} Gaussians")
     if "labels" in config.write:

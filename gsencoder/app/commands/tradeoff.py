@@ -10,12 +10,10 @@ from typing import Any
 from rich.table import Table
 
 from gsencoder.app.options import CommonConfig, settings
-from gsencoder.app.output import WorkFolder, folder_beside, output_folder, refuse_to_replace_inputs
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.summary import Summary
+from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, json_bytes, write_bytes
-from gsencoder.core.settings import option
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.protocols.localization import LocalizationProtocol
@@ -64,13 +62,13 @@ SECTIONS = {
 class LimitConfig:
     """Limits of time and error; the best setting of fusion within them is reported."""
 
-    seconds: float | None = option(None, "largest time for fusing one scene without the teacher, seconds")
-    error: float | None = option(None, "largest error against the reference, 1 − centered cosine")
+    seconds: float | None = option(
+        None, "largest time for fusing one scene without the teacher, seconds", gt=0, lt=math.inf
+    )
+    error: float | None = option(None, "largest error against the reference, 1 − centered cosine", gt=0, lt=math.inf)
 
     def __post_init__(self) -> None:
-        for name in ("seconds", "error"):
-            if (limit := getattr(self, name)) is not None and not 0 < limit < math.inf:
-                raise InputError(f"{name}: expected a number above 0, got {limit}")
+        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,11 +92,12 @@ class TradeoffConfig(CommonConfig):
     choose: ViewsConfig = field(default_factory=ViewsConfig)
 
     def __post_init__(self) -> None:
+        CommonConfig.__post_init__(self)
         if not self.stages or len(set(self.stages)) < len(self.stages):
             raise InputError(f"stages: expected one or more of {', '.join(STAGES)}, each once, got {list(self.stages)}")
 
 
-def run(config: TradeoffConfig, summary: Summary) -> None:
+def run(config: TradeoffConfig, run: Run) -> None:
     """Measures all settings, prints and writes tables and plots, and names the setting for a budget."""
     inputs = Inputs(
         teacher=config.teacher,
@@ -114,43 +113,38 @@ def run(config: TradeoffConfig, summary: Summary) -> None:
     check_sweep(stages, config.sweep)
     paths = [Path(os.path.realpath(path)) for path in find_scenes(config.paths)]
     _check_names(paths)
-    out = config.out or Path("outputs") / "tradeoff"
-    track = Progress(quiet=config.quiet)
-    with (
-        WorkFolder(folder_beside(out, "tradeoff")) as work,
-        output_folder(out, overwrite=config.overwrite, summary=summary) as folder,
-    ):
-        refuse_to_replace_inputs(work.path, settings(config))
-        work.take(anew=not config.resume)
+    out = run.out("tradeoff")
+    with run.resumable(out, "tradeoff", resume=config.resume) as (folder, work):
         identity = {
             "inputs": settings(inputs),
             "scenes": {p.name: str(p) for p in paths},
         }
-        records = Records(work.path, identity)
-        summary.results["continued"] = len(records)
+        records = Records(work, identity)
+        run.results["continued"] = len(records)
         results = []
         for stage in stages:
-            with summary.step(stage.name):
-                results.append(sweep_stage(stage, paths, records, config.sweep, config.halving, track))
+            with run.step(stage.name):
+                results.append(sweep_stage(stage, paths, records, config.sweep, config.halving, run.track))
         exponents: list[ScalingResult] = []
         if config.scaling.points:
-            with summary.step("exponents"):
-                exponents = scaling(config.stages, paths, inputs, config.scaling, seed=config.sweep.seed, track=track)
-        _write(folder, results, exponents, summary)
-        summary.results["picked"] = advice = _advice(results, config.budget)
-    screen = console(config.quiet)
+            with run.step("exponents"):
+                exponents = scaling(
+                    config.stages, paths, inputs, config.scaling, seed=config.sweep.seed, track=run.track
+                )
+        _write(folder, results, exponents, run)
+        run.results["picked"] = advice = _advice(results, config.budget)
     for each in results:
-        screen.print(_table(each))
-        screen.print(f"knobs that matter: {', '.join(each.matter) or 'none'}")
+        run.print(_table(each))
+        run.print(f"knobs that matter: {', '.join(each.matter) or 'none'}")
         for rung in each.rungs:
             more = "" if rung is each.rungs[-1] else f"; the best {len(rung.survivors)} went on"
-            screen.print(f"{counted(len(rung.settings), 'setting')} on {counted(rung.scenes, 'scene')}{more}")
+            run.print(f"{counted(len(rung.settings), 'setting')} on {counted(rung.scenes, 'scene')}{more}")
     for scaled in exponents:
         value, low, high, *_ = scaled.exponent
-        screen.print(f"{scaled.stage}: CPU time grows as {scaled.factor}^{value:.2f} (95 %: {low:.2f} to {high:.2f})")
+        run.print(f"{scaled.stage}: CPU time grows as {scaled.factor}^{value:.2f} (95 %: {low:.2f} to {high:.2f})")
     if advice:
-        screen.print(advice)
-    screen.print(f"{out}: {TABLE}, {SCENES}, {RESULTS}, {PAGE} and {PICTURE}")
+        run.print(advice)
+    run.print(f"{out}: {TABLE}, {SCENES}, {RESULTS}, {PAGE} and {PICTURE}")
 
 
 def _check_names(paths: Sequence[Path]) -> None:
@@ -160,7 +154,7 @@ def _check_names(paths: Sequence[Path]) -> None:
             raise InputError(f"paths: two scenes are called {name}, and results are named by scene; rename one")
 
 
-def _write(folder: Path, results: Sequence[StageResult], exponents: Sequence[ScalingResult], summary: Summary) -> None:
+def _write(folder: Path, results: Sequence[StageResult], exponents: Sequence[ScalingResult], run: Run) -> None:
     rows = [each.row() for result in results for each in result.results]
     write_bytes(folder / TABLE, _csv_of_stages(rows))
     write_bytes(folder / SCENES, _csv_of_stages([scene_row(each) for result in results for each in result.records]))
@@ -168,10 +162,10 @@ def _write(folder: Path, results: Sequence[StageResult], exponents: Sequence[Sca
     write_bytes(folder / RESULTS, json_bytes(everything)[0])
     if exponents:
         write_bytes(folder / EXPONENTS, csv_text([each.row() for each in exponents]).encode())
-    with summary.step("plot"):
+    with run.step("plot"):
         write_bytes(folder / PAGE, page(results, exponents))
         write_bytes(folder / PICTURE, picture(results))
-    summary.results.update(
+    run.results.update(
         settings=rows,
         matter={each.stage.name: list(each.matter) for each in results},
         exponents=[each.row() for each in exponents],

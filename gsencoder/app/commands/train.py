@@ -3,7 +3,6 @@ teacher."""
 
 import shutil
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,11 +10,12 @@ from typing import ClassVar, Literal
 
 from gsencoder.app.heads import describe_heads, head_figures
 from gsencoder.app.options import CommonConfig, settings
-from gsencoder.app.output import WorkFolder, folder_beside, output_folder, prepared_folder, refuse_to_replace_inputs
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.summary import Summary, basis_figures, describe_basis
+from gsencoder.app.output import prepared_folder
+from gsencoder.app.run import Run
+from gsencoder.app.summary import basis_figures, describe_basis
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory
+from gsencoder.core.settings import option
 from gsencoder.core.threads import threads_of_torch
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
@@ -27,7 +27,7 @@ from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import WEIGHTS_FILE, save_weights
 from gsencoder.teachers.build import words_by_teacher
 from gsencoder.train.adapter_heads import dataset_heads, required_heads, teacher_of_heads
-from gsencoder.train.distributed import cpu_share, fail_together, join_processes
+from gsencoder.train.distributed import cpu_share, fail_together
 from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE, check_same_teachers
 from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
 from gsencoder.train.prepared_file import PreparedScene
@@ -64,28 +64,21 @@ class TrainCommandConfig(TrainConfig, CommonConfig):
     device: Device = option("auto", "where scenes are prepared and the encoder computes")
 
 
-def run(config: TrainCommandConfig, summary: Summary) -> None:
+def run(config: TrainCommandConfig, run: Run) -> None:
     """Prepares scenes, trains, and writes weights, log and scores into out=."""
     retain_freed_memory()
-    out = config.out or Path("outputs") / "train"
-    work = folder_beside(out, "training")
-    prepared = prepared_folder(config.prepared, out, work)
+    out = run.out("train")
+    prepared = prepared_folder(config.prepared, out)
     training, held_out = split_scenes(find_scenes(config.paths), config.holdout, config.split, config.holdout_split)
     words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
-    with (
-        WorkFolder(work) as state,
-        join_processes(config.device, settings=settings(config)) as (process, device),
-        ExitStack() as results,
-    ):
-        track = Progress(quiet=config.quiet or not process.is_first)
-        folder = None
+    with run.processes(config.device, out, state="training") as group:
+        process, device, folder = group.process, group.device, None
         with fail_together():
-            if process.is_first and not config.prepare_only:
-                # Opened now, so that an out= that cannot be written is an error before hours of work.
-                folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
-                if config.resume:
-                    check_same_teachers(state.path / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
-        with summary.step("prepare"), threads_of_torch(cpu_share(process, config.prepare_threads)):
+            if not config.prepare_only:
+                folder = group.folder()
+                if folder is not None and config.resume:
+                    check_same_teachers(group.work.path / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
+        with run.step("prepare"), threads_of_torch(cpu_share(process, config.prepare_threads)):
             heads_asked = required_heads(config.heads, config.teachers_by_name)
             datasets = prepare_scenes(
                 training,
@@ -97,33 +90,28 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
                 heads=heads_asked,
                 process=process,
                 device=device,
-                track=track,
+                track=run.track,
             )
-            with_heads = datasets[teacher_of_heads(config.teachers_by_name, heads_asked)]
+            heads = dataset_heads(datasets[teacher_of_heads(config.teachers_by_name, heads_asked)], heads_asked)
         if config.prepare_only:
-            counts = f"{len(training)} scenes to train on, {len(held_out)} for validation"
-            screen = console(config.quiet or not process.is_first)
-            screen.print(f"{prepared}: {counts}")
-            for line in describe_heads(dataset_heads(with_heads, heads_asked)):
-                screen.print(f"{prepared}: {line}")
+            run.print(f"{prepared}: {len(training)} scenes to train on, {len(held_out)} for validation")
+            run.print(*(f"{prepared}: {line}" for line in describe_heads(heads)))
             return
         with fail_together():
-            if process.is_first:
-                refuse_to_replace_inputs(work, settings(config))
-                state.take(anew=not config.resume)
+            group.take(resume=config.resume)
         encoding = EncodeConfig(precision=config.train.precision, device=config.device)
-        with summary.step("train"):
+        with run.step("train"):
             result = fit(
                 datasets,
                 names(training),
                 names(held_out),
                 words,
                 config,
-                work=state.path,
+                work=group.work.path,
                 process=process,
                 device=device,
                 validate=partial(validate_names, config=encoding),
-                track=track,
+                track=run.track,
             )
         if folder is None:
             return
@@ -131,17 +119,13 @@ def run(config: TrainCommandConfig, summary: Summary) -> None:
             name: encoder_basis_figures(result.outputs[name], dataset.scenes(names(held_out)))
             for name, dataset in datasets.items()
         }
-        heads = dataset_heads(with_heads, heads_asked)
-        write_results(folder, state.path, result, figures, heads, config, summary)
+        write_results(folder, group.work.path, result, figures, heads, config, run)
     scores = ", ".join(f"{name} {value:.3f}" for name, value in result.scores.items()) or "not validated"
-    minutes = result.state.seconds / 60
-    screen = console(config.quiet)
-    screen.print(f"{out}: {result.state.step} steps in {minutes:.1f} minutes; {scores}")
+    run.print(f"{out}: {result.state.step} steps in {result.state.seconds / 60:.1f} minutes; {scores}")
     for name, of_teacher in figures.items():
         of = f" for {name}" if len(figures) > 1 else ""
-        screen.print(f"{out}: basis{of}: {describe_basis(of_teacher, 'held-out scenes')}")
-    for line in describe_heads(heads):
-        screen.print(f"{out}: {line}")
+        run.print(f"{out}: basis{of}: {describe_basis(of_teacher, 'held-out scenes')}")
+    run.print(*(f"{out}: {line}" for line in describe_heads(heads)))
 
 
 def names(paths: Sequence[Path]) -> list[str]:
@@ -164,7 +148,7 @@ def write_results(
     figures: dict[str, dict[str, int | float]],
     heads: HeadSet,
     config: TrainCommandConfig,
-    summary: Summary,
+    run: Run,
 ) -> None:
     """Writes weights, words, heads, log and pictures; scores and the figures of each basis go into weights and
     summary."""
@@ -179,7 +163,7 @@ def write_results(
     for name in (EVENTS_FOLDER, "validation"):
         if (work / name).is_dir():
             shutil.copytree(work / name, folder / name)
-    summary.results.update(
+    run.results.update(
         steps=steps,
         seconds=seconds,
         parameters=sum(value.numel() for value in result.encoder.parameters()),

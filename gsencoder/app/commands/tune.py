@@ -7,7 +7,6 @@ import os
 import shutil
 import warnings
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from hashlib import sha256
@@ -15,11 +14,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.app.inputs import asker_of
-from gsencoder.app.options import settings
-from gsencoder.app.output import WorkFolder, folder_beside, output_folder, prepared_folder, refuse_to_replace_inputs
-from gsencoder.app.progress import Progress, console
-from gsencoder.app.scenes import WordsOptions, shown_scene
-from gsencoder.app.summary import Summary
+from gsencoder.app.options import FeaturesConfig
+from gsencoder.app.output import prepared_folder
+from gsencoder.app.run import Run
+from gsencoder.app.scenes import shown_scene
 from gsencoder.core.errors import BusyError, InputError, SceneWarning, about, counted, listed
 from gsencoder.core.files import lock_folder, plain
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE, read_log
@@ -36,7 +34,7 @@ from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.localize import LocalizeConfig, select_features
 from gsencoder.infer.views.targets import ViewsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
-from gsencoder.train.distributed import fail_together, join_processes
+from gsencoder.train.distributed import fail_together
 from gsencoder.train.tune import TuneConfig, TuningPair, open_processor, save_tuned, tune
 from gsencoder.train.vlm import SERVED_FOLDER, TowerLayout, check_peft, check_targets, link_served
 from gsencoder.types import GaussianFeatures
@@ -243,11 +241,15 @@ def _store(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TuneCommandConfig(TuneConfig, WordsOptions):
+class TuneCommandConfig(TuneConfig, FeaturesConfig):
     """Settings of `tune`."""
 
     paths: tuple[str, ...] = option(
-        (), "ScanQA's or SQA3D's file of questions, or a folder that has it", metavar="DATASET", required=True
+        (),
+        "ScanQA's or SQA3D's file of questions, or a folder that has it",
+        metavar="DATASET",
+        one="file or folder of questions",
+        required=True,
     )
     model: str = option(
         "",
@@ -287,20 +289,18 @@ class TuneCommandConfig(TuneConfig, WordsOptions):
     text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
+        FeaturesConfig.__post_init__(self)
         TuneConfig.__post_init__(self)
-        if len(self.paths) > 1:
-            raise InputError(f"paths: expected one file or folder of questions, got {len(self.paths)}")
         if self.project is not None and not self.tokens:
             raise InputError("project: is of rendered features; give tokens=, too")
         VlmConfig(image_side=self.image_side, image_format=self.image_format)
 
 
-def run(config: TuneCommandConfig, summary: Summary) -> None:
+def run(config: TuneCommandConfig, run: Run) -> None:
     """Prepares prompts, trains adapters on their answers, and writes these as peft does."""
     check_peft()
-    out = config.out or Path("outputs") / "tune"
-    work = folder_beside(out, "training")
-    prepared = prepared_folder(config.prepared, out, work)
+    out = run.out("tune")
+    prepared = prepared_folder(config.prepared, out)
     questions = read_dataset(Path(config.paths[0]), config.split, config.scenes)
     model, features = find_file(config.model, "model", folder=True), Path(config.features)
     model_config, _, layout = open_processor(model, with_tokens=bool(config.tokens))
@@ -318,55 +318,46 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
         tokens=config.tokens,
         layout=layout,
     )
-    with (
-        WorkFolder(work) as state,
-        join_processes(config.device, settings=settings(config)) as (process, device),
-        ExitStack() as results,
-    ):
-        track = Progress(quiet=config.quiet or not process.is_first)
-        folder = None
-        with fail_together(), summary.step("prepare"):
-            if process.is_first:
-                if not config.prepare_only:
-                    folder = results.enter_context(output_folder(out, overwrite=config.overwrite, summary=summary))
-                prepare_prompts(questions, features, config.photos, recipe, prepared, track=track)
+    with run.processes(config.device, out, state="training") as group:
+        folder, work = None, group.work.path
+        with fail_together(), run.step("prepare"):
+            if not config.prepare_only:
+                folder = group.folder()
+            if group.process.is_first:
+                prepare_prompts(questions, features, config.photos, recipe, prepared, track=run.track)
         if config.prepare_only:
-            console(config.quiet or not process.is_first).print(
-                f"{prepared}: prompts of {counted(len(questions), 'question')}"
-            )
+            run.print(f"{prepared}: prompts of {counted(len(questions), 'question')}")
             return
         with fail_together():
-            if process.is_first:
-                refuse_to_replace_inputs(work, settings(config))
-                state.take(anew=not config.resume)
+            group.take(resume=config.resume)
         store = PromptStore(prepared)
         pairs = tuning_pairs(questions, features, config.photos, recipe, store)
-        with summary.step("train"):
+        with run.step("train"):
             result = tune(
                 pairs,
                 store,
                 model,
                 config,
                 project=config.project,
-                work=state.path,
-                process=process,
-                device=device,
+                work=work,
+                process=group.process,
+                device=group.device,
                 tensorboard=config.tensorboard,
-                track=track,
+                track=run.track,
             )
         if folder is None:
             return
-        with summary.step("write"):
+        with run.step("write"):
             save_tuned(folder, result)
             if not config.tokens:
                 # A server has no rendered features to give.
                 link_served(folder, model)
-            shutil.copy(state.path / LOG_FILE, folder / LOG_FILE)
-            if (state.path / EVENTS_FOLDER).is_dir():
-                shutil.copytree(state.path / EVENTS_FOLDER, folder / EVENTS_FOLDER)
+            shutil.copy(work / LOG_FILE, folder / LOG_FILE)
+            if (work / EVENTS_FOLDER).is_dir():
+                shutil.copytree(work / EVENTS_FOLDER, folder / EVENTS_FOLDER)
         losses = [float(row["loss"]) for row in read_log(folder / LOG_FILE) if row.get("loss")]
         parameters = list(result.network.parameters())
-        summary.results.update(
+        run.results.update(
             questions=len(questions),
             scenes=len({each.scene for each in questions}),
             steps=result.state.step,
@@ -378,14 +369,13 @@ def run(config: TuneCommandConfig, summary: Summary) -> None:
             adapters="adapter_model.safetensors",
             log=LOG_FILE,
         )
-    screen = console(config.quiet)
-    trained = summary.results["trained"]
-    screen.print(
+    trained = run.results["trained"]
+    run.print(
         f"{out}: {counted(result.state.step, 'step')} on {counted(len(questions), 'question')}, "
         f"{counted(trained, 'parameter')} of adapters; {_told_losses(losses, config.train.log_every)}"
     )
     if not config.tokens:
-        screen.print(f"{out}: transformers serve {out / SERVED_FOLDER}")
+        run.print(f"{out}: transformers serve {out / SERVED_FOLDER}")
 
 
 def _told_losses(losses: Sequence[float], log_every: int) -> str:

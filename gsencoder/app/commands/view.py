@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gsencoder.app.output import check_output_files, sole_writer
-from gsencoder.app.progress import console
-from gsencoder.app.scenes import WordsOptions, queried_scene
-from gsencoder.app.summary import Summary, write_beside
+from gsencoder.app.options import FeaturesConfig
+from gsencoder.app.run import Run
+from gsencoder.app.scenes import queried_scene
 from gsencoder.core.errors import InputError, printable
-from gsencoder.core.files import atomic_file
-from gsencoder.core.process import accept_stop
+from gsencoder.core.files import write_bytes
 from gsencoder.core.settings import option
 from gsencoder.data.scenes import DistinctPaths, SceneConfig, load_scene
-from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, select_features
 from gsencoder.infer.page.page import Bundle, FileOptions, fitting_page, load_bundle, scene_container, served_page
@@ -30,7 +27,7 @@ SUFFIX = ".html"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ViewConfig(WordsOptions):
+class ViewConfig(FeaturesConfig):
     """Settings of `view`."""
 
     paths: tuple[str, ...] = option(
@@ -46,51 +43,45 @@ class ViewConfig(WordsOptions):
     )
     photos: str = option("", "the scene that was fused; its photographs and labeled objects are shown")
     max_gaussians: int = option(
-        1_000_000, "of more Gaussians so many are drawn and searched, evenly chosen and enlarged"
+        1_000_000, "of more Gaussians this number is drawn and searched, evenly chosen and enlarged", ge=1
     )
-    port: int = option(0, "of the server; 0 = any that is free")
+    port: int = option(0, "of the server; 0 = any that is free", ge=0, lt=1 << 16)
     host: str = option("127.0.0.1", "address that the server listens on; others than 127.0.0.1 open it to a network")
     open: bool | None = option(None, "open a browser; empty = if standard output is a terminal")
     megabytes: float = option(
-        25.0, "largest size of out=; spherical harmonics, then Gaussians are left out, and the page says so"
+        25.0,
+        "largest size of out=; spherical harmonics, then Gaussians are left out, and the page says so",
+        gt=0,
+        lt=2000,
     )
-    error: float = option(0.01, "largest mean loss of centered cosine of the quantized features in out=")
-    photographs: int = option(24, "largest number of photographs in out=")
+    error: float = option(0.01, "largest mean loss of centered cosine of the quantized features in out=", gt=0, lt=1)
+    photographs: int = option(24, "largest number of photographs in out=", ge=0)
     data: SceneConfig = field(default_factory=SceneConfig)
     localize: LocalizeConfig = field(default_factory=LocalizeConfig)
     text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
+        FeaturesConfig.__post_init__(self)
         if len(self.paths) > 2:
             raise InputError(f"paths: expected one or two folders of features, got {len(self.paths)}")
-        if self.max_gaussians < 1:
-            raise InputError(f"max_gaussians: expected 1 or more, got {self.max_gaussians}")
-        if not 0 <= self.port < 1 << 16:
-            raise InputError(f"port: expected 0 to 65535, got {self.port}")
         if self.host in ("", "0.0.0.0", "::"):
             raise InputError(
                 f"host: expected one address, such as 127.0.0.1 or that of a network, got {self.host!r}; requests for "
                 "other addresses are refused"
             )
-        if not 0 < self.megabytes < 2000:
-            raise InputError(f"megabytes: expected a size above 0, got {self.megabytes}")
-        if not 0 < self.error < 1:
-            raise InputError(f"error: expected a budget between 0 and 1, got {self.error}")
-        if self.photographs < 0:
-            raise InputError(f"photographs: expected 0 or more, got {self.photographs}")
         if self.localize.contrast or self.localize.mode != "centered":
             raise InputError("localize.contrast, localize.mode: the page compares centered cosines; leave them out")
         if self.out is not None and self.out.suffix.lower() != SUFFIX:
             raise InputError(f"out: expected a file that ends in {SUFFIX}, got {self.out.name}")
 
 
-def run(config: ViewConfig, summary: Summary) -> None:
+def run(config: ViewConfig, run: Run) -> None:
     """Serves the page until it is interrupted, or writes it."""
     DistinctPaths().add(map(Path, config.paths))
     bundle = load_bundle()
     if config.out is not None:
-        check_output_files((config.out, Path(f"{config.out}.summary.json")), config.overwrite)
-    with summary.step("load"):
+        run.check_files(config.out)
+    with run.step("load"):
         photographed = load_scene(config.photos, options=config.data) if config.photos else None
         loaded = [_load(Path(path), config, photographed) for path in config.paths]
     names = [scene.name for scene, _ in loaded]
@@ -102,13 +93,13 @@ def run(config: ViewConfig, summary: Summary) -> None:
     objects = () if photographed is None else photographed.objects
     titles = _titles([Path(path) for path in config.paths])
     if config.out is not None:
-        _write(config.out, config, bundle, loaded, titles, objects, summary)
+        _write(config.out, config, bundle, loaded, titles, objects, run)
     else:
-        _serve(config, bundle, loaded, titles, objects)
+        _serve(config, bundle, loaded, titles, objects, run)
 
 
 def _load(folder: Path, config: ViewConfig, photographed: Scene | None) -> tuple[Scene, Words | None]:
-    scene, _ = with_up(load_features(folder))
+    scene = load_features(folder)
     scene = upright_scene(scene if photographed is None else with_photographs(scene, photographed))
     if not (config.head or config.words) and isinstance(config.text, TableTextConfig):
         _, features = select_features(scene, config.space or None)
@@ -130,6 +121,7 @@ def _serve(
     loaded: Sequence[tuple[Scene, Words | None]],
     titles: Sequence[str],
     objects: tuple[SceneObject, ...],
+    run: Run,
 ) -> None:
     searches = [
         SceneSearch(
@@ -149,8 +141,7 @@ def _serve(
         try:
             server.serve_forever(poll_interval=0.1)
         except KeyboardInterrupt:
-            accept_stop()
-            console(config.quiet).print("ended")
+            run.print("ended")
 
 
 def _write(
@@ -160,10 +151,10 @@ def _write(
     loaded: Sequence[tuple[Scene, Words | None]],
     titles: Sequence[str],
     objects: tuple[SceneObject, ...],
-    summary: Summary,
+    run: Run,
 ) -> None:
     options = FileOptions(error=config.error, sh_degree=3, photographs=config.photographs, photograph_side=640)
-    with summary.step("page"):
+    with run.step("page"):
         page = fitting_page(
             bundle,
             [(scene, title, words) for (scene, words), title in zip(loaded, titles, strict=True)],
@@ -173,24 +164,20 @@ def _write(
             max_gaussians=config.max_gaussians,
             max_bytes=int(config.megabytes * 1e6),
         )
-    with sole_writer(out, overwrite=config.overwrite):
-        with summary.step("write"), atomic_file(out) as stream:
-            stream.write(page.page)
-        summary.results.update(
-            page=str(out),
-            bytes=len(page.page),
-            gaussians=page.gaussians,
-            sh_degree=page.sh_degree,
-            photographs=page.photographs,
-            feature_error=page.feature_error,
-            left_out=list(page.notes),
-        )
-        write_beside(out, summary)
-    screen = console(config.quiet)
-    for note in page.notes:
-        screen.print(note)
+    run.results.update(
+        page=str(out),
+        bytes=len(page.page),
+        gaussians=page.gaussians,
+        sh_degree=page.sh_degree,
+        photographs=page.photographs,
+        feature_error=page.feature_error,
+        left_out=list(page.notes),
+    )
+    with run.file(out), run.step("write"):
+        write_bytes(out, page.page)
+    run.print(*page.notes)
     counts = " and ".join(f"{count:,}" for count in page.gaussians)
-    screen.print(
+    run.print(
         f"{out}: {len(page.page) / 1e6:.1f} MB; {counts} Gaussians, spherical harmonics of degree "
         f"{max(page.sh_degree)}; opens in a browser without a network"
     )

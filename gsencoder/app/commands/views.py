@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from gsencoder.app.heads import features_for_heads, heads_of_folder
-from gsencoder.app.output import output_folder
-from gsencoder.app.progress import console
-from gsencoder.app.scenes import WordsOptions, queried_scene, query_words, shown_scene
-from gsencoder.app.summary import Summary, report_choice, report_promises
+from gsencoder.app.options import QueriesConfig
+from gsencoder.app.output import Summary
+from gsencoder.app.run import Run
+from gsencoder.app.scenes import queried_scene, query_words, shown_scene
+from gsencoder.app.summary import report_choice, report_promises
 from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
@@ -107,20 +108,15 @@ VIEWS, TOKENS = "views.json", "tokens.safetensors"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ViewsCommandConfig(WordsOptions):
+class ViewsCommandConfig(QueriesConfig):
     """Settings of `views`."""
 
-    paths: tuple[str, ...] = option(
-        (), "a folder written by fuse, encode, pack or memory", metavar="FEATURES", required=True
-    )
-    query: tuple[str, ...] = option((), "one or several words, separated by commas")
-    queries: str = option("", "a text file with one query a line")
     token_head: str = option(
         "",
         "adapter head that rendered features of grid= are put through, such as siglip.features; empty = that of head=",
     )
     photos: str = option("", "the scene that was fused; its photographs are shown instead of renders")
-    boxes: int = option(1, "number of boxes of each word that are shown, best first")
+    boxes: int = option(1, "number of boxes of each word that are shown, best first", ge=1)
     grid: tuple[int, ...] = option(
         (), "rows and columns of the patches of a vision tower, on which features are rendered in addition"
     )
@@ -132,10 +128,7 @@ class ViewsCommandConfig(WordsOptions):
     text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
-        if len(self.paths) > 1:
-            raise InputError(f"paths: expected one folder of features, got {len(self.paths)}")
-        if self.boxes < 1:
-            raise InputError(f"boxes: expected 1 or more, got {self.boxes}")
+        QueriesConfig.__post_init__(self)
         check_views_budget(self.budget, self.choose)
         if len(self.grid) not in (0, 2):
             raise InputError(f"grid: expected rows and columns, such as [27,27], got {list(self.grid)}")
@@ -145,16 +138,16 @@ class ViewsCommandConfig(WordsOptions):
             raise InputError("token_head: is for rendered features; give grid= as well, or leave it out")
 
 
-def run(config: ViewsCommandConfig, summary: Summary) -> None:
+def run(config: ViewsCommandConfig, run: Run) -> None:
     """Localizes the words, chooses and renders views of them, and writes the pictures and their scores."""
     folder = Path(config.paths[0])
-    with summary.step("load"):
+    with run.step("load"):
         scene = shown_scene(folder, config.photos, config.data)
     boxes: tuple[Box, ...] = ()
     targets: tuple[Target, ...] = ()
     absent: dict[str, str] = {}
     if config.query or config.queries or config.choose.method == "greedy":
-        with summary.step("localize"):
+        with run.step("localize"):
             words = query_words(config.query, config.queries)
             queried, table = queried_scene(
                 scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
@@ -167,34 +160,30 @@ def run(config: ViewsCommandConfig, summary: Summary) -> None:
             listing = ", ".join(f"{word!r} is {text}" for word, text in absent.items())
             raise InputError(f"views: none of the words has a box in scene {scene.name}: {listing}")
         boxes = best_boxes(localization, config.boxes)
-        summary.results.update(boxes=[box_to_json(box) for box in boxes], words=words_to_json(localization))
+        run.results.update(boxes=[box_to_json(box) for box in boxes], words=words_to_json(localization))
     choice, pictures, promises = None, list[Picture](), list[str]()
     if config.budget.promised:
-        choice, views, pictures = choose_in_budget(scene, targets, config, summary)
+        choice, views, pictures = choose_in_budget(scene, targets, config, run)
     else:
-        with summary.step("choose"):
+        with run.step("choose"):
             views = choose_views(scene, targets, config.choose)
-    out = config.out or Path("outputs") / scene.name / "views"
+    out = run.out(scene.name, "views")
     rows = views_to_json(scene, views)
-    summary.results.update(views=rows, judged=views.judged)
-    with output_folder(out, overwrite=config.overwrite, summary=summary) as target:
-        with summary.step("render"):
+    run.results.update(views=rows, judged=views.judged)
+    with run.folder(out) as target:
+        with run.step("render"):
             write_pictures(target, scene, views, rows, pictures or view_pictures(scene, views)[0], boxes)
         write_json(target / VIEWS, rows)
         if config.grid:
-            with summary.step("tokens"):
+            with run.step("tokens"):
                 write_tokens(target / TOKENS, scene, views, config)
         if choice is not None:
             files = [target / row["picture"] for row in rows]
-            promises = check_promises(choice, scene, targets, views, files, config, summary)
-    screen = console(config.quiet)
-    for word, text in absent.items():
-        screen.print(f"{word}: {text}")
-    for number, each in enumerate(views.chosen):
-        screen.print(f"{number:2d}  {describe_view(each)}")
-    for line in promises:
-        screen.print(f"{out}: {line}")
-    screen.print(f"{out}: {len(views)} of {views.judged} views, {SHEET}, {VIEWS}" + (f", {TOKENS}" * bool(config.grid)))
+            promises = check_promises(choice, scene, targets, views, files, config, run)
+    run.print(*(f"{word}: {text}" for word, text in absent.items()))
+    run.print(*(f"{number:2d}  {describe_view(each)}" for number, each in enumerate(views.chosen)))
+    run.print(*(f"{out}: {line}" for line in promises))
+    run.print(f"{out}: {len(views)} of {views.judged} views, {SHEET}, {VIEWS}" + (f", {TOKENS}" * bool(config.grid)))
 
 
 def write_tokens(path: Path, scene: Scene, views: ViewSet, config: ViewsCommandConfig) -> None:

@@ -8,7 +8,7 @@ import pytest
 from memory_samples import make_memory
 from splats import front_camera, random_gaussians
 
-from gsencoder.app.from_poses import RequestedCameras, memory_of, search_from_poses
+from gsencoder.app.commands.localize import RequestedCameras, memory_of, search_from_poses
 from gsencoder.fusion.folder import load_features, save_features, save_memories
 from gsencoder.infer.from_pose import FromPoseConfig, from_pose
 from gsencoder.infer.localize import LocalizeConfig

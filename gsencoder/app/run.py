@@ -1,0 +1,297 @@
+"""A run of a command: what it prints, the progress that it shows, its record in summary.json, where it writes, and the
+queue of several scenes."""
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
+from rich.segment import Segment
+
+from gsencoder.app.options import CommonConfig, settings
+from gsencoder.app.output import (
+    Summary,
+    WorkFolder,
+    check_output_files,
+    output_file,
+    output_folder,
+    refuse_to_replace_inputs,
+    sibling_folder,
+)
+from gsencoder.core.errors import BusyError, InputError, listed, one_line, printable
+from gsencoder.core.files import SUMMARY_NAME, plain, read_foreign_text
+from gsencoder.core.process import Device, ProcessRank, refuse_several
+from gsencoder.data.scenes import check_names, scene_name
+
+T = TypeVar("T")
+
+
+class Screen(Console):
+    """A console that prints no control characters of the text that it is given: file names and texts of users."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        for text, style, control in super().render(renderable, options):
+            yield Segment(text if control else printable(text), style, control)
+
+
+def console(quiet: bool = False) -> Console:
+    """The console for results and tables: standard output without markup, 200 columns wide if it is not a terminal."""
+    width = None if sys.stdout.isatty() else 200
+    return Screen(file=sys.stdout, quiet=quiet, markup=False, highlight=False, emoji=False, width=width)
+
+
+class Progress:
+    """Shows the progress of loops: a transient bar on a terminal, else a line every few seconds.
+
+    Example:
+        track = Progress(quiet=config.quiet)
+        for view in track(views, "lifting views"):
+            ...
+    """
+
+    def __init__(self, *, quiet: bool = False, stream: Any = None, every: float = 10.0) -> None:
+        """Args:
+        stream: the text stream to write to; None = standard error.
+        every: seconds between lines if the stream is not a terminal; shorter loops print nothing.
+        """
+        self._stream = sys.stderr if stream is None else stream
+        self._quiet = quiet
+        self._every = every
+        self._bars: Bars | None = None
+        self._depth = 0
+
+    def __call__(self, items: Iterable[T], label: str, total: int | None = None) -> Iterator[T]:
+        """Yields the items and shows how many are done."""
+        if total is None and isinstance(items, Sized):
+            total = len(items)
+        if self._quiet:
+            return iter(items)
+        return self._on_terminal(items, label, total) if self._stream.isatty() else self._in_lines(items, label, total)
+
+    def _on_terminal(self, items: Iterable[T], label: str, total: int | None) -> Iterator[T]:
+        if self._bars is None:
+            columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn())
+            screen = Screen(file=self._stream, markup=False, highlight=False)
+            self._bars = Bars(*columns, TimeElapsedColumn(), TimeRemainingColumn(), console=screen, transient=True)
+        # Nested loops share one display, since rich draws one at a time.
+        if self._depth == 0:
+            self._bars.start()
+        self._depth += 1
+        task = self._bars.add_task(label, total=total)
+        try:
+            for item in items:
+                yield item
+                self._bars.advance(task)
+        finally:
+            self._bars.remove_task(task)
+            self._depth -= 1
+            if self._depth == 0:
+                self._bars.stop()
+
+    def _in_lines(self, items: Iterable[T], label: str, total: int | None) -> Iterator[T]:
+        start = last = time.monotonic()
+        of, label = f"/{total}" if total is not None else "", printable(label)
+        count = 0
+        for item in items:
+            yield item
+            count += 1
+            now = time.monotonic()
+            if now - last >= self._every:
+                last = now
+                print(f"{label}: {count}{of} after {now - start:.0f} s", file=self._stream, flush=True)
+        if last > start:
+            print(f"{label}: {count} done in {time.monotonic() - start:.0f} s", file=self._stream, flush=True)
+
+
+class Run(Summary):
+    """A run of a command: its settings and its record, what it prints, and where it writes.
+
+    Attributes:
+        config: the settings.
+        screen: for results and tables.
+        track: shows the progress of loops.
+    """
+
+    def __init__(self, command: str, config: CommonConfig, began: float | None = None) -> None:
+        super().__init__(command, settings(config), began)
+        self.config, self.screen, self.track = config, console(config.quiet), Progress(quiet=config.quiet)
+
+    def print(self, *lines: RenderableType, **options: Any) -> None:
+        """Prints results, each on a line of its own, unless quiet=true."""
+        for line in lines:
+            self.screen.print(line, **options)
+
+    def out(self, *default: str) -> Path:
+        """Where the results go: out=, or outputs/DEFAULT."""
+        return self.config.out or Path("outputs", *default)
+
+    @contextmanager
+    def folder(self, out: Path) -> Iterator[Path]:
+        """Opens the output folder of the results and of this record; see `output_folder`."""
+        with output_folder(out, overwrite=self.config.overwrite, summary=self) as folder:
+            yield folder
+
+    @contextmanager
+    def resumable(self, out: Path, state: str, *, resume: bool) -> Iterator[tuple[Path, Path]]:
+        """Opens the output folder, and the folder OUT.state of work that an interrupted run leaves for the next."""
+        with WorkFolder(sibling_folder(out, state)) as work, self.folder(out) as folder:
+            refuse_to_replace_inputs(work.path, self.settings)
+            work.take(resume=resume)
+            yield folder, work.path
+
+    def check_files(self, *files: Path) -> None:
+        """Checks, before the work, that a file of results, its record, and other files can be written."""
+        check_output_files((*files, Path(f"{files[0]}.{SUMMARY_NAME}")), self.config.overwrite)
+
+    @contextmanager
+    def file(self, out: Path) -> Iterator[None]:
+        """Lets the block write the one file of the results, and writes this record beside it; see `output_file`."""
+        with output_file(out, overwrite=self.config.overwrite, summary=self):
+            yield
+
+    @contextmanager
+    def of_scene(self, name: str, path: Path, common: Sequence[str]) -> Iterator["Run"]:
+        """The run of one of several scenes, which has the warnings `common` and those that come in the block."""
+        run = type(self)(self.command, self.config)
+        run.warnings += common
+        self._scene = (name, path, run)
+        try:
+            yield run
+        finally:
+            self._scene = None
+
+    def scenes(self, paths: Sequence[Path], part: str, one: Callable[[Path, Path, "Run"], None]) -> None:
+        """Runs one scene into out=, or each of several into OUT/NAME; without out= into outputs/NAME/PART.
+
+        Of several scenes those are skipped whose folder holds the results of the same settings, and those that another
+        process is writing now: processes with other numbers `worker` share the scenes, and each begins at another one.
+        An error in one does not stop the others.
+
+        Args:
+            paths: the scenes.
+            part: what the results are called.
+            one: does one scene: its path, the folder for its results, and its run.
+
+        Raises:
+            InputError: two scenes have one name, the error of the only scene, or some of several scenes failed.
+        """
+        check_names(paths)
+        if len(paths) == 1:
+            refuse_several(f"{paths[0]}", "start it once, or give several scenes, which processes share")
+            one(paths[0], self.out(scene_name(paths[0]), part), self)
+            return
+        first = int(len(paths) * ((getattr(self.config, "worker", 0) * GOLDEN) % 1))
+        failures: dict[Path, str] = {}
+        common, overwrite, skipped = tuple(self.warnings), self.config.overwrite, 0
+        for path in (*paths[first:], *paths[:first]):
+            name = scene_name(path)
+            target = self.config.out / name if self.config.out is not None else self.out(name, part)
+            try:
+                if not overwrite and _is_finished(target, self):
+                    skipped += 1
+                    continue
+                with self.of_scene(name, path, common) as run:
+                    one(path, target, run)
+            except BusyError:
+                self.print(f"{target}: another run is writing it now")
+            except InputError as error:
+                with suppress(InputError):
+                    # Another process may have finished the scene in the meantime.
+                    if not overwrite and _is_finished(target, self):
+                        continue
+                failures[path] = str(error) if str(error).startswith(f"{path}: ") else f"{path}: {error}"
+                print(one_line(f"failed: {failures[path]}"), file=sys.stderr)
+        if skipped:
+            self.print(f"{skipped} of {len(paths)} scenes were finished before")
+        if failures:
+            raise ScenesFailedError(
+                f"{len(failures)} of {len(paths)} scenes failed, and the same command tries them again: "
+                f"{listed([str(path) for path in failures])}",
+                tuple(failures.values()),
+            )
+
+    @contextmanager
+    def processes(self, device: Device, out: Path, *, state: str = "") -> Iterator["Group"]:
+        """Joins the processes that a launcher started; with `state`, OUT.state is for unfinished work of the group."""
+        from gsencoder.train.distributed import join_processes  # with torch
+
+        with (
+            WorkFolder(sibling_folder(out, state)) as work,
+            join_processes(device, settings=self.settings) as (process, used),
+            ExitStack() as results,
+        ):
+            if not process.is_first:
+                self.screen, self.track = console(quiet=True), Progress(quiet=True)
+            yield Group(self, out, work, process, used, results)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A run that processes of one launcher share; the first of them writes and prints.
+
+    Attributes:
+        work: for unfinished work.
+        process: the rank of this process.
+        device: that this process computes on.
+    """
+
+    run: Run
+    out: Path
+    work: WorkFolder
+    process: ProcessRank
+    device: Any
+    results: ExitStack
+
+    def folder(self) -> Path | None:
+        """Opens the output folder in the first process, before hours of work; None in the others."""
+        return self.results.enter_context(self.run.folder(self.out)) if self.process.is_first else None
+
+    def take(self, *, resume: bool) -> None:
+        """Takes the folder of unfinished work in the first process."""
+        if self.process.is_first:
+            refuse_to_replace_inputs(self.work.path, self.run.settings)
+            self.work.take(resume=resume)
+
+
+NOT_COMPARED = ("paths", "out", "overwrite", "quiet", "worker", "resume", "device", "preset")
+"""Settings in which two runs with the same results may differ; what a preset sets is compared."""
+GOLDEN = 0.6180339887
+"""Workers begin at the fractional parts of its multiples, which are spread evenly however many there are."""
+
+
+class ScenesFailedError(InputError):
+    """Some of several scenes failed, each of which was reported when it did; `reasons` has a line for each."""
+
+    def __init__(self, message: str, reasons: tuple[str, ...]) -> None:
+        super().__init__(message)
+        self.reasons = reasons
+
+
+def _is_finished(target: Path, run: Run) -> bool:
+    """Whether a folder holds the results of this command with these settings; an InputError if it holds others."""
+    try:
+        record = json.loads(read_foreign_text(target / SUMMARY_NAME))
+    except FileNotFoundError:
+        return False
+    except (OSError, ValueError) as error:
+        raise InputError(f"{target / SUMMARY_NAME}: cannot be read ({type(error).__name__})") from error
+    now = {"command": run.command, **_compared(json.loads(json.dumps(plain(run.settings))))}
+    before = {"command": record.get("command"), **_compared(record.get("settings", {}))}
+    differing = sorted(key for key in {*now, *before} if now.get(key) != before.get(key))
+    if differing:
+        raise InputError(
+            f"{target}: holds the results of other settings ({', '.join(differing[:5])}); give another out= or "
+            "overwrite=true"
+        )
+    return True
+
+
+def _compared(settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in settings.items() if key not in NOT_COMPARED}
