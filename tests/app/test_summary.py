@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from output_folders import names
 
-from gsencoder.app.output import output_folder
-from gsencoder.app.output import SUMMARY_NAME, Summary, peak_memory_mb
+from gsencoder.app.output import SUMMARY_NAME, Summary, output_folder, peak_memory_mb
 from gsencoder.core.errors import SceneWarning
 from gsencoder.core.files import write_json
 
