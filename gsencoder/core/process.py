@@ -248,36 +248,28 @@ class Clock:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
+        self._lock = threading.Lock()
 
     @contextmanager
     def __call__(self, step: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
-        self.seconds[step] = self.seconds.get(step, 0.0) + time.perf_counter() - start
+        seconds = time.perf_counter() - start
+        with self._lock:
+            self.seconds[step] = self.seconds.get(step, 0.0) + seconds
 
     @contextmanager
     def running(self) -> Iterator["Clock"]:
-        """Lets functions decorated with `timed` that this thread calls inside the block count towards this clock."""
-        token = _running.set(self)
+        """Lets functions decorated with `timed` that are called inside the block, also in threads of `ahead`, count
+        towards this clock. Where threads work at the same time, their steps share the seconds of the wall clock."""
+        token, before, start = _running.set(self), dict(self.seconds), time.perf_counter()
         try:
             yield self
         finally:
             _running.reset(token)
-
-    def share_out(self, seconds: float, steps: Iterable[Mapping[str, float]]) -> None:
-        """Adds seconds of the wall clock in which several threads were at work: each step receives its share of the
-        seconds of all threads.
-
-        Args:
-            steps: the seconds of each thread by step, or of each piece of its work.
-        """
-        of_threads: dict[str, float] = {}
-        for each in steps:
-            for step, seconds_of_step in each.items():
-                of_threads[step] = of_threads.get(step, 0.0) + seconds_of_step
-        total = sum(of_threads.values())
-        for step, seconds_of_step in of_threads.items():
-            self.seconds[step] = self.seconds.get(step, 0.0) + (seconds * seconds_of_step / total if total else 0.0)
+            added = {step: seconds - before.get(step, 0.0) for step, seconds in self.seconds.items()}
+            share = min(1.0, (time.perf_counter() - start) / max(sum(added.values()), 1e-9))
+            self.seconds = {step: before.get(step, 0.0) + share * seconds for step, seconds in added.items()}
 
 
 def timed(step: str) -> Callable[[Callable[P, R]], Callable[P, R]]:

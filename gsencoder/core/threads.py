@@ -14,6 +14,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
 from typing import Any, TypeVar
 
 import numpy as np
@@ -178,13 +179,13 @@ def _one_thread() -> Iterator[None]:
 
 def ahead(work: Callable[[int], Result], items: Iterable[int], workers: int = 1) -> Iterator[Result]:
     """`work` of each item, in order; the next ones are computed in `workers` threads while the caller uses the last.
-    The threads that `parallel` has are shared out among the workers."""
+    The threads that `parallel` has are shared out among the workers, which have the caller's context variables."""
     share = max(1, thread_count() // workers)
     pending: deque[Future[Result]] = deque()
     with ThreadPoolExecutor(workers, initializer=_limit_threads, initargs=(share,)) as pool:
         try:
             for item in items:
-                pending.append(pool.submit(work, item))
+                pending.append(pool.submit(copy_context().run, work, item))
                 if len(pending) > workers:
                     yield pending.popleft().result()
             while pending:

@@ -18,12 +18,13 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import Track, untracked
+from gsencoder.core.process import Clock, Track, untracked
 from gsencoder.data.labels.mesh import nearest_rows
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.adapter_heads import Head
+from gsencoder.fusion.errors import sample_cells
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import VisibilityConfig, keep_visible
@@ -49,8 +50,9 @@ def fusion_source(teacher: TeacherConfig, words: Words | None, config: FuseConfi
     """
 
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
-        fusion = fuse(scene, build_teacher(teacher, scene, words), config)
-        return fusion.features, fusion.seconds
+        with Clock().running() as clock:
+            features = fuse(scene, build_teacher(teacher, scene, words), config).features
+        return features, clock.seconds
 
     return source
 
@@ -125,12 +127,13 @@ def fused_head_source(
     """
 
     def outputs(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
-        fusion = fuse(scene, build_teacher(teacher, scene, None), config, sample_cells=True)
-        assert fusion.sample is not None
-        start = time.perf_counter()
-        heads = measure_heads([head], fusion.sample, fusion.features.space, fusion.features.basis)
+        assert scene.views is not None
+        with Clock().running() as clock:
+            fusion = fuse(scene, build_teacher(teacher, scene, None), config)
+        start, sample = time.perf_counter(), sample_cells(fusion.teacher, scene.views, fusion.views)
+        heads = measure_heads([head], sample, fusion.features.space, fusion.features.basis)
         through = head_features(fusion.features, heads.heads[0], heads.space, text_encoder=text_encoder)
-        return through, {**fusion.seconds, "head": time.perf_counter() - start}
+        return through, {**clock.seconds, "head": time.perf_counter() - start}
 
     return outputs
 

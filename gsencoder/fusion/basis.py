@@ -4,12 +4,25 @@ Lifting and rendering are linear, so features may be fused, stored and rendered 
 channels. Because rows of B sum to alpha and not to 1, a rendered map decodes as `(B @ z) @ components + alpha·mean`.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from gsencoder.core.archive import Archive
 from gsencoder.core.errors import InputError
-from gsencoder.types import FeatureBasis, FeatureSpace
+from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace
+
+
+def distinct_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "n D"]:
+    """The vectors of a map that its basis and mean are computed from: of a coded map each row of its table that occurs,
+    once, so that a region counts however few pixels it has; of others each cell that has a vector."""
+    if feature_map.codes is not None:
+        assert feature_map.table is not None
+        counts = np.bincount(feature_map.codes.ravel() + 1, minlength=len(feature_map.table) + 1)
+        return feature_map.table[counts[1:] > 0]
+    rows = feature_map.rows()
+    return rows[np.isfinite(rows[:, 0])]
 
 
 class Moments:
@@ -20,7 +33,7 @@ class Moments:
         self.count = 0.0
         self.second = second
         self.sum: Float64[np.ndarray, " D"] = np.zeros(channels)
-        self.outer: Float64[np.ndarray, "D D"] = np.zeros((channels, channels))
+        self.outer: Float64[np.ndarray, "D D"] = np.zeros((channels, channels) if second else (0, 0))
         self._shift: Float32[np.ndarray, " D"] | None = None
 
     def add(self, vectors: Float[np.ndarray, "n D"]) -> None:
@@ -63,10 +76,15 @@ class Moments:
         self.sum += other.sum + other.count * offset
         self.count += other.count
 
-    def parts(self) -> dict[str, np.ndarray]:
+    def state(self) -> dict[str, np.ndarray]:
         """The arrays that represent the moments in a file."""
         shift = np.zeros(len(self.sum), np.float32) if self._shift is None else self._shift
         return {"count": np.array([self.count]), "sum": self.sum, "outer": self.outer, "shift": shift}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continues from the arrays of `state`."""
+        self.count, self.sum, self.outer = float(state["count"][0]), state["sum"], state["outer"]
+        self._shift = state["shift"] if self.count else None
 
     @classmethod
     def read(cls, file: Archive, channels: int) -> "Moments":
@@ -76,10 +94,9 @@ class Moments:
             InputError: the file is damaged, or of another number of channels.
         """
         moments = cls(channels)
-        moments.count = float(file.array("count", "float64", (1,))[0])
-        moments.sum = file.array("sum", "float64", (channels,))
-        moments.outer = file.array("outer", "float64", (channels, channels))
-        moments._shift = file.array("shift", "float32", (channels,)) if moments.count else None
+        moments.restore(
+            {name: file.array(name, value.dtype.name, value.shape) for name, value in moments.state().items()}
+        )
         return moments
 
     @property

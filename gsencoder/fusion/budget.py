@@ -14,7 +14,7 @@ from jaxtyping import Float32
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Device, Track, untracked
 from gsencoder.core.settings import best_setting, within_seconds
-from gsencoder.fusion.basis import Moments
+from gsencoder.fusion.basis import Moments, distinct_rows
 from gsencoder.fusion.checkpoint import CachedTeacher, WrappedTeacher, open_checkpoint, upright
 from gsencoder.fusion.cost_model import (
     UNKNOWN_SCATTER,
@@ -36,8 +36,8 @@ from gsencoder.fusion.cost_model import (
     within_megabytes,
 )
 from gsencoder.fusion.errors import FieldError, judge
-from gsencoder.fusion.fuse import FuseConfig, Fusion, checked_scene, fuse
-from gsencoder.fusion.lift import FeatureSums, capped, distinct_rows, resolve, view_matrix
+from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse, validate_scene
+from gsencoder.fusion.lift import FeatureSums, limit_rays, resolve, view_matrix
 from gsencoder.fusion.view_coverage import LatticeOf, Sight, trace_sight, view_order
 from gsencoder.render.rays import Lattice, grid_lattice
 from gsencoder.teachers.base import Teacher
@@ -233,7 +233,7 @@ def spread_out(count: int) -> tuple[int, ...]:
 
 def _lattices(views: Views, probe: FeatureMap, exact: FuseConfig) -> LatticeOf:
     """The rays of the exact settings in each view, by the map of one."""
-    rays = capped(exact.blend, probe).rays_per_patch
+    rays = limit_rays(exact.blend, probe).rays_per_patch
     lattice = grid_lattice(probe.grid_from_image, probe.width, probe.height, rays)
     cell_x, cell_y = lattice.dx * lattice.side, lattice.dy * lattice.side
 
@@ -307,7 +307,6 @@ def fuse_within(
     budget: BudgetConfig,
     *,
     work: Path | None = None,
-    sample_cells: bool = False,
     device: Device | torch.device = "auto",
     track: Track = untracked,
     clock: Callable[[], float] = time.perf_counter,
@@ -320,7 +319,6 @@ def fuse_within(
         config: options that the budget does not choose.
         budget: at least one promise.
         work: folder for the maps of a costly teacher, which are then made once, in interrupted runs too.
-        sample_cells: see `fuse`.
         device: see `fuse`.
         track: see `fuse`.
         clock: seconds.
@@ -333,7 +331,7 @@ def fuse_within(
         raise InputError("budget: expected budget.error=, budget.seconds= or budget.megabytes=, got none of them")
     check_budget(budget, config)
     start, teacher = clock(), upright(teacher)
-    gaussians, views = checked_scene(scene, teacher)
+    gaussians, views = validate_scene(scene)
     if views.depths is not None:
         views = replace(views, depths=_CachedDepths(views.depths))
     if work is not None and not teacher.cheap:
@@ -354,7 +352,8 @@ def fuse_within(
         feature_map = maker.feature_map(views, view) if view in maps else map_of(view)
         between = clock()
         matrix = view_matrix(gaussians, views, view, feature_map, lift=config.lift, visibility=visibility, config=blend)
-        FeatureSums(len(gaussians), 1, None, None).add(matrix, _one_channel(feature_map), None)
+        ones = _one_channel(feature_map)
+        FeatureSums(len(gaussians), ones.space, None, None).add(matrix, ones, None)
         return between - begun, clock() - between
 
     choice = choose(
@@ -370,7 +369,7 @@ def fuse_within(
     choice_end = clock()
     scene = replace(scene, views=views)
     cached = _CachedMaps(teacher, maps)
-    fusion = fuse(scene, cached, choice.config, rows=choice.rows, sample_cells=sample_cells, device=device, track=track)
+    fusion = fuse(scene, cached, choice.config, rows=choice.rows, device=device, track=track)
     return BudgetFusion(
         fusion=fusion,
         choice=choice,

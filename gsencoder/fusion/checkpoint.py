@@ -1,6 +1,4 @@
-"""The checkpoint of a fusion: the teacher's maps and the sums so far, from which an interrupted run continues.
-
-A cache of teacher maps in a folder: each map is computed once, and is the same for every later use.
+"""Teachers that are wrapped: upright pictures, maps cached in files; and the checkpoint of an unfinished fusion.
 
 Fusing asks for a dense map twice (for the basis and for the sums), preparing a scene three times, a sweep of settings
 as often as it has settings; making a map takes far longer than reading it. What is given is always what the file
@@ -21,7 +19,6 @@ from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files import atomic_file, read_foreign_text
 from gsencoder.core.settings import first_difference
-from gsencoder.data.splats.files import fingerprint
 from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Gaussians, Views
 from gsencoder.types.orientation import stored_map, upright_views
@@ -92,30 +89,15 @@ class WrappedTeacher:
 
     Attributes:
         teacher: the other one.
-        space, table, mean, needs_images, cheap: as that has them.
     """
 
     def __init__(self, teacher: Teacher) -> None:
         self.teacher = teacher
-        self.needs_images, self.cheap = teacher.needs_images, teacher.cheap
-
-    @property
-    def space(self) -> FeatureSpace:
-        return self.teacher.space
-
-    @property
-    def table(self) -> Float32[np.ndarray, "C D"] | None:
-        return self.teacher.table
-
-    @property
-    def mean(self) -> Float32[np.ndarray, " D"] | None:
-        return self.teacher.mean
+        self.space, self.table, self.mean = teacher.space, teacher.table, teacher.mean
+        self.needs_images, self.cheap, self.settings = teacher.needs_images, teacher.cheap, teacher.settings
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         return self.teacher.feature_map(views, view)
-
-    def settings(self) -> dict[str, Any]:
-        return self.teacher.settings()
 
 
 class UprightTeacher(WrappedTeacher):
@@ -182,28 +164,27 @@ class CachedTeacher(WrappedTeacher):
 
 
 SETTINGS_FILE, SUMS_FILE = "settings.json", "sums.safetensors"
+SAVE_EVERY = 20.0
+"""Seconds between two checkpoints of the sums."""
 
 
 @runtime_checkable
-class RunningSums(Protocol):
-    """What a checkpoint saves of the sums over views (`fusion.lift.FeatureSums`, which needs torch).
+class Sums(Protocol):
+    """Sums over views, such as `gsencoder.fusion.lift.FeatureSums`, which needs torch."""
 
-    Attributes:
-        sums: of the first `views` views.
-        weights: the same.
-        views: how many views were added.
-    """
-
-    sums: Float32[np.ndarray, "N columns"]
-    weights: Float32[np.ndarray, " N"]
     views: int
+
+    def state(self) -> dict[str, np.ndarray]: ...
+
+    def restore(self, views: int, state: Mapping[str, np.ndarray]) -> None: ...
 
 
 class FusionCheckpoint:
     """The folder of a fusion that is not finished: the teacher's maps, and the sums over the views so far."""
 
-    def __init__(self, folder: Path, settings: dict[str, Any], every_seconds: float = 20.0) -> None:
-        """Opens the checkpoint of an earlier run. The folder is made when the first map or sum is written.
+    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
+        """Opens the checkpoint of an earlier run. The folder is made when the first map or sum is written: a run that
+        ends earlier, because its settings are wrong, must not leave a folder that refuses the next run.
 
         Maps and sums without settings are what a run left that was killed while it removed its checkpoint. Nobody knows
         what they were made from, and they are removed.
@@ -211,30 +192,50 @@ class FusionCheckpoint:
         Args:
             folder: of the maps and the sums.
             settings: all that maps and sums depend on, the scene included, as JSON values.
-            every_seconds: time between two checkpoints of the sums.
 
         Raises:
             InputError: the folder holds a checkpoint of other settings (the difference is named), or cannot be used.
         """
-        self.folder, self._every_seconds = folder, every_seconds
-        self._saved_at = time.monotonic()
+        self.folder, self._saved_at, self._advice = folder, time.monotonic(), f"delete {folder} to start again"
         self._settings = json.loads(json.dumps(settings))
         self._exists = (folder / SETTINGS_FILE).is_file()
         if self._exists:
-            earlier = _read_settings(folder / SETTINGS_FILE)
-            if earlier != self._settings:
-                difference = first_difference(earlier, self._settings)
-                raise InputError(f"{folder}: holds a fusion begun with {difference}; delete it to start anew")
-        else:
-            try:
-                for path in (folder / SUMS_FILE, *folder.glob("map_*.safetensors")):
-                    path.unlink(missing_ok=True)
-            except OSError as error:
-                raise InputError(f"{folder}: cannot be used: {error.strerror or error}; delete it") from error
+            with advised(self._advice):
+                earlier = _read_settings(folder / SETTINGS_FILE)
+                if earlier != self._settings:
+                    raise InputError(f"{folder}: holds a fusion begun with {first_difference(earlier, self._settings)}")
+            return
+        try:
+            for path in (folder / SUMS_FILE, *folder.glob("map_*.safetensors")):
+                path.unlink(missing_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder}: cannot be used: {error.strerror or error}; delete it") from error
+
+    def cached(self, teacher: Teacher) -> CachedTeacher:
+        """The teacher with its maps cached in this folder."""
+        return CachedTeacher(teacher, self.folder, before_write=self._make_folder, advice=self._advice)
+
+    def resume(self, sums: Sums) -> int:
+        """Restores the sums of an interrupted run, if there are any; the number of views that they are over.
+
+        Raises:
+            InputError: the checkpoint is damaged, or of other sizes.
+        """
+        if (self.folder / SUMS_FILE).is_file():
+            with advised(self._advice), open_archive(self.folder / SUMS_FILE) as file:
+                state = {name: file.array(name, each.dtype.name, each.shape) for name, each in sums.state().items()}
+                sums.restore(file.value("done", int), state)
+        return sums.views
+
+    def save_if_due(self, sums: Sums) -> None:
+        """Saves the sums from time to time; to be called after each view."""
+        if time.monotonic() - self._saved_at >= SAVE_EVERY:
+            self._make_folder()
+            write_archive(self.folder / SUMS_FILE, sums.state(), {"done": sums.views})
+            self._saved_at = time.monotonic()
 
     def _make_folder(self) -> None:
-        """Makes the folder and writes its settings. Not done before the first map: a run that ends earlier, because its
-        settings are wrong, must not leave a folder that refuses the next run."""
+        """Makes the folder and writes its settings."""
         if self._exists:
             return
         try:
@@ -244,52 +245,6 @@ class FusionCheckpoint:
         with atomic_file(self.folder / SETTINGS_FILE) as stream:
             stream.write(json.dumps(self._settings).encode())
         self._exists = True
-
-    def resume(self, sums: RunningSums) -> None:
-        """Puts the sums of an interrupted run into new ones.
-
-        Raises:
-            InputError: the checkpoint is damaged, or of other sizes.
-        """
-        if (earlier := self.load_sums(*sums.sums.shape)) is not None:
-            sums.views, sums.sums, sums.weights = earlier
-
-    def save_if_due(self, sums: RunningSums) -> None:
-        """Saves the sums from time to time; to be called after each view."""
-        if self.due():
-            self.save_sums(sums.views, sums.sums, sums.weights)
-
-    def due(self) -> bool:
-        """Whether the sums should be saved again."""
-        return time.monotonic() - self._saved_at >= self._every_seconds
-
-    def cached(self, teacher: Teacher) -> CachedTeacher:
-        """The teacher with its maps cached in this folder."""
-        return CachedTeacher(teacher, self.folder, before_write=self._make_folder, advice=self._advice)
-
-    def save_sums(self, done: int, sums: Float32[np.ndarray, "N columns"], weights: Float32[np.ndarray, " N"]) -> None:
-        """Writes the sums over the first `done` views."""
-        self._make_folder()
-        write_archive(self.folder / SUMS_FILE, {"sums": sums, "weights": weights}, {"done": done})
-        self._saved_at = time.monotonic()
-
-    def load_sums(
-        self, gaussians: int, columns: int
-    ) -> tuple[int, Float32[np.ndarray, "N columns"], Float32[np.ndarray, " N"]] | None:
-        """(views done, sums, weights) of an earlier run, or None.
-
-        Raises:
-            InputError: the file is damaged, or of another size.
-        """
-        if not (self.folder / SUMS_FILE).is_file():
-            return None
-        with advised(self._advice), open_archive(self.folder / SUMS_FILE) as file:
-            sums = file.array("sums", "float32", (gaussians, columns))
-            return file.value("done", int), sums, file.array("weights", "float32", (gaussians,))
-
-    @property
-    def _advice(self) -> str:
-        return f"delete {self.folder} to start anew"
 
 
 def open_checkpoint(
@@ -317,19 +272,27 @@ def open_checkpoint(
     """
     settings: dict[str, Any] = {"fuse": dict(config), "teacher": teacher.settings(), "views": list(rows)}
     if basis is not None:
-        settings["basis"] = hashlib.sha256(basis.mean.tobytes() + basis.components.tobytes()).hexdigest()[:16]
-    digest = hashlib.sha256(repr(views.names).encode("utf-8", "backslashreplace"))
-    for name in ("cam_from_world", "Ks", "widths", "heights"):
-        digest.update(np.ascontiguousarray(getattr(views.cameras, name)).tobytes())
-    settings["scene"] = {"gaussians": fingerprint(gaussians)[:16], "views": digest.hexdigest()[:16]}
+        settings["basis"] = _digest(basis.mean, basis.components)
+    splat = (getattr(gaussians, name) for name in ("means", "quats", "scales", "opacities", "sh"))
+    cameras = (getattr(views.cameras, name) for name in ("cam_from_world", "Ks", "widths", "heights"))
+    names = np.frombuffer(repr(views.names).encode("utf-8", "backslashreplace"), np.uint8)
+    settings["scene"] = {"gaussians": _digest(*splat), "views": _digest(names, *cameras)}
     return FusionCheckpoint(folder, settings)
+
+
+def _digest(*arrays: np.ndarray) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(f"{array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
     try:
         settings = json.loads(read_foreign_text(path))
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); delete {path.parent} to start anew") from error
+        raise InputError(f"{path}: cannot be read ({error})") from error
     if not isinstance(settings, dict):
-        raise InputError(f"{path}: expected an object; delete {path.parent} to start anew")
+        raise InputError(f"{path}: expected an object")
     return settings

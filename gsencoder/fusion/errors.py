@@ -4,7 +4,7 @@ A basis keeps a stated share of the energy of the vectors that it was fitted to.
 no features in its coordinates can be closer to the teacher's than the projections of the teacher's own vectors are.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,18 +114,18 @@ def total_fit(sums: Iterable[ProjectionSums]) -> BasisFit:
     return total.fit()
 
 
-def basis_fit(basis: FeatureBasis, teacher: Teacher, views: Views, count: int) -> BasisFit:
-    """How well a basis represents a teacher's maps of `count` evenly spaced views.
+def project_maps(basis: FeatureBasis, teacher: Teacher, views: Views, rows: Iterable[int]) -> ProjectionSums:
+    """The sums over a teacher's maps of some views.
 
     Raises:
-        InputError: the teacher is of another space, or no view has a vector.
+        InputError: the teacher is of another space.
     """
     if teacher.space != basis.space:
         raise InputError(f"basis: is of ({basis.space.describe()}), the maps of ({teacher.space.describe()})")
     sums, teacher = ProjectionSums(), upright(teacher)
-    for view in even_indices(len(views), count):
+    for view in rows:
         sums.add_map(basis, teacher.feature_map(views, int(view)))
-    return sums.fit()
+    return sums
 
 
 MAX_CELLS = 32_768
@@ -158,6 +158,14 @@ class CellSample:
         if not sum(len(part) for part in self._parts):
             raise InputError("heads: no view has a cell with a vector; check the teacher's maps")
         return np.concatenate(self._parts).astype(np.float32, copy=False)
+
+
+def sample_cells(teacher: Teacher, views: Views, rows: Sequence[int]) -> CellSample:
+    """Cells of a teacher's maps of some views."""
+    sample, teacher = CellSample(len(rows)), upright(teacher)
+    for view in rows:
+        sample.add(teacher.feature_map(views, view))
+    return sample
 
 
 DEFAULT_SAMPLE = 20_000

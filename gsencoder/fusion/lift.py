@@ -1,7 +1,7 @@
 """Lifting one view: the matrix that carries its map to the Gaussians, and the sums over all views."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Literal, no_type_check
 
 import numpy as np
@@ -11,11 +11,11 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import timed
 from gsencoder.core.threads import kernel
-from gsencoder.fusion.basis import to_coordinates
+from gsencoder.fusion.basis import Moments, distinct_rows, to_coordinates
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import depth_image
 from gsencoder.render.rays import Lattice, grid_lattice
-from gsencoder.types import FeatureBasis, FeatureMap, Gaussians, Views
+from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Gaussians, Views
 
 Source = Literal["auto", "sensor", "rendered"]
 
@@ -86,19 +86,23 @@ def visible_points(
     return (z >= least) & (z <= most)
 
 
-def visible_depths(
-    depth: Float32[np.ndarray, "H W"], lattice: Lattice, config: VisibilityConfig
+@timed("visibility")
+def depth_interval(
+    depths: Sequence[Float32[np.ndarray, "H W"]], lattice: Lattice, config: VisibilityConfig
 ) -> tuple[Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]]:
-    """The smallest and the largest depth that pass in each row: entries are held against the depths that the row's rays
-    meet, from the nearest to the farthest of them."""
-    return _interval(*_row_range(depth, lattice), config)
+    """The smallest and the largest depth that pass in each row: those between the nearest and the farthest depth that
+    the row's rays meet, widened by the tolerances, in all of the maps."""
+    least, most = np.full(lattice.rows, -np.inf, np.float32), np.full(lattice.rows, np.inf, np.float32)
+    for depth in depths:
+        low, high = _interval(*_row_range(depth, lattice), config)
+        least, most = np.maximum(least, low), np.minimum(most, high)
+    return least, most
 
 
 def keep_visible(b: Blend, depth: Float32[np.ndarray, "H W"], config: VisibilityConfig) -> Blend:
-    """B without the entries that fail (`visible_depths`)."""
-    least, most = visible_depths(depth, b.lattice, config)
-    device = b.weight.device
-    return b.keep_between(torch.from_numpy(least).to(device), torch.from_numpy(most).to(device))
+    """B without the entries that a depth map hides."""
+    least, most = (torch.from_numpy(each).to(b.weight.device) for each in depth_interval([depth], b.lattice, config))
+    return b.keep_between(least, most)
 
 
 def ray_pixels(lattice: Lattice, width: int, height: int) -> tuple[Int32[np.ndarray, " j"], Int32[np.ndarray, " i"]]:
@@ -145,17 +149,6 @@ BLOCK_VALUES = 1 << 27
 """Values of a map that are made at once from its codes, 0.5 GiB."""
 
 
-def distinct_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "n D"]:
-    """The vectors of a map that its basis and mean are computed from: of a coded map each row of its table that occurs,
-    once, so that a region counts however few pixels it has; of others each cell that has a vector."""
-    if feature_map.codes is not None:
-        assert feature_map.table is not None
-        counts = np.bincount(feature_map.codes.ravel() + 1, minlength=len(feature_map.table) + 1)
-        return feature_map.table[counts[1:] > 0]
-    rows = feature_map.rows()
-    return rows[np.isfinite(rows[:, 0])]
-
-
 class FeatureSums:
     """Sums over views of weighted features and of weights; for maps that share a table, of the weight of each of its
     rows.
@@ -171,22 +164,26 @@ class FeatureSums:
     def __init__(
         self,
         gaussians: int,
-        columns: int,
+        space: FeatureSpace,
         basis: FeatureBasis | None,
         table: Float32[np.ndarray, "C D"] | None,
         device: torch.device = torch.device("cpu"),
+        *,
+        with_mean: bool = False,
     ) -> None:
         """Args:
         gaussians: number of rows.
-        columns: coordinates or channels of a row.
+        space: of the maps.
         basis: whose coordinates are summed; None = channels.
         table: that all maps share; None = dense maps, or maps with a table each. Sums are by its rows, unless it
             has so many that sums of vectors are far narrower.
         device: where sums are, and the matrices of the views that are added.
+        with_mean: whether the mean of the maps' vectors is computed on the way.
         """
-        self.basis, self.views, self._shared = basis, 0, table
+        columns = space.channels if basis is None else len(basis.components)
+        self.basis, self.views, self._shared, self.device = basis, 0, table, device
         self.table = table if table is not None and _few_codes(len(table), columns) else None
-        self.device = device
+        self.moments = Moments(space.channels, second=False) if with_mean else None
         width = columns if self.table is None else len(self.table)
         self._sums, self._weights = self._zeros(gaussians, width), self._zeros(gaussians, 1)
 
@@ -194,17 +191,27 @@ class FeatureSums:
     def sums(self) -> Float32[np.ndarray, "N columns"]:
         return self._sums.cpu().numpy()
 
-    @sums.setter
-    def sums(self, values: Float32[np.ndarray, "N columns"]) -> None:
-        self._sums = self._tensor(values)
-
     @property
     def weights(self) -> Float32[np.ndarray, " N"]:
         return self._weights[:, 0].cpu().numpy()
 
-    @weights.setter
-    def weights(self, values: Float32[np.ndarray, " N"]) -> None:
-        self._weights = self._tensor(values[:, None])
+    @property
+    def mean(self) -> Float32[np.ndarray, " D"]:
+        """Mean of the vectors of all maps, with `with_mean`."""
+        assert self.moments is not None
+        return self.moments.mean.astype(np.float32)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The arrays from which `restore` continues."""
+        moments = {} if self.moments is None else self.moments.state()
+        return {"sums": self.sums, "weights": self.weights} | moments
+
+    def restore(self, views: int, state: Mapping[str, np.ndarray]) -> None:
+        """Continues from the arrays of sums over the first `views` views."""
+        self.views, self._sums = views, self._tensor(state["sums"])
+        self._weights = self._tensor(state["weights"][:, None])
+        if self.moments is not None:
+            self.moments.restore(state)
 
     def _zeros(self, rows: int, columns: int) -> torch.Tensor:
         """Zeros on the device; on a CPU allocated by numpy, whose large arrays lie in huge pages that fill many times
@@ -226,6 +233,8 @@ class FeatureSums:
     def add(self, b: Blend, feature_map: FeatureMap, mask: Bool[np.ndarray, "H W"] | None) -> None:
         """Adds a view: sums += Bᵀ @ (share · maps), weights += Bᵀ @ share, with the share of each row in the mask."""
         self.views += 1
+        if self.moments is not None:
+            self.moments.add(distinct_rows(feature_map))
         share = row_mask(mask, b.lattice) if mask is not None else None
         if self.table is not None:
             _lift_shares_into(b, feature_map, share, self._sums)
@@ -351,73 +360,48 @@ def view_matrix(
         view: which of them.
         feature_map: its cells are the rows.
         lift: blend or center.
-        visibility: what hides an entry, resolved (`visibility.resolve`).
+        visibility: what hides an entry, resolved (`resolve`).
         config: knobs of B.
         device: where B is made and held against depth maps; centers are tested on the CPU, and go there as a matrix.
     """
+    depths = depth_maps(gaussians, views, view, visibility, config, device)
     if lift == "center":
-        depths = timed("blend")(_depth_maps)(gaussians, views, view, visibility, config, device, None)
-        matrix = timed("lift")(center_matrix)(gaussians, views, view, feature_map, depths, visibility, config)
-        return matrix.to(device)
-    rays = capped(config, feature_map)
-    make = partial(timed("blend")(blend), gaussians, views.cameras, view, like=feature_map, config=rays, device=device)
-    if visibility.against == ("sensor",):
-        return make(between=timed("visibility")(_between)(views, view, feature_map, visibility, rays))
-    b = make()
-    return _without_hidden(b, gaussians, views, view, visibility, config)
+        return center_matrix(gaussians, views, view, feature_map, depths, visibility, config).to(device)
+    config = limit_rays(config, feature_map)
+    lattice = grid_lattice(feature_map.grid_from_image, feature_map.width, feature_map.height, config.rays_per_patch)
+    between = depth_interval(depths, lattice, visibility) if depths else None
+    return timed("blend")(blend)(
+        gaussians, views.cameras, view, like=feature_map, between=between, config=config, device=device
+    )
 
 
-def _between(
-    views: Views, view: int, feature_map: FeatureMap, visibility: VisibilityConfig, rays: BlendConfig
-) -> tuple[Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]]:
-    """The depths that sensor depth lets through in each row of a map."""
-    assert views.depths is not None
-    size = feature_map.width, feature_map.height
-    lattice = grid_lattice(feature_map.grid_from_image, *size, rays.rays_per_patch)
-    return visible_depths(views.depths[view], lattice, visibility)
+def limit_rays(config: BlendConfig, feature_map: FeatureMap) -> BlendConfig:
+    """No more rays than pixels: the map of a labels teacher has one cell a pixel, and one ray is enough for it."""
+    side = max(1, round(1 / float(np.sqrt(feature_map.grid_from_image[0, 0] * feature_map.grid_from_image[1, 1]))))
+    return replace(config, rays_per_patch=min(config.rays_per_patch, side * side))
 
 
 @timed("visibility")
-def _without_hidden(
-    b: Blend, gaussians: Gaussians, views: Views, view: int, visibility: VisibilityConfig, config: BlendConfig
-) -> Blend:
-    """The matrix without the entries of Gaussians that a depth map hides."""
-    for depth in _depth_maps(gaussians, views, view, visibility, config, b.weight.device, b):
-        b = keep_visible(b, depth, visibility)
-    return b
-
-
-def capped(config: BlendConfig, feature_map: FeatureMap) -> BlendConfig:
-    """No more rays than pixels: the map of a labels teacher has one cell a pixel, and one ray is enough for it."""
-    side = max(1, round(1 / float(np.sqrt(feature_map.grid_from_image[0, 0] * feature_map.grid_from_image[1, 1]))))
-    if config.rays_per_patch <= side * side:
-        return config
-    values = {name: getattr(config, name) for name in config.__dataclass_fields__}
-    return BlendConfig(**{**values, "rays_per_patch": side * side})
-
-
-def _depth_maps(
+def depth_maps(
     gaussians: Gaussians,
     views: Views,
     view: int,
     visibility: VisibilityConfig,
     config: BlendConfig,
-    device: str | torch.device,
-    b: Blend | None,
+    device: str | torch.device = "cpu",
 ) -> list[Float32[np.ndarray, "H W"]]:
+    """The depth maps that entries are held against, world units, 0 = none."""
     maps = []
     for source in visibility.against:
         if source == "sensor":
             assert views.depths is not None
             maps.append(views.depths[view])
         else:
-            size = int(views.cameras.heights[view]), int(views.cameras.widths[view])
-            pixels = b if b is not None and b.lattice.side == 1 and b.shape == size else None
-            pixels = pixels or blend(gaussians, views.cameras, view, config=config, device=device)
-            maps.append(depth_image(pixels))
+            maps.append(depth_image(blend(gaussians, views.cameras, view, config=config, device=device)))
     return maps
 
 
+@timed("lift")
 def center_matrix(
     gaussians: Gaussians,
     views: Views,

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64
 
 from gsencoder.core.threads import kernel, parallel
-from gsencoder.fusion.lift import VisibilityConfig, row_mask, visible_depths
+from gsencoder.fusion.lift import VisibilityConfig, depth_interval, row_mask
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 from gsencoder.render import BlendConfig
 from gsencoder.render import blend_cpu as cpu
@@ -550,7 +550,7 @@ def _view_rays(
 ) -> _ViewRays:
     if visibility.against:
         assert views.depths is not None
-        least, most = visible_depths(views.depths[view], lattice, visibility)
+        least, most = depth_interval([views.depths[view]], lattice, visibility)
     else:
         least, most = np.full(lattice.rows, -np.inf, np.float32), np.full(lattice.rows, np.inf, np.float32)
     if views.masks is not None:

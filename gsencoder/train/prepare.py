@@ -28,8 +28,9 @@ from gsencoder.core.process import ProcessRank, Track
 from gsencoder.core.settings import first_difference
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.checkpoint import CachedTeacher, upright
+from gsencoder.fusion.errors import project_maps
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.lift import capped, row_mask
+from gsencoder.fusion.lift import limit_rays, row_mask
 from gsencoder.models.output_space import OutputSpace, read_output_space
 from gsencoder.render import blend
 from gsencoder.teachers.base import Teacher
@@ -124,6 +125,7 @@ def prepare_scene(
     fused = fuse(scene, teacher, fusion, basis=outputs.basis, device=device)
     chosen = even_indices(len(scene.views), config.render_views or len(scene.views))
     rows = view_rows(scene, teacher, outputs, config, chosen, device)
+    projections = None if outputs.basis is None else project_maps(outputs.basis, teacher, scene.views, fused.views)
     with_rows = replace(scene, views=scene.views.select(chosen))
     write_prepared(
         path,
@@ -133,7 +135,7 @@ def prepare_scene(
         rows,
         source=source,
         precision=config.targets,
-        projections=fused.projections,
+        projections=projections,
     )
 
 
@@ -153,7 +155,9 @@ def view_rows(
     rows, teacher = [], upright(teacher)
     for view in views.tolist():
         targets, valid, grid = _pool_map(teacher.feature_map(scene.views, view), outputs, config.render_cell)
-        b = blend(scene.gaussians, scene.views.cameras, view, like=grid, config=capped(blending, grid), device=device)
+        b = blend(
+            scene.gaussians, scene.views.cameras, view, like=grid, config=limit_rays(blending, grid), device=device
+        )
         if scene.views.masks is not None:
             valid &= row_mask(scene.views.masks[view], b.lattice) == 1
         arrays = tuple(each.cpu().numpy() for each in (b.crow, b.col, b.weight))

@@ -26,10 +26,9 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
-from gsencoder.fusion.basis import Moments, fit_basis, table_basis, to_coordinates
+from gsencoder.fusion.basis import Moments, distinct_rows, fit_basis, table_basis, to_coordinates
 from gsencoder.fusion.checkpoint import upright
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.lift import distinct_rows
 from gsencoder.models.output_space import OutputSpace, output_space_parts
 from gsencoder.teachers.base import MissingInput, Teacher
 from gsencoder.train.distributed import check_agreement, fail_together, value_of_first, values_of_all
@@ -287,7 +286,7 @@ def _block(
         "kinds": list(kinds),
     }
     file.parent.mkdir(exist_ok=True)
-    write_archive(file, moments.parts(), header)
+    write_archive(file, moments.state(), header)
     return Block(answers=answers, kinds=tuple(kinds))
 
 

@@ -1,8 +1,11 @@
 """The seconds of a stage's steps."""
 
+import time
+
 import pytest
 
 from gsencoder.core.process import Clock, timed
+from gsencoder.core.threads import ahead
 
 
 def test_a_clock_adds_up_the_seconds_of_each_step(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -16,7 +19,7 @@ def test_a_clock_adds_up_the_seconds_of_each_step(monkeypatch: pytest.MonkeyPatc
 
 
 def test_marked_functions_count_on_the_clock_that_runs_and_on_none_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    times = iter([0.0, 1.0, 10.0, 12.0, 20.0, 24.0, 30.0, 31.0])
+    times = iter([0.0, 0.0, 1.0, 1.0, 10.0, 12.0, 15.0, 20.0, 24.0, 30.0, 31.0, 40.0])
     monkeypatch.setattr("gsencoder.core.process.time.perf_counter", lambda: next(times))
     double = timed("lift")(lambda number: 2 * number)
     assert double(1) == 2
@@ -33,9 +36,15 @@ def test_marked_functions_count_on_the_clock_that_runs_and_on_none_elsewhere(mon
 
 
 def test_steps_of_several_threads_share_the_seconds_of_the_wall_clock() -> None:
+    def work(item: int) -> int:
+        time.sleep(0.02)
+        return item
+
     clock = Clock()
-    clock.seconds = {"lift": 1.0, "teacher": 2.0}
-    clock.share_out(4.0, [{"blend": 3.0, "lift": 1.0}, {"blend": 2.0}, {"lift": 2.0}])
-    assert clock.seconds == {"lift": 2.5, "teacher": 2.0, "blend": 2.5}
-    clock.share_out(1.0, [])
-    assert clock.seconds == {"lift": 2.5, "teacher": 2.0, "blend": 2.5}
+    clock.seconds = {"teacher": 2.0}
+    start = time.perf_counter()
+    with clock.running():
+        assert list(ahead(timed("blend")(work), range(6), 3)) == [*range(6)]
+    wall = time.perf_counter() - start
+    assert clock.seconds["teacher"] == 2.0
+    assert 0.8 * wall < clock.seconds["blend"] <= wall

@@ -8,7 +8,7 @@ from training_scenes import SPACE, TABLE, DenseSideTeacher, SideTeacher, scene
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.basis import fit_basis, table_basis
-from gsencoder.fusion.errors import ProjectionSums, basis_fit, total_fit
+from gsencoder.fusion.errors import ProjectionSums, project_maps, total_fit
 from gsencoder.types import FeatureBasis, FeatureSpace
 
 WIDE = FeatureSpace(name="wide", channels=12)
@@ -70,7 +70,7 @@ def test_coded_and_dense_maps_of_the_same_vectors_give_the_same_figures() -> Non
     basis = table_basis(TABLE, TABLE.mean(axis=0), SPACE, energy=0.6)
     views = scene(0).views
     assert views is not None
-    coded, dense = (basis_fit(basis, teacher(), views, 2) for teacher in (SideTeacher, DenseSideTeacher))
+    coded, dense = (project_maps(basis, teacher(), views, (0, 1)).fit() for teacher in (SideTeacher, DenseSideTeacher))
     assert coded.vectors == 4 * dense.vectors
     assert (coded.energy, coded.cosine, coded.worst) == pytest.approx(
         (dense.energy, dense.cosine, dense.worst), abs=1e-6
@@ -84,4 +84,4 @@ def test_nothing_to_compare_and_another_space_are_refused() -> None:
     assert views is not None
     basis = basis_of(vectors_of(np.random.default_rng(0)), 2)
     with pytest.raises(InputError, match="is of \\(wide.*the maps of \\(sides"):
-        basis_fit(basis, SideTeacher(), views, 1)
+        project_maps(basis, SideTeacher(), views, (0,))

@@ -5,12 +5,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from splats import front_camera, random_gaussians
 from training_scenes import DenseSideTeacher, scene
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.checkpoint import SETTINGS_FILE, SUMS_FILE, FusionCheckpoint
+from gsencoder.fusion.lift import FeatureSums
+from gsencoder.render import blend
 from gsencoder.teachers.base import Teacher
-from gsencoder.types import FeatureMap, Views
+from gsencoder.types import FeatureMap, FeatureSpace, Views
+
+CAMERA = front_camera(32, 24, 30.0)
 
 
 class CountingTeacher(DenseSideTeacher):
@@ -32,63 +37,78 @@ def a_map(folder: Path, settings: dict[str, Any], teacher: Teacher | None = None
     return FusionCheckpoint(folder, settings).cached(teacher or CountingTeacher()).feature_map(views, view)
 
 
-def test_maps_and_sums_come_back(tmp_path: Path) -> None:
+def sums_of(gaussians: int = 5, views: int = 0) -> FeatureSums:
+    """Sums over the maps of some views, of a mean that is computed on the way."""
+    space = FeatureSpace(name="s", channels=3)
+    sums, lit = FeatureSums(gaussians, space, None, None, with_mean=True), blend(random_gaussians(gaussians), CAMERA)
+    for view in range(views):
+        cells = np.full((*lit.shape, 3), view + 1, np.float32)
+        sums.add(lit, FeatureMap(features=cells, grid_from_image=np.eye(2, 3), space=space), None)
+    return sums
+
+
+def save(checkpoint: FusionCheckpoint, sums: FeatureSums, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gsencoder.fusion.checkpoint.SAVE_EVERY", 0.0)
+    checkpoint.save_if_due(sums)
+
+
+def test_maps_and_sums_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     teacher = CountingTeacher()
     first = a_map(tmp_path / "work", {"a": 1}, teacher)
-    FusionCheckpoint(tmp_path / "work", {"a": 1}).save_sums(2, np.ones((5, 3), np.float32), np.full(5, 2, np.float32))
+    made, sums = sums_of(views=2), sums_of()
+    save(FusionCheckpoint(tmp_path / "work", {"a": 1}), made, monkeypatch)
     again = FusionCheckpoint(tmp_path / "work", {"a": 1})
     np.testing.assert_array_equal(a_map(tmp_path / "work", {"a": 1}, teacher).features, first.features)
     assert teacher.calls == 1
     a_map(tmp_path / "work", {"a": 1}, teacher, view=1)
     assert teacher.calls == 2
-    sums = again.load_sums(5, 3)
-    assert sums is not None
-    assert sums[0] == 2
-    assert (sums[2] == 2).all()
+    assert again.resume(sums) == sums.views == 2
+    assert made.sums.any()
+    for name, array in made.state().items():
+        np.testing.assert_array_equal(sums.state()[name], array)
+    np.testing.assert_array_equal(sums.mean, [1.5, 1.5, 1.5])
 
 
 @pytest.mark.parametrize("name", [SUMS_FILE, "map_00000.safetensors"])
-def test_maps_and_sums_whose_settings_a_kill_removed_are_not_used(name: str, tmp_path: Path) -> None:
+def test_maps_and_sums_whose_settings_a_kill_removed_are_not_used(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The checkpoint of a finished fusion is being removed; the next one has other settings."""
     work = tmp_path / "work"
     a_map(work, {"a": 1})
-    FusionCheckpoint(work, {"a": 1}).save_sums(2, np.ones((5, 3), np.float32), np.full(5, 2, np.float32))
+    save(FusionCheckpoint(work, {"a": 1}), sums_of(views=2), monkeypatch)
     assert (work / name).is_file()
     (work / SETTINGS_FILE).unlink()
     again = FusionCheckpoint(work, {"a": 2})
     assert not (work / name).exists()
-    assert again.load_sums(5, 3) is None
+    assert again.resume(sums_of()) == 0
 
 
 def test_a_run_that_kept_nothing_leaves_no_folder_to_refuse_the_next(tmp_path: Path) -> None:
     FusionCheckpoint(tmp_path / "work", {"patch": 13})
     assert not (tmp_path / "work").exists()
     a_map(tmp_path / "work", {"patch": 14})
-    with pytest.raises(InputError, match="begun with patch=14, and this run asks patch=13; delete it"):
+    with pytest.raises(InputError, match="begun with patch=14, and this run asks patch=13; delete "):
         FusionCheckpoint(tmp_path / "work", {"patch": 13})
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"\xff", b"[" * 100_000])
 def test_settings_that_cannot_be_read_say_what_to_delete(tmp_path: Path, content: bytes) -> None:
     (tmp_path / SETTINGS_FILE).write_bytes(content)
-    with pytest.raises(InputError, match=f"delete {tmp_path} to start anew"):
+    with pytest.raises(InputError, match=f"delete {tmp_path} to start again"):
         FusionCheckpoint(tmp_path, {})
 
 
 @pytest.mark.parametrize("kept_bytes", [0, 7, 100, 200])
-def test_damaged_maps_and_sums_are_named(tmp_path: Path, kept_bytes: int) -> None:
+def test_damaged_maps_and_sums_are_named(tmp_path: Path, kept_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
     checkpoint = FusionCheckpoint(tmp_path, {})
     a_map(tmp_path, {})
-    checkpoint.save_sums(1, np.ones((5, 3), np.float32), np.ones(5, np.float32))
+    save(checkpoint, sums_of(views=1), monkeypatch)
+    with pytest.raises(InputError, match=r"expected sums float32\[6, 3\], got float32\[5, 3\]"):
+        checkpoint.resume(sums_of(6))
     for file in ("map_00000.safetensors", SUMS_FILE):
         (tmp_path / file).write_bytes((tmp_path / file).read_bytes()[:kept_bytes])
-    with pytest.raises(InputError, match=r"map_00000\.safetensors.*delete .* to start anew"):
+    with pytest.raises(InputError, match=r"map_00000\.safetensors.*delete .* to start again"):
         a_map(tmp_path, {})
-    with pytest.raises(InputError, match=r"sums\.safetensors.*delete .* to start anew"):
-        checkpoint.load_sums(5, 3)
-
-
-def test_sums_of_another_size_are_refused(tmp_path: Path) -> None:
-    FusionCheckpoint(tmp_path, {}).save_sums(1, np.ones((5, 3), np.float32), np.ones(5, np.float32))
-    with pytest.raises(InputError, match=r"expected sums float32\[6, 3\], got float32\[5, 3\]"):
-        FusionCheckpoint(tmp_path, {}).load_sums(6, 3)
+    with pytest.raises(InputError, match=r"sums\.safetensors.*delete .* to start again"):
+        checkpoint.resume(sums_of())

@@ -11,7 +11,7 @@ from fixed_teachers import EXACT, SPACE, CodedTeacher, FixedTeacher, make_scene
 from splats import one_gaussian, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.fuse import FuseConfig, Fusion, chosen_views, fuse
+from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse, select_views
 from gsencoder.fusion.lift import VisibilityConfig, view_matrix
 from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Gaussians, Scene, Views
@@ -167,7 +167,7 @@ def test_the_automatic_test_takes_the_depth_that_there_is(
     scene = make_scene(count=1, gaussians=two_walls(), **depths)
     config = FuseConfig(lift=lift, energy=1.0, narrow=0)  # type: ignore[arg-type]
     fusion = fuse(scene, FixedTeacher(random_maps(rng)[:1]), config)
-    assert fusion.tested == tested
+    assert fusion.depth_sources == tested
     named = fuse(
         scene, FixedTeacher(random_maps(rng)[:1]), replace(config, visibility=VisibilityConfig(against=tested))
     )
@@ -218,7 +218,7 @@ def test_sums_of_an_interrupted_lift_are_taken_up(
 ) -> None:
     scene, maps = make_scene(), random_maps(rng)
     module = sys.modules["gsencoder.fusion.fuse"]
-    monkeypatch.setattr("gsencoder.fusion.checkpoint.FusionCheckpoint.due", lambda _: True)
+    monkeypatch.setattr("gsencoder.fusion.checkpoint.SAVE_EVERY", 0.0)
     whole = fuse(scene, FixedTeacher(maps), EXACT, work=tmp_path / "whole")
     lifted: list[int] = []
 
@@ -249,7 +249,7 @@ def test_a_resumed_run_of_a_cheap_narrow_teacher_keeps_the_mean_of_all_views(
     scene, teacher = make_scene(), FixedTeacher(random_maps(rng))
     teacher.cheap = True
     config = replace(EXACT, narrow=SPACE.channels)
-    monkeypatch.setattr("gsencoder.fusion.checkpoint.FusionCheckpoint.due", lambda _: True)
+    monkeypatch.setattr("gsencoder.fusion.checkpoint.SAVE_EVERY", 0.0)
     whole = fuse(scene, teacher, config, work=tmp_path)
     # The sums of all views are there now: nothing is left to lift, and the mean must not be that of nothing.
     again = fuse(scene, teacher, config, work=tmp_path)
@@ -285,7 +285,10 @@ def test_fewer_views_are_spread_evenly(rng: np.random.Generator) -> None:
 
 def test_a_share_of_the_views_is_rounded_up_and_never_none() -> None:
     def chosen(count: int, share: float, views: int = 0) -> tuple[int, ...]:
-        return chosen_views(count, replace(EXACT, view_share=share, views=views))
+        scene, config = make_scene(count=count), replace(EXACT, view_share=share, views=views)
+        assert scene.gaussians is not None
+        assert scene.views is not None
+        return select_views(scene.gaussians, scene.views, config, config.visibility)
 
     assert chosen(5, 1.0) == (0, 1, 2, 3, 4)
     assert chosen(5, 0.6) == (0, 2, 4)

@@ -12,7 +12,7 @@ from torch import nn
 
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.adapter_heads import Head
-from gsencoder.fusion.errors import CellSample
+from gsencoder.fusion.errors import CellSample, sample_cells
 from gsencoder.fusion.measured_heads import equal_rows, head_features, head_space, head_tokens, measure_heads
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
 
@@ -176,12 +176,11 @@ def test_a_fusion_that_continues_from_its_cache_samples_the_cells_of_all_views(t
             return super().feature_map(views, view)
 
     scene, config = a_scene(0), FuseConfig(basis=False)
-    plain = fuse(scene, Expensive(), config, sample_cells=True).sample
+    assert scene.views is not None
+    plain = sample_cells(Expensive(), scene.views, range(len(scene.views)))
     fuse(scene, Expensive(), config, work=tmp_path / "work")
     Expensive.calls = 0
-    continued = fuse(scene, Expensive(), config, work=tmp_path / "work", sample_cells=True).sample
-    assert plain is not None
-    assert continued is not None
+    fusion = fuse(scene, Expensive(), config, work=tmp_path / "work")
+    continued = sample_cells(fusion.teacher, scene.views, fusion.views)
     assert Expensive.calls == 0
     np.testing.assert_allclose(continued.vectors(), plain.vectors(), rtol=1e-3, atol=1e-3)
-    assert fuse(scene, Expensive(), config).sample is None

@@ -6,7 +6,7 @@ import torch
 from splats import front_camera, random_gaussians
 
 from gsencoder.fusion import lift
-from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, capped, center_matrix, keep_visible, view_matrix
+from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, center_matrix, keep_visible, limit_rays, view_matrix
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.images import depth_image
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Views
@@ -30,7 +30,7 @@ def test_cells_without_a_vector_give_neither_features_nor_weight(rng: np.random.
     mask = rng.random((HEIGHT, WIDTH)) < 0.8
     # Every pixel has equally many of a cell's rays.
     share = mask.reshape(HEIGHT // STRIDE, STRIDE, WIDTH // STRIDE, STRIDE).mean(axis=(1, 3)).ravel()
-    sums = FeatureSums(100, channels, None, None)
+    sums = FeatureSums(100, FeatureSpace(name="s", channels=channels), None, None)
     sums.add(b, map_of(cells), mask)
     dense = b.render(torch.eye(100)).numpy().astype(np.float64)
     vectors = cells.reshape(-1, channels)
@@ -54,7 +54,7 @@ def test_shares_are_masked_in_part_and_codes_where_most_of_their_cell_is_out(
     values = {"codes": codes} if form == "codes" else {"shares": shares}
     made = FeatureMap(**values, table=table, grid_from_image=affine, space=space)
     b = blend(random_gaussians(100), CAMERA, like=made)
-    sums = FeatureSums(100, 2, None, table)
+    sums = FeatureSums(100, space, None, table)
     sums.add(b, made, mask)
     sums.add(b, made, None)
     one_hot = (codes[..., None] == np.arange(3)) * np.where(counts > 8, 2.0, 1.0)[..., None]
@@ -81,7 +81,7 @@ def test_many_codes_are_lifted_as_vectors_with_the_same_result(
     b, mask = blend(random_gaussians(100), CAMERA, like=made), rng.random((HEIGHT, WIDTH)) < 0.8
 
     def lifted() -> tuple[np.ndarray, np.ndarray]:
-        sums = FeatureSums(100, rank or 4, basis, None if form == "own tables" else table)
+        sums = FeatureSums(100, space, basis, None if form == "own tables" else table)
         sums.add(b, made, mask)
         sums.add(b, made, None)
         return sums.finish()
@@ -90,7 +90,7 @@ def test_many_codes_are_lifted_as_vectors_with_the_same_result(
     # Each table has now more rows than are summed by code, and the vectors are made three coordinates at a time.
     monkeypatch.setattr(lift, "MAX_CODES", 0)
     monkeypatch.setattr(lift, "BLOCK_VALUES", 3 * codes.size)
-    assert FeatureSums(100, rank or 4, basis, table).table is None
+    assert FeatureSums(100, space, basis, table).table is None
     for one, other in zip(lifted(), (features, weights), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
     assert (weights > 0).sum() > 50
@@ -154,7 +154,7 @@ def test_a_cell_has_no_more_rays_than_pixels(across: float, down: float, rays: i
         space=FeatureSpace(name="s", channels=1),
     )
     config = BlendConfig(rays_per_patch=rays, near=0.5)
-    assert capped(config, feature_map) == BlendConfig(rays_per_patch=most, near=0.5)
+    assert limit_rays(config, feature_map) == BlendConfig(rays_per_patch=most, near=0.5)
 
 
 def test_a_coded_map_has_the_rows_of_its_table_and_none_where_there_is_no_code(rng: np.random.Generator) -> None:
@@ -170,7 +170,7 @@ def test_sums_are_divided_by_their_weights_and_rows_of_hardly_any_weight_are_zer
 ) -> None:
     table = rng.normal(size=(3, 2)).astype(np.float32)
     shares = np.array([[1, 2, 3], [0, 0, 0], [0, 1e-39, 0], [0.5, 0, 0.25]], np.float32)
-    sums = FeatureSums(4, 2, None, table if coded else None)
+    sums = FeatureSums(4, FeatureSpace(name="s", channels=2), None, table if coded else None)
     if coded:
         sums.sums[:] = shares
     else:

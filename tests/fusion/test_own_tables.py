@@ -11,9 +11,10 @@ from training_scenes import PREPARE, prepared
 from training_scenes import SPACE as SIDES
 from training_scenes import scene as side_scene
 
+from gsencoder.fusion.basis import distinct_rows
 from gsencoder.fusion.checkpoint import CachedTeacher, read_map, write_map
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.fusion.lift import VisibilityConfig, distinct_rows
+from gsencoder.fusion.lift import VisibilityConfig
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.train.prepare import _pool_map
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Scene, Views

@@ -185,7 +185,7 @@ def test_merged_moments_are_those_of_all_vectors_though_their_mean_is_long(tmp_p
     for number, chunk in enumerate(chunks):
         part = Moments(6)
         part.add(chunk)
-        write_archive(tmp_path / f"{number}.safetensors", part.parts(), {})
+        write_archive(tmp_path / f"{number}.safetensors", part.state(), {})
         total.merge(Moments(6))
         with open_archive(tmp_path / f"{number}.safetensors") as file:
             total.merge(Moments.read(file, 6))

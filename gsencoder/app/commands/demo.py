@@ -143,8 +143,8 @@ def search(
 ) -> TeacherResult:
     """Fuses a teacher, stores the features, reads them back, localizes words, and compares boxes with the true ones."""
     title = folder.name
-    fusion = fuse(scene, teacher, config.fusion, track=run.track)
-    run.timings[f"fuse {title}"] = sum(fusion.seconds.values())
+    with run.step(f"fuse {title}"):
+        fusion = fuse(scene, teacher, config.fusion, track=run.track)
     folder.mkdir()
     with run.step("store"):
         save_features(

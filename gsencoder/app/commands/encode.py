@@ -13,6 +13,7 @@ from gsencoder.app.output import Summary
 from gsencoder.app.run import Progress, Run
 from gsencoder.app.scenes import with_reported_up
 from gsencoder.app.summary import basis_figures, describe_basis, report_choice, report_promises
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning, about, counted
 from gsencoder.core.pretrained import digest_files
 from gsencoder.core.process import retain_freed_memory
@@ -291,7 +292,7 @@ def _basis_figures(
 def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Encoder, count: int) -> dict[str, float]:
     """How well the encoder's basis represents its teacher's maps of some of a scene's views."""
     # Teachers need torch, which encoding with an exported graph does without.
-    from gsencoder.fusion.errors import basis_fit
+    from gsencoder.fusion.errors import project_maps
     from gsencoder.teachers.build import build_teacher, words_by_teacher
     from gsencoder.train.prepare_scenes import SourceConfig
 
@@ -305,4 +306,4 @@ def _figures_of_scene(scene: Scene, name: str, basis: FeatureBasis, encoder: Enc
     teachers = source.teachers_by_name
     only = next(iter(teachers)) if len(teachers) == 1 else name
     teacher = build_teacher(teachers[only], scene, words_by_teacher(teachers, source.text).get(only))
-    return basis_fit(basis, teacher, scene.views, count).figures()
+    return project_maps(basis, teacher, scene.views, even_indices(len(scene.views), count).tolist()).fit().figures()

@@ -17,7 +17,7 @@ from gsencoder.app.run import Progress, Run
 from gsencoder.app.summary import describe_basis, report_choice, report_promises
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, counted
-from gsencoder.core.process import Device
+from gsencoder.core.process import Clock, Device
 from gsencoder.core.settings import MEGABYTE, option
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
@@ -26,6 +26,7 @@ from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.budget import BudgetFusion, fuse_within, realised_error
 from gsencoder.fusion.cameras import CamerasOfSplat, check_orbits
 from gsencoder.fusion.cost_model import BudgetConfig, check_budget
+from gsencoder.fusion.errors import project_maps, sample_cells
 from gsencoder.fusion.folder import FEATURES_FILE, HEADS_FILE, WORDS_FILE, save_features
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.measured_heads import heads_of, measure_heads, save_heads, stored_heads
@@ -52,22 +53,20 @@ class BudgetOptions(Protocol):
     def quiet(self) -> bool: ...
 
 
-def fuse_in_budget(
-    scene: Scene, teacher: Teacher, config: BudgetOptions, summary: Summary, work: Path, *, sample_cells: bool
-) -> BudgetFusion:
+def fuse_in_budget(scene: Scene, teacher: Teacher, config: BudgetOptions, summary: Summary, work: Path) -> BudgetFusion:
     """Chooses a setting and fuses; says which setting that is, and what is predicted of it."""
-    fused = fuse_within(
-        scene,
-        teacher,
-        config.fusion,
-        config.budget,
-        work=None if teacher.cheap else work,
-        sample_cells=sample_cells,
-        device=config.device,
-        track=Progress(quiet=config.quiet),
-    )
+    with Clock().running() as clock:
+        fused = fuse_within(
+            scene,
+            teacher,
+            config.fusion,
+            config.budget,
+            work=None if teacher.cheap else work,
+            device=config.device,
+            track=Progress(quiet=config.quiet),
+        )
     choice = fused.choice
-    summary.add_seconds({"choose": fused.choosing, **fused.fusion.seconds})
+    summary.add_seconds({"choose": fused.choosing, **clock.seconds})
     report_choice(
         summary,
         scene.name,
@@ -184,25 +183,22 @@ def run(config: FuseCommandConfig, run: Run) -> None:
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
             in_budget: BudgetFusion | None = None
             if config.budget.promised:
-                in_budget = fuse_in_budget(scene, teacher, config, run, work_folder(out), sample_cells=bool(heads))
+                in_budget = fuse_in_budget(scene, teacher, config, run, work_folder(out))
                 fusion = in_budget.fusion
             else:
-                fusion = fuse(
-                    scene,
-                    teacher,
-                    config.fusion,
-                    basis=basis,
-                    work=None if teacher.cheap else work_folder(out),
-                    sample_cells=bool(heads),
-                    device=config.device,
-                    track=run.track,
-                )
-                run.add_seconds(fusion.seconds)
+                work = None if teacher.cheap else work_folder(out)
+                with Clock().running() as clock:
+                    fusion = fuse(
+                        scene, teacher, config.fusion, basis=basis, work=work, device=config.device, track=run.track
+                    )
+                run.add_seconds(clock.seconds)
             write_features(folder, scene, fusion, words_beside(teacher, chosen.words), chosen.teacher, run)
+            if basis is not None and scene.views is not None:
+                run.results.update(project_maps(basis, fusion.teacher, scene.views, fusion.views).fit().figures())
             lines = []
             if in_budget is not None:
                 lines = check_promises(in_budget, folder / FEATURES_FILE, config, run)
-            lines += write_heads(folder, heads, fusion, run)
+            lines += write_heads(folder, heads, scene, fusion, run)
             if config.report:
                 from gsencoder.app.reports import report_fusion
 
@@ -256,11 +252,10 @@ def write_features(
         gaussians=len(features),
         seen=int(features.seen.sum()),
         views=len(fusion.views),
-        visibility=list(fusion.tested),
+        visibility=list(fusion.depth_sources),
         channels=features.space.channels,
         rank=features.features.shape[1],
         energy_kept=features.basis.energy_kept if features.basis is not None else 1.0,
-        **(fusion.projections.fit().figures() if fusion.projections is not None else {}),
         truncation=fusion.truncation,
         median_weight=float(np.median(features.weights[features.seen])),
         space=features.space.describe(),
@@ -268,13 +263,15 @@ def write_features(
     )
 
 
-def write_heads(folder: Path, heads: Sequence[Head], fusion: Fusion, summary: Summary) -> list[str]:
+def write_heads(folder: Path, heads: Sequence[Head], scene: Scene, fusion: Fusion, summary: Summary) -> list[str]:
     """Measures adapter heads over the maps that were fused, writes them, and adds their figures to the summary; returns
     a line for each head."""
-    if fusion.sample is None:
+    if not heads:
         return []
+    assert scene.views is not None
     with summary.step("heads"):
-        measured = measure_heads(heads, fusion.sample, fusion.features.space, fusion.features.basis)
+        sample = sample_cells(fusion.teacher, scene.views, fusion.views)
+        measured = measure_heads(heads, sample, fusion.features.space, fusion.features.basis)
         save_heads(folder / HEADS_FILE, measured)
     summary.results.update(heads=head_figures(measured))
     return describe_heads(measured)

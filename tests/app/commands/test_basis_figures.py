@@ -12,7 +12,7 @@ from gsencoder.app.summary import describe_basis
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.errors import basis_fit
+from gsencoder.fusion.errors import project_maps
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.onnx.export import random_cloud
 from gsencoder.models.weights import load_weights
@@ -57,7 +57,7 @@ def test_training_states_what_the_basis_keeps_of_its_scenes_and_of_held_out_ones
     assert (figures["rank"], figures["energy_kept"]) == (3, outputs.basis.energy_kept)
     views = load_scene(folder / "room_1").views
     assert views is not None
-    direct = basis_fit(outputs.basis, PaletteTeacher(PaletteConfig()), views, len(views))
+    direct = project_maps(outputs.basis, PaletteTeacher(PaletteConfig()), views, range(len(views))).fit()
     assert {name: figures[name] for name in direct.figures()} == pytest.approx(direct.figures(), abs=1e-3)
 
 
