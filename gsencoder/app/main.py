@@ -27,7 +27,7 @@ from gsencoder.core.errors import InputError, SceneWarning, clipped, one_line, p
 from gsencoder.core.process import Stopped, refuse_several, stop_of, stopping_signals
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Command:
     """A command of the command line.
 
@@ -44,110 +44,60 @@ class Command:
     several: bool = False
 
     def load(self) -> tuple[type[CommonConfig], Callable[[Any, Any], None]]:
-        """The settings class and `run(config, summary)`."""
+        """The settings class and `run(config, run)`."""
         module = importlib.import_module(f"gsencoder.app.commands.{self.name}")
         return getattr(module, self.config), module.run
 
 
-COMMANDS = {
-    command.name: command
-    for command in (
-        Command(
-            name="demo",
-            config="DemoConfig",
-            help="run the whole pipeline on a built-in room, offline, and write a report",
-        ),
-        Command(
-            name="reconstruct",
-            config="ReconstructCommandConfig",
-            help="make a splat from photographs, with or without poses",
-            several=True,
-        ),
-        Command(
-            name="fuse",
-            config="FuseCommandConfig",
-            help="lift a teacher's feature maps onto the Gaussians of a scene",
-            several=True,
-        ),
-        Command(
-            name="memory",
-            config="MemoryCommandConfig",
-            help="remember the features of several teachers in a few channels a Gaussian, and a bank",
-            several=True,
-        ),
-        Command(
-            name="train", config="TrainCommandConfig", help="distil a teacher into an encoder of splats", several=True
-        ),
-        Command(
-            name="encode",
-            config="EncodeCommandConfig",
-            help="compute features of a splat with an encoder, in one pass",
-            several=True,
-        ),
-        Command(
-            name="pack", config="PackConfig", help="store features in a few bytes a Gaussian, or for other programs"
-        ),
-        Command(
-            name="export",
-            config="ExportConfig",
-            help="export an encoder, which takes raw Gaussians, or a memory as one ONNX file",
-        ),
-        Command(
-            name="localize", config="LocalizeCommandConfig", help="find words in a scene: boxes, scores and pictures"
-        ),
-        Command(
-            name="select",
-            config="SelectCommandConfig",
-            help="write the Gaussians of words as splats of their own, the scene without them, and labels",
-        ),
-        Command(
-            name="views",
-            config="ViewsCommandConfig",
-            help="choose and render the views that show best what a word stands for",
-        ),
-        Command(
-            name="view",
-            config="ViewConfig",
-            help="look at a scene and its features in a browser, and search it; or write that as one file",
-        ),
-        Command(name="ask", config="AskCommandConfig", help="ask a vision-language model about views of a scene"),
-        Command(
-            name="questions",
-            config="QuestionsCommandConfig",
-            help="make questions and expressions with their answers from the labels of scenes",
-        ),
-        Command(
-            name="tune",
-            config="TuneCommandConfig",
-            help="train adapters of a vision-language model on questions about scenes and their answers",
-            several=True,
-        ),
-        Command(
-            name="evaluate",
-            config="EvaluateConfig",
-            help="score boxes, names, masks and views on labeled scenes",
-            several=True,
-        ),
-        Command(
-            name="score",
-            config="ScoreConfig",
-            help="score files of predictions, of this program or another, against a benchmark's truth",
-        ),
-        Command(
-            name="tradeoff",
-            config="TradeoffConfig",
-            help="measure what each knob of a stage costs and gains, alone and together",
-        ),
-        Command(
-            name="inspect", config="InspectConfig", help="show what a scene or a splat file holds, and what is wrong"
-        ),
-        Command(
-            name="repair",
-            config="RepairConfig",
-            help="mend a splat file, or the poses of a scene, and report the changes",
-        ),
-    )
-}
+_LISTED = (
+    Command("demo", "DemoConfig", "run the whole pipeline on a built-in room, offline, and write a report"),
+    Command(
+        "reconstruct", "ReconstructCommandConfig", "make a splat from photographs, with or without poses", several=True
+    ),
+    Command("fuse", "FuseCommandConfig", "lift a teacher's feature maps onto the Gaussians of a scene", several=True),
+    Command(
+        "memory",
+        "MemoryCommandConfig",
+        "remember the features of several teachers in a few channels a Gaussian, and a bank",
+        several=True,
+    ),
+    Command("train", "TrainCommandConfig", "distil a teacher into an encoder of splats", several=True),
+    Command("encode", "EncodeCommandConfig", "compute features of a splat with an encoder, in one pass", several=True),
+    Command("pack", "PackConfig", "store features in a few bytes a Gaussian, or for other programs"),
+    Command("export", "ExportConfig", "export an encoder, which takes raw Gaussians, or a memory as one ONNX file"),
+    Command("localize", "LocalizeCommandConfig", "find words in a scene: boxes, scores and pictures"),
+    Command(
+        "select",
+        "SelectCommandConfig",
+        "write the Gaussians of words as splats of their own, the scene without them, and labels",
+    ),
+    Command("views", "ViewsCommandConfig", "choose and render the views that show best what a word stands for"),
+    Command(
+        "view", "ViewConfig", "look at a scene and its features in a browser, and search it; or write that as one file"
+    ),
+    Command("ask", "AskCommandConfig", "ask a vision-language model about views of a scene"),
+    Command(
+        "questions",
+        "QuestionsCommandConfig",
+        "make questions and expressions with their answers from the labels of scenes",
+    ),
+    Command(
+        "tune",
+        "TuneCommandConfig",
+        "train adapters of a vision-language model on questions about scenes and their answers",
+        several=True,
+    ),
+    Command("evaluate", "EvaluateConfig", "score boxes, names, masks and views on labeled scenes", several=True),
+    Command(
+        "score",
+        "ScoreConfig",
+        "score files of predictions, of this program or another, against a benchmark's truth",
+    ),
+    Command("tradeoff", "TradeoffConfig", "measure what each knob of a stage costs and gains, alone and together"),
+    Command("inspect", "InspectConfig", "show what a scene or a splat file holds, and what is wrong"),
+    Command("repair", "RepairConfig", "mend a splat file, or the poses of a scene, and report the changes"),
+)
+COMMANDS = {command.name: command for command in _LISTED}
 
 
 FLAGS = {
@@ -191,13 +141,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         _report("error", str(error), debug)
         _report_notes(error)
         return 2
-    except (KeyboardInterrupt, Stopped) as stop:
-        return _stopped(stop, debug)
-    except SystemError as error:
-        inner = stop_of(error)
-        if inner is None:
+    except (KeyboardInterrupt, Stopped, SystemError) as error:
+        stop = stop_of(error)
+        if stop is None:
             raise
-        return _stopped(inner, debug)
+        return _stopped(stop, debug)
     except BrokenPipeError:
         _discard_stdout()
         return 1
@@ -256,13 +204,10 @@ def _large_numbers(key: str, value: Any) -> Iterator[str]:
 
 
 def _stopped(stop: Stopped | KeyboardInterrupt, debug: bool) -> int:
-    if isinstance(stop, KeyboardInterrupt):
-        _report("interrupted", "", debug)
-        _report_notes(stop)
-        return 128 + signal.SIGINT
-    _report("stopped", signal.Signals(stop.number).name, debug)
+    number = stop.number if isinstance(stop, Stopped) else signal.SIGINT
+    _report(*(("stopped", signal.Signals(number).name) if isinstance(stop, Stopped) else ("interrupted", "")), debug)
     _report_notes(stop)
-    return 128 + stop.number
+    return 128 + number
 
 
 def _report(kind: str, message: str, debug: bool) -> None:

@@ -20,6 +20,7 @@ import json
 import math
 import mmap
 import os
+import shutil
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -516,34 +517,25 @@ def read_npz(
         raise InputError(f"{file}: cannot be read as .npz: {message}") from error
 
 
-def _described(dtype: np.dtype, shape: tuple[int, ...]) -> str:
-    name = "Python objects, which would run code" if dtype.hasobject else f"{dtype}"
-    return f"{' × '.join(f'{each:,}' for each in shape) or 'one'} of {name}"
-
-
 def _read_member(archive: zipfile.ZipFile, name: str, kind: str, ndim: int, file: Path, max_text: int) -> np.ndarray:
-    """Reads an array; its header must match the size in the archive, which is checked before memory is allocated."""
+    """Reads an array whose header matches its size in the archive; of another kind it is not read."""
     where, size = f"{file}: {name}", archive.getinfo(f"{name}.npy").file_size
     if size > LARGEST_ARRAY:
         raise InputError(f"{where} claims {size:,} bytes; at most {LARGEST_ARRAY:,} are read")
     with archive.open(f"{name}.npy") as stream:
         version = np.lib.format.read_magic(stream)
-        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
-        if read is None:
-            raise InputError(f"{where}: unknown .npy version {version}")
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = read(stream)
-        count = int(np.prod(shape, dtype=object))
         if dtype.kind != kind or len(shape) != ndim:
-            raise InputError(
-                f"{where}: expected {ndim} {'axis' if ndim == 1 else 'axes'} of {_KINDS[kind]}, got "
-                f"{_described(dtype, shape)}"
-            )
+            got = "Python objects, which would run code" if dtype.hasobject else str(dtype)
+            sides, axes = " × ".join(map(str, shape)) or "one", "1 axis" if ndim == 1 else f"{ndim} axes"
+            raise InputError(f"{where}: expected {axes} of {_KINDS[kind]}, got {sides} of {got}")
         length = dtype.itemsize // np.dtype("U1").itemsize
         if kind == "U" and length > max_text:
             raise InputError(f"{where}: entries of {length:,} characters, expected at most {max_text:,}")
         expected = size - stream.tell()
-        if count * dtype.itemsize != expected:
-            raise InputError(f"{where}: header claims {count * dtype.itemsize:,} bytes, the file holds {expected:,}")
+        if int(np.prod(shape, dtype=object)) * dtype.itemsize != expected:
+            raise InputError(f"{where}: its header claims other sizes than the {expected:,} bytes that the file holds")
         data = stream.read(expected)
     if len(data) != expected:
         raise InputError(f"{where}: truncated, {expected - len(data):,} of {expected:,} bytes are missing")
@@ -600,16 +592,10 @@ def copy_checked(source: Path, target: Path, check: Callable[[Path], object]) ->
         check: reads the copy; raises InputError where it is damaged.
     """
     with atomic_file(target) as stream:
-        for block in _blocks(source):
-            stream.write(block)
+        with readable(source), open_foreign(source) as original:
+            shutil.copyfileobj(original, stream)
         stream.flush()
         try:
             check(Path(stream.name))
         except InputError as error:
             raise InputError(str(error).replace(stream.name, str(source))) from error
-
-
-def _blocks(path: Path) -> Iterator[bytes]:
-    with readable(path), open_foreign(path) as stream:
-        while block := stream.read(BLOCK_BYTES):
-            yield block
