@@ -144,7 +144,7 @@ CASES: dict[str, Case] = {
     "tune": Case(
         lambda given: [
             "tune", str(given / "ScanQA_v1.0_train.json"), f"model={given / 'model'}",
-            f"features={given / 'tuned'}", *VIEWS, "image_side=64", "image_format=png", "lora.rank=4",
+            f"features={given / 'tuned'}", *VIEWS, "image_side=64", "lora.rank=4",
             "train.steps=2", "train.accumulate=1", "train.warmup=1", "train.log_every=1", "train.checkpoint_every=0",
         ],
         beside=("out.prepared",),

@@ -1,13 +1,15 @@
 """Settings of `gsencoder evaluate`."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from gsencoder.app.heads import words_of_head
-from gsencoder.app.inputs import stored_source, stored_words, with_stored_features
 from gsencoder.app.options import CommonConfig
 from gsencoder.app.run import Progress
+from gsencoder.app.scenes import folder_of, memory_of, queried_scene
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.core.settings import option
@@ -39,7 +41,7 @@ from gsencoder.evaluate.sources import (
     space_of_words,
     table_beside,
 )
-from gsencoder.fusion.folder import heads_beside
+from gsencoder.fusion.folder import heads_beside, load_features
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.measured_heads import find_head, heads_of, load_heads
 from gsencoder.infer.chunks import EncodeConfig
@@ -48,7 +50,7 @@ from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.teachers.build import TeacherConfig, words_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, stating_trained, words_of_table
-from gsencoder.types import Scene
+from gsencoder.types import QueryMemory, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,8 +130,9 @@ def stored_features(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
         raise InputError("features: a folder has its own Gaussians and words; leave out weights=, splat= and teacher=")
     first = next(iter(find_scenes(config.paths)))
     scene = load_scene(first, options=config.data)
-    options = {"head": config.head, "space": config.space}
-    return stored_source, stored_words(config.features, scene.name, text=config.text, **options)
+    folder = folder_of(config.features, scene.name)
+    _, words = queried_scene(load_features(folder), folder, head=config.head, space=config.space, text=config.text)
+    return lambda scene: (next(iter(scene.features.values())), {}), words
 
 
 def _given_words(config: EvaluateConfig) -> Words:
@@ -183,3 +186,36 @@ def method_name(config: EvaluateConfig) -> str:
     if config.features:
         return Path(config.features).resolve().name
     return "encoded" if config.weights else "fused"
+
+
+def with_stored_features(
+    scenes: Iterable[tuple[Scene, float]],
+    features: str,
+    *,
+    head: str = "",
+    space: str = "",
+    text: TextConfig = TableTextConfig(),
+) -> Iterator[tuple[Scene, float]]:
+    """Labeled scenes with the Gaussians and features of a folder, as `load_scenes` yields scenes.
+
+    The features may have been made from other views of the scene, such as all but those that are evaluated; the origin,
+    which is the mean of the cameras, is then another one.
+    """
+    for scene, seconds in scenes:
+        folder = folder_of(features, scene.name)
+        stored = load_features(folder)
+        if stored.name != scene.name:
+            raise InputError(
+                f"features: {folder} holds those of scene {stored.name}, and {scene.name} is evaluated; give a folder "
+                f"that has the features of each scene in a folder of its name"
+            )
+        queried, _ = queried_scene(stored, folder, head=head, space=space, text=text)
+        assert queried.gaussians is not None
+        means = (queried.gaussians.means + (stored.origin - scene.origin)).astype(np.float32)
+        gaussians = replace(queried.gaussians, means=means)
+        yield replace(scene, gaussians=gaussians, features=queried.features), seconds
+
+
+def stored_memory(features: str, scene: Scene) -> QueryMemory | None:
+    """The memory that the features of a scene were read from; None where features are stored themselves."""
+    return memory_of(folder_of(features, scene.name), scene)

@@ -130,3 +130,9 @@ def _table_beside(folder: Path, space: FeatureSpace) -> TextTable | None:
     except InputError:
         return None
     return table if table is not None and table.space.text_encoder == space.text_encoder else None
+
+
+def folder_of(features: str, scene: str) -> Path:
+    """The folder of a scene's features: the one of its name in a folder of several, else the folder itself."""
+    inner = Path(features) / scene
+    return inner if inner.is_dir() else Path(features)

@@ -50,7 +50,9 @@ def check_limits(settings: Any) -> None:
         numbers = value if isinstance(value, tuple) else () if value is None else (value,)
         if not all(LIMITS[name][0](number, limit) for number in numbers for name, limit in limits.items()):
             expected = " and ".join(LIMITS[name][1].format(limits[name]) for name in LIMITS if name in limits)
-            raise InputError(f"{item.name}: expected {expected}, got {value}")
+            raise InputError(
+                f"{item.name}: expected {expected}, got {list(value) if isinstance(value, tuple) else value}"
+            )
 
 
 Settings = TypeVar("Settings")

@@ -1,19 +1,20 @@
 """`gsencoder ask FEATURES question=…`: the answer of a VLM that sees the best views of what the question names."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsencoder.app.inputs import load_asker, localized_captions, photos_of, scene_folders
 from gsencoder.app.options import FeaturesConfig, settings
 from gsencoder.app.run import Run
+from gsencoder.app.scenes import folder_of, load_words, queried_scene, shown_scene
 from gsencoder.core.errors import InputError, SceneWarning, counted, listed, printable
 from gsencoder.core.files import write_json
 from gsencoder.core.process import Clock
 from gsencoder.core.settings import option
-from gsencoder.data.scenes import SceneConfig
+from gsencoder.data.scenes import DistinctPaths, SceneConfig, kind_of_path
+from gsencoder.fusion.folder import holds_features, table_path
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question, Task, check_question
 from gsencoder.infer.ask.batch import (
     ANSWER,
@@ -29,20 +30,33 @@ from gsencoder.infer.ask.questions import (
     BatchQuestion,
     QuestionSet,
     SetQuestion,
+    caption_question,
     is_question_set,
     read_question_set,
     read_questions,
 )
 from gsencoder.infer.ask.server import VlmConfig, VlmServer, request_body
-from gsencoder.infer.localize import LocalizeConfig
-from gsencoder.infer.views.targets import ViewsConfig
-from gsencoder.text.vocabulary import TableTextConfig, TextConfig
+from gsencoder.infer.localize import LocalizeConfig, localize, select_features
+from gsencoder.infer.views.targets import ViewsConfig, best_boxes
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, closed_table
+from gsencoder.types import Scene
 
 PREDICTIONS = "predictions.json"
 
 
+@dataclass(frozen=True, kw_only=True)
+class AskingConfig(FeaturesConfig):
+    """The options of commands that make prompts about scenes. Without slots, as `CommonConfig`."""
+
+    ask: AskConfig = field(default_factory=AskConfig)
+    choose: ViewsConfig = field(default_factory=ViewsConfig)
+    data: SceneConfig = field(default_factory=SceneConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AskCommandConfig(FeaturesConfig):
+class AskCommandConfig(AskingConfig):
     """Settings of `ask`."""
 
     paths: tuple[str, ...] = option(
@@ -75,12 +89,7 @@ class AskCommandConfig(FeaturesConfig):
     )
     dry_run: bool = option(False, "write the prompt and the pictures without sending them")
     resume: bool = option(True, "continue an interrupted batch; false = ask every question again")
-    ask: AskConfig = field(default_factory=AskConfig)
     vlm: VlmConfig = field(default_factory=VlmConfig)
-    choose: ViewsConfig = field(default_factory=ViewsConfig)
-    data: SceneConfig = field(default_factory=SceneConfig)
-    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
-    text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
         FeaturesConfig.__post_init__(self)
@@ -115,7 +124,7 @@ def run(config: AskCommandConfig, run: Run) -> None:
     if not questions:
         check_question(config.task, config.question)
     with run.step("load"):
-        asker = load_asker(config, folder, config.photos)
+        asker = asker_of(config, config.vlm, shown_scene(folder, config.photos, config.data), folder)
     out = run.out(asker.scene.name, "answers" if questions else "answer")
     if questions:
         ask_file(out, questions, asker, server, config, run)
@@ -179,7 +188,8 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
     with run.resumable(out, "answers", resume=config.resume) as (folder, work):
         for path in folders:
             with run.step("load"):
-                asker = load_asker(config, path, photos_of(config.photos, path))
+                photos = str(folder_of(config.photos, path.name)) if config.photos else ""
+                asker = asker_of(config, config.vlm, shown_scene(path, photos, config.data), path)
             name = asker.scene.name
             if name in counts:
                 raise InputError(f"{path}: holds features of scene {name}, and so does another folder; give one")
@@ -261,3 +271,80 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
             else f"{counted(len(answered), 'request')}, {REQUEST}"
         )
     )
+
+
+def asker_of(config: AskingConfig, vlm: VlmConfig, scene: Scene, folder: Path) -> Asker:
+    """The asker of a scene that was loaded from a folder of features. A box can be asked about without words."""
+    words: Words | None
+    if config.head:
+        scene, words = queried_scene(
+            scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
+        )
+    else:
+        space = select_features(scene, config.space or None)[1].space
+        has_own_words = config.words or not isinstance(config.text, TableTextConfig)
+        has_words = has_own_words or table_path(folder, space.text_encoder) is not None
+        words = load_words(folder, space, config.words, config.text) if has_words else None
+    return Asker(
+        scene,
+        words,
+        space=None if config.head else config.space or None,
+        config=config.ask,
+        localization=config.localize,
+        views=config.choose,
+        vlm=vlm,
+    )
+
+
+def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:
+    """The folders of features at paths: each path, or the folders in it that are called like one of the scenes."""
+    folders = DistinctPaths()
+    for path in map(Path, paths):
+        inner = [path] if holds_features(path) else []
+        if not inner and path.is_dir():
+            inner = sorted(filter(holds_features, path.iterdir()))
+        if not inner:
+            raise InputError(
+                f"{path}: {kind_of_path(path)}; expected a folder of features, which `gsencoder fuse`, `encode`, "
+                "`memory` and `pack` write, or a folder of such folders"
+            )
+        folders.add(folder for folder in inner if folder is path or folder.name in scenes)
+    return list(folders.paths)
+
+
+def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[SetQuestion, ...]:
+    """Questions for captions of the best boxes of names, `ask.boxes` for each; names that no table knows have none.
+
+    Warns:
+        SceneWarning: names that no table knows, or none of which has a box.
+    """
+    if asker.words is None:
+        raise InputError(f"proposals=localize: no words lead into the features of {asker.scene.name}; give words=")
+    table = closed_table(asker.words)
+    known_names = [name for name in names if table is None or table.find(name) is not None]
+    if len(known_names) < len(names):
+        unknown = [name for name in names if name not in known_names]
+        warnings.warn(
+            f"proposals=localize: {asker.scene.name}: the text table lacks {len(unknown)} of {len(names)} names of "
+            f"objects, of which there are no captions: {listed(unknown)}; give a text tower (text=)",
+            SceneWarning,
+            stacklevel=2,
+        )
+    if not known_names:
+        return ()
+    localization = localize(asker.scene, known_names, asker.words, asker.localization, space=asker.space)
+    questions = []
+    for number, box in enumerate(best_boxes(localization, asker.config.boxes)):
+        low, high = box.aabb_min.tolist(), box.aabb_max.tolist()
+        aabb = ((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        keys = {"obj_prob": [1 - float(box.probability), float(box.probability)]}
+        if (box.aabb_min < box.aabb_max).all():
+            questions.append(caption_question(asker.scene.name, str(number), aabb, keys))
+    if not questions:
+        warnings.warn(
+            f"proposals=localize: {asker.scene.name}: no name of an object has a box there ({listed(known_names)}), so "
+            "that there is nothing to caption",
+            SceneWarning,
+            stacklevel=2,
+        )
+    return tuple(questions)

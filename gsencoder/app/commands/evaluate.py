@@ -10,9 +10,9 @@ from gsencoder.app.evaluate_settings import (
     scenes_of,
     source_of_head,
     stored_features,
+    stored_memory,
     teacher_or_encoder,
 )
-from gsencoder.app.inputs import stored_memory
 from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError, about, counted
 from gsencoder.core.files import csv_text, write_bytes

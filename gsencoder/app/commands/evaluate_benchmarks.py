@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsencoder.app.commands.score import print_report, write_report
-from gsencoder.app.evaluate_settings import EvaluateConfig, method_name, scenes_of
-from gsencoder.app.inputs import stored_memory
+from gsencoder.app.evaluate_settings import EvaluateConfig, method_name, scenes_of, stored_memory
 from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError, SceneWarning, about, advised, counted, listed
 from gsencoder.data.labels.captions import read_texts, read_view_captions, write_view_captions

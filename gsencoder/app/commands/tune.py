@@ -7,14 +7,13 @@ import os
 import shutil
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from gsencoder.app.inputs import asker_of
-from gsencoder.app.options import FeaturesConfig
+from gsencoder.app.commands.ask import AskingConfig, asker_of
 from gsencoder.app.output import prepared_folder
 from gsencoder.app.run import Run
 from gsencoder.app.scenes import shown_scene
@@ -27,13 +26,10 @@ from gsencoder.core.settings import option
 from gsencoder.data.labels.questions import Question as TruthQuestion
 from gsencoder.data.labels.questions import read_questions
 from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
-from gsencoder.data.scenes import SceneConfig
-from gsencoder.infer.ask.ask import AskConfig, Asker, Question
+from gsencoder.infer.ask.ask import Asker, Question
 from gsencoder.infer.ask.batch import store_prompt
 from gsencoder.infer.ask.server import VlmConfig
-from gsencoder.infer.localize import LocalizeConfig, select_features
-from gsencoder.infer.views.targets import ViewsConfig
-from gsencoder.text.vocabulary import TableTextConfig, TextConfig
+from gsencoder.infer.localize import select_features
 from gsencoder.train.distributed import fail_together
 from gsencoder.train.tune import TuneConfig, TuningPair, open_processor, save_tuned, tune
 from gsencoder.train.vlm import SERVED_FOLDER, TowerLayout, check_peft, check_targets, link_served
@@ -42,32 +38,25 @@ from gsencoder.types import GaussianFeatures
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PromptRecipe:
-    """How questions become prompts: the settings of `ask`, and the tower whose output rendered features replace.
+    """How questions become prompts: the options of `ask`, and the tower whose output rendered features replace.
 
     Attributes:
-        words, space, head: see the options of `ask`.
-        ask, choose, localize, data, text, vlm: sections of `ask`.
+        config: the options of `ask`.
+        vlm: size of the pictures.
         tokens: name of the features that are rendered on the tower's grid; empty = none.
         layout: of the tower's output, with `tokens`.
     """
 
-    words: str
-    space: str
-    head: str
-    ask: AskConfig
-    choose: ViewsConfig
-    localize: LocalizeConfig
-    data: SceneConfig
-    text: TextConfig
+    config: AskingConfig
     vlm: VlmConfig
     tokens: str
     layout: TowerLayout | None
 
     def to_json(self) -> dict[str, Any]:
         """All that prompts depend on besides scene and question."""
-        names = ("words", "space", "head", "ask", "choose", "localize", "data", "text", "tokens", "layout")
-        values = {name: plain(getattr(self, name)) for name in names}
-        return values | {"image_side": self.vlm.image_side, "image_format": self.vlm.image_format}
+        names = ("words", "space", "head", "ask", "choose", "localize", "data", "text")
+        values = {name: plain(getattr(self.config, name)) for name in names}
+        return values | {"tokens": self.tokens, "layout": plain(self.layout), "image_side": self.vlm.image_side}
 
 
 def read_dataset(path: Path, split: str, scenes: Sequence[str]) -> tuple[TruthQuestion, ...]:
@@ -205,12 +194,12 @@ def _state(folder: Path) -> list[list[Any]]:
 
 def _asker(folder: Path, photos: str, recipe: PromptRecipe) -> tuple[Asker, GaussianFeatures | None]:
     """What asks about a scene, and the features that are rendered as tokens."""
-    scene = shown_scene(folder, photos, recipe.data)
+    scene = shown_scene(folder, photos, recipe.config.data)
     features = None
     if recipe.tokens:
         with about(f"tokens={recipe.tokens}"):
             features = select_features(scene, recipe.tokens)[1]
-    return asker_of(recipe, scene, folder), features
+    return asker_of(recipe.config, recipe.vlm, scene, folder), features
 
 
 def _store(
@@ -241,7 +230,7 @@ def _store(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TuneCommandConfig(TuneConfig, FeaturesConfig):
+class TuneCommandConfig(TuneConfig, AskingConfig):
     """Settings of `tune`."""
 
     paths: tuple[str, ...] = option(
@@ -268,13 +257,7 @@ class TuneCommandConfig(TuneConfig, FeaturesConfig):
         "name of the feature space that is rendered on the grid of the model's vision tower and replaces "
         "its output (Idefics3, SmolVLM, LLaVA); empty = the model looks at the pictures",
     )
-    project: bool | None = option(
-        None,
-        "with tokens=: train a linear layer from the features to the tower's channels; left out: where "
-        "their numbers differ",
-    )
     image_side: int = option(768, "longer side of the pictures, as in the vlm.image_side of ask, pixels")
-    image_format: Literal["jpeg", "png"] = option("jpeg", "of the pictures, as in the vlm.image_format of ask")
     prepared: Path | None = option(
         None, "folder of prepared prompts, created if missing; empty = OUT.prepared", metavar="PATH"
     )
@@ -282,18 +265,11 @@ class TuneCommandConfig(TuneConfig, FeaturesConfig):
     resume: bool = option(True, "continue an interrupted run; false = start again")
     tensorboard: bool = option(False, "write TensorBoard events in addition to log.csv")
     device: Device = option("auto", "where the model computes")
-    ask: AskConfig = field(default_factory=AskConfig)
-    choose: ViewsConfig = field(default_factory=ViewsConfig)
-    data: SceneConfig = field(default_factory=SceneConfig)
-    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
-    text: TextConfig = field(default_factory=TableTextConfig)
 
     def __post_init__(self) -> None:
-        FeaturesConfig.__post_init__(self)
+        AskingConfig.__post_init__(self)
         TuneConfig.__post_init__(self)
-        if self.project is not None and not self.tokens:
-            raise InputError("project: is of rendered features; give tokens=, too")
-        VlmConfig(image_side=self.image_side, image_format=self.image_format)
+        VlmConfig(image_side=self.image_side)
 
 
 def run(config: TuneCommandConfig, run: Run) -> None:
@@ -306,17 +282,7 @@ def run(config: TuneCommandConfig, run: Run) -> None:
     model_config, _, layout = open_processor(model, with_tokens=bool(config.tokens))
     check_targets(model_config, config.lora.targets)
     recipe = PromptRecipe(
-        words=config.words,
-        space=config.space,
-        head=config.head,
-        ask=config.ask,
-        choose=config.choose,
-        localize=config.localize,
-        data=config.data,
-        text=config.text,
-        vlm=VlmConfig(image_side=config.image_side, image_format=config.image_format),
-        tokens=config.tokens,
-        layout=layout,
+        config=config, vlm=VlmConfig(image_side=config.image_side), tokens=config.tokens, layout=layout
     )
     with run.processes(config.device, out, state="training") as group:
         folder, work = None, group.work.path
@@ -338,7 +304,6 @@ def run(config: TuneCommandConfig, run: Run) -> None:
                 store,
                 model,
                 config,
-                project=config.project,
                 work=work,
                 process=group.process,
                 device=group.device,

@@ -29,7 +29,6 @@ QUICK = (
     "choose.candidates=4",
     "choose.count=2",
     "image_side=64",
-    "image_format=png",
     "lora.rank=4",
     "train.steps=3",
     "train.accumulate=1",
@@ -95,7 +94,7 @@ def test_prompts_are_those_that_ask_sends(given: Path, tmp_path: Path) -> None:
     question = QUESTIONS[0][1]
     (prompt,) = (each for each in store.prompts.values() if question in each.text)
     arguments = ["ask", str(given / "features" / "room_a"), f"question={question}", f"out={tmp_path / 'asked'}"]
-    vlm = ["vlm.image_side=64", "vlm.image_format=png", "dry_run=true"]
+    vlm = ["vlm.image_side=64", "dry_run=true"]
     assert cli.main([*arguments, *vlm, *QUICK[:3], "quiet=true"]) == 0
     parts = json.loads((tmp_path / "asked" / "request.json").read_text())["messages"][0]["content"]
     assert parts[-1]["text"] == prompt.text
@@ -213,7 +212,6 @@ def test_bad_input_is_refused_in_a_line(given: Path, tmp_path: Path, capsys: pyt
     assert "no weights as safetensors" in refused(f"model={bare}")
     assert "is no folder" in refused(f"features={tmp_path / 'gone'}")
     assert "tokens" in refused("tokens=radio")
-    assert "project: is of rendered features" in refused("project=true")
     assert "image_side: expected 16" in refused("image_side=2")
     assert "lora.rank: expected 1" in refused("lora.rank=0")
     assert "train.compile" in refused("train.compile=true")

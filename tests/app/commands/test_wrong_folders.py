@@ -8,8 +8,8 @@ import pytest
 from command_runs import refusal
 from textured_box import box_cameras, box_views, write_box
 
+from gsencoder.app.commands.ask import scene_folders
 from gsencoder.app.commands.fuse import load_weights_spaces
-from gsencoder.app.inputs import scene_folders
 from gsencoder.app.output import WorkFolder
 from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import find_scenes
