@@ -4,8 +4,8 @@ import numpy as np
 import torch
 from torch import nn
 
-from gsencoder.fusion.adapter_heads import Head, Residual
 from gsencoder.fusion.measured_heads import HeadFit, MeasuredHead
+from gsencoder.teachers.adapter_heads import Head, Residual
 from gsencoder.types import FeatureSpace
 
 SPACE = FeatureSpace(name="radio", channels=6, teacher="radio", weights="abcd", preprocessing="resized")

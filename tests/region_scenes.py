@@ -13,7 +13,7 @@ from splats import front_camera, random_gaussians
 
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import build_teacher
-from gsencoder.teachers.masks import RegionsConfig
+from gsencoder.teachers.regions import RegionsConfig
 from gsencoder.text.table import TextTable, make_text_table, unit
 from gsencoder.types import Cameras, Scene, SceneObject, Views
 

@@ -7,7 +7,7 @@ from region_scenes import WIDTH, region_scene
 
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import build_teacher
-from gsencoder.teachers.masks import OnnxRegionOptions, RegionsConfig
+from gsencoder.teachers.regions import OnnxRegionOptions, RegionsConfig
 from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureMap
 

@@ -21,7 +21,6 @@ from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 
 from gsencoder.core.archive import open_archive
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.checkpoint import SUMS_FILE, FusionCheckpoint, read_map, write_map
 from gsencoder.fusion.folder import (
     FEATURES_FILE,
@@ -38,6 +37,7 @@ from gsencoder.memory.index import index_features
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights
 from gsencoder.reconstruct.parameters import RowAdam, State, anchor_at, load_state, parameters_from, save_state
+from gsencoder.teachers.adapter_heads import Head
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.loop import TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE

@@ -43,11 +43,11 @@ from gsencoder.evaluate.sources import (
 )
 from gsencoder.fusion.folder import heads_beside, load_features
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.fusion.measured_heads import find_head, heads_of, load_heads
+from gsencoder.fusion.measured_heads import find_head, load_heads
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.load import file_of_encoder, load_encoder
 from gsencoder.infer.localize import LocalizeConfig
-from gsencoder.teachers.build import TeacherConfig, words_of
+from gsencoder.teachers.build import TeacherConfig, load_teacher_heads, words_of
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, stating_trained, words_of_table
 from gsencoder.types import QueryMemory, Scene
@@ -161,7 +161,7 @@ def source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
         encoder = load_encoder(config.weights, config.encode.device)
         source = encoder_source(encoder, config.encode, config.space or heads.space.name)
         return head_source(source, heads, head, words.space.text_encoder), words
-    (measured_head,) = heads_of(config.teacher, [config.head], "head")
+    (measured_head,) = load_teacher_heads(config.teacher, [config.head], "head")
     words = words_of_head(measured_head, table, config.text)
     return fused_head_source(config.teacher, measured_head, words.space.text_encoder, config.fusion), words
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.fusion.adapter_heads import TEXT_KINDS, Head, text_kind
 from gsencoder.fusion.folder import HEADS_FILE
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, find_head, head_features, load_heads
 from gsencoder.infer.localize import select_features
+from gsencoder.teachers.adapter_heads import TEXT_KINDS, Head, text_kind
 from gsencoder.text.models import TransformersTower
 from gsencoder.text.table import TextTable, TextTower, load_text_table
 from gsencoder.text.vocabulary import (

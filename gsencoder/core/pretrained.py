@@ -11,8 +11,6 @@ from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gsencoder.core.errors import InputError, SceneWarning, advised, listed, readable
 from gsencoder.core.files import check_foreign, open_foreign, read_foreign_text
 
@@ -38,11 +36,7 @@ POINTER = b"version https://git-lfs"
 
 
 def check_fetched(path: Path) -> None:
-    """Checks that a file is not the pointer that git keeps in the place of a large one.
-
-    Raises:
-        InputError: it is, or cannot be read.
-    """
+    """Checks that a file is not the pointer that git keeps in the place of a large one."""
     with readable(path), open_foreign(path) as stream:
         if stream.read(len(POINTER)) == POINTER:
             raise InputError(f"{path}: is a pointer of git-lfs and not the file itself; fetch it with git lfs pull")
@@ -53,11 +47,8 @@ def find_file(name: str, option: str, *, folder: bool = False) -> Path:
 
     Args:
         name: a path, or a bare file name.
-        option: name of the option, for the error.
+        option: that gives it, for the error.
         folder: whether to look for a folder, for models of several files.
-
-    Raises:
-        InputError: none of them exists, or what is installed is damaged.
     """
     models = os.environ.get(MODELS_VARIABLE, "")
     tried = [Path(name)]
@@ -74,22 +65,14 @@ def find_file(name: str, option: str, *, folder: bool = False) -> Path:
 
 @cache
 def check_installed() -> None:
-    """Checks the files in INSTALLED_MODELS, once a process.
-
-    Raises:
-        InputError: one is missing or damaged.
-    """
+    """Checks that the files in INSTALLED_MODELS are there and undamaged, once a process."""
     for name, digest in INSTALLED_DIGESTS.items():
         _check_digest(INSTALLED_MODELS / name, digest, "gsencoder")
 
 
 @cache
 def sentence_encoder_graph() -> Path:
-    """The graph that belongs to the folder SENTENCE_ENCODER, checked once a process.
-
-    Raises:
-        InputError: its distribution is not installed, or the file is missing or damaged.
-    """
+    """The graph that belongs to the folder SENTENCE_ENCODER, checked once a process."""
     try:
         path = Path(str(distribution(GRAPH_REQUIREMENT.partition("==")[0]).locate_file(GRAPH_FILE)))
     except PackageNotFoundError as error:
@@ -112,11 +95,7 @@ def _check_digest(path: Path, expected: str, requirement: str) -> None:
 
 
 def digest_files(*files: Path, settings: object = None) -> str:
-    """A fingerprint of the contents of files, in this order, and of settings; 16 hexadecimal digits.
-
-    Raises:
-        InputError: one cannot be read.
-    """
+    """A fingerprint of the contents of files, in this order, and of settings; 16 hexadecimal digits."""
     digest = hashlib.sha256(b"" if settings is None else repr(settings).encode("utf-8", "backslashreplace"))
     for path in files:
         with readable(path), open_foreign(path) as stream:
@@ -133,33 +112,24 @@ UNREADABLE = (ImportError, OSError, ValueError, RuntimeError, KeyError, Attribut
 VOCABULARIES = ("tokenizer.json", "vocab.txt", "vocab.json", "*.model", "*.tiktoken")
 
 
-def load_pretrained(
-    loader: Any,
-    folder: Path,
-    subject: str,
-    *,
-    other_parts: str = "warn",
-    known_parts: Sequence[str] = (),
-    **options: Any,
-) -> Any:
+ANY = ("",)
+"""Prefixes that all keys of weights have."""
+
+
+def load_pretrained(loader: Any, folder: Path, subject: str, *, ignored: Sequence[str] = (), **options: Any) -> Any:
     """A model with exactly the weights of a folder, in evaluation mode and in float32.
 
     Args:
         loader: a class of transformers with `from_pretrained`.
         folder: with `config.json` and safetensors files.
         subject: who loads it, for messages.
-        other_parts: what is done about weights of modules that the class does not have, such as the other tower of a
-            joint model: "warn" or "ignore".
-        known_parts: what keys of weights begin with that are read from the same files by other means, and need no
-            warning.
+        ignored: prefixes of weights of modules that the class does not have, such as the other tower of a joint model,
+            which need no warning.
         options: further arguments of `from_pretrained`.
 
     Raises:
         InputError: the folder holds no model of that class, or weights that do not fit its configuration or are not
             finite.
-
-    Warns:
-        SceneWarning: weights of other modules are not used, with `other_parts="warn"`.
     """
     weight_files(folder, subject)
     with _readable(folder, subject):
@@ -167,16 +137,13 @@ def load_pretrained(
 
         # transformers would take the type of the files, in which pictures of float32 do not fit every layer.
         model, report = _from_pretrained(loader, str(folder), use_safetensors=True, dtype=torch.float32, **options)
-    report["unexpected_keys"] = [key for key in report["unexpected_keys"] if not key.startswith(tuple(known_parts))]
-    _check_keys(folder, model, report, subject, other_parts)
-    _check_finite(folder, model, subject)
-    return model.eval()
+    return _checked(folder, model, report, subject, ignored)
 
 
 def load_part(loader: Any, config: Any, folder: Path, weight: str, subject: str) -> tuple[Any, list[Path]]:
-    """A part of the model of a folder, such as the vision tower of a vision-language model, with exactly its weights.
+    """A part of the model of a folder, such as the tower of a vision-language model, and the files of its weights.
 
-    No other weights are read. The part is in evaluation mode and in float32.
+    No other weights are read.
 
     Args:
         loader: a class of transformers with `from_pretrained`.
@@ -185,13 +152,6 @@ def load_part(loader: Any, config: Any, folder: Path, weight: str, subject: str)
         weight: name of one of the part's weights within the part; the rest of its name in the files is the prefix of
             the part.
         subject: who loads it, for messages.
-
-    Returns:
-        The part, and the files that hold weights of it.
-
-    Raises:
-        InputError: the files hold no such part or several, or weights that do not fit its configuration or are not
-            finite.
     """
     files = weight_files(folder, subject)
     with _readable(folder, subject):
@@ -213,17 +173,11 @@ def load_part(loader: Any, config: Any, folder: Path, weight: str, subject: str)
                     if name.startswith(prefixes[0]):
                         weights[name.removeprefix(prefixes[0])] = opened.get_tensor(name)
         model, report = _from_pretrained(loader, None, config=config, state_dict=weights, dtype=torch.float32)
-    _check_keys(folder, model, report, subject, "warn")
-    _check_finite(folder, model, subject)
-    return model.eval(), used
+    return _checked(folder, model, report, subject, ()), used
 
 
 def weight_files(folder: Path, subject: str) -> list[Path]:
-    """The safetensors files of a folder.
-
-    Raises:
-        InputError: there are none, or not all that the index names.
-    """
+    """The safetensors files of a folder: all that the index names, at least one."""
     index = folder / INDEX_FILE
     if index.is_file():
         try:
@@ -254,7 +208,7 @@ def _check_files(folder: Path) -> None:
 
 
 def _from_pretrained(loader: Any, source: str | None, **options: Any) -> tuple[Any, dict[str, Any]]:
-    """A model and the report of which of its weights were there."""
+    """A model and the report of which of its weights the files have."""
     with quiet_transformers():
         # Sizes that do not match are reported with the keys that do not, instead of an error that names none.
         model, report = loader.from_pretrained(
@@ -286,11 +240,8 @@ def _readable(folder: Path, subject: str) -> Iterator[None]:
 
 
 def read_config(folder: Path, subject: str) -> Any:
-    """The configuration of the model in a folder.
-
-    Raises:
-        InputError: transformers is missing, or does not know the model without the folder's own code.
-    """
+    """The configuration of the model in a folder; InputError where transformers does not know the model without the
+    folder's own code."""
     _check_files(folder)
     try:
         from transformers import AutoConfig
@@ -313,29 +264,9 @@ def _unreadable(folder: Path, subject: str, error: Exception) -> InputError:
     return InputError(f"{subject}: {folder} holds no model that transformers reads: {message[:160]}")
 
 
-def _check_finite(folder: Path, model: Any, subject: str) -> None:
-    """Kernels of attention may turn weights that are not finite into features that are, and wrong."""
-    broken = [name for name, value in model.named_parameters() if not value.isfinite().all()]
-    if broken:
-        raise InputError(
-            f"{subject}: {folder}: {len(broken)} weights are not finite ({listed(broken, 3)}); the files are damaged, "
-            "or the model's training diverged; get them again"
-        )
-
-
 def load_companion(loader: Any, folder: Path, subject: str, noun: str, **options: Any) -> Any:
-    """What belongs to the model of a folder, such as its tokenizer or its preprocessing.
-
-    Args:
-        loader: a class of transformers with `from_pretrained`.
-        folder: of the model.
-        subject: who loads it, for messages.
-        noun: what it is, for messages.
-        options: further arguments of `from_pretrained`.
-
-    Raises:
-        InputError: transformers cannot read it.
-    """
+    """What belongs to the model of a folder, such as its tokenizer or its preprocessing, which `noun` calls in
+    messages."""
     _check_files(folder)
     try:
         with quiet_transformers():
@@ -346,11 +277,7 @@ def load_companion(loader: Any, folder: Path, subject: str, noun: str, **options
 
 
 def load_tokenizer(folder: Path, subject: str, **options: Any) -> Any:
-    """The tokenizer of a folder; arguments are those of `load_companion`.
-
-    Raises:
-        InputError: the folder holds no vocabulary, or transformers cannot read it.
-    """
+    """The tokenizer of a folder; arguments are those of `load_companion`."""
     # Without any vocabulary transformers makes a tokenizer that knows nothing.
     if not any(path for pattern in VOCABULARIES for path in folder.glob(pattern)):
         raise InputError(f"{subject}: {folder}: the tokenizer is missing; expected tokenizer.json beside the model")
@@ -376,53 +303,53 @@ def quiet_transformers() -> Iterator[None]:
             logging.enable_progress_bar()
 
 
-def _check_keys(folder: Path, model: Any, report: Mapping[str, Any], subject: str, other_parts: str) -> None:
-    """Whether the files hold exactly the weights of the model: transformers fills what is missing with random ones, and
-    drops layers that the configuration does not have."""
+def _checked(folder: Path, model: Any, report: Mapping[str, Any], subject: str, ignored: Sequence[str]) -> Any:
+    """The model for evaluation, if the files hold exactly its weights, and these are finite.
+
+    transformers fills what is missing with random weights, and drops layers that the configuration does not have.
+    Kernels of attention may turn weights that are not finite into features that are, and wrong.
+    """
     modules = {name.partition(".")[0] for name in model.state_dict()}
-    unused = sorted(report["unexpected_keys"])
-    surplus = [name for name in unused if name.partition(".")[0] in modules]
-    reshaped = sorted(str(entry[0]) for entry in report["mismatched_keys"])
+    unused = sorted(key for key in report["unexpected_keys"] if not key.startswith(tuple(ignored)))
     for names, problem in (
         (sorted(report["missing_keys"]), "are missing"),
-        (reshaped, "have other shapes than the configuration says"),
-        (surplus, "belong to layers that the configuration does not have"),
+        (sorted(str(entry[0]) for entry in report["mismatched_keys"]), "have other shapes than the configuration says"),
+        (
+            sorted(key for key in report["unexpected_keys"] if key.partition(".")[0] in modules),
+            "belong to layers that the configuration does not have",
+        ),
     ):
         if names:
             raise InputError(
                 f"{subject}: {folder}: the weights do not fit the configuration: {len(names)} {problem} "
                 f"({listed(names, 3)}); expected config.json and weights of one model"
             )
-    if unused and other_parts == "warn":
+    if unused:
         warnings.warn(
             f"{subject}: {folder}: {len(unused)} weights that are no part of the backbone are not used: "
             f"{listed(unused, 3)}",
             SceneWarning,
             stacklevel=4,
         )
+    broken = [name for name, value in model.named_parameters() if not value.isfinite().all()]
+    if broken:
+        raise InputError(
+            f"{subject}: {folder}: {len(broken)} weights are not finite ({listed(broken, 3)}); the files are damaged, "
+            "or the model's training diverged; get them again"
+        )
+    return model.eval()
 
 
 SILENT = 4
 """Severity from which onnxruntime prints: errors of loading and running become ours, in one line."""
 
 
-def open_session(path: Path, subject: str, *, threads: int = 0) -> Any:
-    """A session for a file of the user.
-
-    Args:
-        path: of the .onnx file.
-        subject: who loads it, for the message.
-        threads: of onnxruntime; 0 = its own choice.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
+def open_session(path: Path, subject: str) -> Any:
+    """A session of onnxruntime for a file of the user, on the CPU."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = SILENT
-    if threads:
-        options.intra_op_num_threads = threads
     with readable(path):
         check_foreign(path)
     try:
@@ -431,45 +358,3 @@ def open_session(path: Path, subject: str, *, threads: int = 0) -> Any:
         check_fetched(path)
         message = " ".join(str(error).replace(str(path), path.name).split())[:120]
         raise InputError(f"{subject}: {path} is no model that onnxruntime reads: {message}") from error
-
-
-def choose_tensors(session: Any, input_name: str, output_name: str, subject: str, advice: str = "") -> tuple[str, str]:
-    """The names of an input and an output of a session: those given, else the first ones.
-
-    Args:
-        session: of a file.
-        input_name: empty = the first.
-        output_name: empty = the first.
-        subject: who asks, and which file, for the message.
-        advice: ends the message.
-
-    Raises:
-        InputError: the file has no tensors of these names.
-    """
-    inputs, outputs = ([tensor.name for tensor in side()] for side in (session.get_inputs, session.get_outputs))
-    chosen_input = input_name or (inputs[0] if inputs else "")
-    chosen_output = output_name or (outputs[0] if outputs else "")
-    if chosen_input not in inputs or chosen_output not in outputs:
-        raise InputError(
-            f"{subject} has inputs {inputs} and outputs {outputs}, not {chosen_input!r} and {chosen_output!r}{advice}"
-        )
-    return chosen_input, chosen_output
-
-
-def run_on_picture(session: Any, tensors: tuple[str, str], picture: np.ndarray, subject: str) -> Any:
-    """The output of a session for one picture.
-
-    Args:
-        session: of a file.
-        tensors: names of its input and its output.
-        picture: the input, with its batch axis.
-        subject: who asks, and which file, for the message.
-
-    Raises:
-        InputError: it does not run.
-    """
-    try:
-        return session.run([tensors[1]], {tensors[0]: np.ascontiguousarray(picture)})[0]
-    except Exception as error:  # onnxruntime raises its own classes, which share only this base
-        message = " ".join(str(error).split())[:200]
-        raise InputError(f"{subject} does not run on a picture {list(picture.shape)}: {message}") from error

@@ -23,7 +23,6 @@ from gsencoder.data.labels.mesh import nearest_rows
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.errors import sample_cells
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
@@ -33,6 +32,7 @@ from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.load import Encoder
 from gsencoder.infer.relevancy import relevancy
 from gsencoder.render import blend
+from gsencoder.teachers.adapter_heads import Head
 from gsencoder.teachers.build import TeacherConfig, build_teacher
 from gsencoder.text.table import TextEncoder, TextTable, check_space
 from gsencoder.text.vocabulary import Words

@@ -27,21 +27,18 @@ from torch import Tensor
 from gsencoder.core.archive import Archive, open_archive, write_archive
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, about
-from gsencoder.fusion.adapter_heads import (
+from gsencoder.fusion.basis import to_coordinates
+from gsencoder.fusion.errors import WORST, CellSample
+from gsencoder.fusion.folder import check_heads_space, read_heads_space
+from gsencoder.teachers.adapter_heads import (
     PARTS,
     TEXT_KINDS,
     Head,
     default_part,
     describe_layers,
     read_layers,
-    read_radio_heads,
     split_name,
 )
-from gsencoder.fusion.basis import to_coordinates
-from gsencoder.fusion.errors import WORST, CellSample
-from gsencoder.fusion.folder import check_heads_space, read_heads_space
-from gsencoder.teachers.build import TeacherConfig
-from gsencoder.teachers.radio import RadioConfig, check_radio, radio_folder
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 CHUNK = 4096
@@ -271,37 +268,6 @@ def head_tokens(tokens: Float[Tensor, "V tokens D"], head: MeasuredHead) -> Floa
     """
     outputs = head_outputs(head.head, tokens.reshape(-1, tokens.shape[-1]).float().numpy())
     return torch.from_numpy(outputs).reshape(*tokens.shape[:-1], head.channels)
-
-
-def stored_heads(config: TeacherConfig) -> tuple[str, ...]:
-    """The names of the heads that are stored beside a teacher's features (teacher.heads=)."""
-    return config.heads if isinstance(config, RadioConfig) else ()
-
-
-def heads_of(config: TeacherConfig, names: Sequence[str], option: str = "heads") -> list[Head]:
-    """Adapter heads of a teacher.
-
-    Args:
-        config: of the teacher.
-        names: of the heads; see `gsencoder.fusion.adapter_heads`.
-        option: of the command, for errors.
-
-    Raises:
-        InputError: the teacher has no heads, or none of these names, or they cannot be read.
-    """
-    if not names:
-        return []
-    for name in names:
-        if name.endswith((".safetensors", ".onnx")) or "/" in name or Path(name).is_file():
-            raise InputError(
-                f"{option}={name}: expected names of the teacher's adapter heads, such as siglip or sam.features; "
-                "they are read from the folder of teacher.model=, and their statistics are computed, so no file is "
-                "given"
-            )
-    if not isinstance(config, RadioConfig):
-        raise InputError(f"{option}={names[0]}: teacher={config.name} has no adapter heads; teacher=radio has some")
-    folder = radio_folder(config)
-    return read_radio_heads(folder, names, check_radio(folder))
 
 
 def save_heads(path: Path, heads: HeadSet) -> None:

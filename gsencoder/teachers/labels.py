@@ -2,40 +2,68 @@
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Int32, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.teachers.base import MissingInput
-from gsencoder.teachers.captions import codes_of
-from gsencoder.types import FeatureMap, FeatureSpace, SceneObject, Views
+from gsencoder.core.settings import option
+from gsencoder.teachers.base import MissingInput, Teacher, TeacherSettings
+from gsencoder.teachers.pictures import photograph
+from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.text.vocabulary import OpenVocabulary, Words, closed_table
+from gsencoder.types import FeatureMap, FeatureSpace, Scene, SceneObject, Views
+
+
+def codes_of(labels: Int32[np.ndarray, "H W"], row_of: dict[int, int]) -> Int32[np.ndarray, "H W"]:
+    """For each pixel the row of its label, −1 for labels without one."""
+    if not row_of:
+        return np.full(labels.shape, -1, np.int32)
+    known = np.array(sorted(row_of), np.int32)
+    rows = np.array([row_of[int(label)] for label in known], np.int32)
+    nearest = np.searchsorted(known, labels).clip(max=len(known) - 1)
+    return np.where(known[nearest] == labels, rows[nearest], np.int32(-1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LabelsConfig:
+class LabelsConfig(TeacherSettings):
     """Settings of the labels teacher."""
 
-    name: Literal["labels"] = "labels"
-    words: str = field(
-        default="clip_vitb32_names.npz",
-        metadata={
-            "help": "text table of the names; a bare name is also looked for in GSENCODER_MODELS; this one is installed"
-        },
-    )
+    per_scene = True
+    needs_labels = True
 
-    cell: int = field(
-        default=1,
-        metadata={"help": "pixels along a cell; above 1 its vectors are averaged, as a teacher with patches sees them"},
+    name: Literal["labels"] = "labels"
+    words: str = option(
+        "clip_vitb32_names.npz",
+        "text table of the names; a bare name is also looked for in GSENCODER_MODELS; this one is installed",
+    )
+    cell: int = option(
+        1, "pixels along a cell; above 1 its vectors are averaged, as a teacher with patches sees them", ge=1
     )
 
     def __post_init__(self) -> None:
+        TeacherSettings.__post_init__(self)
         if not self.words:
             raise InputError("words: the labels teacher needs a text table of its names")
-        if self.cell < 1:
-            raise InputError(f"cell: expected at least 1 pixel, got {self.cell}")
+
+    def build(self, scene: Scene, words: Words | None) -> Teacher:
+        assert words is not None
+        if isinstance(words, OpenVocabulary):
+            words = words.including(sorted({o.name for o in scene.objects if o.name is not None}))
+        table = closed_table(words)
+        return LabelsTeacher(
+            scene.objects,
+            table.names,
+            table.embeddings,
+            text_encoder=table.space.text_encoder,
+            mean=table.mean,
+            cell=self.cell,
+        )
+
+    def refuse_text(self) -> str:
+        return ""
 
 
 class LabelsTeacher:
@@ -59,7 +87,7 @@ class LabelsTeacher:
         mean: Float32[np.ndarray, " D"] | None = None,
         cell: int = 1,
     ) -> None:
-        """Makes the scene's table.
+        """Makes the scene's table; MissingInput without objects, InputError for a name that the table lacks.
 
         Args:
             objects: which instance value has which name.
@@ -68,10 +96,6 @@ class LabelsTeacher:
             text_encoder: what made these.
             mean: of the text side, which "other" points along; None = that of the table.
             cell: pixels along the side of a cell of the maps.
-
-        Raises:
-            MissingInput: no objects.
-            InputError: a name that the table lacks.
         """
         if not objects:
             raise MissingInput(
@@ -105,12 +129,7 @@ class LabelsTeacher:
         self._code = {o.id: self.names.index(o.name) for o in objects if o.name is not None}
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """Codes at image resolution, or vectors on a grid of cells.
-
-        Raises:
-            MissingInput: the scene has no instance maps.
-            InputError: an instance map is smaller than a cell.
-        """
+        """Codes at image resolution, or vectors on a grid of cells."""
         if views.instances is None:
             raise MissingInput("teacher labels: the scene has no instance maps (instance_file_path in transforms.json)")
         instances = views.instances[view]
@@ -149,19 +168,25 @@ _PROTOTYPES: dict[str, tuple[tuple[int, int, int], ...]] = {
 COLOR_NAMES = tuple(_PROTOTYPES)
 
 
+SOFTNESS = 12.0
+"""Distance in L*a*b* over which one name gives way to another."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PaletteConfig:
+class PaletteConfig(TeacherSettings):
     """Settings of the palette teacher."""
 
     name: Literal["palette"] = "palette"
-    cell: int = field(default=2, metadata={"help": "pixels along the side of a cell, averaged before naming"})
-    softness: float = field(default=12.0, metadata={"help": "L*a*b* distance over which one name gives way to another"})
+    cell: int = option(2, "pixels along the side of a cell, averaged before naming", ge=1)
 
-    def __post_init__(self) -> None:
-        if self.cell < 1:
-            raise InputError(f"cell: expected at least 1 pixel, got {self.cell}")
-        if not 1e-3 <= self.softness <= 1e6:
-            raise InputError(f"softness: expected a distance from 0.001 to 1e6, got {self.softness}")
+    def build(self, scene: Scene, words: Words | None) -> Teacher:  # noqa: ARG002
+        return PaletteTeacher(self)
+
+    def text_table(self) -> TextTable:
+        return make_text_table(COLOR_NAMES, np.eye(len(COLOR_NAMES), dtype=np.float32), "palette-11")
+
+    def refuse_text(self) -> str:
+        return "text=: teacher=palette has the words of its eleven colors; leave out text="
 
 
 def lab_from_rgb(rgb: UInt8[np.ndarray, "*n 3"]) -> Float32[np.ndarray, "*n 3"]:
@@ -190,12 +215,12 @@ class PaletteTeacher:
 
     def __init__(self, config: PaletteConfig = PaletteConfig()) -> None:
         """Prepares the prototypes of each name."""
-        self.cell, self.softness = cell, softness = config.cell, config.softness
+        self.cell = cell = config.cell
         self.space = FeatureSpace(
             name="palette-11",
             channels=len(COLOR_NAMES),
             teacher="palette",
-            preprocessing=f"mean of {cell}×{cell} pixels, softness {softness:g} in L*a*b*",
+            preprocessing=f"mean of {cell}×{cell} pixels, softness {SOFTNESS:g} in L*a*b*",
             text_encoder="palette-11",
         )
         lab = [lab_from_rgb(np.array(colors, np.uint8)) for colors in _PROTOTYPES.values()]
@@ -203,15 +228,8 @@ class PaletteTeacher:
         self._owner = np.repeat(np.arange(len(lab)), [len(part) for part in lab])
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """Color-name shares on a grid of cells; pixels over the last whole cell are left out.
-
-        Raises:
-            MissingInput: the scene has no pictures.
-            InputError: one of them is smaller than a cell.
-        """
-        if views.images is None:
-            raise MissingInput("teacher palette: the scene has no pictures")
-        image, cell = views.images[view], self.cell
+        """Color-name shares on a grid of cells; pixels over the last whole cell are left out."""
+        image, cell = photograph(views, view, "teacher palette"), self.cell
         h, w = image.shape[0] // cell, image.shape[1] // cell
         if h == 0 or w == 0:
             raise InputError(f"teacher palette: view {views.names[view]} is smaller than a cell of {cell} pixels")
@@ -231,9 +249,9 @@ class PaletteTeacher:
         for center, owner in zip(self._centers, self._owner, strict=True):
             distance = (lightness - center[0]) ** 2 + (a - center[1]) ** 2 + (b - center[2]) ** 2
             np.minimum(nearest[owner], distance, out=nearest[owner])
-        score = -np.ascontiguousarray(nearest.T) / (2 * self.softness**2)
+        score = -np.ascontiguousarray(nearest.T) / (2 * SOFTNESS**2)
         score = np.exp(score - score.max(axis=1, keepdims=True))
         return (score / score.sum(axis=1, keepdims=True)).astype(np.float32)
 
     def settings(self) -> dict[str, Any]:
-        return {"name": "palette", "cell": self.cell, "softness": self.softness}
+        return {"name": "palette", "cell": self.cell, "softness": SOFTNESS}

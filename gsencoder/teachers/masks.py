@@ -1,33 +1,35 @@
-"""Masks of regions: for each pixel of a view the number of its region, from files or from the scene's instance maps.
+"""Masks of regions: for each pixel of a view the number of its region, from files, instance maps, or a SAM model.
 
-Masks of a SAM or SAM2 model of transformers, prompted with a grid of points (Kirillov et al., Segment Anything).
-
-For each point the model gives three masks with the IoU that it predicts of each. Masks stay whose predicted IoU and
-whose stability are large enough; of two that overlap too much the one with the larger predicted IoU stays. What still
-overlaps, as a mug and the table under it, is painted with the smaller mask on top.
+SAM and SAM2 of transformers are prompted with a grid of points (Kirillov et al., Segment Anything). For each point the
+model gives three masks with the IoU that it predicts of each. Masks stay whose predicted IoU and whose stability are
+large enough; of two that overlap too much the one with the larger predicted IoU stays. Where masks still overlap, as a
+mug and the table under it, the smaller one is on top.
 """
 
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Int32, UInt8
 from PIL import Image
+from torch.nn.functional import interpolate
 
+from gsencoder.core.device import choose_device, enough_memory
 from gsencoder.core.errors import InputError
-from gsencoder.core.pretrained import digest_files, find_file, load_companion, load_pretrained, read_config
+from gsencoder.core.pretrained import ANY, digest_files, find_file, load_companion, load_pretrained, read_config
 from gsencoder.core.process import Device
 from gsencoder.data.readers.label_images import LABEL_SUFFIXES, label_files
 from gsencoder.teachers.base import MissingInput
-from gsencoder.teachers.onnx import normalized
-from gsencoder.teachers.tower import read_preprocessing
+from gsencoder.teachers.pictures import photograph, read_preprocessing
 from gsencoder.types import Scene, Views
 from gsencoder.types.orientation import turned
 
+WHAT = "teacher regions"
 ENDINGS = tuple(ending for suffix in LABEL_SUFFIXES for ending in (suffix, suffix.upper()))
 """Of label images, as cameras and people write them."""
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".ppm")
@@ -64,11 +66,6 @@ class InstanceMasks:
     cheap = True
 
     def __init__(self, scene: Scene) -> None:
-        """Checks that there are some.
-
-        Raises:
-            MissingInput: there are none.
-        """
         if scene.views is None or scene.views.instances is None:
             raise MissingInput(
                 "teacher regions: masks=instances: the scene has no instance maps (instance_file_path in "
@@ -77,13 +74,8 @@ class InstanceMasks:
         self._instances = scene.views.instances
 
     def labels(self, views: Views, view: int) -> Int32[np.ndarray, "H W"]:
-        """The instance map of a view.
-
-        Raises:
-            InputError: there is none, or it cannot be read.
-        """
-        if views.instances is None:
-            raise MissingInput("teacher regions: masks=instances: the scene has no instance maps")
+        """The instance map of a view."""
+        assert views.instances is not None
         return views.instances[view]
 
     def settings(self) -> dict[str, Any]:
@@ -100,16 +92,7 @@ class FileMasks:
     cheap = True
 
     def __init__(self, scene: Scene, folder: str) -> None:
-        """Finds the file of each view.
-
-        Args:
-            scene: whose views.
-            folder: see `scene_path`.
-
-        Raises:
-            MissingInput: no such folder beside the scene.
-            InputError: no folder is named or there, files that are missing, or several for one view.
-        """
+        """Finds the file of each view in a folder; see `scene_path`."""
         if not folder:
             raise InputError(
                 "teacher.folder= is missing: the folder of label images, one a view; or give "
@@ -126,11 +109,7 @@ class FileMasks:
         self._orientations = scene.views.orientations
 
     def labels(self, views: Views, view: int) -> Int32[np.ndarray, "H W"]:
-        """The label image of a view.
-
-        Raises:
-            InputError: it cannot be read, or has another size than the photograph.
-        """
+        """The label image of a view."""
         row = self._row_of[views.names[view]]
         labels: Int32[np.ndarray, "H W"] = self._files[row]
         # Files lie as photographs are stored; upright views have no orientations.
@@ -143,16 +122,16 @@ class FileMasks:
 
 
 def scene_path(scene: Scene, name: str, option: str) -> Path:
-    """A file or folder beside a scene: in the scene's folder, else at the path itself.
+    """A file or folder of a scene: in the scene's folder, else at the path itself.
 
     Raises:
         MissingInput: there is none, and the name is relative, so that other scenes may have one.
         InputError: there is none at an absolute path, or the name stands for both.
     """
-    beside = scene.folder / name if scene.folder is not None and not Path(name).is_absolute() else None
-    existing = [path for path in (beside, Path(name)) if path is not None and path.exists()]
+    inside = scene.folder / name if scene.folder is not None and not Path(name).is_absolute() else None
+    existing = [path for path in (inside, Path(name)) if path is not None and path.exists()]
     if not existing:
-        tried = " or ".join(str(path) for path in (beside, Path(name)) if path is not None)
+        tried = " or ".join(str(path) for path in (inside, Path(name)) if path is not None)
         absent = InputError if Path(name).is_absolute() else MissingInput
         raise absent(f"{option}: nothing at {tried}")
     if len(existing) == 2 and not existing[0].samefile(existing[1]):
@@ -171,11 +150,7 @@ def view_stem(name: str) -> PurePosixPath:
 
 def label_paths(folder: Path, names: Sequence[str]) -> list[Path]:
     """The label image of each view: called like the view, with another ending; the folders of a view's name may be left
-    out where the rest is the name of no other view.
-
-    Raises:
-        InputError: views have no file, or several.
-    """
+    out where the rest is the name of no other view."""
     stems = [view_stem(name) for name in names]
     count = Counter(stem.name for stem in stems)
     paths: list[Path] = []
@@ -211,161 +186,6 @@ def label_paths(folder: Path, names: Sequence[str]) -> list[Path]:
     return paths
 
 
-LARGEST_SIDE = 8192
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OnnxRegionOptions:
-    """How pictures are given to the .onnx file of an image tower, and how its output is read."""
-
-    input: str = field(default="", metadata={"help": "input tensor [B,3,H,W]; empty = the model's first"})
-    output: str = field(default="", metadata={"help": "output tensor; empty = the model's first"})
-    layout: Literal["tokens", "grid"] = field(
-        default="tokens", metadata={"help": "vector=map: output as [B, T, D] tokens or as [B, D, h, w] grid"}
-    )
-    skip_tokens: int = field(default=0, metadata={"help": "vector=map: leading tokens that are no patches"})
-    patch: int = field(default=14, metadata={"help": "vector=map: pixels of the resized picture in a cell"})
-    size: int = field(
-        default=0,
-        metadata={
-            "help": "pixels along the longer side of the picture (map), or the side of a square crop (crop; a model of "
-            "a fixed size has its own); 0 = 448 and 224"
-        },
-    )
-    scale: float = field(default=255.0, metadata={"help": "8-bit values are divided by this, then mean and std apply"})
-    mean: tuple[float, ...] = field(default=(0.485, 0.456, 0.406), metadata={"help": "subtracted per channel"})
-    std: tuple[float, ...] = field(default=(0.229, 0.224, 0.225), metadata={"help": "divided per channel"})
-    threads: int = field(default=0, metadata={"help": "onnxruntime threads; 0 = its own choice"})
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("skip_tokens", 0, 1_000_000),
-            ("patch", 1, LARGEST_SIDE),
-            ("size", 0, LARGEST_SIDE),
-            ("threads", 0, 1024),
-        ):
-            if not low <= getattr(self, name) <= high:
-                raise InputError(f"{name}: expected a whole number from {low} to {high}, got {getattr(self, name)}")
-        if not 1e-6 <= self.scale <= 1e6:
-            raise InputError(f"scale: expected a number from 1e-6 to 1e6, got {self.scale}")
-        for name, least in (("mean", -1e6), ("std", 1e-6)):
-            values = getattr(self, name)
-            if len(values) != 3 or not all(least <= value <= 1e6 for value in values):
-                raise InputError(f"{name}: expected three numbers, one a channel, got {list(values)}")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RegionsConfig:
-    """Where masks of regions come from, and what vector each region gets."""
-
-    name: Literal["regions"] = "regions"
-    masks: Literal["files", "instances", "sam"] = field(
-        default="files",
-        metadata={
-            "help": "files = label images in teacher.folder=; instances = the instance maps of the scene; sam = masks "
-            "of a SAM model, teacher.sam="
-        },
-    )
-    folder: str = field(
-        default="",
-        metadata={
-            "help": "masks=files: folder of label images, one a view, called like the photograph but with .png, .npy "
-            "or .safetensors; looked for in the scene's folder, then as a path"
-        },
-    )
-    vector: Literal["captions", "map", "crop"] = field(
-        default="captions",
-        metadata={
-            "help": "captions = the text vector of each region's caption or name; map = the mean of teacher.model's "
-            "dense features over the region; crop = teacher.model's pooled vector of the region's box"
-        },
-    )
-    captions: str = field(
-        default="",
-        metadata={
-            "help": 'vector=captions: a JSON file, {"label": "caption"} or {"view": {"label": "caption"}}; empty = '
-            "captions.json in the folder of the masks, or with masks=instances the names of the scene's objects"
-        },
-    )
-    rest: Literal["none", "mean"] = field(
-        default="mean",
-        metadata={
-            "help": "vector=captions: what pixels without a captioned region are: mean = something else, the direction "
-            "of the text side's mean; none = nothing is known of them, they have no feature"
-        },
-    )
-    words: str = field(
-        default="", metadata={"help": "text table that leads into the space, or has the captions, if no text= is given"}
-    )
-    model: str = field(
-        default="",
-        metadata={
-            "help": "image tower of vector=map and vector=crop: an .onnx file, or a folder of a model for transformers "
-            "(map: a vision tower or RADIO; crop: CLIP, SigLIP or another with a pooled output); also looked for in "
-            "GSENCODER_MODELS"
-        },
-    )
-    joint: bool = field(
-        default=False,
-        metadata={
-            "help": "the image tower is the image side of the joint model that text= is the text side of; with "
-            "vector=crop a folder of CLIP or SigLIP says so itself"
-        },
-    )
-    around: Literal["picture", "nothing"] = field(
-        default="picture",
-        metadata={"help": "vector=crop: what of the box is not in the region: the photograph as it is, or plain gray"},
-    )
-    min_area: int = field(
-        default=64,
-        metadata={"help": "vector=map and crop, and masks=sam: smallest number of pixels of a region in a view"},
-    )
-    sam: str = field(
-        default="",
-        metadata={"help": "folder of a SAM model for transformers; also looked for in GSENCODER_MODELS"},
-    )
-    points: int = field(default=32, metadata={"help": "masks=sam: points a side of the grid that prompts it"})
-    min_iou: float = field(default=0.88, metadata={"help": "masks=sam: smallest IoU that the model predicts of a mask"})
-    min_stability: float = field(
-        default=0.95,
-        metadata={"help": "masks=sam: smallest IoU of a mask at logit thresholds of 1 and −1"},
-    )
-    max_overlap: float = field(
-        default=0.7, metadata={"help": "masks=sam: of two masks with a larger IoU the better one stays"}
-    )
-    device: Device = field(default="auto", metadata={"help": "where models of folders run"})
-    onnx: OnnxRegionOptions = field(default_factory=OnnxRegionOptions)
-
-    def __post_init__(self) -> None:
-        if self.vector == "captions" and self.masks == "sam":
-            raise InputError(
-                "vector: captions belong to labels that are known, and masks=sam numbers its masks anew; give "
-                "vector=map or vector=crop, or label images (masks=files)"
-            )
-        if self.folder and self.masks != "files":
-            raise InputError(f"folder: holds label images of masks=files, and masks is {self.masks}")
-        if self.sam and self.masks != "sam":
-            raise InputError(f"sam: makes the masks of masks=sam, and masks is {self.masks}")
-        if self.vector == "captions" and (self.model or self.joint):
-            raise InputError("model, joint: belong to vector=map and vector=crop, and vector is captions")
-        if self.vector != "captions" and self.captions:
-            raise InputError(f"captions: are the vectors of vector=captions, and vector is {self.vector}")
-        if self.vector == "captions" and self.onnx != OnnxRegionOptions():
-            raise InputError("onnx: says how an image tower is run (vector=map or crop), and vector is captions")
-        if self.around != "picture" and self.vector != "crop":
-            raise InputError(f"around: says what crops show (vector=crop), and vector is {self.vector}")
-        if self.rest != "mean" and self.vector != "captions":
-            raise InputError(f"rest: is what has no caption (vector=captions), and vector is {self.vector}")
-        if not 1 <= self.min_area <= 1 << 31:
-            raise InputError(f"min_area: expected a number from 1, got {self.min_area}")
-        if not 1 <= self.points <= 256:
-            raise InputError(f"points: expected 1 to 256 points a side, got {self.points}")
-        for name in ("min_iou", "min_stability", "max_overlap"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"{name}: expected a share in [0, 1], got {getattr(self, name)}")
-
-
-WHAT = "teacher regions"
 SAM, SAM2 = ("sam",), ("sam2", "sam2_video")
 POINTS_AT_ONCE = 32
 STABILITY_OFFSET = 1.0
@@ -374,15 +194,8 @@ STABILITY_OFFSET = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Proposal:
-    """A mask that a model proposes.
-
-    Attributes:
-        top: first row of its box.
-        left: first column.
-        pixels: the mask inside of its box.
-        area: number of its pixels.
-        score: the IoU that the model predicts of it.
-    """
+    """A mask that a model proposes: the pixels of its box, which begins at row `top` and column `left`, how many they
+    are, and the IoU that the model predicts."""
 
     top: int
     left: int
@@ -406,56 +219,52 @@ class _Input:
     columns: int
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SamOptions:
+    """Which masks of a SAM model stay; see `gsencoder.teachers.regions.RegionsConfig`."""
+
+    points: int = 32
+    min_iou: float = 0.88
+    min_stability: float = 0.95
+    max_overlap: float = 0.7
+    min_area: int = 64
+
+
 class SamMasks:
-    """Masks that a model of a folder makes; see `gsencoder.teachers.masks.RegionMasks`."""
+    """Masks that a model of a folder makes."""
 
     needs_images = True
     cheap = False
 
-    def __init__(self, config: RegionsConfig) -> None:
-        """Loads model and preprocessing; nothing is fetched from anywhere.
-
-        Args:
-            config: the folder, and which masks stay.
-
-        Raises:
-            InputError: transformers is missing, or the folder holds no SAM with its preprocessing.
-        """
-        if not config.sam:
+    def __init__(self, model: str, options: SamOptions = SamOptions(), device: Device = "auto") -> None:
+        """Loads model and preprocessing; nothing is fetched from anywhere."""
+        if not model:
             raise InputError("teacher.sam= is missing: the folder of a SAM model, for masks=sam")
-        folder = find_file(config.sam, "teacher.sam", folder=True)
+        folder = find_file(model, "teacher.sam", folder=True)
         kind = read_config(folder, WHAT).model_type
         if kind not in (*SAM, *SAM2):
             raise InputError(f"{WHAT}: {folder} holds a {kind} model, expected sam or sam2")
         import transformers
 
-        from gsencoder.core.device import choose_device
-
-        self.config, self._is_first = config, kind in SAM
+        self.options, self._is_first = options, kind in SAM
         loader = transformers.SamModel if self._is_first else transformers.Sam2Model
         # The published SAM2 is a model of videos, whose memory is no part of one of pictures.
-        model = load_pretrained(loader, folder, WHAT, other_parts="warn" if self._is_first else "ignore")
+        network = load_pretrained(loader, folder, WHAT, ignored=() if self._is_first else ANY)
         if self._is_first:
             self._processor = load_companion(transformers.AutoImageProcessor, folder, WHAT, "preprocessing")
         else:
-            self._side = int(model.config.prompt_encoder_config.image_size)
+            self._side = int(network.config.prompt_encoder_config.image_size)
             # The preprocessing of SAM2 in transformers needs torchvision: a squeeze to a square, and these colors.
             self._colors = read_preprocessing(folder, WHAT)
-        self._device = choose_device(config.device)
-        self._model = model.to(self._device)
+        self._device = choose_device(device)
+        self._model = network.to(self._device)
         self._digest = digest_files(*sorted([*folder.glob("*.safetensors"), *folder.glob("*.json")]))
 
     def labels(self, views: Views, view: int) -> Int32[np.ndarray, "H W"]:
-        """The masks of a photograph, numbered from 1 from the largest to the smallest.
-
-        Raises:
-            InputError: no pictures, or outputs that are not finite.
-        """
-        if views.images is None:
-            raise MissingInput(f"{WHAT}: masks=sam: the scene has no pictures")
-        image = views.images[view]
+        """The masks of a photograph, numbered from 1 from the largest to the smallest."""
+        image = photograph(views, view, f"{WHAT}: masks=sam")
         try:
-            staying = suppress(self.proposals(image), self.config.max_overlap)
+            staying = suppress(self.proposals(image), self.options.max_overlap)
         except (InputError, RuntimeError) as error:
             message = " ".join(str(error).split())[:200]
             advice = "" if isinstance(error, InputError) else "; expected a configuration and weights of one SAM model"
@@ -466,12 +275,7 @@ class SamMasks:
         """All masks of the points of the grid whose predicted IoU, stability and size are large enough, best first.
 
         Masks are made at the resolution of the photograph one at a time, so that memory does not grow with it.
-
-        Raises:
-            InputError: outputs that are not finite.
         """
-        from gsencoder.core.device import enough_memory
-
         prepared = self._prepare(image)
         size = image.shape[0], image.shape[1]
         for score, logits in sorted(self._candidates(prepared), key=lambda candidate: -candidate[0]):
@@ -482,11 +286,7 @@ class SamMasks:
 
     def _candidates(self, prepared: _Input) -> list[tuple[float, Any]]:
         """The masks whose predicted IoU is large enough, as that IoU and logits of the model's own resolution."""
-        import torch
-
-        from gsencoder.core.device import enough_memory
-
-        points = grid_points(self.config.points) * np.array([prepared.columns, prepared.rows], np.float32)
+        points = grid_points(self.options.points) * np.array([prepared.columns, prepared.rows], np.float32)
         candidates: list[tuple[float, Any]] = []
         with torch.inference_mode(), enough_memory(WHAT, "teacher.points="):
             embeddings = self._model.get_image_embeddings(prepared.tensor)
@@ -501,28 +301,22 @@ class SamMasks:
                 scores, masks = outputs.iou_scores[0].flatten().float(), outputs.pred_masks[0].flatten(0, 1).float()
                 if not (torch.isfinite(scores).all() and torch.isfinite(masks).all()):
                     raise InputError("masks or scores of SAM are not finite; check the weights")
-                good = torch.nonzero(scores >= self.config.min_iou)[:, 0]
+                good = torch.nonzero(scores >= self.options.min_iou)[:, 0]
                 # Indexing copies, so that the other masks of the chunk are freed.
                 candidates += zip(scores[good].tolist(), masks[good], strict=True)
         return candidates
 
     def _prepare(self, image: UInt8[np.ndarray, "H W 3"]) -> _Input:
-        import torch
-
         if self._is_first:
             inputs = self._processor(images=Image.fromarray(image), return_tensors="pt")
             rows, columns = inputs["reshaped_input_sizes"][0].tolist()
             return _Input(tensor=inputs["pixel_values"].to(self._device), rows=rows, columns=columns)
         side = self._side
         squeezed = np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BILINEAR))
-        colors = self._colors
-        values = normalized(squeezed, 1 / colors.factor, colors.mean, colors.std).transpose(2, 0, 1)[None]
-        return _Input(tensor=torch.from_numpy(np.ascontiguousarray(values)).to(self._device), rows=side, columns=side)
+        return _Input(tensor=self._colors.tensor(squeezed).to(self._device), rows=side, columns=side)
 
     def _logits_of_picture(self, logits: Any, prepared: _Input, size: tuple[int, int]) -> Float32[np.ndarray, "H W"]:
         """The logits of a mask at the resolution of the picture, without the padding of the input."""
-        from torch.nn.functional import interpolate
-
         values = logits[None, None]
         if self._is_first:
             values = interpolate(values, tuple(prepared.tensor.shape[-2:]), mode="bilinear", align_corners=False)
@@ -532,7 +326,7 @@ class SamMasks:
     def _proposal(self, logits: Float32[np.ndarray, "H W"], score: float) -> Proposal | None:
         mask = logits > 0
         area = int(mask.sum())
-        if area < self.config.min_area or stability(logits) < self.config.min_stability:
+        if area < self.options.min_area or stability(logits) < self.options.min_stability:
             return None
         rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
         top, left = int(rows[0]), int(columns[0])
@@ -541,7 +335,7 @@ class SamMasks:
 
     def settings(self) -> dict[str, Any]:
         names = ("points", "min_iou", "min_stability", "max_overlap")
-        return {"masks": "sam", "model": self._digest, **{name: getattr(self.config, name) for name in names}}
+        return {"masks": "sam", "model": self._digest, **{name: getattr(self.options, name) for name in names}}
 
 
 def grid_points(side: int) -> Float32[np.ndarray, "n 2"]:
@@ -580,7 +374,7 @@ def suppress(proposals: Iterable[Proposal], max_overlap: float) -> list[Proposal
 
 
 def _overlap(a: Proposal, b: Proposal, most: float) -> bool:
-    """Whether the IoU of two masks is above `most`; it is at most the ratio of their areas, which is quickly told."""
+    """Whether the IoU of two masks is above `most`; it is at most the ratio of their areas, which is quickly known."""
     return min(a.area, b.area) > most * max(a.area, b.area) and mask_iou(a, b) > most
 
 

@@ -1,120 +1,112 @@
 """The `radio` teacher: RADIO's backbone features through transformers, which SplatDistill distils (sec. 3.2)."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
+from jaxtyping import Float
+from torch import Tensor, nn
 
+from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import digest_files, find_file, load_pretrained, read_config
-from gsencoder.teachers.base import MissingInput
-from gsencoder.teachers.onnx import fit_to_patches
-from gsencoder.types import FeatureMap, FeatureSpace, Views
+from gsencoder.core.process import Device
+from gsencoder.core.settings import option
+from gsencoder.teachers.adapter_heads import ADAPTERS, WHAT, Head, read_radio_heads
+from gsencoder.teachers.base import Teacher, TeacherSettings, check_channels, text_encoder_of
+from gsencoder.teachers.pictures import Preprocessing, TorchTeacher
+from gsencoder.text.vocabulary import Words
+from gsencoder.types import FeatureSpace, Scene
 
-WHAT = "teacher radio"
-ADAPTERS = "radio_model.adaptors."
-"""What the keys of adapter heads begin with in the files of weights; `gsencoder.fusion.adapter_heads` reads them."""
 PICKLED = (".tar", ".pth", ".pt", ".bin", ".ckpt")
-"""What names of files end with that are opened by unpickling them."""
+"""Endings of files that are opened by unpickling them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RadioConfig:
+class RadioConfig(TeacherSettings):
     """Which RADIO, and how pictures are given to it."""
 
+    has_heads = True
+
     name: Literal["radio"] = "radio"
-    model: str = field(
-        default="", metadata={"help": "folder of a RADIO model for transformers; also looked for in GSENCODER_MODELS"}
+    model: str = option("", "folder of a RADIO model for transformers; also looked for in GSENCODER_MODELS")
+    size: int = option(768, "longer side of the resized picture in pixels", ge=1, le=2048)
+    words: str = option("", "text table that leads into the space; empty if none")
+    heads: tuple[str, ...] = option(
+        (),
+        "adapter heads that are stored with the features, such as siglip or sam: NAME.summary, "
+        "NAME.features, or NAME for the one that is meant most often",
+        names=True,
     )
-    size: int = field(default=768, metadata={"help": "longer side of the resized picture in pixels"})
-    words: str = field(default="", metadata={"help": "text table that leads into the space; empty if none"})
-    heads: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "names": True,
-            "help": "adapter heads that are stored with the features, such as siglip or sam: NAME.summary, "
-            "NAME.features, or NAME for the one that is meant most often",
-        },
-    )
-    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where the backbone runs"})
+    device: Device = option("auto", "where the backbone runs")
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.size <= 2048:
-            raise InputError(f"size: expected 1 to 2048 pixels, got {self.size}")
+    def build(self, scene: Scene, words: Words | None) -> Teacher:  # noqa: ARG002
+        teacher = RadioTeacher(self, text_encoder=text_encoder_of(words))
+        check_channels(teacher.space, words)
+        return teacher
+
+    @property
+    def stored_heads(self) -> tuple[str, ...]:
+        return self.heads
+
+    def read_heads(self, names: Sequence[str]) -> list[Head]:
+        folder = radio_folder(self)
+        return read_radio_heads(folder, names, check_radio(folder))
+
+    def refuse_text(self) -> str:
+        return (
+            "text=: no text tower speaks for the features of RADIO's backbone; leave out text= here, and give it "
+            "where an adapter head is asked: localize head=siglip text=…"
+        )
 
 
-class RadioTeacher:
-    """The backbone's patch features as they are: adapter heads lead from them into other spaces."""
+class RadioNetwork(nn.Module):
+    """The patch features of RADIO's backbone."""
 
-    table = None
-    mean = None
-    needs_images = True
-    cheap = False
-
-    def __init__(self, config: RadioConfig, *, text_encoder: str = "") -> None:
-        """Loads the model from its folder; nothing is fetched from anywhere.
-
-        Args:
-            config: which, and how.
-            text_encoder: what turns words into this space; empty if nothing does.
-
-        Raises:
-            InputError: transformers is missing, or the folder holds no RADIO.
-        """
-        folder = radio_folder(config)
-        check_radio(folder)
+    def __init__(self, folder: Path) -> None:
         from transformers import AutoModel
 
-        from gsencoder.core.device import choose_device
+        super().__init__()
+        self._model = load_pretrained(AutoModel, folder, WHAT, ignored=(ADAPTERS,))
+        self.patch, self.channels = int(self._model.config.patch_size), int(self._model.config.hidden_size)
 
-        model = load_pretrained(AutoModel, folder, WHAT, known_parts=(ADAPTERS,))
-        device = choose_device(config.device).type
-        self._model, self._device, self.config = model.to(device), device, config
+    def forward(self, pixels: Float[Tensor, "1 3 H W"]) -> Float[Tensor, "h w D"]:
+        """One vector a patch, float32, of a picture in [0, 1]."""
+        rows, columns = pixels.shape[2] // self.patch, pixels.shape[3] // self.patch
+        features: Tensor = self._model(pixel_values=pixels).features[0]
+        return features.float().reshape(rows, columns, -1)
+
+
+class RadioTeacher(TorchTeacher):
+    """The backbone's patch features as they are: adapter heads lead from them into other spaces."""
+
+    subject = WHAT
+    preprocessing = Preprocessing()
+
+    def __init__(self, config: RadioConfig, *, text_encoder: str = "") -> None:
+        """Loads the model from its folder; nothing is fetched from anywhere."""
+        folder = radio_folder(config)
+        check_radio(folder)
+        self.device, self.size, self.config = choose_device(config.device).type, config.size, config
+        self.network = network = RadioNetwork(folder).to(self.device)
         self._digest = digest_files(*sorted([*folder.glob("*.safetensors"), *folder.glob("config.json")]))
         self.space = FeatureSpace(
             name=f"radio-{folder.resolve().name}",
-            channels=model.config.hidden_size,
+            channels=network.channels,
             teacher="radio",
             weights=self._digest,
             layer="features",
-            preprocessing=f"resized to {config.size} px in multiples of {model.config.patch_size}",
+            preprocessing=f"resized to {config.size} px in multiples of {network.patch}",
             text_encoder=text_encoder,
         )
-
-    def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The backbone's patch features of one picture.
-
-        Raises:
-            MissingInput: no pictures.
-            InputError: features that are not finite.
-        """
-        import torch
-
-        from gsencoder.core.device import enough_memory, teacher_autocast
-
-        if views.images is None:
-            raise MissingInput("teacher radio: the scene has no pictures")
-        patch = self._model.config.patch_size
-        resized, grid_from_image = fit_to_patches(views.images[view], self.config.size, patch)
-        pixels = torch.from_numpy(resized.astype(np.float32) / 255).permute(2, 0, 1)[None].to(self._device)
-        with torch.inference_mode(), teacher_autocast(self._device), enough_memory(WHAT, "teacher.size="):
-            features = self._model(pixel_values=pixels).features[0].float().cpu().numpy()
-        if not np.isfinite(features).all():
-            raise InputError(f"teacher radio: features of view {views.names[view]!r} are not finite; check the weights")
-        grid = features.reshape(resized.shape[0] // patch, resized.shape[1] // patch, -1)
-        return FeatureMap(features=np.ascontiguousarray(grid), grid_from_image=grid_from_image, space=self.space)
 
     def settings(self) -> dict[str, Any]:
         return {"name": "radio", "model": self._digest, "size": self.config.size}
 
 
 def radio_folder(config: RadioConfig) -> Path:
-    """The folder of a RADIO model.
-
-    Raises:
-        InputError: none is named or there, or a file is.
-    """
+    """The folder of a RADIO model; InputError where none is named, or a file is."""
     if not config.model:
         raise InputError("teacher.model= is missing: the folder of a RADIO model")
     if config.model.lower().endswith(PICKLED) or Path(config.model).is_file():
@@ -126,11 +118,7 @@ def radio_folder(config: RadioConfig) -> Path:
 
 
 def check_radio(folder: Path) -> int:
-    """Checks that a folder states that it holds a RADIO model; returns the channels of its backbone.
-
-    Raises:
-        InputError: it does not, or transformers cannot read its configuration.
-    """
+    """Checks that a folder states that it holds a RADIO model; returns the channels of its backbone."""
     stated = read_config(folder, WHAT)
     if stated.model_type != "radio":
         raise InputError(f"{WHAT}: {folder} holds a {stated.model_type} model, expected radio")

@@ -1,73 +1,430 @@
-"""The `regions` teacher from its settings: masks of regions, and one vector for each (M3 sec. 3.3, LangSplat)."""
+"""The `regions` teacher: masks of regions, and one vector for each, of its caption or of the picture (M3 sec. 3.3,
+LangSplat)."""
 
+import hashlib
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Int32, UInt8
 from PIL import Image
 
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.device import choose_device, enough_memory
+from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.pretrained import (
-    choose_tensors,
+    ANY,
     digest_files,
     find_file,
     load_companion,
     load_pretrained,
-    open_session,
     quiet_transformers,
     read_config,
-    run_on_picture,
 )
 from gsencoder.core.process import Device
-from gsencoder.teachers.base import MissingInput, Teacher
-from gsencoder.teachers.captions import (
-    IDENTITY,
-    CaptionedRegions,
-    Captions,
-    captions_of_objects,
-    codes_of,
-    read_captions,
-)
+from gsencoder.core.settings import option
+from gsencoder.data.readers.transforms_json import read_json
+from gsencoder.teachers.base import MissingInput, Teacher, TeacherSettings, check_channels, text_encoder_of
+from gsencoder.teachers.labels import codes_of
 from gsencoder.teachers.masks import (
+    WHAT,
     FileMasks,
     InstanceMasks,
-    OnnxRegionOptions,
     RegionMasks,
-    RegionsConfig,
     SamMasks,
+    SamOptions,
     scene_path,
+    view_stem,
 )
-from gsencoder.teachers.onnx import OnnxConfig, OnnxTeacher, normalized
-from gsencoder.teachers.radio import RadioConfig, RadioTeacher
-from gsencoder.teachers.tower import TransformersConfig, TransformersTeacher
-from gsencoder.text.models import JOINT
-from gsencoder.text.vocabulary import OpenVocabulary, Words
-from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
+from gsencoder.teachers.onnx import DenseOnnxOptions, OnnxConfig
+from gsencoder.teachers.pictures import LARGEST_SIDE, OnnxNetwork
+from gsencoder.teachers.radio import RadioConfig
+from gsencoder.teachers.tower import TransformersConfig
+from gsencoder.text.table import MAX_NAME, MAX_SHOWN
+from gsencoder.text.vocabulary import Words
+from gsencoder.types import FeatureMap, FeatureSpace, Scene, SceneObject, Views
+
+CAPTIONS_FILE = "captions.json"
 
 
-@runtime_checkable
-class RegionVectors(Protocol):
-    """Makes a vector of each region of a picture.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OnnxRegionOptions(DenseOnnxOptions):
+    """How pictures are given to the .onnx file of an image tower, and how its output is read."""
+
+    size: int = option(
+        0,
+        "pixels along the longer side of the picture (map), or the side of a square crop (crop; a model of "
+        "a fixed size has its own); 0 = 448 and 224",
+        ge=0,
+        le=LARGEST_SIDE,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegionsConfig(TeacherSettings):
+    """Where masks of regions come from, and what vector each region gets."""
+
+    per_scene: ClassVar[bool] = True
+
+    name: Literal["regions"] = "regions"
+    masks: Literal["files", "instances", "sam"] = option(
+        "files",
+        "files = label images in teacher.folder=; instances = the instance maps of the scene; sam = masks "
+        "of a SAM model, teacher.sam=",
+    )
+    folder: str = option(
+        "",
+        "masks=files: folder of label images, one a view, called like the photograph but with .png, .npy "
+        "or .safetensors; looked for in the scene's folder, then as a path",
+    )
+    vector: Literal["captions", "map", "crop"] = option(
+        "captions",
+        "captions = the text vector of each region's caption or name; map = the mean of teacher.model's "
+        "dense features over the region; crop = teacher.model's pooled vector of the region's box",
+    )
+    captions: str = option(
+        "",
+        'vector=captions: a JSON file, {"label": "caption"} or {"view": {"label": "caption"}}; empty = '
+        "captions.json in the folder of the masks, or with masks=instances the names of the scene's objects",
+    )
+    rest: Literal["none", "mean"] = option(
+        "mean",
+        "vector=captions: what pixels without a captioned region are: mean = something else, the direction "
+        "of the text side's mean; none = nothing is known of them, they have no feature",
+    )
+    words: str = option("", "text table that leads into the space, or has the captions, if no text= is given")
+    model: str = option(
+        "",
+        "image tower of vector=map and vector=crop: an .onnx file, or a folder of a model for transformers "
+        "(map: a vision tower or RADIO; crop: CLIP, SigLIP or another with a pooled output); also looked for in "
+        "GSENCODER_MODELS",
+    )
+    joint: bool = option(
+        False,
+        "the image tower is the image side of the joint model that text= is the text side of; with "
+        "vector=crop a folder of CLIP or SigLIP says so itself",
+    )
+    around: Literal["picture", "nothing"] = option(
+        "picture", "vector=crop: what of the box is not in the region: the photograph as it is, or plain gray"
+    )
+    min_area: int = option(
+        64, "vector=map and crop, and masks=sam: smallest number of pixels of a region in a view", ge=1, le=1 << 31
+    )
+    sam: str = option("", "folder of a SAM model for transformers; also looked for in GSENCODER_MODELS")
+    points: int = option(32, "masks=sam: points a side of the grid that prompts it", ge=1, le=256)
+    min_iou: float = option(0.88, "masks=sam: smallest IoU that the model predicts of a mask", ge=0, le=1)
+    min_stability: float = option(0.95, "masks=sam: smallest IoU of a mask at logit thresholds of 1 and −1", ge=0, le=1)
+    max_overlap: float = option(0.7, "masks=sam: of two masks with a larger IoU the better one stays", ge=0, le=1)
+    device: Device = option("auto", "where models of folders run")
+    onnx: OnnxRegionOptions = field(default_factory=OnnxRegionOptions)
+
+    def __post_init__(self) -> None:
+        TeacherSettings.__post_init__(self)
+        if self.vector == "captions" and self.masks == "sam":
+            raise InputError(
+                "vector: captions belong to labels that are known, and masks=sam numbers its masks itself; give "
+                "vector=map or vector=crop, or label images (masks=files)"
+            )
+        has_captions = self.vector == "captions"
+        for name, used, owner in (
+            ("folder", self.masks == "files", "masks=files"),
+            ("sam", self.masks == "sam", "masks=sam"),
+            ("model", not has_captions, "vector=map and vector=crop"),
+            ("joint", not has_captions, "vector=map and vector=crop"),
+            ("onnx", not has_captions, "vector=map and vector=crop"),
+            ("captions", has_captions, "vector=captions"),
+            ("rest", has_captions, "vector=captions"),
+            ("around", self.vector == "crop", "vector=crop"),
+        ):
+            if not used and getattr(self, name) != _DEFAULTS[name]:
+                raise InputError(f"{name}: is an option of {owner}, and masks is {self.masks}, vector {self.vector}")
+
+    def build(self, scene: Scene, words: Words | None) -> Teacher:
+        if self.vector == "captions" and words is None:
+            raise InputError(
+                f"{WHAT}: captions need words: give a text tower (text=onnx text.model=FOLDER), or a text table "
+                "that has them (teacher.words=)"
+            )
+        masks = self._masks(scene)
+        if scene.views is None:
+            raise InputError(f"{WHAT}: the scene has no views")
+        if words is not None and self.vector == "captions":
+            captions = self._captions(scene, scene.views, masks)
+            return CaptionedRegions(scene.views, masks, captions, words, rest=self.rest == "mean")
+        vectors = self._vectors(scene, words)
+        check_channels(vectors.space, words)
+        return PicturedRegions(scene.views, masks, vectors, min_area=self.min_area)
+
+    def refuse_text(self) -> str:
+        if self.vector != "captions" and not self.joint and not (self.vector == "crop" and is_joint(self.model)):
+            return (
+                "text=: vectors of regions are taken for those of the text tower if teacher.joint=true says that "
+                "teacher.model= and text= belong to one joint model, such as CLIP; other models have no words"
+            )
+        return TeacherSettings.refuse_text(self)
+
+    def _masks(self, scene: Scene) -> RegionMasks:
+        if self.masks == "instances":
+            return InstanceMasks(scene)
+        if self.masks == "files":
+            return FileMasks(scene, self.folder)
+        options = SamOptions(**{item.name: getattr(self, item.name) for item in fields(SamOptions)})
+        return SamMasks(self.sam, options, self.device)
+
+    def _captions(self, scene: Scene, views: Views, masks: RegionMasks) -> "Captions":
+        if self.captions:
+            return read_captions(scene_path(scene, self.captions, "teacher.captions"), views.names)
+        if not isinstance(masks, FileMasks):
+            return captions_of_objects(scene.objects)
+        path = masks.folder / CAPTIONS_FILE
+        if not path.is_file():
+            raise InputError(
+                f"{WHAT}: {path}: no such file; vector=captions needs captions of the labels: give "
+                "teacher.captions=, or vector=map or vector=crop"
+            )
+        return read_captions(path, views.names)
+
+    def _vectors(self, scene: Scene, words: Words | None) -> "MapVectors | CropVectors":
+        """What makes vectors of regions from the picture."""
+        if not self.model:
+            raise InputError(
+                f"teacher.model= is missing: the image tower of vector={self.vector}, an .onnx file or "
+                "a folder for transformers"
+            )
+        if self.vector == "map":
+            return MapVectors(dense_settings(self).build(scene, words))
+        tower: OnnxImageTower | TransformersImageTower
+        if self.model.lower().endswith(".onnx"):
+            tower = OnnxImageTower(find_file(self.model, "teacher.model"), self.onnx)
+        else:
+            tower = TransformersImageTower(find_file(self.model, "teacher.model", folder=True), self.device)
+        return CropVectors(tower, text_encoder=text_encoder_of(words), around=self.around)
+
+
+_DEFAULTS = {
+    "folder": "",
+    "sam": "",
+    "model": "",
+    "joint": False,
+    "onnx": OnnxRegionOptions(),
+    "captions": "",
+    "rest": "mean",
+    "around": "picture",
+}
+"""Options that belong to one kind of masks or vectors, at their defaults."""
+
+
+def dense_settings(config: RegionsConfig) -> TeacherSettings:
+    """The settings of the teacher whose maps are averaged over regions."""
+    if config.model.lower().endswith(".onnx"):
+        options = {item.name: getattr(config.onnx, item.name) for item in fields(DenseOnnxOptions)}
+        return OnnxConfig(model=config.model, **{**options, "size": config.onnx.size or OnnxConfig().size})
+    folder = find_file(config.model, "teacher.model", folder=True)
+    if read_config(folder, WHAT).model_type == "radio":
+        return RadioConfig(model=config.model, device=config.device)
+    return TransformersConfig(model=config.model, device=config.device)
+
+
+OBJECTS = "objects.json"
+FORMS = '{"label": "caption"} for all views, or {"view": {"label": "caption"}}'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Captions:
+    """Captions by label: `shared` by all views, or `by_view`, by the view's whole name without its ending."""
+
+    shared: Mapping[int, str] | None = None
+    by_view: Mapping[str, Mapping[int, str]] | None = None
+    source: str = ""
+
+    def of_view(self, name: str) -> Mapping[int, str]:
+        """The captions of the labels of a view."""
+        if self.shared is not None:
+            return self.shared
+        assert self.by_view is not None
+        return self.by_view.get(str(view_stem(name)), {})
+
+
+def captions_of_objects(objects: Sequence[SceneObject]) -> Captions:
+    """The names of a scene's objects as captions of its instance maps."""
+    names = {item.id: item.name for item in objects if item.name is not None}
+    if not names:
+        raise InputError(
+            f"{WHAT}: masks=instances: no object of the scene has a name (objects.json); give "
+            "a JSON file of captions, teacher.captions="
+        )
+    return Captions(shared=names, source=OBJECTS)
+
+
+def read_captions(path: Path, view_names: Sequence[str]) -> Captions:
+    """Captions of a JSON file: {"label": "caption"} for all views, or {"view": {"label": "caption"}}.
+
+    Views are called by their names, with or without the ending, or by the last part of the name where that is unique.
+    """
+    data = read_json(path, unique_keys=True)
+    if not isinstance(data, dict) or not data:
+        got = "an empty object" if isinstance(data, dict) else type(data).__name__
+        raise InputError(f"{path}: expected captions of regions, {FORMS}; got {got}")
+    nested = {isinstance(value, dict) for value in data.values()}
+    if nested == {False}:
+        return Captions(shared=_labels(data, path, ""), source=str(path))
+    if nested != {True}:
+        odd = next(key for key, value in data.items() if not isinstance(value, dict))
+        raise InputError(f"{path}: expected captions of regions, {FORMS}; got a mixture of both, see {odd[:40]!r}")
+    by_view = {str(view_stem(view)): _labels(data[view], path, f" view {view[:40]!r}:") for view in data}
+    if len(by_view) < len(data):
+        raise InputError(f"{path}: a view is listed twice, with and without the ending of its picture")
+    stems = [view_stem(name) for name in view_names]
+    ends = [stem.name for stem in stems]
+    double = sorted({end for end in ends if ends.count(end) > 1 and end in by_view} - {str(stem) for stem in stems})
+    if double:
+        raise InputError(f"{path}: {double[0]!r} stands for {ends.count(double[0])} views; write their whole names")
+    unique = {stem.name: str(stem) for stem in stems if ends.count(stem.name) == 1}
+    both = sorted(
+        end for end, full_name in unique.items() if end != full_name and end in by_view and full_name in by_view
+    )
+    if both:
+        raise InputError(f"{path}: {both[0]!r} and {unique[both[0]]!r} are one view, which is listed twice")
+    by_view = {unique.get(view, view): captions for view, captions in by_view.items()}
+    if not any(str(stem) in by_view for stem in stems):
+        raise InputError(
+            f"{path}: none of its {len(by_view)} views is one of the scene, first {next(iter(data))[:40]!r}; the "
+            f"scene's are {view_names[0]!r}, …"
+        )
+    return Captions(by_view=by_view, source=str(path))
+
+
+def _labels(data: Mapping[str, Any], path: Path, where: str) -> dict[int, str]:
+    captions: dict[int, str] = {}
+    for key, text in data.items():
+        if not (key.isascii() and key.isdigit()) or not 1 <= int(key[:12]) < 2**31:
+            raise InputError(f"{path}:{where} expected labels as numbers from 1, got {key[:40]!r} ({FORMS})")
+        if not isinstance(text, str) or not text.strip():
+            raise InputError(f"{path}:{where} label {key}: expected a caption as text, got {str(text)[:40]!r}")
+        if len(text) > MAX_NAME:
+            raise InputError(
+                f"{path}:{where} label {key}: caption {text[:MAX_SHOWN]!r}… has {len(text):,} characters, expected at "
+                f"most {MAX_NAME:,}"
+            )
+        if int(key) in captions:
+            raise InputError(f"{path}:{where} label {int(key)} has two captions")
+        captions[int(key)] = text.strip()
+    return captions
+
+
+IDENTITY = np.array([[1.0, 0, 0], [0, 1.0, 0]])
+
+
+class CaptionedRegions:
+    """Each pixel has the vector of its region's caption; pixels of no region, or of one without a caption, have none,
+    or with `rest` that of something else: the direction of the text side's mean.
 
     Attributes:
-        space: of the vectors.
+        kinds: the captions, which are stored with the features as words.
+        captions: rows of the table, "" where it is the mean's direction.
     """
 
-    @property
-    def space(self) -> FeatureSpace: ...
+    cheap = True
 
-    def vectors(
-        self, views: Views, view: int, labels: Int32[np.ndarray, "H W"], regions: Sequence[int]
-    ) -> Float32[np.ndarray, "n D"]:
-        """A vector for each of the regions; NaN where there is none."""
-        ...
+    def __init__(self, views: Views, masks: RegionMasks, captions: Captions, words: Words, *, rest: bool) -> None:
+        """Embeds the captions, and looks at the labels of all views once; warns of regions without a caption, and of
+        captions of labels that no view has.
+
+        Args:
+            views: of the scene.
+            masks: of regions.
+            captions: of their labels.
+            words: turns captions into vectors.
+            rest: whether the rest of a picture is something else; otherwise nothing is known of it.
+        """
+        self._masks, self._captions, self._rest = masks, captions, rest
+        self.needs_images = masks.needs_images
+        used = self._check_labels(views)
+        self.kinds = tuple(sorted(used))
+        self.captions = (*([""] if rest else []), *self.kinds)
+        self.mean = words.mean
+        with about(f"{WHAT}: captions"):
+            vectors = words.encode(self.kinds)
+        if rest:
+            direction = words.mean.astype(np.float64)
+            direction /= np.sqrt((direction * direction).sum() + 1e-24)
+            vectors = np.concatenate([direction.astype(np.float32)[None], vectors])
+        self.table: Float32[np.ndarray, "C D"] = np.ascontiguousarray(vectors, np.float32)
+        self._row_of = {caption: row for row, caption in enumerate(self.captions)}
+        self.space = FeatureSpace(
+            name=f"regions-{words.space.text_encoder}",
+            channels=words.space.channels,
+            teacher="regions",
+            layer="captions of regions" + (", the rest as the mean" if rest else ""),
+            text_encoder=words.space.text_encoder,
+        )
+
+    def _check_labels(self, views: Views) -> set[str]:
+        """The captions that occur."""
+        used, bare, everywhere, regions, lost = set[str](), list[int](), set[int](), 0, list[str]()
+        for view, name in enumerate(views.names):
+            labels = regions_of(self._masks.labels(views, view))[0].tolist()
+            captions = self._captions.of_view(name)
+            regions += len(labels)
+            everywhere.update(labels)
+            used |= {captions[label] for label in labels if label in captions}
+            bare += [label for label in labels if label not in captions]
+            if self._captions.by_view is not None:
+                lost += [f"{name}: {label}" for label in sorted(set(captions) - set(labels))]
+        source = f"{WHAT}: {self._captions.source}"
+        if not regions:
+            raise InputError(f"{WHAT}: the masks of all {len(views)} views are empty: they have no label above 0")
+        if not used:
+            raise InputError(
+                f"{source}: none of its captions belongs to one of the {regions:,} regions, whose labels are "
+                f"{_numbers(everywhere)}"
+            )
+        if bare:
+            _warn(
+                f"{WHAT}: {len(bare):,} of {regions:,} regions in {len(views)} views have no caption and "
+                f"{'count as something else' if self._rest else 'no feature'}; their labels are {_numbers(bare)}"
+            )
+        if lost:
+            # Small regions may be lost where pictures are made smaller.
+            _warn(f"{source}: {len(lost)} labels are in no pixel of the masks of their views: {listed(lost, 5)}")
+        shared = self._captions.shared or {}
+        unused = set(shared) - everywhere
+        # Objects of a scene may be hidden in all views; a file of captions was written for its masks.
+        if unused and self._captions.source != OBJECTS:
+            _warn(f"{source}: {len(unused)} of {len(shared)} labels occur in no mask: {_numbers(unused)}")
+        return used
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        """Codes at the resolution of the picture."""
+        labels = self._masks.labels(views, view)
+        captions = self._captions.of_view(views.names[view])
+        rows = {label: self._row_of[text] for label, text in captions.items() if text in self._row_of}
+        codes = codes_of(labels, rows)
+        if self._rest:
+            codes = np.maximum(codes, 0)
+        return FeatureMap(codes=codes, table=self.table, grid_from_image=IDENTITY, space=self.space)
 
     def settings(self) -> dict[str, Any]:
-        """All that the vectors depend on beside views and labels, as JSON values."""
-        ...
+        captions = self._captions.shared or self._captions.by_view
+        digest = hashlib.sha256(self.table.tobytes() + repr(captions).encode("utf-8", "backslashreplace"))
+        return {"name": "regions", "captions": digest.hexdigest()[:16], "rest": self._rest, **self._masks.settings()}
+
+
+def regions_of(labels: Int32[np.ndarray, "H W"]) -> tuple[np.ndarray, np.ndarray]:
+    """Labels above 0, and their numbers of pixels."""
+    values, sizes = np.unique(labels, return_counts=True)
+    return values[values > 0], sizes[values > 0]
+
+
+def _numbers(labels: Iterable[int]) -> str:
+    return listed([str(label) for label in sorted(set(labels))])
+
+
+def _warn(message: str) -> None:
+    warnings.warn(message, SceneWarning, stacklevel=2)
 
 
 class PicturedRegions:
@@ -78,56 +435,31 @@ class PicturedRegions:
     needs_images = True
     cheap = False
 
-    def __init__(self, views: Views, masks: RegionMasks, vectors: RegionVectors, *, min_area: int) -> None:
-        """Looks at the masks of all views once, where they are at hand.
-
-        Args:
-            views: of the scene.
-            masks: of regions.
-            vectors: of regions.
-            min_area: smallest number of pixels of a region in a view.
-
-        Raises:
-            InputError: the scene has no pictures, or no view has a region that is large enough.
-
-        Warns:
-            SceneWarning: regions are too small.
-        """
+    def __init__(self, views: Views, masks: RegionMasks, vectors: "MapVectors | CropVectors", *, min_area: int) -> None:
+        """Looks at the masks of all views once, where they are at hand, and warns of regions of less than `min_area`
+        pixels."""
         if views.images is None:
-            raise MissingInput("teacher regions: the scene has no pictures to make vectors of regions from")
+            raise MissingInput(f"{WHAT}: the scene has no pictures to make vectors of regions from")
         self._masks, self._vectors, self._min_area = masks, vectors, min_area
         self.space = vectors.space
         if masks.cheap:
             self._check_sizes(views)
 
     def _check_sizes(self, views: Views) -> None:
-        sizes = np.concatenate([_regions_of(self._masks.labels(views, view))[1] for view in range(len(views))])
+        sizes = np.concatenate([regions_of(self._masks.labels(views, view))[1] for view in range(len(views))])
         small = int((sizes < self._min_area).sum())
+        where = f"regions in {len(views)} views have less than {self._min_area} pixels"
         if not len(sizes):
-            raise InputError(
-                f"teacher regions: the masks of all {len(views)} views are empty: they have no label above 0"
-            )
+            raise InputError(f"{WHAT}: the masks of all {len(views)} views are empty: they have no label above 0")
         if small == len(sizes):
-            raise InputError(
-                f"teacher regions: all {small:,} regions in {len(views)} views have less than {self._min_area} "
-                "pixels (teacher.min_area)"
-            )
+            raise InputError(f"{WHAT}: all {small:,} {where} (teacher.min_area)")
         if small:
-            warnings.warn(
-                f"teacher regions: {small:,} of {len(sizes):,} regions in {len(views)} views have less than "
-                f"{self._min_area} pixels and no feature (teacher.min_area)",
-                SceneWarning,
-                stacklevel=4,
-            )
+            _warn(f"{WHAT}: {small:,} of {len(sizes):,} {where} and no feature (teacher.min_area)")
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """Codes at the resolution of the picture, into the vectors of the view's regions.
-
-        Raises:
-            InputError: the mask or the picture cannot be read, or a vector is not finite.
-        """
+        """Codes at the resolution of the picture, into the vectors of the view's regions."""
         labels = self._masks.labels(views, view)
-        values, sizes = _regions_of(labels)
+        values, sizes = regions_of(labels)
         regions = [int(value) for value in values[sizes >= self._min_area]]
         table = np.zeros((0, self.space.channels), np.float32)
         if regions:
@@ -144,19 +476,10 @@ class PicturedRegions:
         }
 
 
-def _regions_of(labels: Int32[np.ndarray, "H W"]) -> tuple[np.ndarray, np.ndarray]:
-    """Labels above 0, and their numbers of pixels."""
-    values, sizes = np.unique(labels, return_counts=True)
-    return values[values > 0], sizes[values > 0]
-
-
 class MapVectors:
     """The mean of a dense teacher's features over the pixels of a region, each with the cell that its center is in."""
 
     def __init__(self, teacher: Teacher) -> None:
-        """Args:
-        teacher: with dense maps.
-        """
         self.teacher = teacher
         space = teacher.space
         self.space = FeatureSpace(
@@ -172,17 +495,13 @@ class MapVectors:
     def vectors(
         self, views: Views, view: int, labels: Int32[np.ndarray, "H W"], regions: Sequence[int]
     ) -> Float32[np.ndarray, "n D"]:
-        """Means over regions.
-
-        Raises:
-            InputError: the teacher gives no finite vector in a region.
-        """
+        """Means over regions; InputError where the teacher gives no finite vector in a region."""
         dense = self.teacher.feature_map(views, view)
         means = region_means(dense, labels, regions)
         bad = np.flatnonzero(~np.isfinite(means).all(axis=1))
         if bad.size:
             raise InputError(
-                f"teacher regions: view {views.names[view]!r}: {bad.size} of {len(regions)} regions have no finite "
+                f"{WHAT}: view {views.names[view]!r}: {bad.size} of {len(regions)} regions have no finite "
                 f"vector, first label {regions[bad[0]]}; check the model, and how pictures are given to it"
             )
         return means
@@ -198,11 +517,6 @@ def region_means(
 
     A pixel beyond the border of the grid takes the nearest cell; cells without a vector count for nothing, and a region
     without any other is NaN.
-
-    Args:
-        dense: of the same view.
-        labels: at the resolution of the picture.
-        regions: labels whose means are wanted.
     """
     affine, (height, width) = dense.grid_from_image, labels.shape
     line = np.floor(affine[1, 1] * (np.arange(height) + 0.5) + affine[1, 2]).astype(np.int64).clip(0, dense.height - 1)
@@ -220,7 +534,6 @@ def region_means(
     return ((counts @ rows[finite].astype(np.float64)) / np.where(sizes > 0, sizes, np.nan)).astype(np.float32)
 
 
-WHAT = "teacher regions"
 JOINT_IMAGE = {
     "clip": ("CLIPVisionModelWithProjection", "image_embeds"),
     "siglip": ("SiglipVisionModel", "pooler_output"),
@@ -230,40 +543,16 @@ JOINT_IMAGE = {
 DEFAULT_SIDE = 224
 
 
-@runtime_checkable
-class ImageTower(Protocol):
-    """Turns a picture into one vector.
-
-    Attributes:
-        name: for people.
-        digest: of its files.
-        channels: D.
-        preprocessing: in words.
-        gray: the color, 0 to 255, that means nothing to it.
-        joint: whether its files say that it is the image side of a joint model.
-    """
-
-    name: str
-    digest: str
-    channels: int
-    preprocessing: str
-    gray: tuple[int, int, int]
-    joint: bool
-
-    def embed(self, picture: UInt8[np.ndarray, "S S 3"]) -> Float32[np.ndarray, " D"]:
-        """The pooled vector of a square picture."""
-        ...
-
-
 class CropVectors:
     """The vector of each region's box, filled up to a square with plain gray."""
 
-    def __init__(self, tower: ImageTower, *, text_encoder: str, around: str) -> None:
-        """Args:
-        tower: embeds crops.
-        text_encoder: what turns words into its space; empty if nothing does.
-        around: "picture", or "nothing" = the rest of the box is gray.
-        """
+    def __init__(
+        self,
+        tower: "OnnxImageTower | TransformersImageTower",
+        *,
+        text_encoder: str,
+        around: Literal["picture", "nothing"],
+    ) -> None:
         self.tower, self._around = tower, around
         self.space = FeatureSpace(
             name=f"regions-{tower.name}",
@@ -278,11 +567,7 @@ class CropVectors:
     def vectors(
         self, views: Views, view: int, labels: Int32[np.ndarray, "H W"], regions: Sequence[int]
     ) -> Float32[np.ndarray, "n D"]:
-        """Unit vectors of crops.
-
-        Raises:
-            InputError: the model does not run, or gives a vector that is not finite or has no length.
-        """
+        """Unit vectors of crops; InputError for one that is not finite or has no length."""
         assert views.images is not None
         image = views.images[view]
         vectors = [self._vector(image, labels == label, label, views.names[view]) for label in regions]
@@ -318,14 +603,8 @@ def square_crop(
     *,
     masked: bool,
 ) -> UInt8[np.ndarray, "S S 3"]:
-    """The box of a mask, in the middle of a gray square, so that no tower cuts off the ends of a long region.
-
-    Args:
-        image: the photograph.
-        mask: of one region, not empty.
-        gray: the color of what is no part of the crop.
-        masked: whether that holds for the pixels of the box outside of the mask, too.
-    """
+    """The box of a mask, in the middle of a gray square, so that no tower cuts off the ends of a long region; with
+    `masked`, pixels of the box outside of the mask are gray, too."""
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
     crop = image[box]
@@ -340,83 +619,60 @@ def square_crop(
 
 
 class OnnxImageTower:
-    """An .onnx file with a pooled output [1, D]; see `ImageTower`."""
+    """An .onnx file that gives a square picture one pooled vector, [1, D].
 
-    joint = False
+    Attributes:
+        name: of the file.
+        digest: of its content.
+        channels: D.
+        preprocessing: in words.
+        gray: the color, 0 to 255, that means nothing to it.
+    """
 
     def __init__(self, path: Path, options: OnnxRegionOptions) -> None:
-        """Reads the model's signature, and runs it once to see how many channels it gives.
-
-        Args:
-            path: of the file.
-            options: how pictures are given to it.
-
-        Raises:
-            InputError: it cannot be read, does not take a square picture, or has no pooled output.
-        """
-        self._session = open_session(path, WHAT, threads=options.threads)
-        self._options, self.name = options, path.stem
-        advice = " (teacher.onnx.input, teacher.onnx.output)"
-        self._tensors = choose_tensors(self._session, options.input, options.output, f"{WHAT}: {path.name}", advice)
-        shape = next(each.shape for each in self._session.get_inputs() if each.name == self._tensors[0])
-        fixed = shape[-1] if len(shape) == 4 and isinstance(shape[-1], int) and shape[-1] > 0 else 0
-        self._side = fixed or options.size or DEFAULT_SIDE
-        self.digest = digest_files(path)
+        """Reads the model's signature, and runs it once to see how many channels it gives."""
+        self._network = network = OnnxNetwork(path, options, WHAT)
+        self._side = network.fixed[1] if network.fixed else options.size or DEFAULT_SIDE
+        self.name, self.digest = network.name, network.digest
         self.gray = _gray([value * options.scale for value in options.mean])
         self.preprocessing = (
-            f"square of {self._side} px, output {self._tensors[1]}, / {options.scale:g} − {list(options.mean)} "
+            f"square of {self._side} px, output {network.output}, / {options.scale:g} − {list(options.mean)} "
             f"/ {list(options.std)}"
         )
         self.channels = len(self.embed(np.zeros((self._side, self._side, 3), np.uint8)))
 
     def embed(self, picture: UInt8[np.ndarray, "S S 3"]) -> Float32[np.ndarray, " D"]:
-        """See `ImageTower.embed`.
-
-        Raises:
-            InputError: the model does not run on it, or its output is no pooled one.
-        """
-        options = self._options
+        """The pooled vector of a square picture."""
         resized = Image.fromarray(picture).resize((self._side, self._side), Image.Resampling.BICUBIC)
-        tensor = normalized(np.asarray(resized), options.scale, options.mean, options.std).transpose(2, 0, 1)[None]
-        output = run_on_picture(self._session, self._tensors, tensor, f"{WHAT}: {self.name}")
+        output = self._network.run(np.asarray(resized))
         sides = np.shape(output)
         if len(sides) < 2 or sides[0] != 1 or any(side != 1 for side in sides[2:]):
             raise InputError(
-                f"{WHAT}: {self.name} gave {self._tensors[1]!r} of shape {list(sides)}, expected a pooled output "
-                "[1, channels]; give teacher.onnx.output=, or vector=map for a dense one"
+                f"{self._network.subject} gave {self._network.output!r} of shape {list(sides)}, expected a pooled "
+                "output [1, channels]; give teacher.onnx.output=, or vector=map for a dense one"
             )
         return np.asarray(output, np.float32).reshape(-1)
 
 
 class TransformersImageTower:
-    """The image side of CLIP, SigLIP or SigLIP2, or another model with a pooled output; see `ImageTower`."""
+    """The image side of CLIP, SigLIP or SigLIP2, or another model with a pooled output; attributes are those of
+    `OnnxImageTower`."""
 
     def __init__(self, folder: Path, device: Device) -> None:
-        """Loads model and preprocessing; nothing is fetched from anywhere.
-
-        Args:
-            folder: of the model.
-            device: where it runs.
-
-        Raises:
-            InputError: transformers is missing, or the folder holds no such model with its preprocessing.
-        """
+        """Loads model and preprocessing; nothing is fetched from anywhere."""
         stated = read_config(folder, WHAT)
         import transformers
 
-        from gsencoder.core.device import choose_device
-
         kind = stated.model_type.removesuffix("_vision_model")
         loader, self._output = JOINT_IMAGE.get(kind, ("AutoModel", "pooler_output"))
-        self.joint = kind in JOINT_IMAGE and kind in JOINT
-        other = "ignore" if kind in JOINT_IMAGE else "warn"
+        ignored = ANY if kind in JOINT_IMAGE else ()
         if kind == "clip" and hasattr(stated, "vision_config"):
             # Releases state the width of the joint space at the top alone, where the image side does not look.
             stated.vision_config.projection_dim = stated.projection_dim
             options = {"config": stated.vision_config}
         else:
             options = {}
-        model = load_pretrained(getattr(transformers, loader), folder, WHAT, other_parts=other, **options)
+        model = load_pretrained(getattr(transformers, loader), folder, WHAT, ignored=ignored, **options)
         with quiet_transformers():
             self._processor = load_companion(transformers.AutoImageProcessor, folder, WHAT, "preprocessing")
         self._uncut = _without_cropping(self._processor)
@@ -428,15 +684,7 @@ class TransformersImageTower:
         self.channels = len(self.embed(np.zeros((32, 32, 3), np.uint8)))
 
     def embed(self, picture: UInt8[np.ndarray, "S S 3"]) -> Float32[np.ndarray, " D"]:
-        """See `ImageTower.embed`.
-
-        Raises:
-            InputError: the model has no pooled output.
-        """
-        import torch
-
-        from gsencoder.core.device import enough_memory
-
+        """The pooled vector of a square picture; InputError where the model has none."""
         with quiet_transformers():
             inputs = self._processor(images=Image.fromarray(picture), return_tensors="pt", **self._uncut)
         try:
@@ -458,16 +706,12 @@ class TransformersImageTower:
 
 
 def is_joint(model: str) -> bool:
-    """Whether the configuration of a folder says that it is the image side of a joint model.
-
-    Raises:
-        InputError: there is no such folder, or transformers cannot read its configuration.
-    """
-    if model.lower().endswith(".onnx"):
+    """Whether the configuration of a folder says that it is the image side of a joint model."""
+    if not model or model.lower().endswith(".onnx"):
         return False
     stated = read_config(find_file(model, "teacher.model", folder=True), WHAT)
-    kind = stated.model_type.removesuffix("_vision_model")
-    return kind in JOINT_IMAGE and kind in JOINT
+    kind: str = stated.model_type.removesuffix("_vision_model")
+    return kind in JOINT_IMAGE
 
 
 def _without_cropping(processor: Any) -> dict[str, Any]:
@@ -481,125 +725,3 @@ def _without_cropping(processor: Any) -> dict[str, Any]:
 def _gray(values: Sequence[float]) -> tuple[int, int, int]:
     red, green, blue = (round(min(max(float(value), 0.0), 255.0)) for value in values)
     return red, green, blue
-
-
-RegionsTeacher = CaptionedRegions | PicturedRegions
-CAPTIONS_FILE = "captions.json"
-
-
-def build_regions(config: RegionsConfig, scene: Scene, words: Words | None) -> RegionsTeacher:
-    """The teacher of one scene.
-
-    Args:
-        config: settings.
-        scene: whose masks and captions are read.
-        words: of the space; they embed captions.
-
-    Raises:
-        InputError: masks, captions, a model or words are missing or do not fit.
-    """
-    if config.vector == "captions" and words is None:
-        raise InputError(
-            "teacher regions: captions need words: give a text tower (text=onnx text.model=FOLDER), or a text table "
-            "that has them (teacher.words=)"
-        )
-    masks = _masks(config, scene)
-    if scene.views is None:
-        raise InputError("teacher regions: the scene has no views")
-    if config.vector == "captions":
-        assert words is not None
-        captions = _captions(config, scene, masks)
-        return CaptionedRegions(scene.views, masks, captions, words, rest=config.rest == "mean")
-    vectors = _vectors(config, words)
-    if words is not None and words.space.channels != vectors.space.channels:
-        raise InputError(
-            f"teacher regions: its vectors have {vectors.space.channels} channels and its words "
-            f"{words.space.channels} ({words.space.text_encoder}); expected both of one joint model"
-        )
-    return PicturedRegions(scene.views, masks, vectors, min_area=config.min_area)
-
-
-def _masks(config: RegionsConfig, scene: Scene) -> RegionMasks:
-    if config.masks == "instances":
-        return InstanceMasks(scene)
-    return SamMasks(config) if config.masks == "sam" else FileMasks(scene, config.folder)
-
-
-def _captions(config: RegionsConfig, scene: Scene, masks: RegionMasks) -> Captions:
-    assert scene.views is not None
-    if config.captions:
-        return read_captions(scene_path(scene, config.captions, "teacher.captions"), scene.views.names)
-    if isinstance(masks, FileMasks):
-        path = masks.folder / CAPTIONS_FILE
-        if not path.is_file():
-            raise InputError(
-                f"teacher regions: {path}: no such file; vector=captions needs captions of the labels: give "
-                "teacher.captions=, or vector=map or vector=crop"
-            )
-        return read_captions(path, scene.views.names)
-    return captions_of_objects(scene.objects)
-
-
-def _vectors(config: RegionsConfig, words: Words | None) -> RegionVectors:
-    """Vectors from the picture.
-
-    Raises:
-        InputError: no model, one that cannot be used, or words that it is not the image side of.
-    """
-    if not config.model:
-        raise InputError(
-            f"teacher.model= is missing: the image tower of vector={config.vector}, an .onnx file or "
-            "a folder for transformers"
-        )
-    text_encoder = words.space.text_encoder if words is not None else ""
-    if config.vector == "map":
-        dense = dense_teacher(config, text_encoder)
-        if isinstance(words, OpenVocabulary) and isinstance(dense, TransformersTeacher) and not dense.joint:
-            raise InputError(
-                f"text=: no words lead into {dense.space.layer} of {dense.space.name}; leave out text=, or give a "
-                "text-aligned model (CLIP, SigLIP, SigLIP2) with its head"
-            )
-        return MapVectors(dense)
-    tower: ImageTower
-    if config.model.lower().endswith(".onnx"):
-        tower = OnnxImageTower(find_file(config.model, "teacher.model"), config.onnx)
-    else:
-        tower = TransformersImageTower(find_file(config.model, "teacher.model", folder=True), config.device)
-    if words is not None and not (tower.joint or config.joint or config.words):
-        raise InputError(
-            f"text=: the vectors of {tower.name} are taken for those of the text tower if teacher.joint=true says that "
-            "both belong to one joint model, such as CLIP; other towers have no words"
-        )
-    return CropVectors(tower, text_encoder=text_encoder, around=config.around)
-
-
-def dense_teacher(config: RegionsConfig, text_encoder: str) -> Teacher:
-    """The teacher whose maps are averaged over regions.
-
-    Raises:
-        InputError: it cannot be used.
-    """
-    if not config.model.lower().endswith(".onnx"):
-        folder = find_file(config.model, "teacher.model", folder=True)
-        if read_config(folder, "teacher regions").model_type != "radio":
-            return TransformersTeacher(
-                TransformersConfig(model=config.model, device=config.device), text_encoder=text_encoder
-            )
-        return RadioTeacher(RadioConfig(model=config.model, device=config.device), text_encoder=text_encoder)
-    options = config.onnx
-    return OnnxTeacher(
-        OnnxConfig(
-            model=config.model,
-            input=options.input,
-            output=options.output,
-            layout=options.layout,
-            skip_tokens=options.skip_tokens,
-            patch=options.patch,
-            size=options.size or OnnxConfig().size,
-            scale=options.scale,
-            mean=options.mean,
-            std=options.std,
-            threads=options.threads,
-        ),
-        text_encoder=text_encoder,
-    )

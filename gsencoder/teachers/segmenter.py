@@ -11,48 +11,48 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float32, Float64, UInt8
 from PIL import Image
 
+from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import (
-    choose_tensors,
     digest_files,
     find_file,
     load_companion,
     load_pretrained,
     load_tokenizer,
-    open_session,
     quiet_transformers,
     read_config,
-    run_on_picture,
 )
 from gsencoder.core.process import Device
-from gsencoder.teachers.base import MissingInput
-from gsencoder.teachers.onnx import fit_to_patches, normalized
+from gsencoder.core.settings import option
+from gsencoder.teachers.base import Teacher, TeacherSettings
+from gsencoder.teachers.pictures import (
+    LARGEST_SIDE,
+    OnnxNetwork,
+    OnnxOptions,
+    check_finite,
+    fit_to_patches,
+    photograph,
+    resize_affine,
+)
 from gsencoder.text.vocabulary import Words
-from gsencoder.types import FeatureMap, FeatureSpace, Views
+from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 
+WHAT = "teacher segmenter"
+MULTIPLE = 32
+"""Sides of pictures are multiples of this, where a model does not have a size of its own."""
 MAX_CLASSES_BYTES = 1 << 22
 
 
 def synonyms_of_classes(names: Sequence[str], nothing: Sequence[str]) -> list[list[str]]:
-    """The synonyms of each class; none of a class that is no kind of thing.
-
-    Args:
-        names: of the classes.
-        nothing: names of classes that are no kind of thing.
-
-    Raises:
-        InputError: a class has no name.
-
-    Warns:
-        SceneWarning: several classes have one name.
-    """
+    """The synonyms of each class; none of a class whose name is in `nothing`, as it is no kind of thing."""
     no_kind = {word.strip().casefold() for word in nothing}
     synonyms = [[] if name.strip().casefold() in no_kind else _synonyms(name) for name in names]
     for name, each in zip(names, synonyms, strict=True):
@@ -75,11 +75,7 @@ def _synonyms(name: str) -> list[str]:
 
 
 def read_classes(path: Path) -> tuple[str, ...]:
-    """The names in a .json list or object of numbers to names, or the lines of a text file.
-
-    Raises:
-        InputError: the file is none of these, or a name is empty.
-    """
+    """The names in a .json list or object of numbers to names, or the lines of a text file."""
     try:
         text = read_foreign_text(path, MAX_CLASSES_BYTES)
         values = json.loads(text) if path.suffix.lower() == ".json" else text.splitlines()
@@ -97,154 +93,77 @@ def read_classes(path: Path) -> tuple[str, ...]:
     return tuple(name.strip() for name in values)
 
 
-TYPES = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(uint8)": np.uint8}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OnnxSegmenterOptions:
-    """How pictures are given to an ONNX file, and how its output is read."""
+class OnnxSegmenterOptions(OnnxOptions):
+    """How pictures are given to an ONNX file, and which output has the scores."""
 
-    input: str = field(default="", metadata={"help": "input tensor; empty = the model's first"})
-    output: str = field(default="", metadata={"help": "output tensor; empty = the model's first"})
-    activation: Literal["softmax", "none"] = field(
-        default="softmax",
-        metadata={"help": "softmax = the output is logits; none = it is probabilities already"},
+    size: int = option(
+        512,
+        "longer side of the picture in pixels; a model of a fixed size has its own, and the picture "
+        "is squeezed into it",
+        ge=1,
+        le=LARGEST_SIDE,
     )
-    size: int = field(
-        default=512,
-        metadata={
-            "help": "longer side of the picture in pixels; a model of a fixed size has its own, and the picture "
-            "is squeezed into it"
-        },
-    )
-    multiple: int = field(default=32, metadata={"help": "sides of the picture are multiples of this"})
-    scale: float = field(default=255.0, metadata={"help": "8-bit values are divided by this, then mean and std apply"})
-    mean: tuple[float, ...] = field(default=(0.485, 0.456, 0.406), metadata={"help": "subtracted per channel"})
-    std: tuple[float, ...] = field(default=(0.229, 0.224, 0.225), metadata={"help": "divided per channel"})
-    threads: int = field(default=0, metadata={"help": "onnxruntime threads; 0 = its own choice"})
 
-    def __post_init__(self) -> None:
-        if self.activation not in ("softmax", "none"):
-            raise InputError(f"activation: expected softmax or none, got {self.activation!r}")
-        for name, least, most in (("size", 1, 8192), ("multiple", 1, 1024), ("threads", 0, 1024)):
-            if not least <= getattr(self, name) <= most:
-                raise InputError(f"{name}: expected a whole number from {least} to {most}, got {getattr(self, name)}")
-        if not 1e-6 <= self.scale <= 1e6:
-            raise InputError(f"scale: expected a number from 1e-6 to 1e6, got {self.scale}")
-        for name, low in (("mean", -1e6), ("std", 1e-6)):
-            values = getattr(self, name)
-            if len(values) != 3 or not all(low <= value <= 1e6 for value in values):
-                raise InputError(f"{name}: expected three numbers, one a channel, got {list(values)}")
+
+Scores = tuple[Float32[np.ndarray, "h w C"], bool, Float64[np.ndarray, "2 3"]]
+"""Class scores of a picture, whether they are probabilities (else logits), and the affine from its pixels to cells."""
 
 
 class OnnxSegmenter:
-    """See `gsencoder.teachers.segmenter.Segmenter`."""
+    """An .onnx file that gives scores of classes on a grid.
+
+    Attributes:
+        name: of the file.
+        digest: of its content.
+        classes: the names in the .json of the same name; empty where there is none.
+        preprocessing: in words.
+    """
 
     def __init__(self, path: Path, options: OnnxSegmenterOptions) -> None:
-        """Reads the model's signature.
-
-        Args:
-            path: the .onnx file.
-            options: settings.
-
-        Raises:
-            InputError: it cannot be read, or does not take one picture of three channels.
-        """
-        self._session = open_session(path, "teacher segmenter", threads=options.threads)
-        self.name, self.options = path.stem, options
-        self._input, self._output = choose_tensors(
-            self._session,
-            options.input,
-            options.output,
-            f"teacher segmenter: {path.name}",
-            " (teacher.onnx.input, teacher.onnx.output)",
-        )
-        tensor = next(tensor for tensor in self._session.get_inputs() if tensor.name == self._input)
-        shape = tensor.shape
-        if len(shape) != 4 or tensor.type not in TYPES or 3 not in (shape[1], shape[3]):
-            raise InputError(
-                f"teacher segmenter: {path.name} takes {tensor.type}{shape}; expected one picture of float or uint8, "
-                "[1, 3, H, W] or [1, H, W, 3]"
-            )
-        self._channels_first = shape[1] == 3
-        self._type = TYPES[tensor.type]
-        sides = shape[2:4] if self._channels_first else shape[1:3]
-        self._fixed = (sides[0], sides[1]) if all(isinstance(side, int) and side > 0 for side in sides) else None
-        beside = path.with_suffix(".json")
-        self.classes: tuple[str, ...] = ()
-        if beside.is_file():
-            self.classes = read_classes(beside)
-        size = f"{self._fixed[1]}×{self._fixed[0]} px" if self._fixed else f"{options.size} px"
-        self.preprocessing = f"resized to {size}, output {self._output}, {options.activation}"
-        if self._type != np.uint8:
+        self._network = network = OnnxNetwork(path, options, WHAT)
+        self.name, self.digest, self._size = network.name, network.digest, options.size
+        names = path.with_suffix(".json")
+        self.classes = read_classes(names) if names.is_file() else ()
+        size = f"{network.fixed[1]}×{network.fixed[0]} px" if network.fixed else f"{options.size} px"
+        self.preprocessing = f"resized to {size}, output {network.output}, softmax"
+        if not network.takes_bytes:
             self.preprocessing += f", / {options.scale:g} − {list(options.mean)} / {list(options.std)}"
-        self.digest = digest_files(path)
 
-    def outputs(
-        self, image: UInt8[np.ndarray, "H W 3"], num_classes: int
-    ) -> tuple[Float32[np.ndarray, "h w C"], bool, Float64[np.ndarray, "2 3"]]:
-        """Class scores of one picture.
+    def scores(self, image: UInt8[np.ndarray, "H W 3"], num_classes: int) -> Scores:
+        """Class scores; `num_classes` tells the axis of the classes from those of the grid.
 
-        Args:
-            image: any size.
-            num_classes: tells the axis of the classes from those of the grid; where it does not, outputs are laid out
-                as inputs are.
-
-        Raises:
-            InputError: the model does not run on it, or gives no grid of classes.
+        Outputs that are probabilities already (from 0, a sum of 1 in each cell) are recognized: no logits are.
         """
-        resized = self._fitted(image)
-        feed = resized[None] if not self._channels_first else resized.transpose(2, 0, 1)[None]
-        where = f"teacher segmenter: {self.name}"
-        output = run_on_picture(self._session, (self._input, self._output), feed, where)
+        network = self._network
+        if network.fixed:
+            picture = np.asarray(Image.fromarray(image).resize(network.fixed[::-1], Image.Resampling.BILINEAR))
+        else:
+            picture, _ = fit_to_patches(image, self._size, MULTIPLE)
+        output = network.run(picture)
         if not isinstance(output, np.ndarray) or output.ndim != 4 or len(output) != 1 or output.dtype.kind != "f":
             raise InputError(
-                f"{where} gave {self._output!r} of {getattr(output, 'dtype', '?')}{list(np.shape(output))}; expected "
-                "scores [1, classes, rows, columns]; give teacher.onnx.output= of the logits"
+                f"{network.subject} gave {network.output!r} of {getattr(output, 'dtype', '?')}"
+                f"{list(np.shape(output))}; expected scores [1, classes, rows, columns]; give teacher.onnx.output="
             )
-        scores = output[0].transpose(1, 2, 0) if self._classes_first(output.shape, num_classes) else output[0]
-        rows, columns = scores.shape[:2]
-        affine = np.array([[columns / image.shape[1], 0.0, 0.0], [0.0, rows / image.shape[0], 0.0]])
-        return np.ascontiguousarray(scores, np.float32), self.options.activation == "none", affine
-
-    def _classes_first(self, shape: tuple[int, ...], count: int) -> bool:
-        first, last = shape[1] == count, shape[3] == count
-        return first if first != last else self._channels_first
-
-    def _fitted(self, image: UInt8[np.ndarray, "H W 3"]) -> Any:
-        """The picture in the model's size and type."""
-        options = self.options
-        if self._fixed:
-            resized = np.asarray(Image.fromarray(image).resize(self._fixed[::-1], Image.Resampling.BILINEAR))
-        else:
-            resized, _ = fit_to_patches(image, options.size, options.multiple)
-        if self._type == np.uint8:
-            return resized
-        return normalized(resized, options.scale, options.mean, options.std).astype(self._type)
+        first, last = output.shape[1] == num_classes, output.shape[3] == num_classes
+        classes_first = first if first != last else network.channels_first
+        scores = np.ascontiguousarray(output[0].transpose(1, 2, 0) if classes_first else output[0], np.float32)
+        are_probabilities = bool(scores.min() >= 0 and np.abs(scores.sum(axis=-1) - 1).max() <= SUM_TOLERANCE)
+        return scores, are_probabilities, resize_affine(scores.shape[:2], image.shape[:2])
 
 
-WHAT = "teacher segmenter"
 MASK_HEADS = ("mask2former", "oneformer", "maskformer", "eomt", "eomt_dinov3")
 """Kinds of models that give a class and a mask for each of many queries."""
 
 
 class TransformersSegmenter:
-    """See `gsencoder.teachers.segmenter.Segmenter`."""
+    """A segmenter of transformers with its preprocessing; attributes are those of `OnnxSegmenter`."""
 
     def __init__(self, folder: Path, device: Device) -> None:
-        """Loads model and preprocessing; nothing is fetched from anywhere.
-
-        Args:
-            folder: of the model.
-            device: where the model runs.
-
-        Raises:
-            InputError: transformers is missing, or the folder holds no segmenter with its preprocessing.
-        """
+        """Loads model and preprocessing; nothing is fetched from anywhere."""
         config = read_config(folder, WHAT)
         import transformers
-
-        from gsencoder.core.device import choose_device
 
         self._kind = config.model_type
         universal = self._kind in MASK_HEADS
@@ -264,14 +183,8 @@ class TransformersSegmenter:
         files = [*folder.glob("*.safetensors"), *folder.glob("*.json"), *folder.glob("*.txt")]
         self.digest = digest_files(*sorted(files))
 
-    def outputs(
-        self,
-        image: UInt8[np.ndarray, "H W 3"],
-        num_classes: int,  # noqa: ARG002
-    ) -> tuple[Float32[np.ndarray, "h w C"], bool, Float64[np.ndarray, "2 3"]]:
-        """Class scores of one picture: logits of a semantic head, probabilities of a head of masks."""
-        import torch
-
+    def scores(self, image: UInt8[np.ndarray, "H W 3"], num_classes: int) -> Scores:  # noqa: ARG002
+        """Class scores: logits of a semantic head, probabilities of a head of masks."""
         task = {"task_inputs": ["semantic"]} if self._kind == "oneformer" else {}
         with quiet_transformers():
             inputs = self._processor(images=image, return_tensors="pt", **task)
@@ -286,9 +199,8 @@ class TransformersSegmenter:
                 scores = outputs.logits[0]
         values = scores.permute(1, 2, 0).float().cpu().numpy()
         # Padding at the right and below is part of the grid, and no part of the picture.
-        rows, columns = (side * used / size for side, used, size in zip(values.shape, filled, input_size, strict=False))
-        affine = np.array([[columns / image.shape[1], 0.0, 0.0], [0.0, rows / image.shape[0], 0.0]])
-        return np.ascontiguousarray(values), are_probabilities, affine
+        sides = [side * used / size for side, used, size in zip(values.shape, filled, input_size, strict=False)]
+        return np.ascontiguousarray(values), are_probabilities, resize_affine(sides, image.shape[:2])
 
 
 def _oneformer_processor(folder: Path, task_tokens: int) -> Any:
@@ -306,8 +218,6 @@ def _oneformer_processor(folder: Path, task_tokens: int) -> Any:
 def _semantic_map(classes: Any, masks: Any) -> Any:
     """Σ over queries of the probability of a class, times that of the mask, [C, h, w]; cells that several queries claim
     are brought down to a sum of 1."""
-    import torch
-
     probabilities = classes.float().softmax(dim=-1)[..., :-1]
     scores = torch.einsum("qc,qhw->chw", probabilities, masks.float().sigmoid())
     return scores / scores.sum(dim=0, keepdim=True).clamp(min=1)
@@ -326,64 +236,36 @@ SUM_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SegmenterConfig:
+class SegmenterConfig(TeacherSettings):
     """Which network, what its classes are called, and how pictures are given to it."""
 
     name: Literal["segmenter"] = "segmenter"
-    model: str = field(
-        default="",
-        metadata={
-            "help": "an .onnx file, or a folder of a model for transformers (SegFormer, Mask2Former, OneFormer, …); "
-            "also looked for in GSENCODER_MODELS"
-        },
+    model: str = option(
+        "",
+        "an .onnx file, or a folder of a model for transformers (SegFormer, Mask2Former, OneFormer, …); "
+        "also looked for in GSENCODER_MODELS",
     )
-    classes: str = field(
-        default="",
-        metadata={
-            "help": "names of its classes in their order: a .json list or a text file with one a line; empty = those "
-            "of the model's folder, or the .json beside the .onnx file"
-        },
+    classes: str = option(
+        "",
+        "names of its classes in their order: a .json list or a text file with one a line; empty = those "
+        "of the model's folder, or the .json beside the .onnx file",
     )
-    nothing: tuple[str, ...] = field(
-        default=("other", "others", "background", "unlabeled", "unlabelled", "unknown", "void", "nothing"),
-        metadata={"help": "classes that are no kind of thing; they stand for the mean of the text side"},
+    nothing: tuple[str, ...] = option(
+        ("other", "others", "background", "unlabeled", "unlabelled", "unknown", "void", "nothing"),
+        "classes that are no kind of thing; they stand for the mean of the text side",
     )
-    temperature: float = field(default=1.0, metadata={"help": "softmax temperature of the posteriors"})
-    words: str = field(default="", metadata={"help": "text table with the names of the classes, if no text= is given"})
-    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where a model of a folder runs"})
+    temperature: float = option(1.0, "softmax temperature of the posteriors", ge=1e-3, le=1e3)
+    words: str = option("", "text table with the names of the classes, if no text= is given")
+    device: Device = option("auto", "where a model of a folder runs")
     onnx: OnnxSegmenterOptions = field(default_factory=OnnxSegmenterOptions)
 
-    def __post_init__(self) -> None:
-        if not 1e-3 <= self.temperature <= 1e3:
-            raise InputError(f"temperature: expected a number from 0.001 to 1000, got {self.temperature}")
-
-
-@runtime_checkable
-class Segmenter(Protocol):
-    """A network that gives posteriors of its classes on a grid of cells.
-
-    Attributes:
-        name: for people.
-        digest: of its files.
-        classes: names that its own files give, in order; empty where they give none.
-        preprocessing: in words.
-    """
-
-    name: str
-    digest: str
-    classes: tuple[str, ...]
-    preprocessing: str
-
-    def outputs(
-        self, image: UInt8[np.ndarray, "H W 3"], num_classes: int
-    ) -> tuple[Float32[np.ndarray, "h w C"], bool, Float64[np.ndarray, "2 3"]]:
-        """Class scores, whether they are probabilities (else logits), and the affine from image pixels to cells.
-
-        Args:
-            image: any size.
-            num_classes: tells the axis of the classes from those of the grid.
-        """
-        ...
+    def build(self, scene: Scene, words: Words | None) -> Teacher:  # noqa: ARG002
+        if words is None:
+            raise InputError(
+                f"{WHAT}: its classes need words: give a text tower (text=onnx text.model=FOLDER), or a text table "
+                "that has their names (teacher.words=)"
+            )
+        return SegmenterTeacher(self, words)
 
 
 class SegmenterTeacher:
@@ -398,19 +280,11 @@ class SegmenterTeacher:
     cheap = False
 
     def __init__(self, config: SegmenterConfig, words: Words) -> None:
-        """Loads the network, and embeds the names of its classes.
-
-        Args:
-            config: settings.
-            words: turns names into vectors.
-
-        Raises:
-            InputError: no such model, or names that are missing, of the wrong number, or unknown to `words`.
-        """
+        """Loads the network, and embeds the names of its classes with `words`."""
         if not config.model:
             raise InputError("teacher.model= is missing: an .onnx file, or a folder for transformers")
         self.config = config
-        self._network: Segmenter
+        self._network: OnnxSegmenter | TransformersSegmenter
         if Path(config.model).suffix.lower() == ".onnx":
             self._network = OnnxSegmenter(find_file(config.model, "teacher.model"), config.onnx)
         else:
@@ -422,7 +296,7 @@ class SegmenterTeacher:
             self.names = self._network.classes
         if not self.names:
             raise InputError(
-                f"teacher segmenter: {self._network.name}: no file says what its classes are called; give "
+                f"{WHAT}: {self._network.name}: no file says what its classes are called; give "
                 "teacher.classes= (a .json list, or a text file with one name a line)"
             )
         self.mean = words.mean
@@ -440,27 +314,17 @@ class SegmenterTeacher:
         )
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """Shares of the classes in the cells of one picture.
-
-        Raises:
-            InputError: no pictures, or outputs that are not finite, or of another number of classes.
-        """
-        if views.images is None:
-            raise MissingInput("teacher segmenter: the scene has no pictures")
-        scores, are_probabilities, grid_from_image = self._network.outputs(views.images[view], len(self.names))
-        where = f"teacher segmenter: {self._network.name}: view {views.names[view]!r}"
+        """Shares of the classes in the cells of one picture."""
+        image = photograph(views, view, WHAT)
+        scores, are_probabilities, grid_from_image = self._network.scores(image, len(self.names))
+        where = f"{WHAT}: {self._network.name}: view {views.names[view]!r}"
         if scores.shape[-1] != len(self.names):
             raise InputError(
                 f"{where}: the network gives {scores.shape[-1]} classes, and there are {len(self.names)} names for "
                 "them; check teacher.classes and teacher.onnx.output"
             )
-        bad = int(np.count_nonzero(~np.isfinite(scores)))
-        if bad:
-            raise InputError(
-                f"{where}: {bad} of {scores.size} outputs are not finite; check the model, and how pictures are given "
-                "to it (teacher.onnx.scale, mean, std)"
-            )
-        shares = _checked_shares(scores, where) if are_probabilities else softmax(scores, self.config.temperature)
+        check_finite(scores, where, "the model, and how pictures are given to it (teacher.onnx.scale, mean, std)")
+        shares = scores if are_probabilities else softmax(scores, self.config.temperature)
         return FeatureMap(shares=shares, table=self.table, grid_from_image=grid_from_image, space=self.space)
 
     def settings(self) -> dict[str, Any]:
@@ -483,27 +347,13 @@ def softmax(logits: Float32[np.ndarray, "h w C"], temperature: float) -> Float32
     return shares.astype(np.float32)
 
 
-def _checked_shares(scores: Float32[np.ndarray, "h w C"], where: str) -> Float32[np.ndarray, "h w C"]:
-    """Probabilities as they are; cells may sum to less than 1, where no class is meant.
-
-    Raises:
-        InputError: one is negative, or a cell sums to more than 1.
-    """
-    if scores.min() < 0 or scores.sum(axis=-1).max() > 1 + SUM_TOLERANCE:
-        raise InputError(
-            f"{where}: expected probabilities, from 0 and at most 1 in sum, got {float(scores.min()):.3g} to "
-            f"{float(scores.sum(axis=-1).max()):.3g}; are these logits (teacher.onnx.activation=softmax)?"
-        )
-    return scores
-
-
 def _class_vectors(synonyms: Sequence[Sequence[str]], words: Words) -> Float32[np.ndarray, "C D"]:
     """The vector of each class: the normalized mean over its synonyms; of a class without any the direction of the text
     side's mean, as the labels teacher has it for "other"."""
     phrases = list(dict.fromkeys(phrase for each in synonyms for phrase in each))
     if not phrases:
-        raise InputError("teacher segmenter: none of its classes is a kind of thing; check teacher.nothing")
-    with about("teacher segmenter: names of its classes"):
+        raise InputError(f"{WHAT}: none of its classes is a kind of thing; check teacher.nothing")
+    with about(f"{WHAT}: names of its classes"):
         vector_of = dict(zip(phrases, words.encode(phrases).astype(np.float64), strict=True))
     mean = words.mean.astype(np.float64)
     table = np.stack([np.mean([vector_of[phrase] for phrase in each], axis=0) if each else mean for each in synonyms])

@@ -1,23 +1,31 @@
 """The `transformers` teacher: dense features of vision towers (CLIP, SigLIP, DINO, SAM, those of VLMs)."""
 
-import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64, UInt8
-from PIL import Image
+from jaxtyping import Float
 from torch import Tensor, nn
 
+from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import read_foreign_text
-from gsencoder.core.pretrained import digest_files, find_file, load_part, load_pretrained, read_config, weight_files
-from gsencoder.teachers.base import MissingInput
-from gsencoder.teachers.onnx import fit_to_patches, normalized, patches_of
-from gsencoder.types import FeatureMap, FeatureSpace, Views
+from gsencoder.core.pretrained import (
+    ANY,
+    digest_files,
+    find_file,
+    load_part,
+    load_pretrained,
+    read_config,
+    weight_files,
+)
+from gsencoder.core.process import Device
+from gsencoder.core.settings import option
+from gsencoder.teachers.base import Teacher, TeacherSettings, check_channels, text_encoder_of
+from gsencoder.teachers.pictures import LARGEST_SIDE, TorchTeacher, read_preprocessing
+from gsencoder.text.vocabulary import OpenVocabulary, Words
+from gsencoder.types import FeatureSpace, Scene
 
 WHAT = "teacher transformers"
 
@@ -76,8 +84,6 @@ class TowerInFolder:
     """What the configuration of a folder says about its vision tower.
 
     Attributes:
-        kind: of the tower.
-        config: of the tower, as transformers reads it.
         alone: whether the folder holds the tower alone.
         cut_out: whether it is a part of a larger model, such as a vision-language model, of which nothing else is read.
     """
@@ -89,17 +95,14 @@ class TowerInFolder:
 
 
 def tower_in(folder: Path) -> TowerInFolder:
-    """The vision tower of a folder, by its config.json.
-
-    Raises:
-        InputError: transformers does not know the model without code of its own, or it has no tower of these kinds.
-    """
+    """The vision tower of a folder, by its config.json."""
     stated = read_config(folder, WHAT)
     config: Any = stated if stated.model_type in KINDS else getattr(stated, "vision_config", None)
     kind = KINDS.get(getattr(config, "model_type", ""))
     if kind is None:
         inner = f" with a {config.model_type} tower" if config is not None else ""
-        hint = "give teacher=radio for it" if stated.model_type == "radio" else f"expected one of {supported()}"
+        hint = f"expected one of {', '.join(kind.name for kind in KINDS.values())}, or a vision-language model with one"
+        hint = "give teacher=radio for it" if stated.model_type == "radio" else hint
         raise InputError(f"{WHAT}: {folder} holds a {stated.model_type} model{inner}; {hint}")
     if stated.model_type == "clip":
         # The width of the joint space stands in both configurations, and in old files only in this one.
@@ -109,237 +112,96 @@ def tower_in(folder: Path) -> TowerInFolder:
     return TowerInFolder(kind=kind, config=config, alone=alone, cut_out=cut_out)
 
 
-def supported() -> str:
-    """The kinds, for messages."""
-    return (
-        ", ".join(kind.name for kind in KINDS.values())
-        + ", or a vision-language model with such a tower (LLaVA, PaliGemma, Gemma 3, …)"
-    )
-
-
-FILES = ("processor_config.json", "preprocessor_config.json")
-"""Where it is stated: in the section `image_processor` of a processor's file, which transformers prefers, or alone."""
-FLOAT_FILTERS = {Image.Resampling.BILINEAR: "bilinear", Image.Resampling.BICUBIC: "bicubic"}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Preprocessing:
-    """Resize with a filter, times a factor, minus a mean, divided by a standard deviation.
-
-    Attributes:
-        resample: filter of the resize.
-        factor: 8-bit values are multiplied by this.
-        mean: subtracted, one a channel.
-        std: divided by, one a channel.
-        floats: whether values are resized after they were multiplied, and not rounded to 8 bits.
-    """
-
-    resample: Image.Resampling
-    factor: float
-    mean: tuple[float, ...]
-    std: tuple[float, ...]
-    floats: bool = False
-
-    def fit(
-        self, image: UInt8[np.ndarray, "H W 3"], size: int, patch: int
-    ) -> tuple[Float32[np.ndarray, "1 3 h w"], Float64[np.ndarray, "2 3"]]:
-        """What the network takes, with sides of whole patches, and the affine from pixels of the picture to patches.
-
-        Args:
-            image: any size.
-            size: about what the longer side becomes, pixels.
-            patch: pixels along a patch.
-        """
-        if self.floats:
-            return self._fit_floats(image, size, patch)
-        resized, affine = fit_to_patches(image, size, patch, self.resample)
-        return normalized(resized, 1 / self.factor, self.mean, self.std).transpose(2, 0, 1)[None], affine
-
-    def _fit_floats(
-        self, image: UInt8[np.ndarray, "H W 3"], size: int, patch: int
-    ) -> tuple[Float32[np.ndarray, "1 3 h w"], Float64[np.ndarray, "2 3"]]:
-        import torch
-
-        height, width = image.shape[:2]
-        rows, columns = patches_of(height, width, size, patch)
-        values = torch.from_numpy(image.astype(np.float32).transpose(2, 0, 1)[None] * np.float32(self.factor))
-        resized = torch.nn.functional.interpolate(
-            values, (rows * patch, columns * patch), mode=FLOAT_FILTERS[self.resample], antialias=True
-        )
-        pixels = normalized(resized[0].permute(1, 2, 0).numpy(), 1.0, self.mean, self.std)
-        return pixels.transpose(2, 0, 1)[None], np.array([[columns / width, 0, 0], [0, rows / height, 0]])
-
-    def describe(self) -> str:
-        """For the feature space."""
-        numbers = (f"{name} {[round(value, 6) for value in getattr(self, name)]}" for name in ("mean", "std"))
-        return f"{self.resample.name.lower()}, × {self.factor:.6g}, {', '.join(numbers)}"
-
-
-def read_preprocessing(folder: Path, subject: str, *, floats: bool = False) -> Preprocessing:
-    """The preprocessing that a folder states.
-
-    Its sizes and crops are not used: a map is of the whole picture. Mean, standard deviation and filter must be stated,
-    since features of pictures that were normalized otherwise look plausible, and are wrong.
-
-    Args:
-        folder: of the model.
-        subject: who reads it, for messages.
-        floats: see `Preprocessing`.
-
-    Raises:
-        InputError: no file, or one that does not state it.
-    """
-    path, stated = _stated(folder, subject)
-    where = f"{subject}: {path}"
-    missing = [name for name in ("resample", "image_mean", "image_std") if name not in stated]
-    if missing:
-        raise InputError(f"{where} does not state {', '.join(missing)}; take the file that belongs to the model")
-    if type(stated["resample"]) is not int or not 0 <= stated["resample"] <= 5:
-        raise InputError(f"{where}: resample: expected a number from 0 to 5, got {stated['resample']!r}")
-    resample = Image.Resampling(stated["resample"])
-    if floats and resample not in FLOAT_FILTERS:
-        raise InputError(f"{where}: resample: expected 2 (bilinear) or 3 (bicubic), got {int(resample)}")
-    normalizes = stated.get("do_normalize", True)
-    factor = stated.get("rescale_factor", 1 / 255) if stated.get("do_rescale", True) else 1.0
-    if not _is_number(factor) or factor <= 0:
-        raise InputError(f"{where}: rescale_factor: expected a number above 0, got {factor!r}")
-    return Preprocessing(
-        resample=resample,
-        factor=float(factor),
-        mean=_three(stated["image_mean"], f"{where}: image_mean") if normalizes else (0.0, 0.0, 0.0),
-        std=_three(stated["image_std"], f"{where}: image_std", positive=True) if normalizes else (1.0, 1.0, 1.0),
-        floats=floats,
-    )
-
-
-def _stated(folder: Path, subject: str) -> tuple[Path, dict[str, Any]]:
-    for path in (folder / name for name in FILES):
-        try:
-            stated = json.loads(read_foreign_text(path))
-        except FileNotFoundError:
-            continue
-        except (OSError, ValueError) as error:
-            raise InputError(f"{subject}: {path}: cannot be read: {error}") from error
-        section = stated.get("image_processor") if isinstance(stated, dict) and path.name == FILES[0] else stated
-        if isinstance(section, dict):
-            return path, section
-    raise InputError(
-        f"{subject}: {folder} has no preprocessor_config.json, which says how its pictures are resized and normalized; "
-        "take the file that belongs to the model"
-    )
-
-
-def _three(value: Any, where: str, *, positive: bool = False) -> tuple[float, ...]:
-    numbers = value if isinstance(value, list) else []
-    if len(numbers) != 3 or not all(_is_number(number) and (number > 0 or not positive) for number in numbers):
-        expected = "three numbers above 0" if positive else "three numbers"
-        raise InputError(f"{where}: expected {expected}, one a channel, got {str(value)[:60]}")
-    return tuple(float(number) for number in numbers)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
-
-
-LARGEST_SIDE = 8192
-"""Pixels along a resized picture."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TransformersConfig:
+class TransformersConfig(TeacherSettings):
     """Which vision tower, which of its vectors, and how pictures are given to it."""
 
     name: Literal["transformers"] = "transformers"
-    model: str = field(
-        default="",
-        metadata={
-            "help": "folder of a model for transformers (CLIP, SigLIP, SigLIP2, DINOv2, DINOv3, SAM, LLaVA, PaliGemma, "
-            "SmolVLM, …); also looked for in GSENCODER_MODELS"
-        },
+    model: str = option(
+        "",
+        "folder of a model for transformers (CLIP, SigLIP, SigLIP2, DINOv2, DINOv3, SAM, LLaVA, PaliGemma, "
+        "SmolVLM, …); also looked for in GSENCODER_MODELS",
     )
-    dense: Literal["auto", "tokens", "values", "summary"] = field(
-        default="auto",
-        metadata={
-            "help": "vectors of patches: tokens = hidden states; in the space of the text tower: values = of the last "
-            "attention (MaskCLIP), summary = the summary head on each patch; auto = values of CLIP, summary of SigLIP, "
-            "else tokens"
-        },
+    dense: Literal["auto", "tokens", "values", "summary"] = option(
+        "auto",
+        "vectors of patches: tokens = hidden states; in the space of the text tower: values = of the last "
+        "attention (MaskCLIP), summary = the summary head on each patch; auto = values of CLIP, summary of SigLIP, "
+        "else tokens",
     )
-    layer: int | None = field(
-        default=None,
-        metadata={
-            "help": "hidden states of this layer: -2 = before the last layer, -1 = after it, 1 = after the first; "
-            "null = after the final norm"
-        },
+    layer: int | None = option(
+        None,
+        "hidden states of this layer: -2 = before the last layer, -1 = after it, 1 = after the first; "
+        "null = after the final norm",
     )
-    size: int = field(
-        default=0, metadata={"help": "longer side of the resized picture in pixels; 0 = as the model was trained"}
+    size: int = option(
+        0, "longer side of the resized picture in pixels; 0 = as the model was trained", ge=0, le=LARGEST_SIDE
     )
-    large: Literal["interpolate", "windows"] = field(
-        default="interpolate",
-        metadata={
-            "help": "pictures of another size than the model's: its position embeddings are interpolated, or windows "
-            "of its size are averaged"
-        },
+    large: Literal["interpolate", "windows"] = option(
+        "interpolate",
+        "pictures of another size than the model's: its position embeddings are interpolated, or windows "
+        "of its size are averaged",
     )
-    overlap: float = field(
-        default=0.5, metadata={"help": "smallest share of a window that the next one covers again, with large=windows"}
+    overlap: float = option(
+        0.5, "smallest share of a window that the next one covers again, with large=windows", ge=0, le=0.9
     )
-    words: str = field(default="", metadata={"help": "text table that leads into the space; empty if none"})
-    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where the tower runs"})
+    words: str = option("", "text table that leads into the space; empty if none")
+    device: Device = option("auto", "where the tower runs")
 
     def __post_init__(self) -> None:
-        if not 0 <= self.size <= LARGEST_SIDE:
-            raise InputError(f"size: expected 1 to {LARGEST_SIDE} pixels, or 0, got {self.size}")
-        if not 0 <= self.overlap <= 0.9:
-            raise InputError(f"overlap: expected a share from 0 to 0.9, got {self.overlap}")
+        TeacherSettings.__post_init__(self)
         if self.layer is not None and self.dense in ("values", "summary"):
             raise InputError(f"layer: hidden states of a layer are dense=tokens, got dense={self.dense}")
 
+    def build(self, scene: Scene, words: Words | None) -> Teacher:  # noqa: ARG002
+        tower = TransformersTeacher(self, text_encoder=text_encoder_of(words))
+        if isinstance(words, OpenVocabulary) and not tower.network.joint:
+            raise InputError(
+                f"text=: no words lead into {tower.space.layer} of {tower.space.name}; leave out text=, or give a "
+                "text-aligned model (CLIP, SigLIP, SigLIP2) with its head"
+            )
+        check_channels(tower.space, words)
+        return tower
 
-class TransformersTeacher:
+    def refuse_text(self) -> str:
+        if self.dense == "tokens" or self.layer is not None:
+            return (
+                "text=: no words lead into hidden states (teacher.dense=tokens, teacher.layer=); give "
+                "teacher.dense=values or summary with a text-aligned model, or leave out text="
+            )
+        return TeacherSettings.refuse_text(self)
+
+    def takes_text(self) -> bool:
+        # With dense=auto the folder decides, which is read when the teacher is built.
+        return self.dense in ("values", "summary")
+
+
+class TransformersTeacher(TorchTeacher):
     """A vision tower on whole pictures, which are resized to multiples of the patch, without a crop."""
 
-    table = None
-    mean = None
-    needs_images = True
-    cheap = False
+    subject = WHAT
 
     def __init__(self, config: TransformersConfig, *, text_encoder: str = "") -> None:
-        """Loads tower and preprocessing; nothing is fetched from anywhere.
-
-        Args:
-            config: which, and how.
-            text_encoder: what turns words into this space; empty if nothing does.
-
-        Raises:
-            InputError: transformers is missing, or the folder holds no tower of a kind that is known, with its
-                preprocessing.
-        """
+        """Loads tower and preprocessing; nothing is fetched from anywhere."""
         if not config.model:
             raise InputError("teacher.model= is missing: the folder of a vision model")
         folder = find_file(config.model, "teacher.model", folder=True)
         tower = tower_in(folder)
-        self._preprocessing = read_preprocessing(folder, WHAT, floats=tower.kind.resizes_floats)
-        from gsencoder.core.device import choose_device
-
-        self._device = choose_device(config.device).type
-        network = VisionTower(folder, tower, config.dense, config.layer).to(self._device)
-        self._network, self.config = network, config
-        self.joint = network.joint
-        self._size = config.size or network.native
-        if tower.kind.native_only and config.large == "interpolate" and self._size > network.native:
+        self.preprocessing = read_preprocessing(folder, WHAT, floats=tower.kind.resizes_floats)
+        self.device, self.config = choose_device(config.device).type, config
+        self.network: VisionTower = VisionTower(folder, tower, config.dense, config.layer).to(self.device)
+        network = self.network
+        self.size = config.size or network.native
+        if tower.kind.native_only and config.large == "interpolate" and self.size > network.native:
             raise InputError(
-                f"{WHAT}: size: {tower.kind.name} takes pictures of up to {network.native} pixels, got {self._size}; "
+                f"{WHAT}: size: {tower.kind.name} takes pictures of up to {network.native} pixels, got {self.size}; "
                 "give large=windows for larger ones"
             )
-        how = f"{self._preprocessing.describe()}, resized to {self._size} px in multiples of {network.patch}"
+        how = f"{self.preprocessing.describe()}, resized to {self.size} px in multiples of {network.patch}"
         if config.large == "windows":
             how += f", windows of {network.native} px with an overlap of {config.overlap:g}"
         layer = "after the final norm" if config.layer is None else f"of layer {config.layer}"
-        name = folder.resolve().name
         self.space = FeatureSpace(
-            name=name,
+            name=folder.resolve().name,
             channels=network.channels,
             teacher="transformers",
             weights=network.digest,
@@ -348,40 +210,21 @@ class TransformersTeacher:
             text_encoder=text_encoder,
         )
 
-    def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The tower's vectors of the patches of one picture.
-
-        Raises:
-            MissingInput: no pictures.
-            InputError: features that are not finite.
-        """
-        import torch
-
-        from gsencoder.core.device import enough_memory, teacher_autocast
-
-        if views.images is None:
-            raise MissingInput(f"{WHAT}: the scene has no pictures")
-        network = self._network
-        fitted, grid_from_image = self._preprocessing.fit(views.images[view], self._size, network.patch)
-        pixels = torch.from_numpy(np.ascontiguousarray(fitted)).to(self._device)
-        with torch.inference_mode(), teacher_autocast(self._device), enough_memory(WHAT, "teacher.size="):
-            if self.config.large == "windows":
-                cells = map_in_windows(network, pixels, network.patch, network.native, self.config.overlap)
-            else:
-                cells = network(pixels)
-        features = np.ascontiguousarray(cells.cpu().numpy())
-        if not np.isfinite(features).all():
-            raise InputError(f"{WHAT}: features of view {views.names[view]!r} are not finite; check the weights")
-        return FeatureMap(features=features, grid_from_image=grid_from_image, space=self.space)
+    def map_of(self, pixels: Float[Tensor, "1 3 H W"]) -> Float[Tensor, "h w D"]:
+        network = self.network
+        if self.config.large == "windows":
+            return map_in_windows(network, pixels, network.patch, network.native, self.config.overlap)
+        out: Tensor = network(pixels)
+        return out
 
     def settings(self) -> dict[str, Any]:
         values: dict[str, Any] = {
             "name": "transformers",
-            "model": self._network.digest,
-            "dense": self._network.dense,
+            "model": self.network.digest,
+            "dense": self.network.dense,
             "layer": self.config.layer,
-            "size": self._size,
-            "preprocessing": self._preprocessing.describe(),
+            "size": self.size,
+            "preprocessing": self.preprocessing.describe(),
             "large": self.config.large,
         }
         return {**values, "overlap": self.config.overlap} if self.config.large == "windows" else values
@@ -422,9 +265,6 @@ class VisionTower(nn.Module):
             dense: what the vectors are; auto = in the joint space if there is one: values of CLIP, summary of SigLIP.
             layer: tokens are hidden states of a layer, as transformers counts them: 0 = what goes into the first layer,
                 −1 = what comes from the last one, without the final norm. None = after the final norm.
-
-        Raises:
-            InputError: weights that cannot be read or do not fit, or vectors or a layer that the model does not have.
         """
         super().__init__()
         self._kind, config = tower.kind, tower.config
@@ -438,7 +278,7 @@ class VisionTower(nn.Module):
                 f"{WHAT}: layer: expected {-layers - 1} to {layers}, as this {self._kind.name} tower has {layers} "
                 f"layers, got {layer}"
             )
-        import transformers
+        import transformers  # Slow, and not needed by other teachers.
 
         if tower.cut_out:
             loader = getattr(transformers, self._kind.loader)
@@ -446,8 +286,8 @@ class VisionTower(nn.Module):
         else:
             projects = "WithProjection" if self._head == "projection" else ""
             loader = getattr(transformers, self._kind.loader + projects)
-            others = "warn" if tower.alone else "ignore"
-            self._model = load_pretrained(loader, folder, WHAT, other_parts=others, config=config)
+            ignored = () if tower.alone else ANY
+            self._model = load_pretrained(loader, folder, WHAT, ignored=ignored, config=config)
         self.digest = digest_files(folder / "config.json", *files)
         self.patch = _side(config.patch_size)
         # SigLIP2 with pictures of any shape states a number of patches instead.
@@ -490,11 +330,7 @@ class VisionTower(nn.Module):
         return int(config.hidden_size)
 
     def forward(self, pixels: Float[Tensor, "1 3 H W"]) -> Float[Tensor, "h w D"]:
-        """One vector a patch, float32.
-
-        Args:
-            pixels: a normalized picture with sides of whole patches.
-        """
+        """One vector a patch, float32, of a normalized picture with sides of whole patches."""
         rows, columns = pixels.shape[2] // self.patch, pixels.shape[3] // self.patch
         if self._kind.name == "SAM":
             return self._grid_of_sam(pixels)[:rows, :columns].float()
@@ -560,13 +396,8 @@ def _names_of_weights(folder: Path) -> set[str]:
 
 
 def window_starts(count: int, window: int, overlap: float) -> list[int]:
-    """Where windows begin along a side, in patches: evenly apart, the first at 0 and the last one at the end.
-
-    Args:
-        count: patches along the side.
-        window: patches along a window; one window is enough where it is not less than `count`.
-        overlap: smallest share of a window that the next one covers again, in [0, 1).
-    """
+    """Where windows of `window` patches begin along a side of `count`: evenly apart, the first at 0 and the last one at
+    the end; each covers again at least the share `overlap` of the one before."""
     if window >= count:
         return [0]
     step = max(1, int(window * (1 - overlap)))

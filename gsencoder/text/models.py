@@ -3,7 +3,7 @@
 import json
 import string
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +13,7 @@ from jaxtyping import Float32, Int64
 from gsencoder.core.errors import InputError, readable
 from gsencoder.core.files import check_foreign, read_foreign_text
 from gsencoder.core.pretrained import (
+    ANY,
     SENTENCE_ENCODER,
     digest_files,
     find_file,
@@ -22,6 +23,7 @@ from gsencoder.core.pretrained import (
     read_config,
     sentence_encoder_graph,
 )
+from gsencoder.core.settings import option
 from gsencoder.text.table import NO_TEMPLATES, check_known, check_templates, unit
 
 Pooling = Literal["mean", "cls", "eos", "output"]
@@ -37,31 +39,17 @@ class OnnxTextConfig:
     """A text tower in a folder with an ONNX graph and `tokenizer.json`."""
 
     name: Literal["onnx"] = "onnx"
-    model: str = field(
-        default="",
-        metadata={
-            "help": "folder with model.onnx and tokenizer.json; also looked for in GSENCODER_MODELS; minilm_l6 is "
-            "installed"
-        },
+    model: str = option(
+        "", "folder with model.onnx and tokenizer.json; also looked for in GSENCODER_MODELS; minilm_l6 is installed"
     )
-    pooling: Literal["auto"] | Pooling = field(
-        default="auto",
-        metadata={
-            "help": "how token vectors become one: mean, cls = the first, eos = the last, output = the model does it; "
-            "auto = as the folder says"
-        },
+    pooling: Literal["auto"] | Pooling = option(
+        "auto",
+        "how token vectors become one: mean, cls = the first, eos = the last, output = the model does it; "
+        "auto = as the folder says",
     )
-    templates: tuple[str, ...] = field(
-        default=NO_TEMPLATES,
-        metadata={"help": "sentences with {} for the phrase, whose vectors are averaged"},
-    )
-    threads: int = field(default=0, metadata={"help": "onnxruntime threads; 0 = its own choice"})
+    templates: tuple[str, ...] = option(NO_TEMPLATES, "sentences with {} for the phrase, whose vectors are averaged")
 
     def __post_init__(self) -> None:
-        if self.pooling not in ("auto", "mean", "cls", "eos", "output"):
-            raise InputError(f"pooling: expected auto, mean, cls, eos or output, got {self.pooling!r}")
-        if not 0 <= self.threads <= 1024:
-            raise InputError(f"threads: expected 0 to 1024, got {self.threads}")
         check_templates(self.templates)
 
 
@@ -100,7 +88,7 @@ class OnnxTower:
             raise InputError(f"{folder}: {missing} is missing; expected a text tower as optimum exports it")
         self.name, self._folder = folder.resolve().name, folder
         self._tokenizer = _load_tokenizer(tokenizer)
-        self._session = open_session(graph, "text tower", threads=config.threads)
+        self._session = open_session(graph, "text tower")
         self._inputs = {tensor.name: tensor.shape for tensor in self._session.get_inputs()}
         unknown = sorted(set(self._inputs) - set(KNOWN_INPUTS))
         if "input_ids" not in self._inputs or unknown:
@@ -323,30 +311,19 @@ class TransformersTextConfig:
     """A text tower in a folder that transformers reads."""
 
     name: Literal["transformers"] = "transformers"
-    model: str = field(
-        default="", metadata={"help": "folder of the model and its tokenizer; also looked for in GSENCODER_MODELS"}
+    model: str = option("", "folder of the model and its tokenizer; also looked for in GSENCODER_MODELS")
+    pooling: Literal["auto"] | Pooling = option(
+        "auto",
+        "how token vectors become one: mean, cls = the first, eos = the last, output = the model does it; "
+        "auto = as the kind of model or its folder says",
     )
-    pooling: Literal["auto"] | Pooling = field(
-        default="auto",
-        metadata={
-            "help": "how token vectors become one: mean, cls = the first, eos = the last, output = the model does it; "
-            "auto = as the kind of model or its folder says"
-        },
+    lower: Literal["auto", "yes", "no"] = option(
+        "auto", "lower-case phrases and remove punctuation; auto = where the kind of model was trained so"
     )
-    lower: Literal["auto", "yes", "no"] = field(
-        default="auto",
-        metadata={"help": "lower-case phrases and remove punctuation; auto = where the kind of model was trained so"},
-    )
-    templates: tuple[str, ...] = field(
-        default=NO_TEMPLATES,
-        metadata={"help": "sentences with {} for the phrase, whose vectors are averaged"},
-    )
-    device: Literal["auto", "cpu", "cuda"] = field(default="auto", metadata={"help": "where it runs"})
+    templates: tuple[str, ...] = option(NO_TEMPLATES, "sentences with {} for the phrase, whose vectors are averaged")
+    device: Literal["auto", "cpu", "cuda"] = option("auto", "where it runs")
 
     def __post_init__(self) -> None:
-        for name, known in (("pooling", ("auto", "mean", "cls", "eos", "output")), ("lower", ("auto", "yes", "no"))):
-            if getattr(self, name) not in known:
-                raise InputError(f"{name}: expected one of {', '.join(known)}, got {getattr(self, name)!r}")
         check_templates(self.templates)
 
 
@@ -389,7 +366,7 @@ class TransformersTower:
         # What looks like a special token in a phrase is text.
         self._tokenizer = load_tokenizer(folder, WHAT, split_special_tokens=True)
         loader = getattr(transformers, self._kind.loader if self._kind else "AutoModel")
-        model = load_pretrained(loader, folder, WHAT, other_parts="ignore" if self._kind else "warn")
+        model = load_pretrained(loader, folder, WHAT, ignored=ANY if self._kind else ())
         rows = model.get_input_embeddings().num_embeddings
         if len(self._tokenizer) > rows:
             raise InputError(

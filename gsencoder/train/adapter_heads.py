@@ -14,22 +14,19 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.errors import CellSample
 from gsencoder.fusion.folder import HEADS_FILE, check_heads_space
 from gsencoder.fusion.measured_heads import (
     HeadSet,
     choose_heads,
     has_head,
-    heads_of,
     load_heads,
     measure_heads,
     save_heads,
-    stored_heads,
 )
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.teachers.build import TeacherConfig
-from gsencoder.teachers.radio import RadioConfig
+from gsencoder.teachers.adapter_heads import Head
+from gsencoder.teachers.build import TeacherConfig, load_teacher_heads
 from gsencoder.train.losses import AdapterHead
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.space import OpenScene, sampled_maps
@@ -72,7 +69,7 @@ def teacher_of_heads(teachers: Mapping[str, TeacherConfig], heads: Sequence[str]
     Raises:
         InputError: heads are named, and several teachers have some.
     """
-    with_heads = [name for name, config in teachers.items() if isinstance(config, RadioConfig)]
+    with_heads = [name for name, config in teachers.items() if config.has_heads]
     if heads and len(with_heads) > 1:
         raise InputError(
             f"heads={','.join(heads)}: {' and '.join(with_heads)} have adapter heads; expected one such teacher"
@@ -83,7 +80,7 @@ def teacher_of_heads(teachers: Mapping[str, TeacherConfig], heads: Sequence[str]
 def required_heads(loss_heads: Sequence[str], teachers: Mapping[str, TeacherConfig]) -> tuple[str, ...]:
     """The names of the heads that a training needs: those of the render loss, and those that are stored beside the
     weights besides."""
-    stored = [name for config in teachers.values() for name in stored_heads(config)]
+    stored = [name for config in teachers.values() for name in config.stored_heads]
     return tuple(dict.fromkeys([*loss_heads, *stored]))
 
 
@@ -98,7 +95,7 @@ def missing_heads(dataset: PreparedDataset, names: Sequence[str], teacher: Teach
     if stored is not None and all(has_head(stored, name) for name in names):
         return []
     stored_names = stored.names if stored is not None else ()
-    return [head for head in heads_of(teacher, names) if head.name not in stored_names]
+    return [head for head in load_teacher_heads(teacher, names) if head.name not in stored_names]
 
 
 def measure_dataset_heads(

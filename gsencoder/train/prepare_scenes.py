@@ -22,15 +22,14 @@ from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
-from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.cameras import CamerasOfSplat, check_orbits, with_views
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.folder import TEACHER_NAME
 from gsencoder.models.output_space import check_distinct
+from gsencoder.teachers.adapter_heads import Head
 from gsencoder.teachers.base import MissingInput, Teacher
 from gsencoder.teachers.build import TeacherConfig, build_teacher, options_of_member
 from gsencoder.teachers.labels import LabelsConfig
-from gsencoder.teachers.masks import RegionsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
 from gsencoder.train.distributed import check_agreement, fail_together
@@ -111,7 +110,7 @@ class SceneReader:
     def teacher(self, name: str, scene: Scene) -> Teacher:
         """The teacher of a scene. Objects and masks belong to a scene; any other teacher is built once for all."""
         config = self.config.teachers_by_name[name]
-        if isinstance(config, (LabelsConfig, RegionsConfig)):
+        if config.per_scene:
             return build_teacher(config, scene, self.words.get(name))
         if name not in self._shared:
             self._shared[name] = build_teacher(config, scene, self.words.get(name))

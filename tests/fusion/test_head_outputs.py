@@ -11,9 +11,9 @@ from measured_heads import SPACE, measured
 from torch import nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.errors import CellSample, sample_cells
 from gsencoder.fusion.measured_heads import equal_rows, head_features, head_space, head_tokens, measure_heads
+from gsencoder.teachers.adapter_heads import Head
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
 
 

@@ -15,7 +15,6 @@ from torch import nn
 
 from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.folder import copy_heads, heads_beside
 from gsencoder.fusion.measured_heads import (
     HeadSet,
@@ -26,6 +25,7 @@ from gsencoder.fusion.measured_heads import (
     load_heads,
     save_heads,
 )
+from gsencoder.teachers.adapter_heads import Head
 
 
 def head_set() -> HeadSet:

@@ -14,8 +14,8 @@ from splats import front_camera
 from torch.nn import functional
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.adapter_heads import Head, read_radio_heads, text_kind
-from gsencoder.fusion.measured_heads import heads_of
+from gsencoder.teachers.adapter_heads import Head, read_radio_heads, text_kind
+from gsencoder.teachers.build import load_teacher_heads
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.radio import RadioConfig, RadioTeacher
 from gsencoder.types import Views
@@ -217,7 +217,7 @@ def test_files_of_pickles_are_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match=r"is a file, and files of pickles, such as \.pth\.tar, are never opened"):
         RadioTeacher(RadioConfig(model=str(tmp_path / name)))
     with pytest.raises(InputError, match="are never opened"):
-        heads_of(RadioConfig(model=str(tmp_path / name)), ["siglip"])
+        load_teacher_heads(RadioConfig(model=str(tmp_path / name)), ["siglip"])
 
 
 @pytest.mark.parametrize("name", ["radio-v2.5-h.pth.tar", "pytorch_model.bin"])
@@ -229,7 +229,7 @@ def test_heads_of_a_folder_of_pickles_are_refused_as_its_backbone_is(tmp_path: P
         RadioTeacher(RadioConfig(model=str(tmp_path)))
     assert "has no weights as safetensors, and files of pickles are not opened" in str(of_backbone.value)
     with pytest.raises(InputError) as of_heads:
-        heads_of(RadioConfig(model=str(tmp_path)), ["siglip"])
+        load_teacher_heads(RadioConfig(model=str(tmp_path)), ["siglip"])
     assert str(of_heads.value) == str(of_backbone.value)
 
 
@@ -246,10 +246,10 @@ def test_files_that_the_index_of_the_weights_names_and_that_are_missing_are_name
         (tmp_path / first).unlink()
     missing = f"1 of 2 .* missing: {second};" if present else f"2 of 2 .* missing: {first}, {second};"
     with pytest.raises(InputError, match=missing):
-        heads_of(RadioConfig(model=str(tmp_path)), ["siglip"])
+        load_teacher_heads(RadioConfig(model=str(tmp_path)), ["siglip"])
     index.write_text("{")
     with pytest.raises(InputError, match="index.json cannot be read"):
-        heads_of(RadioConfig(model=str(tmp_path)), ["siglip"])
+        load_teacher_heads(RadioConfig(model=str(tmp_path)), ["siglip"])
     if present:
         (tmp_path / second).write_bytes((tmp_path / first).read_bytes())
         index.write_text(json.dumps({"weight_map": {"a": first}}))
@@ -259,10 +259,10 @@ def test_files_that_the_index_of_the_weights_names_and_that_are_missing_are_name
 
 def test_heads_of_a_teacher_without_any_and_files_of_heads_are_refused(folder: Path) -> None:
     with pytest.raises(InputError, match="heads=siglip: teacher=palette has no adapter heads; teacher=radio has some"):
-        heads_of(PaletteConfig(), ["siglip"])
+        load_teacher_heads(PaletteConfig(), ["siglip"])
     with pytest.raises(InputError, match=r"heads=old\.safetensors: expected names of the teacher's adapter heads"):
-        heads_of(RadioConfig(model=str(folder)), ["old.safetensors"])
-    assert heads_of(PaletteConfig(), []) == []
+        load_teacher_heads(RadioConfig(model=str(folder)), ["old.safetensors"])
+    assert load_teacher_heads(PaletteConfig(), []) == []
 
 
 def test_the_backbone_of_a_release_is_loaded_without_its_code_and_without_warnings(folder: Path) -> None:

@@ -17,9 +17,8 @@ from vision_towers import JOINT_CHANNELS, save_preprocessing
 from vision_towers import VISION as TOWER_VISION
 
 from gsencoder.core.errors import InputError
-from gsencoder.teachers.build import build_teacher, takes_text, words_of
-from gsencoder.teachers.masks import OnnxRegionOptions, RegionsConfig
-from gsencoder.teachers.regions import TransformersImageTower, square_crop
+from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.teachers.regions import OnnxRegionOptions, RegionsConfig, TransformersImageTower, square_crop
 from gsencoder.text.models import OnnxTextConfig
 
 TEXT = {**SMALL, "vocab_size": 8, "max_position_embeddings": 12, "eos_token_id": 3, "bos_token_id": 2}
@@ -91,9 +90,8 @@ def test_crops_through_a_tower_of_transformers_equal_a_direct_call_of_the_librar
     processor.save_pretrained(tmp_path / "model")
     masks = write_masks(tmp_path / "m")
     words = toy_words("mug", "table", channels=8 if make is joint_clip else 16)
-    if not joint:
-        with pytest.raises(InputError, match="if teacher.joint=true says that both belong to one joint model"):
-            build(masks, tmp_path / "model", "crop", words)
+    config = RegionsConfig(vector="crop", model=str(tmp_path / "model"))
+    assert (not config.refuse_text()) == joint
     teacher = build(masks, tmp_path / "model", "crop", words, min_area=1, joint=not joint, device="cpu")
     assert teacher.space.text_encoder == "toy"
     scene = region_scene()
@@ -114,7 +112,7 @@ def test_crops_through_a_tower_of_transformers_equal_a_direct_call_of_the_librar
 
 def test_models_without_a_pooled_output_are_refused(tmp_path: Path) -> None:
     masks = write_masks(tmp_path / "m")
-    with pytest.raises(InputError, match=r"gave 'out' of shape \[1, 3, 8, 8\], expected a pooled output"):
+    with pytest.raises(InputError, match=r"gave 'out' of shape \[1, 3, 8, 8\], expected a pooled"):
         build(masks, save_colors(tmp_path / "net.onnx"), "crop")
     with pytest.raises(InputError, match="teacher.model= is missing: the image tower of vector=map"):
         build_teacher(RegionsConfig(folder=str(masks), vector="map"), region_scene(), None)
@@ -125,13 +123,10 @@ def test_models_without_a_pooled_output_are_refused(tmp_path: Path) -> None:
 
 def test_a_text_tower_needs_a_joint_model(tmp_path: Path) -> None:
     tower = OnnxTextConfig(model="nowhere")
-    with pytest.raises(InputError, match="if teacher.joint=true says that teacher.model= and text= belong to one"):
-        words_of(RegionsConfig(vector="map", model="x.onnx"), tower)
+    for vector in ("map", "crop"):
+        with pytest.raises(InputError, match="if teacher.joint=true says that teacher.model= and text= belong to one"):
+            words_of(RegionsConfig(vector=vector, model="x.onnx"), tower)  # type: ignore[arg-type]
     model, masks = save_pool(tmp_path / "net.onnx"), write_masks(tmp_path / "m")
-    with pytest.raises(
-        InputError, match="the vectors of net are taken for those of the text tower if teacher.joint=true"
-    ):
-        build(masks, model, "crop", toy_words("mug", channels=3))
     joint = build(masks, model, "crop", toy_words("mug", channels=3), joint=True, min_area=1)
     assert joint.space.text_encoder == "toy"
 
@@ -189,9 +184,9 @@ def test_a_crop_teacher_without_a_joint_space_takes_no_words_beside_one_that_has
     for name, make in (("clip", joint_clip), ("vit", plain_vit)):
         make()[0].save_pretrained(tmp_path / name)
     config = RegionsConfig(masks="instances", vector="crop", model=str(tmp_path / "vit"))
-    assert not takes_text(config)
-    assert takes_text(replace(config, joint=True))
-    assert takes_text(replace(config, model=str(tmp_path / "clip")))
+    assert not config.takes_text()
+    assert replace(config, joint=True).takes_text()
+    assert replace(config, model=str(tmp_path / "clip")).takes_text()
 
 
 def test_tokens_before_those_of_patches_are_skipped(tmp_path: Path) -> None:

@@ -18,16 +18,16 @@ from gsencoder.core.errors import InputError
 from gsencoder.fusion.fuse import fuse
 from gsencoder.teachers.build import build_teacher
 from gsencoder.teachers.masks import (
-    OnnxRegionOptions,
     Proposal,
-    RegionsConfig,
     SamMasks,
+    SamOptions,
     grid_points,
     mask_iou,
     paint,
     stability,
     suppress,
 )
+from gsencoder.teachers.regions import OnnxRegionOptions, RegionsConfig
 
 SIDE = 64
 POINTS = {"hidden_size": 16, "image_size": SIDE, "mask_input_channels": 4}
@@ -102,9 +102,9 @@ def saved(tmp_path: Path) -> Callable[[Callable[[], Any]], tuple[Path, Any]]:
     return save
 
 
-def config_of(folder: Path, **options: Any) -> RegionsConfig:
-    given = {"min_iou": 0.0, "min_stability": 0.0, "max_overlap": 1.0, "min_area": 1, "points": 3, "device": "cpu"}
-    return RegionsConfig(masks="sam", vector="map", model="x.onnx", sam=str(folder), **{**given, **options})
+def masks_of(folder: Path, **options: Any) -> SamMasks:
+    given = {"min_iou": 0.0, "min_stability": 0.0, "max_overlap": 1.0, "min_area": 1, "points": 3}
+    return SamMasks(str(folder), SamOptions(**{**given, **options}), "cpu")
 
 
 def photograph() -> np.ndarray:
@@ -136,7 +136,7 @@ def masks_of_library(folder: Path, model: Any, points: np.ndarray) -> tuple[np.n
 @pytest.mark.parametrize("side", [3, 6])
 def test_proposals_are_the_masks_that_the_library_gives_for_the_points(saved: Any, side: int) -> None:
     folder, model = saved(sam)
-    made = list(SamMasks(config_of(folder, points=side)).proposals(photograph()))
+    made = list(masks_of(folder, points=side).proposals(photograph()))
     points = grid_points(side) * (WIDTH, HEIGHT)
     logits, scores = masks_of_library(folder, model, points)
     expected = [
@@ -156,7 +156,7 @@ def test_proposals_are_the_masks_that_the_library_gives_for_the_points(saved: An
 
 def test_sam2_sees_the_picture_squeezed_into_its_square(saved: Any) -> None:
     folder, model = saved(sam2)
-    made = list(SamMasks(config_of(folder)).proposals(photograph()))
+    made = list(masks_of(folder).proposals(photograph()))
     from PIL import Image
 
     squeezed = np.asarray(Image.fromarray(photograph()).resize((SIDE, SIDE), Image.Resampling.BILINEAR)) / 255
@@ -178,20 +178,20 @@ def test_sam2_sees_the_picture_squeezed_into_its_square(saved: Any) -> None:
 @pytest.mark.parametrize("make", [sam, sam2])
 def test_thresholds_leave_the_proposals_that_reach_them(saved: Any, make: Any) -> None:
     folder, _ = saved(make)
-    every = list(SamMasks(config_of(folder)).proposals(photograph()))
+    every = list(masks_of(folder).proposals(photograph()))
     scores, areas = sorted(each.score for each in every), sorted(each.area for each in every)
     middle = scores[len(scores) // 2] - 1e-6
-    fewer = list(SamMasks(config_of(folder, min_iou=middle)).proposals(photograph()))
+    fewer = list(masks_of(folder, min_iou=middle).proposals(photograph()))
     assert len(fewer) == sum(score >= middle for score in scores) < len(every)
-    large = SamMasks(config_of(folder, min_area=areas[-1])).proposals(photograph())
+    large = masks_of(folder, min_area=areas[-1]).proposals(photograph())
     assert [each.area for each in large] == [areas[-1]] * areas.count(areas[-1])
-    steady = list(SamMasks(config_of(folder, min_stability=1.0)).proposals(photograph()))
+    steady = list(masks_of(folder, min_stability=1.0).proposals(photograph()))
     assert len(steady) < len(every)
 
 
 def test_masks_of_a_large_photograph_are_made_one_at_a_time(saved: Any) -> None:
     folder, _ = saved(sam)
-    masks, large = SamMasks(config_of(folder, points=4)), np.repeat(np.repeat(photograph(), 20, axis=0), 20, axis=1)
+    masks, large = masks_of(folder, points=4), np.repeat(np.repeat(photograph(), 20, axis=0), 20, axis=1)
     tracemalloc.start()
     count = sum(1 for _ in masks.proposals(large))
     _, peak = tracemalloc.get_traced_memory()
@@ -262,7 +262,9 @@ def test_a_teacher_with_masks_of_sam_gives_each_region_a_vector(saved: Any, tmp_
     )
     teacher = build_teacher(config, scene, None)
     made = teacher.feature_map(scene.views, 0)
-    labels = SamMasks(config).labels(scene.views, 0)
+    options = SamOptions(points=3, min_iou=0.0, min_stability=0.0, max_overlap=0.5)
+    masks = SamMasks(str(folder), options, "cpu")
+    labels = masks.labels(scene.views, 0)
     assert made.codes is not None
     assert made.table is not None
     assert made.codes.max() >= 0
@@ -276,7 +278,7 @@ def test_a_teacher_with_masks_of_sam_gives_each_region_a_vector(saved: Any, tmp_
     bare = region_scene(images=None).views
     assert bare is not None
     with pytest.raises(InputError, match="masks=sam: the scene has no pictures"):
-        SamMasks(config).labels(bare, 0)
+        masks.labels(bare, 0)
 
 
 def test_the_published_form_of_sam2_a_model_of_videos_makes_masks_of_pictures(saved: Any) -> None:
@@ -292,11 +294,11 @@ def test_the_published_form_of_sam2_a_model_of_videos_makes_masks_of_pictures(sa
         "memory_fuser_embed_dim": 32,
         "memory_fuser_intermediate_dim": 32,
     }
-    of_pictures = list(SamMasks(config_of(folder)).proposals(photograph()))
+    of_pictures = list(masks_of(folder).proposals(photograph()))
     video = transformers.Sam2VideoModel(transformers.Sam2VideoConfig(**parts, **sizes))
     assert not video.load_state_dict(model.state_dict(), strict=False).unexpected_keys
     video.save_pretrained(folder)
-    of_videos = list(SamMasks(config_of(folder)).proposals(photograph()))
+    of_videos = list(masks_of(folder).proposals(photograph()))
     assert len(of_videos) == len(of_pictures) > 3
     for one, other in zip(of_videos, of_pictures, strict=True):
         np.testing.assert_array_equal(full(one), full(other))
@@ -304,18 +306,18 @@ def test_the_published_form_of_sam2_a_model_of_videos_makes_masks_of_pictures(sa
 
 def test_folders_of_other_models_are_refused(saved: Any, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="teacher.sam= is missing: the folder of a SAM model"):
-        SamMasks(RegionsConfig(masks="sam", vector="map", model="x.onnx"))
+        SamMasks("")
     vision = {"hidden_size": 16, "intermediate_size": 32, "num_hidden_layers": 1, "num_attention_heads": 2}
     transformers.ViTModel(transformers.ViTConfig(**vision)).save_pretrained(tmp_path / "vit")
     with pytest.raises(InputError, match="holds a vit model, expected sam or sam2"):
-        SamMasks(config_of(tmp_path / "vit"))
+        masks_of(tmp_path / "vit")
     folder, model = saved(sam2)
     (folder / "preprocessor_config.json").write_text(json.dumps({"image_mean": [0.5]}))
     with pytest.raises(InputError, match="does not state resample, image_std"):
-        SamMasks(config_of(folder))
+        masks_of(folder)
     (folder / "preprocessor_config.json").unlink()
     with pytest.raises(InputError, match="has no preprocessor_config.json"):
-        SamMasks(config_of(folder))
+        masks_of(folder)
     model.mask_decoder.iou_prediction_head.proj_out.bias.data[:] = torch.nan
     model.save_pretrained(folder)
     (folder / "preprocessor_config.json").write_text(
@@ -326,10 +328,10 @@ def test_folders_of_other_models_are_refused(saved: Any, tmp_path: Path) -> None
     with pytest.raises(
         InputError, match=r"1 weights are not finite \(mask_decoder.iou_prediction_head.proj_out.bias\)"
     ):
-        SamMasks(config_of(folder))
+        masks_of(folder)
     model.mask_decoder.iou_prediction_head.proj_out.bias.data[:] = 0
     model.save_pretrained(folder)
-    masks = SamMasks(config_of(folder))
+    masks = masks_of(folder)
     masks._model.mask_decoder.iou_prediction_head.proj_out.bias.data[:] = torch.nan
     with pytest.raises(InputError, match="view 'images/a.jpg': masks or scores of SAM are not finite"):
         masks.labels(views, 0)
@@ -338,4 +340,4 @@ def test_folders_of_other_models_are_refused(saved: Any, tmp_path: Path) -> None
 @pytest.mark.parametrize("change", [{"points": 4}, {"min_iou": 0.1}, {"min_stability": 0.1}, {"max_overlap": 0.5}])
 def test_settings_that_change_masks_change_the_settings(saved: Any, change: dict[str, Any]) -> None:
     folder, _ = saved(sam)
-    assert SamMasks(config_of(folder, **change)).settings() != SamMasks(config_of(folder)).settings()
+    assert masks_of(folder, **change).settings() != masks_of(folder).settings()

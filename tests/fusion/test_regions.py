@@ -26,10 +26,10 @@ from text_towers import save_graph, save_tokenizer
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.teachers.base import MissingInput, Teacher
-from gsencoder.teachers.build import build_teacher, text_table_of, words_beside, words_of
-from gsencoder.teachers.captions import read_captions
+from gsencoder.teachers.build import build_teacher, stored_words, text_table_of, words_of
 from gsencoder.teachers.labels import LabelsConfig
-from gsencoder.teachers.masks import RegionsConfig, label_paths
+from gsencoder.teachers.masks import label_paths
+from gsencoder.teachers.regions import RegionsConfig, read_captions
 from gsencoder.text.models import OnnxTextConfig
 from gsencoder.text.table import REFERENCE_NOUNS, save_text_table
 from gsencoder.text.vocabulary import OpenVocabulary
@@ -104,7 +104,7 @@ def test_the_words_beside_the_features_hold_the_captions(tmp_path: Path) -> None
     captions = {"1": "red mug on a table", "7": "table", "9": "lamp"}
     (tmp_path / "masks/captions.json").write_text(json.dumps(captions))
     teacher = build_teacher(config, region_scene(), words)
-    table = words_beside(teacher, words)
+    table = stored_words(teacher, words)
     assert table is not None
     assert table.find("red mug on a table") is not None
     np.testing.assert_allclose(table.encode(["red mug on a table"]), words.encode(["red mug on a table"]), atol=1e-6)

@@ -14,7 +14,8 @@ from splats import random_gaussians
 
 from gsencoder.fusion.checkpoint import read_map, write_map
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.teachers.build import build_teacher, words_beside
+from gsencoder.teachers import segmenter
+from gsencoder.teachers.build import build_teacher, stored_words
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.teachers.segmenter import synonyms_of_classes
 from gsencoder.text.table import unit
@@ -53,10 +54,17 @@ def expected_shares(image: np.ndarray) -> np.ndarray:
     ],
 )
 def test_shares_are_the_posteriors_in_every_layout(
-    tmp_path: Path, rng: np.random.Generator, image: np.ndarray, input_type: int, shape: Any, last: bool
+    tmp_path: Path,
+    rng: np.random.Generator,
+    image: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
+    input_type: int,
+    shape: Any,
+    last: bool,
 ) -> None:
+    monkeypatch.setattr(segmenter, "MULTIPLE", 4)
     save_graph(tmp_path / "net.onnx", input_type=input_type, shape=shape, last=last)
-    teacher = teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, size=12, multiple=4))
+    teacher = teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, size=12))
     made = teacher.feature_map(views_of(image), 0)
     assert made.shares is not None
     np.testing.assert_allclose(made.shares, expected_shares(image), atol=1e-5)
@@ -122,7 +130,7 @@ def test_words_beside_the_features_hold_the_classes(tmp_path: Path) -> None:
     save_graph(tmp_path / "net.onnx")
     vocabulary = make_vocabulary(HashTower(), "onnx", templates=("{}",))
     (tmp_path / "classes.json").write_text(json.dumps(["other", "wall", "zebra crossing", "table"]))
-    beside = words_beside(teacher_of(tmp_path / "net.onnx", vocabulary), vocabulary)
+    beside = stored_words(teacher_of(tmp_path / "net.onnx", vocabulary), vocabulary)
     assert beside is not None
     assert beside.find("zebra crossing") is not None
     assert beside.find("other") is None
@@ -137,7 +145,7 @@ def test_words_beside_labels_hold_the_names_of_all_objects(tmp_path: Path) -> No
     )
     scene = Scene(name="s", objects=objects)
     teacher = build_teacher(LabelsConfig(), scene, vocabulary)
-    beside = words_beside(teacher, vocabulary)
+    beside = stored_words(teacher, vocabulary)
     assert beside is not None
     assert beside.find("other") is None
     for name in ("abacus", "zebra crossing"):

@@ -31,14 +31,6 @@ def image(rng: np.random.Generator) -> np.ndarray:
     return rng.integers(0, 4, (8, 12, 3)).astype(np.uint8)
 
 
-def test_probabilities_are_taken_as_they_are_and_logits_are_recognized(
-    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
-) -> None:
-    save_graph(tmp_path / "net.onnx")
-    with pytest.raises(InputError, match=r"expected probabilities.*are these logits"):
-        teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, activation="none")).feature_map(views_of(image), 0)
-
-
 def test_a_segmenter_needs_a_model_words_and_pictures(tmp_path: Path, rng: np.random.Generator) -> None:
     save_graph(tmp_path / "net.onnx")
     config = SegmenterConfig(model=str(tmp_path / "net.onnx"))
@@ -67,33 +59,18 @@ def test_words_are_those_of_a_table_or_of_the_colors_or_none(tmp_path: Path, rng
         words_of(PaletteConfig(), OnnxTextConfig(model="any"))
 
 
-def test_probabilities_may_sum_to_less_than_one_and_be_zero_and_not_negative(
-    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
+@pytest.mark.parametrize(("fourth", "probable"), [(0.5, True), (0.509, True), (0.52, False), (0.48, False)])
+def test_outputs_that_are_probabilities_already_are_taken_as_they_are(
+    tmp_path: Path, rng: np.random.Generator, fourth: float, probable: bool
 ) -> None:
-    probable = replace(PLAIN, activation="none", scale=18.0)
-    for least in (0, 1):
-        picture = np.maximum(image, np.uint8(least))
-        save_graph(tmp_path / "net.onnx", fourth=0.5 * least)
-        made = teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(picture), 0)
-        assert made.shares is not None
-        np.testing.assert_allclose(made.shares[..., :3], picture.reshape(4, 2, 6, 2, 3).mean((1, 3)) / 18, atol=1e-6)
-        assert (made.shares[..., 3] == 0.5 * least).all()
-    save_graph(tmp_path / "net.onnx", fourth=-0.01)
-    with pytest.raises(InputError, match="expected probabilities, from 0"):
-        teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(image), 0)
-
-
-def test_probabilities_that_were_rounded_may_sum_to_a_hundredth_more_than_one(
-    tmp_path: Path, rng: np.random.Generator, image: np.ndarray
-) -> None:
-    probable, black = replace(PLAIN, activation="none"), np.zeros_like(image)
-    save_graph(tmp_path / "net.onnx", fourth=1.01)
-    made = teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(black), 0)
+    """Rounded ones may differ from a sum of 1 by a hundredth."""
+    save_graph(tmp_path / "net.onnx", fourth=fourth)
+    image = np.broadcast_to(np.uint8([3, 6, 9]), (8, 12, 3)).copy()
+    made = teacher_of(tmp_path / "net.onnx", words(rng), replace(PLAIN, scale=36.0)).feature_map(views_of(image), 0)
+    scores = np.float32([3 / 36, 6 / 36, 9 / 36, fourth])
     assert made.shares is not None
-    assert (made.shares == np.float32([0, 0, 0, 1.01])).all()
-    save_graph(tmp_path / "net.onnx", fourth=1.011)
-    with pytest.raises(InputError, match=r"got 0 to 1\.01; are these logits"):
-        teacher_of(tmp_path / "net.onnx", words(rng), probable).feature_map(views_of(black), 0)
+    expected = scores if probable else softmax(scores[None, None], 1.0)[0, 0]
+    np.testing.assert_allclose(made.shares[1, 2], expected, atol=1e-6)
 
 
 def test_pictures_are_normalized_as_those_of_imagenet_unless_stated() -> None:
@@ -119,12 +96,11 @@ def test_settings_tell_how_pictures_are_given_to_the_network(
     for options in ({"scale": 2.0}, {"mean": (0.0, 0.5, 0.0)}, {"std": (1.0, 1.0, 2.0)}):
         assert (settings(**options) == settings()) is byte
     assert settings(size=64) != settings()
-    assert settings(activation="none") != settings()
 
 
 @pytest.mark.parametrize(
     ("name", "least", "most"),
-    [("size", 1, 8192), ("multiple", 1, 1024), ("threads", 0, 1024), ("scale", 1e-6, 1e6), ("temperature", 1e-3, 1e3)],
+    [("size", 1, 8192), ("scale", 1e-6, 1e6), ("temperature", 1e-3, 1e3)],
 )
 def test_settings_may_lie_at_the_ends_of_their_range_and_no_further(name: str, least: float, most: float) -> None:
     settings: type = SegmenterConfig if name == "temperature" else OnnxSegmenterOptions
@@ -143,7 +119,7 @@ def test_softmax_holds_at_the_extremes() -> None:
 def test_what_does_not_fit_is_one_line(tmp_path: Path, rng: np.random.Generator, image: np.ndarray) -> None:
     path, table = tmp_path / "net.onnx", words(rng)
     save_graph(path)
-    with pytest.raises(InputError, match="1 of 96 outputs are not finite"):
+    with pytest.raises(InputError, match="1 of 96 values are not finite"):
         _nan_teacher(path, table).feature_map(views_of(image), 0)
     (tmp_path / "classes.json").write_text('["wall", "chair"]')
     with pytest.raises(InputError, match="gives 4 classes, and there are 2 names for them"):
@@ -156,8 +132,8 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path, rng: np.random.Generator,
         teacher_of(path, table)
     with pytest.raises(InputError, match="no file says what its classes are called"):
         SegmenterTeacher(SegmenterConfig(model=str(path)), table)
-    with pytest.raises(InputError, match=r"net.onnx has inputs \['image'\] and outputs \['scores'\], not 'x'"):
-        SegmenterTeacher(SegmenterConfig(model=str(path), onnx=replace(PLAIN, input="x")), table)
+    with pytest.raises(InputError, match=r"net.onnx has outputs \['scores'\], not 'x'"):
+        SegmenterTeacher(SegmenterConfig(model=str(path), onnx=replace(PLAIN, output="x")), table)
     path.write_bytes(b"no model")
     with pytest.raises(InputError, match="is no model that onnxruntime reads"):
         teacher_of(path, table)
@@ -166,14 +142,14 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path, rng: np.random.Generator,
 def _nan_teacher(path: Path, table: TextTable) -> SegmenterTeacher:
     teacher = teacher_of(path, table)
     network = teacher._network
-    outputs = network.outputs
+    scores_of = network.scores
 
     def broken(image: np.ndarray, num_classes: int) -> Any:
-        scores, probable, affine = outputs(image, num_classes)
+        scores, probable, affine = scores_of(image, num_classes)
         scores[0, 0, 0] = np.nan
         return scores, probable, affine
 
-    network.outputs = broken  # type: ignore[method-assign]
+    network.scores = broken  # type: ignore[method-assign]
     return teacher
 
 

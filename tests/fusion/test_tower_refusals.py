@@ -24,7 +24,7 @@ def test_values_that_are_not_finite_name_the_view(copied: Any, settings: dict[st
     # Finite weights whose outputs are not.
     huge = torch.full((16,), torch.finfo(torch.float32).max)
     change_weights(folder, lambda weights: {**weights, "layernorm.weight": huge, "layernorm.bias": huge.clone()})
-    with pytest.raises(InputError, match="features of view 'left.png' are not finite"):
+    with pytest.raises(InputError, match="view 'left.png': 66 of 128 values are not finite"):
         features(folder, **settings)
 
 
@@ -36,9 +36,9 @@ def test_a_scene_without_pictures_is_refused(models: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"size": -1}, "size: expected 1 to 8192 pixels"),
-        ({"overlap": 1.0}, "overlap: expected a share from 0 to 0.9"),
-        ({"overlap": -0.1}, "overlap: expected a share"),
+        ({"size": -1}, "size: expected 0 or more and at most 8192"),
+        ({"overlap": 1.0}, "overlap: expected 0 or more and at most 0.9"),
+        ({"overlap": -0.1}, "overlap: expected 0 or more and at most 0.9"),
         ({"dense": "values", "layer": -2}, "layer: hidden states of a layer are dense=tokens"),
     ],
 )

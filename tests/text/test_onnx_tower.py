@@ -135,7 +135,7 @@ def test_the_shared_sentence_encoder_equals_a_direct_call(shared: Path) -> None:
     import onnxruntime
 
     path = shared / "models" / "minilm_l6"
-    tower = OnnxTower(OnnxTextConfig(model=str(path), pooling="mean", threads=1))
+    tower = OnnxTower(OnnxTextConfig(model=str(path), pooling="mean"))
     tokenizer = Tokenizer.from_file(str(path / "tokenizer.json"))
     tokenizer.no_padding()
     session = onnxruntime.InferenceSession(str(path / "model.onnx"), providers=["CPUExecutionProvider"])

@@ -11,11 +11,11 @@ from textured_box import box_cameras
 from torch import nn
 
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.errors import CellSample
 from gsencoder.fusion.folder import HEADS_FILE
 from gsencoder.fusion.measured_heads import HeadFit, HeadSet, MeasuredHead, load_heads, save_heads
 from gsencoder.models.output_space import OutputSpace
+from gsencoder.teachers.adapter_heads import Head
 from gsencoder.teachers.base import MissingInput
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.radio import RadioConfig
@@ -162,7 +162,7 @@ def of_teacher(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     def read(teacher: Any, names: Any) -> list[Head]:
         return [heads[name] for name in names]
 
-    monkeypatch.setattr("gsencoder.train.adapter_heads.heads_of", read)
+    monkeypatch.setattr("gsencoder.train.adapter_heads.load_teacher_heads", read)
     return read
 
 

@@ -15,10 +15,10 @@ from training_scenes import LOSSES, SMALL, SideTeacher, prepared
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import ProcessRank
-from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.folder import HEADS_FILE
 from gsencoder.fusion.measured_heads import HeadFit, HeadSet, MeasuredHead, save_heads
 from gsencoder.models.output_space import OutputSpaces
+from gsencoder.teachers.adapter_heads import Head
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.radio import RadioConfig
 from gsencoder.train import run

@@ -22,18 +22,25 @@ from gsencoder.core.settings import MEGABYTE, option
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
-from gsencoder.fusion.adapter_heads import Head
 from gsencoder.fusion.budget import BudgetFusion, fuse_within, realised_error
 from gsencoder.fusion.cameras import CamerasOfSplat, check_orbits
 from gsencoder.fusion.cost_model import BudgetConfig, check_budget
 from gsencoder.fusion.errors import project_maps, sample_cells
 from gsencoder.fusion.folder import FEATURES_FILE, HEADS_FILE, WORDS_FILE, save_features
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
-from gsencoder.fusion.measured_heads import heads_of, measure_heads, save_heads, stored_heads
+from gsencoder.fusion.measured_heads import measure_heads, save_heads
 from gsencoder.models.output_space import OutputSpaces, name_of_space
+from gsencoder.teachers.adapter_heads import Head
 from gsencoder.teachers.base import Teacher
-from gsencoder.teachers.build import AutoConfig, TeacherConfig, build_teacher, choose_teacher, words_beside, words_of
-from gsencoder.teachers.labels import LabelsConfig
+from gsencoder.teachers.build import (
+    AutoConfig,
+    TeacherConfig,
+    build_teacher,
+    choose_teacher,
+    load_teacher_heads,
+    stored_words,
+    words_of,
+)
 from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
@@ -156,9 +163,9 @@ def run(config: FuseCommandConfig, run: Run) -> None:
     paths = find_scenes(config.paths)
     with run.step("teacher"):
         words_once, heads = cache(words_of), list[Head]()
-        if not isinstance(config.teacher, AutoConfig):
+        if config.teacher.name != "auto":
             words_once(config.teacher, config.text)  # What cannot be read is an error before any scene is.
-            heads = heads_of(config.teacher, stored_heads(config.teacher), "teacher.heads")
+            heads = load_teacher_heads(config.teacher, config.teacher.stored_heads, "teacher.heads")
     outputs = load_weights_spaces(config.basis) if config.basis else None
 
     def one(path: Path, out: Path, run: Run) -> None:
@@ -172,7 +179,7 @@ def run(config: FuseCommandConfig, run: Run) -> None:
                 orbits=config.orbits,
                 cameras=config.cameras,
                 blend=config.fusion.blend,
-                labels=isinstance(config.teacher, LabelsConfig),
+                labels=config.teacher.needs_labels,
             )
             with run.step("teacher"):
                 chosen = choose_teacher(config.teacher, config.text, scene, words_once)
@@ -192,7 +199,7 @@ def run(config: FuseCommandConfig, run: Run) -> None:
                         scene, teacher, config.fusion, basis=basis, work=work, device=config.device, track=run.track
                     )
                 run.add_seconds(clock.seconds)
-            write_features(folder, scene, fusion, words_beside(teacher, chosen.words), chosen.teacher, run)
+            write_features(folder, scene, fusion, stored_words(teacher, chosen.words), chosen.teacher, run)
             if basis is not None and scene.views is not None:
                 run.results.update(project_maps(basis, fusion.teacher, scene.views, fusion.views).fit().figures())
             lines = []

@@ -25,8 +25,7 @@ from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.load import load_encoder
 from gsencoder.memory.bank import BankConfig, RawSample
 from gsencoder.models.output_space import check_distinct, name_of_space
-from gsencoder.teachers.build import build_teacher, words_beside, words_by_teacher
-from gsencoder.teachers.labels import LabelsConfig
+from gsencoder.teachers.build import build_teacher, stored_words, words_by_teacher
 from gsencoder.text.table import TextTable
 from gsencoder.train.batch import sample_rows
 from gsencoder.train.distributed import fail_together
@@ -161,7 +160,7 @@ def _load(path: Path, config: MemoryCommandConfig, run: Run) -> Scene:
         orbits=config.orbits,
         cameras=config.cameras,
         blend=config.prepare.fusion.blend,
-        labels=any(isinstance(each, LabelsConfig) for each in config.teachers_by_name.values()),
+        labels=any(each.needs_labels for each in config.teachers_by_name.values()),
     )
 
 
@@ -196,7 +195,7 @@ def _prepare(
                     device=device,
                     track=run.track,
                 )
-            if (table := words_beside(teacher, words.get(name))) is not None:
+            if (table := stored_words(teacher, words.get(name))) is not None:
                 tables[name] = table
     return tables
 

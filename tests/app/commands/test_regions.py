@@ -16,7 +16,7 @@ from gsencoder.core.archive import open_archive
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features
-from gsencoder.teachers.masks import RegionsConfig
+from gsencoder.teachers.regions import RegionsConfig
 from gsencoder.text.table import load_text_table
 
 

@@ -28,7 +28,10 @@ from gsencoder.core.archive import Archive
 from gsencoder.core.errors import InputError, about, listed
 from gsencoder.core.files import read_foreign_text
 from gsencoder.core.pretrained import check_fetched, weight_files
-from gsencoder.teachers.radio import ADAPTERS, WHAT
+
+WHAT = "teacher radio"
+ADAPTERS = "radio_model.adaptors."
+"""The prefix of the keys of adapter heads in files of weights."""
 
 LAYER_TYPES: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
     "linear": (nn.Linear, ("weight", "bias")),
