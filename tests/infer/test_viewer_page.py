@@ -1,32 +1,41 @@
-"""The page of `view`: its arrays hold what the scene holds, and no text of a scene becomes markup or script."""
+"""The page of `view`: its arrays hold what the scene holds, no text of it becomes markup or script, and a file holds as
+much of a scene as fits."""
 
 import base64
 import gzip
+import hashlib
 import io
 import json
 import re
+import struct
 from dataclasses import replace
-from functools import cache
+from html import unescape
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
-from viewed_rooms import HOSTILE, STUB, name_features, room_scene, save_viewed_room, search_of
+from viewed_rooms import HOSTILE, STUB, room_scene, save_viewed_room, search_of
 from viewer_containers import read_container
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat
 from gsencoder.fusion.quantize import compact
+from gsencoder.infer.boxes import box_to_json
 from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.page import search as module
 from gsencoder.infer.page.page import (
+    SCRIPT,
+    STYLE,
     WORD_STEP,
+    Bundle,
     Container,
     FileOptions,
     MadePage,
     file_container,
     file_page,
     fitting_page,
+    jpeg_of,
     json_in_script,
     load_bundle,
     scene_container,
@@ -39,32 +48,60 @@ from gsencoder.infer.page.search import (
     SceneSearch,
     drawn_scene,
     object_numbers,
+    pca_bytes,
     rows_of_features,
     spz_bytes,
     weight_bytes,
 )
-from gsencoder.infer.relevancy import ThresholdConfig, relevancy, threshold
-from gsencoder.types import Scene
+from gsencoder.infer.relevancy import ThresholdConfig, feature_axes, relevancy, threshold
+from gsencoder.text.table import make_text_table
+from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene
 
-OPTIONS = FileOptions(error=0.01, sh_degree=3, photographs=2, photograph_side=64)
-room = cache(room_scene)
+OPTIONS = FileOptions(error=0.01, sh_degree=3, photographs=3, photograph_side=64)
+ROOM = room_scene()
+SPACE = FeatureSpace(name="names", channels=6, teacher="labels", text_encoder="table")
+WORDS = ("mug", "ball", "lamp", "bowl")
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    made = tmp_path_factory.mktemp("viewed")
+def search(tmp_path_factory: pytest.TempPathFactory) -> SceneSearch:
+    made = tmp_path_factory.mktemp("arrays")
     save_viewed_room(made)
-    return made / "features"
-
-
-@pytest.fixture(scope="module")
-def search(folder: Path) -> SceneSearch:
-    return search_of(folder)
+    return search_of(made / "features")
 
 
 @pytest.fixture(scope="module")
 def written(search: SceneSearch) -> Container:
     return read_container(file_container(search, (), OPTIONS).to_bytes())
+
+
+def features_of(vectors: np.ndarray, weights: np.ndarray) -> GaussianFeatures:
+    return GaussianFeatures(
+        features=vectors.astype(np.float32),
+        weights=weights.astype(np.float32),
+        mean=np.zeros(6, np.float32),
+        space=SPACE,
+    )
+
+
+def small_search(
+    vectors: np.ndarray, weights: np.ndarray, config: LocalizeConfig = LocalizeConfig(), **changes: object
+) -> SceneSearch:
+    """A search over Gaussians with the given features; the words are the axes, and their mean is removed."""
+    assert ROOM.gaussians is not None
+    scene = replace(
+        ROOM,
+        gaussians=ROOM.gaussians.select(np.arange(len(vectors))),
+        features={"names": features_of(vectors, weights)},
+        **changes,  # type: ignore[arg-type]
+    )
+    table = replace(make_text_table(WORDS, np.eye(4, 6, dtype=np.float32), "table"), mean=np.zeros(6, np.float32))
+    return SceneSearch(shown=drawn_scene(scene, "few", max_gaussians=10**6), words=table, config=config)
+
+
+def replace_shown(search: SceneSearch, scene: Scene, **changes: object) -> SceneSearch:
+    shown = replace(search.shown, scene=scene, **changes)  # type: ignore[arg-type]
+    return SceneSearch(shown=shown, words=search.words, config=search.config)
 
 
 def cosines_of_page(page: Container, word: int) -> np.ndarray:
@@ -101,21 +138,18 @@ def test_a_container_is_read_as_it_was_written(rng: np.random.Generator) -> None
         np.testing.assert_array_equal(read.arrays[name], array)
 
 
-@pytest.mark.parametrize("data", [b"", b"GSVIEW01", b"something else entirely"])
-def test_other_bytes_are_no_container(data: bytes) -> None:
-    with pytest.raises(InputError, match="begin with"):
-        read_container(data)
-
-
-def test_a_container_that_is_cut_off_is_refused() -> None:
-    whole = Container(meta={}, arrays={"a": np.arange(100, dtype=np.uint8)}).to_bytes()
-    with pytest.raises(InputError, match="ends behind"):
-        read_container(whole[:-50])
-
-
-def test_float64_has_no_place_in_a_container() -> None:
-    with pytest.raises(InputError, match="float64"):
-        Container(meta={}, arrays={"a": np.zeros(1)}).to_bytes()
+@pytest.mark.parametrize("length", range(1, 18))
+def test_header_and_arrays_begin_at_multiples_of_eight_bytes(length: int) -> None:
+    arrays = {"first": np.arange(length, dtype=np.uint8), "second": np.arange(length, dtype=np.float32)}
+    data = Container(meta={"name": "x" * length}, arrays=arrays).to_bytes()
+    (header,) = struct.unpack_from("<I", data, 8)
+    assert (12 + header) % 8 == 0
+    listed = json.loads(data[12 : 12 + header])["arrays"]
+    assert all(entry["offset"] % 8 == 0 for entry in listed.values())
+    assert len(data) % 8 == 0
+    for cut in (1, 4, 9):
+        with pytest.raises(InputError, match="ends behind"):
+            read_container(data[: 12 + header + listed["second"]["offset"] + 4 * length - cut])
 
 
 def test_relevancy_from_the_arrays_of_a_page_is_that_of_the_features_within_the_budget(
@@ -141,14 +175,6 @@ def test_words_of_a_page_lose_no_more_than_their_rounding(search: SceneSearch, w
         np.testing.assert_allclose(cosines_of_page(written, word), exact, atol=1e-4)
 
 
-def test_a_page_orders_boxes_of_a_word_as_localize_does(search: SceneSearch, written: Container) -> None:
-    localization = localize(search.shown.scene, ["mug"], search.words, search.config)
-    page = cosines_of_page(written, written.meta["words"].index("mug"))
-    rows = np.concatenate([box.rows for box in localization.boxes])
-    assert len(rows)
-    assert (page[rows] >= localization.thresholds[0] - 0.1).all()
-
-
 def test_what_a_server_answers_is_the_relevancy_in_steps(search: SceneSearch) -> None:
     table = search.words
     for name in table.names:
@@ -160,74 +186,78 @@ def test_what_a_server_answers_is_the_relevancy_in_steps(search: SceneSearch) ->
         assert answer.threshold == pytest.approx(threshold(exact, ThresholdConfig()), abs=1e-6)
 
 
-def test_boxes_of_a_server_are_those_of_localize(search: SceneSearch) -> None:
-    localization = localize(search.shown.scene, ["mug"], search.words, search.config)
-    sent = search.boxes("mug")
-    assert [box["score"] for box in sent["boxes"]] == [box.score for box in localization.boxes]
-    assert sent["probability"] == pytest.approx(float(localization.probabilities[0]))
+@pytest.mark.filterwarnings("ignore:.*words have no box")
+def test_boxes_of_a_word_are_those_of_localize_at_any_threshold_and_a_file_has_those_of_all_words(
+    search: SceneSearch, written: Container
+) -> None:
+    for name, answer in zip(search.words.names, written.meta["answers"], strict=True):
+        localization = localize(search.shown.scene, [name], search.words, search.config)
+        sent = search.boxes(name)
+        assert sent["boxes"] == answer["boxes"] == [box_to_json(box) for box in localization.boxes]
+        assert sent["probability"] == answer["probability"] == float(localization.probabilities[0])
+        assert answer["threshold"] == float(localization.thresholds[0])
+    assert search.boxes("mug")["boxes"]
     assert search.boxes("piano")["boxes"] == []
     assert search.boxes("piano")["probability"] < 0.02
+    config = LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.9))
+    expected = localize(search.shown.scene, ["mug"], search.words, config)
+    assert search.boxes("mug", 0.9)["boxes"] == [box_to_json(box) for box in expected.boxes]
+    assert search.boxes("mug", 0.9)["boxes"] != search.boxes("mug")["boxes"]
 
 
-def test_the_words_of_gaussians_are_those_of_their_object(search: SceneSearch) -> None:
-    rows = localize(search.shown.scene, ["mug"], search.words, search.config).boxes[0].rows
-    assert search.best_words(rows.tolist())[0][0] == "mug"
-    assert search.best_words([int(rows[0])])[0][0] == "mug"
-    unseen = np.flatnonzero(~search.shown.features.seen)
-    assert search.best_words(unseen[:3].tolist()) == []
+def test_thinned_gaussians_cover_as_much_as_all_and_keep_their_weights(search: SceneSearch) -> None:
+    whole = search.shown
+    thin = drawn_scene(whole.scene, "t", max_gaussians=1289, advice="more fits elsewhere")
+    rows = np.linspace(0, len(whole.gaussians) - 1, 1289).round().astype(int)
+    area = len(whole.gaussians) / 1289
+    np.testing.assert_allclose(thin.gaussians.scales, whole.gaussians.scales[rows] * area**0.5, rtol=1e-5)
+    np.testing.assert_array_equal(thin.features.weights, whole.features.weights[rows])
+    assert f"enlarged {area**0.5:.2f} times. more fits elsewhere." in thin.notes[0]
+    assert scene_container(replace_shown(search, thin.scene, total=thin.total), ()).meta["total"] == thin.total
 
 
-def test_labels_name_what_gaussians_are_and_nothing_that_was_not_seen(search: SceneSearch) -> None:
-    labels = search.labels()
-    seen = search.shown.features.seen
-    assert (labels.numbers[~seen] == NO_LABEL).all()
-    rows = localize(search.shown.scene, ["mug"], search.words, search.config).boxes[0].rows
-    names = {labels.names[number] for number in labels.numbers[rows] if number != NO_LABEL}
-    assert names == {"mug"}
+def test_weights_of_rows_go_with_them_where_features_share_a_table() -> None:
+    index = np.array([0, 1, 1, -1], np.int32)
+    shared = GaussianFeatures(
+        features=np.eye(2, 6, dtype=np.float32),
+        weights=np.array([1, 2, 3, 0], np.float32),
+        mean=np.zeros(6, np.float32),
+        space=SPACE,
+        index=index,
+    )
+    made = rows_of_features(shared, np.array([3, 1]))
+    assert made.weights.tolist() == [0, 2]
+    assert made.index is not None
+    assert made.index.tolist() == [-1, 1]
 
 
-def test_the_splat_of_a_page_keeps_the_order_and_places_of_its_rows(search: SceneSearch, tmp_path: Path) -> None:
-    gaussians = search.shown.gaussians
-    (tmp_path / "a.spz").write_bytes(spz_bytes(gaussians))
+def test_a_note_counts_what_was_never_seen_and_features_stand_under_the_name_of_their_space(
+    search: SceneSearch,
+) -> None:
+    unseen = int((search.shown.features.weights == 0).sum())
+    assert 0 < unseen < 1000
+    assert search.shown.notes == (f"{unseen:,} Gaussians were seen by no view and have no features; they are grey.",)
+    renamed = replace(search.shown.scene, features={"elsewhere": search.shown.features})
+    assert list(drawn_scene(renamed, "t", max_gaussians=10).scene.features) == ["names"]
+
+
+def test_equal_features_have_equal_colors_others_differ_and_unseen_ones_are_grey() -> None:
+    kinds = np.array([0, 1, 1, 3, 2, 1, 0, 3])
+    colors = pca_bytes(features_of(np.eye(6)[kinds], kinds < 3))
+    assert (colors[kinds == 3] == 90).all()
+    for kind in range(3):
+        assert len(np.unique(colors[kinds == kind], axis=0)) == 1
+    assert len(np.unique(colors, axis=0)) == 4
+
+
+def test_the_splat_of_a_page_has_the_shapes_and_colors_of_its_gaussians(tmp_path: Path) -> None:
+    assert ROOM.gaussians is not None
+    (tmp_path / "a.spz").write_bytes(spz_bytes(ROOM.gaussians))
     read = load_splat(tmp_path / "a.spz")
-    assert np.abs(read.means - gaussians.means).max() < 1e-3
-    assert np.abs(read.opacities - gaussians.opacities).max() <= 1 / 510 + 1e-6
-
-
-def test_harmonics_above_a_degree_are_left_out(tmp_path: Path, rng: np.random.Generator) -> None:
-    scene = room()
-    assert scene.gaussians is not None
-    few = scene.gaussians.select(np.arange(20))
-    full = replace(few, sh=(0.1 * rng.normal(size=(20, 16, 3))).astype(np.float32))
-    for degree, coefficients in ((0, 1), (1, 4), (3, 16)):
-        (tmp_path / "a.spz").write_bytes(spz_bytes(full, sh_degree=degree))
-        assert load_splat(tmp_path / "a.spz").sh.shape[1] == coefficients
-
-
-def test_thinned_scenes_say_so_and_keep_features_with_their_gaussians(search: SceneSearch) -> None:
-    scene = search.shown.scene
-    thin = drawn_scene(scene, "t", max_gaussians=500)
-    assert len(thin.gaussians) == len(thin.features) == 500
-    assert thin.total == len(search.shown.gaussians)
-    assert "500 of" in thin.notes[0]
-    assert "max_gaussians=" in thin.notes[0]
-    places = {tuple(mean): row for row, mean in enumerate(search.shown.gaussians.means.tolist())}
-    rows = [places[tuple(mean)] for mean in thin.gaussians.means.tolist()]
-    np.testing.assert_array_equal(thin.features.features, search.shown.features.features[rows])
-
-
-def test_a_scene_that_is_not_thinned_is_left_as_it_is(search: SceneSearch) -> None:
-    count = len(search.shown.gaussians)
-    whole = drawn_scene(search.shown.scene, "t", max_gaussians=count)
-    assert whole.gaussians is search.shown.gaussians
-
-
-def test_features_that_share_a_table_keep_it() -> None:
-    features, _ = name_features(room())
-    index = np.where(features.seen, np.arange(len(features)) % 7, -1).astype(np.int32)
-    shared = replace(features, features=features.features[:7], index=index)
-    rows = np.array([5, 900, 17])
-    np.testing.assert_array_equal(rows_of_features(shared, rows).stored(), shared.stored(rows))
+    # Logarithms of scales have steps of 1/16.
+    assert np.abs(np.log(read.scales / ROOM.gaussians.scales)).max() <= 1 / 32 + 1e-5
+    assert np.abs(read.sh[:, 0] - ROOM.gaussians.sh[:, 0]).max() < 0.05
+    assert np.abs((read.quats * ROOM.gaussians.quats).sum(axis=1)).min() > 0.999
 
 
 @pytest.mark.parametrize(
@@ -238,97 +268,150 @@ def test_weights_are_coded_by_their_logarithm_and_zero_means_never(weights: list
     np.testing.assert_array_equal(weight_bytes(np.array(weights, np.float32))[0], codes)
 
 
-def test_a_gaussian_belongs_to_the_smallest_object_around_it() -> None:
-    scene = room()
-    inner = replace(scene.objects[-1], aabb_min=np.full(3, -0.1), aabb_max=np.full(3, 0.1))
-    outer = replace(inner, aabb_min=np.full(3, -1.0), aabb_max=np.full(3, 1.0))
-    means = np.array([[0, 0, 0], [0.5, 0, 0], [2, 0, 0]], np.float32)
-    np.testing.assert_array_equal(object_numbers(means, (inner, outer), np.zeros(3), 0.0), [1, 2, 0])
-    np.testing.assert_array_equal(object_numbers(means, (outer, inner), np.zeros(3), 0.0), [2, 1, 0])
+def test_the_ends_of_the_weights_come_with_their_codes() -> None:
+    assert weight_bytes(np.array([0, 4, 2, 8], np.float32))[1:] == (2.0, 8.0)
+    assert weight_bytes(np.zeros(3, np.float32))[1:] == (1.0, 1.0)
 
 
-@pytest.mark.parametrize("text", [HOSTILE, "</script>", "<!--<script>", "\u2028\u2029", "\ud800", "]]>", "&lt;"])
-def test_no_text_ends_the_element_that_its_json_stands_in(text: str) -> None:
-    written = json_in_script({"name": text, "list": [text]})
-    assert not re.search(r"[<>&\u2028\u2029\ud800]", written)
-    assert json.loads(written) == {"name": text, "list": [text]}
+def test_boxes_of_objects_are_in_world_coordinates_enlarged_and_the_smallest_volume_wins() -> None:
+    cube = replace(ROOM.objects[-1], aabb_min=np.full(3, 99.5), aabb_max=np.full(3, 100.5))
+    pole = replace(cube, aabb_min=np.array([95, 99.9, 99.9]), aabb_max=np.array([105, 100.1, 100.1]))
+    means = np.array([[0, 0, 0], [0, 0.55, 0], [0, 0.65, 0], [4, 0, 0], [5.05, 0, 0], [-0.55, 0.3, -0.55]], np.float32)
+    for objects, expected in (((cube, pole), [2, 1, 0, 2, 2, 1]), ((pole, cube), [1, 2, 0, 1, 1, 2])):
+        made = object_numbers(means, objects, np.full(3, 100.0), 0.1)
+        assert made.tolist() == expected
+    with pytest.raises(InputError, match="fewer than 65,536 objects"):
+        object_numbers(means[:1], [cube] * (1 << 16), np.zeros(3), 0.0)
 
 
-def test_titles_are_escaped_and_scripts_are_bound_to_their_sum() -> None:
-    page, policy = served_page(STUB, HOSTILE, {"kind": "server", "scenes": 1, "notes": [HOSTILE]})
-    text = page.decode("utf-8")
-    assert text.count("<script") == 2
-    assert "<img" not in text
-    assert "'unsafe-inline'" not in policy
-    assert "default-src 'none'" in policy
+def test_margins_of_objects_are_half_a_spacing(search: SceneSearch) -> None:
+    scene = search.shown.scene
+    named = replace(ROOM.objects[0], name=None)
+    made = scene_container(search, (named, *ROOM.objects[1:]))
+    assert made.meta["objects"][0] == ""
+    objects = (named, *ROOM.objects[1:])
+    expected = object_numbers(search.shown.gaussians.means, objects, scene.origin, 0.5 * search.spacing)
+    np.testing.assert_array_equal(made.arrays["objects"], expected)
+    far = replace_shown(search, replace(scene, origin=scene.origin + 100))
+    assert not scene_container(far, objects).arrays["objects"].any()
 
 
-def test_a_page_of_a_file_holds_its_scenes_and_loads_nothing(written: Container, search: SceneSearch) -> None:
-    container = file_container(search, (), OPTIONS)
-    page = file_page(STUB, "a", {"kind": "file", "scenes": 1, "notes": []}, [container]).decode("utf-8")
-    packed = re.search(r'id="scene-0">([A-Za-z0-9+/=]+)</script>', page)
-    assert packed is not None
-    read = read_container(gzip.decompress(base64.b64decode(packed[1])))
-    assert read.meta == written.meta
-    assert "connect-src 'none';" in page.replace("&#x27;", "'")
-    assert not re.search(r"(src|href)=\"?https?:", page)
+def test_a_page_knows_the_units_the_weights_and_the_cameras_of_its_scene(search: SceneSearch) -> None:
+    scene = replace(search.shown.scene, metres_per_unit=0.25, origin=np.array([1.0, -2.0, 3.0]), views=ROOM.views)
+    other = SceneSearch(shown=replace(search.shown, scene=scene), words=search.words, config=search.config)
+    made = read_container(file_container(other, (), replace(OPTIONS, photographs=0)).to_bytes())
+    assert made.meta["metresPerUnit"] == 0.25
+    assert made.meta["origin"] == [1, -2, 3]
+    assert made.meta["photographs"] is False
+    assert made.meta["weights"] == list(weight_bytes(search.shown.features.weights)[1:])
+    assert made.meta["floor"] == feature_axes(search.shown.features).floor > 0
+    assert ROOM.views is not None
+    cameras = ROOM.views.cameras
+    assert made.arrays["sizes"].tolist() == np.stack([cameras.widths, cameras.heights], axis=1).tolist()
+    np.testing.assert_array_equal(made.arrays["camFromWorld"], cameras.cam_from_world)
 
 
-def test_photographs_of_a_file_are_small_and_say_whose_they_are(search: SceneSearch) -> None:
-    scene = room()
-    shown = replace(search.shown, scene=replace(search.shown.scene, views=scene.views))
-    container = file_container(replace_shown(search, shown.scene), (), OPTIONS)
-    assert container.meta["photographViews"] == [0, 5]
-    first = container.arrays["photographs"][: container.meta["photographSizes"][0]].tobytes()
-    with Image.open(io.BytesIO(first)) as picture:
-        assert picture.size == (64, 48)
-
-
-def replace_shown(search: SceneSearch, scene: Scene) -> SceneSearch:
-    shown = drawn_scene(scene, "features", max_gaussians=1_000_000)
-    return SceneSearch(shown=shown, words=search.words, config=search.config)
-
-
-def test_objects_come_with_numbers_and_names(search: SceneSearch) -> None:
-    scene = room()
-    container = scene_container(search, scene.objects)
-    assert container.meta["objects"] == [each.name or "" for each in scene.objects]
-    assert container.arrays["objects"].max() <= len(scene.objects)
-    assert "objects" not in scene_container(search, ()).arrays
-
-
-def test_a_page_that_is_too_large_loses_harmonics_then_gaussians_and_says_so(search: SceneSearch) -> None:
+def test_options_of_a_file_bound_harmonics_features_and_photographs(search: SceneSearch, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     scene = search.shown.scene
     assert scene.gaussians is not None
-    sh = np.concatenate([scene.gaussians.sh, rng.normal(size=(len(scene.gaussians), 8, 3))], axis=1).astype(np.float32)
-    colored = replace(scene, gaussians=replace(scene.gaussians, sh=0.1 * sh))
-
-    def fitting(limit: int) -> MadePage:
-        made = fitting_page(
-            STUB, [(colored, "t", search.words)], LocalizeConfig(), (), OPTIONS, max_gaussians=10**6, max_bytes=limit
-        )
-        assert len(made.page) <= limit
-        return made
-
-    whole = fitting(10**7)
-    assert whole.sh_degree == (2,)
-    assert not any("harmonics" in note for note in whole.notes)
-    fewer = fitting(len(whole.page) - 1)
-    assert fewer.sh_degree == (1,)
-    assert any("above degree 1 of 2" in note for note in fewer.notes)
-    thinned = fitting(len(whole.page) // 4)
-    assert thinned.sh_degree == (0,)
-    assert thinned.gaussians < whole.gaussians
-    assert any("Gaussians are drawn" in note for note in thinned.notes)
-    with pytest.raises(InputError, match="not even"):
-        fitting(10_000)
+    sh = np.concatenate([scene.gaussians.sh, 0.1 * rng.normal(size=(len(scene.gaussians), 8, 3))], axis=1)
+    rich = replace_shown(
+        search, replace(scene, gaussians=replace(scene.gaussians, sh=sh.astype(np.float32)), views=ROOM.views)
+    )
+    for degree, written in ((0, 0), (1, 1), (3, 2)):
+        made = file_container(rich, (), replace(OPTIONS, sh_degree=degree))
+        assert made.meta["shDegree"] == written
+        (tmp_path / "a.spz").write_bytes(made.arrays["splat"].tobytes())
+        assert load_splat(tmp_path / "a.spz").sh.shape[1] == (written + 1) ** 2
+    fine, coarse = (file_container(rich, (), replace(OPTIONS, error=error)).meta for error in (0.002, 0.05))
+    assert fine["featureError"] <= 0.002 < coarse["featureError"] <= 0.05
+    made = file_container(rich, (), OPTIONS)
+    sizes = made.meta["photographSizes"]
+    assert sum(sizes) == len(made.arrays["photographs"])
+    assert ROOM.views is not None
+    assert ROOM.views.images is not None
+    start = 0
+    for view, size in zip(made.meta["photographViews"], sizes, strict=True):
+        assert made.arrays["photographs"][start : start + size].tobytes() == jpeg_of(ROOM.views, view, 64)
+        start += size
 
 
-def test_a_threshold_that_pages_do_not_compute_is_refused(search: SceneSearch) -> None:
-    config = LocalizeConfig(threshold=ThresholdConfig(kind="otsu"))
-    with pytest.raises(InputError, match="otsu"):
-        file_container(SceneSearch(shown=search.shown, words=search.words, config=config), (), OPTIONS)
+def test_photographs_keep_their_shape_and_nearly_their_colors() -> None:
+    assert ROOM.views is not None
+    assert ROOM.views.images is not None
+    with Image.open(io.BytesIO(jpeg_of(ROOM.views, 2, 1000))) as picture:
+        difference = np.asarray(picture, float) - ROOM.views.images[2]
+    assert np.sqrt((difference**2).mean()) < 8
+    for view in (-1, len(ROOM.views)):
+        with pytest.raises(InputError, match=f"expected one of 6 views with photographs, got {view}"):
+            jpeg_of(ROOM.views, view, 64)
+
+
+def test_labels_are_the_words_of_most_weight_and_only_of_what_is_like_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    axes = np.eye(6)
+    unlike = axes[4] + 0.2 * axes[3]  # Most like the bowl, and not like it; heavy.
+    vectors = np.stack([0 * axes[0], axes[0], axes[2], axes[1], axes[1], axes[1], unlike, axes[0] + 0.5 * axes[2]])
+    weights = np.array([0, 10, 5, 1, 1, 1, 100, 1])
+    none = NO_LABEL
+    labels = small_search(vectors, weights).labels
+    assert labels.names == ("mug", "lamp", "ball")
+    assert labels.numbers.tolist() == [none, 0, 1, 2, 2, 2, none, 0]
+    monkeypatch.setattr(module, "LABELS", 2)
+    monkeypatch.setattr(module, "LABEL_BLOCK", 3)
+    labels = small_search(vectors, weights).labels
+    assert labels.names == ("mug", "lamp")
+    assert labels.numbers.tolist() == [none, 0, 1, none, none, none, none, 0]
+
+
+def test_words_of_gaussians_are_weighed_and_the_same_where_features_lie_in_a_basis() -> None:
+    axes = np.eye(6)
+    vectors = np.stack([axes[0], axes[1], axes[1], 5 * axes[2], np.zeros(6)])
+    weights = np.array([10, 1, 1, 1, 0])
+    plain = small_search(vectors, weights)
+    best = plain.best_words([0, 1, 2, 3, 4])
+    # The mean direction is (10, 2, 1, 0, 0, 0) / 13; lengths of features do not count.
+    assert [name for name, _ in best] == ["mug", "ball", "lamp", "bowl"]
+    np.testing.assert_allclose([cosine for _, cosine in best], np.array([10, 2, 1, 0]) / 13, atol=1e-5)
+    assert plain.best_words([4]) == []
+    turn = np.linalg.qr(np.random.default_rng(2).normal(size=(6, 6)))[0][:, :5]
+    basis = FeatureBasis(
+        mean=np.zeros(6, np.float32), components=turn.T.astype(np.float32), energy_kept=1.0, space=SPACE
+    )
+    inside = vectors @ turn
+    features = GaussianFeatures(
+        features=inside.astype(np.float32),
+        weights=weights.astype(np.float32),
+        mean=np.zeros(6, np.float32),
+        space=SPACE,
+        basis=basis,
+    )
+    scene = replace(plain.shown.scene, features={"names": features})
+    expected = small_search(inside @ turn.T, weights).best_words([0, 1, 2, 3])
+    turned = replace_shown(plain, scene).best_words([0, 1, 2, 3])
+    assert [name for name, _ in turned] == [name for name, _ in expected]
+    np.testing.assert_allclose([c for _, c in turned], [c for _, c in expected], atol=1e-5)
+
+
+def test_a_scene_in_which_nothing_was_seen_has_no_threshold_and_no_labels() -> None:
+    blind = small_search(np.zeros((4, 6)), np.zeros(4))
+    answer = blind.ask("mug")
+    assert answer.threshold is None
+    assert blind.labels.names == ()
+    assert blind.best_words([0, 1]) == []
+
+
+def test_the_threshold_of_an_answer_is_that_of_the_settings() -> None:
+    config = LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.37))
+    assert small_search(np.eye(6), np.ones(6), config).ask("mug").threshold == pytest.approx(0.37)
+
+
+def test_the_spacing_of_one_gaussian_is_its_size_and_another_space_is_refused() -> None:
+    one = small_search(np.eye(6)[:1], np.ones(1))
+    assert one.spacing == pytest.approx(np.median(one.shown.gaussians.scales))
+    other = make_text_table(WORDS, np.eye(4, 6, dtype=np.float32), "another encoder")
+    with pytest.raises(InputError, match="use the text encoder 'table'"):
+        SceneSearch(shown=one.shown, words=other, config=LocalizeConfig())
 
 
 def test_features_without_words_are_shown_and_say_that_none_lead_into_them(search: SceneSearch) -> None:
@@ -344,6 +427,144 @@ def test_features_without_words_are_shown_and_say_that_none_lead_into_them(searc
     np.testing.assert_array_equal(page.arrays["pca"], scene_container(search, ()).arrays["pca"])
 
 
-def test_a_bundle_that_was_not_built_is_one_line_that_says_how(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="make viewer"):
+@pytest.mark.parametrize("text", [HOSTILE, "</script>", "<!--<script>", "\u2028\u2029", "\ud800", "]]>", "&lt;"])
+def test_no_text_ends_the_element_that_its_json_stands_in(text: str) -> None:
+    written = json_in_script({"name": text, "list": [text]})
+    assert not re.search(r"[<>&\u2028\u2029\ud800]", written)
+    assert json.loads(written) == {"name": text, "list": [text]}
+
+
+SETTINGS = {"kind": "file", "scenes": 1, "notes": []}
+
+
+AWKWARD = Bundle(script="f('</script><!-- </SCRIPT'); // é", style="body::after { content: 'é'; }")
+
+
+def digest(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+@pytest.mark.parametrize(("served", "connect"), [(True, "'self'"), (False, "'none'")])
+def test_a_page_may_run_its_own_script_alone_and_connect_to_its_server_alone(served: bool, connect: str) -> None:
+    """What no policy lists is 'none'."""
+    if served:
+        made, policy = served_page(AWKWARD, "a", SETTINGS)
+    else:
+        made = file_page(AWKWARD, "a", SETTINGS, [])
+    page = made.decode()
+    if not served:
+        match = re.search(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', page)
+        assert match is not None
+        policy = unescape(match[1])
+    script = page[page.rindex("<script>") + len("<script>") : page.rindex("</script>")]
+    style = page[page.index("<style>") + len("<style>") : page.index("</style>")]
+    assert dict(part.split(" ", 1) for part in policy.split("; ")) == {
+        "default-src": "'none'", "script-src": f"'sha256-{digest(script)}' 'wasm-unsafe-eval'",
+        "style-src": f"'sha256-{digest(style)}'", "img-src": "blob: data:", "worker-src": "blob: data:",
+        "connect-src": connect, "base-uri": "'none'", "form-action": "'none'",
+    }  # fmt: skip
+    assert '<meta name="referrer" content="no-referrer">' in page
+
+
+def test_a_script_cannot_end_its_element() -> None:
+    page = file_page(AWKWARD, "a", SETTINGS, []).decode()
+    script = page[page.rindex("<script>") + len("<script>") : page.rindex("</script>")]
+    assert not re.search(r"</script|<!--", script, re.IGNORECASE)
+    assert page.lower().count("</script") == 2
+
+
+def test_titles_that_no_encoding_knows_become_question_marks() -> None:
+    title = "a\ud800b"
+    assert b"<title>a?b</title>" in served_page(STUB, title, SETTINGS)[0]
+    assert b"<title>a?b</title>" in file_page(STUB, title, SETTINGS, [])
+
+
+def test_a_page_of_the_same_scene_is_the_same_whenever_it_is_written() -> None:
+    page = file_page(STUB, "a", SETTINGS, [Container(meta={}, arrays={})]).decode()
+    match = re.search(r'id="scene-0">([^<]+)<', page)
+    assert match is not None
+    # The time in the header of gzip.
+    assert base64.b64decode(match[1])[4:8] == bytes(4)
+
+
+@pytest.mark.parametrize("broken", [SCRIPT, STYLE])
+def test_a_bundle_that_cannot_be_read_is_one_line(tmp_path: Path, broken: str) -> None:
+    for name in (SCRIPT, STYLE):
+        (tmp_path / name).mkdir() if name == broken else (tmp_path / name).write_text("")
+    with pytest.raises(InputError, match=f"{broken}.*make viewer"):
         load_bundle(tmp_path)
+
+
+def colored(scene: Scene, degree: int) -> Scene:
+    assert scene.gaussians is not None
+    sh = np.random.default_rng(1).normal(size=(len(scene.gaussians), (degree + 1) ** 2, 3)) * 0.1
+    return replace(scene, gaussians=replace(scene.gaussians, sh=sh.astype(np.float32)))
+
+
+def fitted(search: SceneSearch, limit: int, *degrees: int, options: FileOptions = OPTIONS, **further: int) -> MadePage:
+    scenes = [(colored(search.shown.scene, degree), f"t{degree}", search.words) for degree in degrees]
+    limits = {"max_gaussians": 10**6, "max_bytes": limit} | further
+    return fitting_page(STUB, scenes, LocalizeConfig(), ROOM.objects, options, **limits)
+
+
+def scenes_of(made: MadePage) -> list[Container]:
+    matches = re.findall(r'id="scene-\d+">([^<]+)<', made.page.decode())
+    return [read_container(gzip.decompress(base64.b64decode(blob))) for blob in matches]
+
+
+def test_a_page_holds_all_up_to_its_last_byte_and_says_what_it_knows(search: SceneSearch) -> None:
+    whole = fitted(search, 10**7, 1)
+    count = len(search.shown.gaussians)
+    assert (whole.sh_degree, whole.gaussians) == ((1,), (count,))
+    assert whole.notes[0] == f"This file knows {len(search.words.names)} words."
+    assert any("were seen by no view" in note for note in whole.notes)
+    assert fitted(search, len(whole.page), 1).page == whole.page
+    less = fitted(search, len(whole.page) - 1, 1)
+    assert less.sh_degree == (0,)
+    assert f"larger than {(len(whole.page) - 1) / 1e6:g} MB (megabytes=) keeps them" in less.notes[0]
+    (scene,) = scenes_of(whole)
+    assert scene.meta["objects"] == [each.name or "" for each in ROOM.objects]
+    assert scene.meta["title"] == "t1"
+
+
+def test_harmonics_are_those_of_the_richest_scene_up_to_the_option(search: SceneSearch) -> None:
+    both = fitted(search, 10**7, 0, 2)
+    assert both.sh_degree == (0, 2)
+    assert not any("harmonics" in note for note in both.notes)
+    assert [scene.meta["title"] for scene in scenes_of(both)] == ["t0", "t2"]
+    capped = fitted(search, 10**7, 0, 2, options=replace(OPTIONS, sh_degree=1))
+    assert capped.sh_degree == (0, 1)
+    assert any("above degree 1 of 2 are left out" in note for note in capped.notes)
+
+
+def test_a_thinned_page_uses_most_of_its_size_whatever_was_asked_for(search: SceneSearch) -> None:
+    whole = fitted(search, 10**7, 0)
+    limit = len(whole.page) // 2
+    for most in (10**6, len(search.shown.gaussians)):
+        made = fitted(search, limit, 0, max_gaussians=most)
+        assert 0.6 * limit < len(made.page) <= limit
+        assert any("megabytes= or max_gaussians= takes more" in note for note in made.notes)
+    tight = fitted(search, len(whole.page), 0, max_gaussians=1500)
+    assert tight.gaussians == (1500,)
+    with pytest.raises(InputError, match="not even 1,000 Gaussians fit beside the page itself, which takes 0.0 MB;"):
+        fitted(search, len(whole.page) // 8, 0)
+
+
+def test_photographs_are_counted_as_they_are_in_the_file(search: SceneSearch) -> None:
+    scene = replace(search.shown.scene, views=ROOM.views)
+    for photographs, count in ((0, 0), (2, 2), (9, 6)):
+        made = fitting_page(
+            STUB, [(scene, "t", search.words)], LocalizeConfig(), (), replace(OPTIONS, photographs=photographs),
+            max_gaussians=1500, max_bytes=10**7,
+        )  # fmt: skip
+        assert made.photographs == (count,)
+        assert scenes_of(made)[0].meta["photographs"] is (count > 0)
+
+
+def test_titles_are_escaped_and_scripts_are_bound_to_their_sum() -> None:
+    page, policy = served_page(STUB, HOSTILE, {"kind": "server", "scenes": 1, "notes": [HOSTILE]})
+    text = page.decode("utf-8")
+    assert text.count("<script") == 2
+    assert "<img" not in text
+    assert "'unsafe-inline'" not in policy
+    assert "default-src 'none'" in policy

@@ -1,43 +1,82 @@
 """The server of `view` answers its own page, and nothing and nobody else."""
 
 import http.client
+import io
 import json
 import socket
 import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import contextmanager
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from viewed_rooms import STUB, room_scene, save_viewed_room, search_of
 from viewer_containers import read_container
-from viewer_requests import at, call, connected, head
 
 from gsencoder.core.errors import InputError
+from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.infer.page import server as viewer_server
 from gsencoder.infer.page.page import scene_container, served_page
-from gsencoder.infer.page.search import SceneSearch
-from gsencoder.infer.page.server import MAX_BODY, MAX_ROWS, ViewServer
+from gsencoder.infer.page.search import RELEVANCY_STEP, UNSEEN, SceneSearch
+from gsencoder.infer.page.server import MAX_BODY, MAX_ROWS, MAX_WORD, ViewServer
+from gsencoder.infer.relevancy import ThresholdConfig
 
 
-@pytest.fixture(scope="module")
-def search(tmp_path_factory: pytest.TempPathFactory) -> SceneSearch:
-    folder = tmp_path_factory.mktemp("served")
-    save_viewed_room(folder)
-    search = search_of(folder / "features")
-    search.shown = replace(search.shown, scene=replace(search.shown.scene, views=room_scene().views))
-    return search
+class Connection(http.client.HTTPConnection):
+    """Sends any letters of a path, which the library refuses."""
+
+    def _encode_request(self, request: str) -> bytes:
+        return request.encode("utf-8")
 
 
-@pytest.fixture(scope="module")
-def server(search: SceneSearch) -> Iterator[ViewServer]:
-    page = served_page(STUB, "room", {"kind": "server", "scenes": 1, "notes": []})
-    with ViewServer(page, [search], [scene_container(search, ())]) as made:
+def call(
+    server: ViewServer, method: str, path: str, body: Any = None, *, headers: dict[str, str] | None = None
+) -> tuple[int, bytes, http.client.HTTPMessage]:
+    """An answer to a request to a path behind the token; a body that is no bytes is sent as JSON."""
+    connection = Connection(server.server_address[0], server.server_address[1], timeout=10)
+    data = body if isinstance(body, bytes) or body is None else json.dumps(body).encode()
+    sent = {"Content-Type": "application/json"} if data is not None else {}
+    connection.request(method, path, data, sent | (headers or {}))
+    response = connection.getresponse()
+    read = response.read()
+    connection.close()
+    return response.status, read, response.headers
+
+
+def at(server: ViewServer, rest: str) -> str:
+    return f"/{server.token}/{rest}"
+
+
+def connected(server: ViewServer) -> socket.socket:
+    """A connection on which nothing was sent."""
+    return socket.create_connection((str(server.server_address[0]), server.server_address[1]), timeout=10)
+
+
+def sent(server: ViewServer, text: str) -> bytes:
+    """All that comes back for the bytes of a request, until the server closes the connection."""
+    with connected(server) as stream:
+        stream.sendall(text.encode())
+        parts = []
+        while part := stream.recv(1 << 16):
+            parts.append(part)
+    return b"".join(parts)
+
+
+def head(server: ViewServer, method: str, rest: str, *lines: str) -> str:
+    """The lines of a request before its body."""
+    host, port = server.server_address[:2]
+    return "\r\n".join([f"{method} {at(server, rest)} HTTP/1.1", f"Host: {host}:{port}", *lines, "", ""])
+
+
+@contextmanager
+def running(searches: list[SceneSearch], **options: Any) -> Iterator[ViewServer]:
+    page = served_page(STUB, "room", {"kind": "server", "scenes": len(searches), "notes": []})
+    with ViewServer(page, searches, [scene_container(each, ()) for each in searches], **options) as made:
         thread = threading.Thread(target=made.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         yield made
@@ -45,38 +84,175 @@ def server(search: SceneSearch) -> Iterator[ViewServer]:
         thread.join()
 
 
-def test_the_page_comes_with_a_policy_that_allows_its_own_script_alone(server: ViewServer) -> None:
-    status, page, headers = call(server, "GET", at(server, ""))
+@pytest.fixture(scope="module")
+def searches(tmp_path_factory: pytest.TempPathFactory) -> list[SceneSearch]:
+    """A scene with photographs, and one of fewer Gaussians without any."""
+    folder = tmp_path_factory.mktemp("requests")
+    save_viewed_room(folder)
+    first = search_of(folder / "features")
+    first.shown = replace(first.shown, scene=replace(first.shown.scene, views=room_scene().views))
+    second = search_of(folder / "features", max_gaussians=2000)
+    second.shown = replace(second.shown, scene=replace(second.shown.scene, views=None))
+    second.config = LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.37))
+    return [first, second]
+
+
+@pytest.fixture(scope="module")
+def server(searches: list[SceneSearch]) -> Iterator[ViewServer]:
+    with running(searches) as made:
+        yield made
+
+
+def test_each_scene_is_answered_under_its_own_number(server: ViewServer, searches: list[SceneSearch]) -> None:
+    for number, search in enumerate(searches):
+        count = len(search.shown.gaussians)
+        assert read_container(call(server, "GET", at(server, f"scene/{number}"))[1]).meta["count"] == count
+        labels = read_container(call(server, "GET", at(server, f"labels/{number}"))[1])
+        np.testing.assert_array_equal(labels.arrays["numbers"], search.labels.numbers)
+        answer = read_container(call(server, "POST", at(server, "ask"), {"scene": number, "word": "mug"})[1])
+        expected = search.ask("mug")
+        np.testing.assert_array_equal(answer.arrays["relevancy"], expected.relevancy)
+        assert (answer.arrays["relevancy"] == UNSEEN).any()
+        assert answer.meta == {
+            "word": "mug", "threshold": pytest.approx(expected.threshold), "step": RELEVANCY_STEP, "unseen": UNSEEN,
+        }  # fmt: skip
+
+
+def test_photographs_come_whole_and_a_scene_without_any_says_so(server: ViewServer) -> None:
+    photographs = room_scene().views
+    assert photographs is not None
+    assert photographs.images is not None
+    for view in (0, 4):
+        with Image.open(io.BytesIO(call(server, "GET", at(server, f"photograph/0/{view}"))[1])) as picture:
+            assert picture.size == (96, 72)
+            errors = [np.abs(np.asarray(picture, float) - each).mean() for each in photographs.images]
+        assert int(np.argmin(errors)) == view
+    status, data, _ = call(server, "GET", at(server, "photograph/1/0"))
+    assert (status, json.loads(data)["error"]) == (404, "the scene has no photographs")
+
+
+@pytest.mark.parametrize("scene", [False, True, 2, -1, 0.0, None, [0]])
+def test_what_is_no_number_of_a_scene_is_refused(server: ViewServer, scene: Any) -> None:
+    assert call(server, "POST", at(server, "ask"), {"scene": scene, "word": "mug"})[0] == 400
+
+
+def test_what_is_as_large_as_it_may_be_is_answered(server: ViewServer, searches: list[SceneSearch]) -> None:
+    count = len(searches[0].shown.gaussians)
+    # Nobody knows the word, but it is one.
+    assert call(server, "POST", at(server, "ask"), {"scene": 0, "word": "x" * MAX_WORD})[0] == 422
+    for rows, status in (([count - 1] * MAX_ROWS, 200), ([count], 400), ([0, -1], 400)):
+        assert call(server, "POST", at(server, "words"), {"scene": 0, "rows": rows})[0] == status
+    question = json.dumps({"scene": 0, "word": "mug"}).encode()
+    assert call(server, "POST", at(server, "ask"), question.ljust(MAX_BODY))[0] == 200
+
+
+def test_blanks_around_a_word_and_after_the_kind_of_a_body_do_not_matter(server: ViewServer) -> None:
+    kind = {"Content-Type": "Application/JSON ; charset=utf-8"}
+    status, data, _ = call(server, "POST", at(server, "boxes"), {"scene": 0, "word": " mug\n"}, headers=kind)
     assert status == 200
-    assert page == server.page[0]
-    assert headers["Content-Security-Policy"] == server.page[1]
-    assert headers["Cache-Control"] == "no-store"
-    assert headers["X-Frame-Options"] == "DENY"
+    assert {box["query"] for box in json.loads(data)["boxes"]} == {"mug"}
+    assert call(server, "GET", at(server, "") + "?again")[0] == 200
 
 
-def test_a_scene_comes_as_its_container(server: ViewServer, search: SceneSearch) -> None:
-    status, data, _ = call(server, "GET", at(server, "scene/0"))
-    assert status == 200
-    assert read_container(data).meta["count"] == len(search.shown.gaussians)
+def test_the_pages_own_questions_have_its_origin(server: ViewServer) -> None:
+    port = server.server_address[1]
+    for origin, status in ((f"http://127.0.0.1:{port}", 200), (f"https://127.0.0.1:{port}", 403), ("null", 403)):
+        answer = call(server, "POST", at(server, "boxes"), {"scene": 0, "word": "mug"}, headers={"Origin": origin})
+        assert answer[0] == status
 
 
-def test_a_word_is_answered_with_the_relevancy_of_all_gaussians(server: ViewServer, search: SceneSearch) -> None:
-    status, data, _ = call(server, "POST", at(server, "ask"), {"scene": 0, "word": " mug "})
-    assert status == 200
-    np.testing.assert_array_equal(read_container(data).arrays["relevancy"], search.ask("mug").relevancy)
-
-
-def test_boxes_words_labels_and_photographs_are_answered(server: ViewServer) -> None:
-    status, data, _ = call(server, "POST", at(server, "boxes"), {"scene": 0, "word": "mug"})
-    assert status == 200
-    assert json.loads(data)["boxes"][0]["query"] == "mug"
+def test_boxes_come_at_a_threshold_and_words_for_gaussians(server: ViewServer, searches: list[SceneSearch]) -> None:
+    for question, cutoff in (({}, None), ({"threshold": None}, None), ({"threshold": 0.3}, 0.3)):
+        status, data, _ = call(server, "POST", at(server, "boxes"), {"scene": 0, "word": "mug"} | question)
+        assert (status, json.loads(data)) == (200, searches[0].boxes("mug", cutoff))
+    for wrong in (2, -1.5, "0.3", [0]):
+        question = {"scene": 0, "word": "mug", "threshold": wrong}
+        assert call(server, "POST", at(server, "boxes"), question)[0] == 400
     status, data, _ = call(server, "POST", at(server, "words"), {"scene": 0, "rows": [0, 1, 2]})
-    assert status == 200
-    assert json.loads(data)["words"][0][0] == "room"
-    status, data, _ = call(server, "GET", at(server, "labels/0"))
-    assert "mug" in read_container(data).meta["names"]
-    status, data, headers = call(server, "GET", at(server, "photograph/0/3"))
-    assert (status, headers["Content-Type"], data[:2]) == (200, "image/jpeg", b"\xff\xd8")
+    assert (status, json.loads(data)["words"][0][0]) == (200, "room")
+
+
+@pytest.mark.parametrize("rest", ["", "scene/0", "nowhere"])
+def test_answers_stay_with_the_page(server: ViewServer, rest: str) -> None:
+    _, page, headers = call(server, "GET", at(server, rest))
+    expected = {
+        "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer",
+        "Cross-Origin-Resource-Policy": "same-origin", "X-Frame-Options": "DENY",
+    }  # fmt: skip
+    assert {name: headers[name] for name in expected} == expected
+    assert headers["Content-Security-Policy"] == (server.page[1] if rest == "" else None)
+    assert (page == server.page[0]) == (rest == "")
+
+
+def test_a_part_of_the_token_is_another_token(server: ViewServer) -> None:
+    for path in (f"/{server.token[:-1]}/", f"/{server.token}x/", f"/{server.token[1:]}/"):
+        assert call(server, "GET", path)[0] == 403
+
+
+def test_a_body_that_was_refused_is_not_taken_for_the_next_request(server: ViewServer) -> None:
+    hidden = head(server, "GET", "scene/0")
+    lines = ("Content-Type: text/plain", f"Content-Length: {len(hidden)}")
+    answer = sent(server, head(server, "POST", "ask", *lines) + hidden)
+    assert answer.startswith(b"HTTP/1.1 415")
+    assert answer.count(b"HTTP/1.1") == 1
+    assert b"\r\nConnection: close\r\n" in answer
+
+
+def test_a_connection_answers_one_request_after_another(server: ViewServer) -> None:
+    twice = head(server, "GET", "labels/1") + head(server, "GET", "labels/1", "Connection: close")
+    assert sent(server, twice).count(b"HTTP/1.1 200") == 2
+
+
+@pytest.mark.parametrize(
+    ("lines", "status"),
+    [
+        (("Content-Type: application/json",), b"411"),
+        (("Content-Type: application/json", "Content-Length: 1e3"), b"411"),
+        (("Content-Type: application/json", f"Content-Length: {'9' * 5000}"), b"413"),
+        (("Content-Type: application/json", "Content-Length: -5"), b"411"),
+        (("Content-Type: application/json", "Content-Length: ٣"), b"411"),
+        (("Content-Type: application/json", f"Content-Length: {10**11}"), b"413"),
+        (("Content-Length: 2",), b"415"),
+    ],
+)
+def test_a_length_is_a_number_and_not_too_large(server: ViewServer, lines: tuple[str, ...], status: bytes) -> None:
+    assert sent(server, head(server, "POST", "ask", *lines)).split()[1] == status
+
+
+def test_a_body_that_does_not_come_is_waited_for_and_then_refused(
+    server: ViewServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert 0 < viewer_server.TIMEOUT <= 60
+    monkeypatch.setattr(viewer_server._Handler, "timeout", 0.2)
+    lines = ("Content-Type: application/json", "Content-Length: 10")
+    assert sent(server, head(server, "POST", "ask", *lines)).startswith(b"HTTP/1.1 400")
+    assert sent(server, "") == b""
+
+
+def test_another_address_has_its_own_name_alone(searches: list[SceneSearch]) -> None:
+    try:
+        with socket.create_server(("127.0.0.2", 0)):
+            pass
+    except OSError:
+        pytest.skip("there is no second address of this machine")
+    with running(searches[:1], host="127.0.0.2") as server:
+        port = server.server_address[1]
+        assert server.address == f"http://127.0.0.2:{port}/{server.token}/"
+        for host, status in (("127.0.0.2", 200), ("127.0.0.1", 403), ("localhost", 403)):
+            assert call(server, "GET", at(server, ""), headers={"Host": f"{host}:{port}"})[0] == status
+
+
+def test_an_address_of_version_six_stands_in_brackets(searches: list[SceneSearch]) -> None:
+    try:
+        with socket.create_server(("::1", 0), family=socket.AF_INET6):
+            pass
+    except OSError:
+        pytest.skip("this machine has no IPv6")
+    with running(searches[:1], host="::1") as server:
+        port = server.server_address[1]
+        assert server.address == f"http://[::1]:{port}/{server.token}/"
+        assert call(server, "GET", at(server, ""), headers={"Host": f"[::1]:{port}"})[0] == 200
+        assert call(server, "GET", at(server, ""), headers={"Host": f"::1:{port}"})[0] == 403
 
 
 @pytest.mark.parametrize("word", ["banjo", "‮tub", "<script>alert(1)</script>"])
@@ -119,7 +295,7 @@ def test_a_request_of_another_site_is_refused(server: ViewServer) -> None:
         "../../etc/passwd",
         "..%2f..%2fetc/passwd",
         "scene/../0",
-        "scene/1",
+        "scene/2",
         "scene/-1",
         "scene/0/",
         "scene/٣",
@@ -170,27 +346,6 @@ def test_a_body_of_another_kind_is_refused(server: ViewServer) -> None:
     assert call(server, "POST", at(server, "ask"), {"scene": 0, "word": "mug"}, headers=headers)[0] == 415
 
 
-def test_megabytes_are_refused_before_they_are_read(server: ViewServer) -> None:
-    with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=10) as stream:
-        port = server.server_address[1]
-        stream.sendall(
-            f"POST {at(server, 'ask')} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nContent-Type: application/json\r\n"
-            f"Content-Length: {10**11}\r\n\r\n".encode()
-        )
-        assert stream.recv(64).startswith(b"HTTP/1.1 413")
-
-
-@pytest.mark.parametrize("length", ["", "-5", "1e3", "٣", "999999999999999999999"])
-def test_a_length_that_is_no_number_is_refused(server: ViewServer, length: str) -> None:
-    with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=10) as stream:
-        port = server.server_address[1]
-        stream.sendall(
-            f"POST {at(server, 'ask')} HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nContent-Type: application/json\r\n"
-            f"Content-Length: {length}\r\n\r\n".encode()
-        )
-        assert stream.recv(64).split()[1] in (b"411", b"413")
-
-
 @pytest.mark.parametrize("method", ["HEAD", "PUT", "DELETE", "PATCH", "OPTIONS", "TRACE"])
 def test_other_methods_are_refused_after_the_token(server: ViewServer, method: str) -> None:
     status, _, headers = call(server, method, at(server, ""))
@@ -198,19 +353,19 @@ def test_other_methods_are_refused_after_the_token(server: ViewServer, method: s
     assert call(server, method, "/wrong/")[0] == 403
 
 
-def test_a_port_in_use_is_one_line_that_says_so(server: ViewServer, search: SceneSearch) -> None:
+def test_a_port_in_use_is_one_line_that_says_so(server: ViewServer, searches: list[SceneSearch]) -> None:
     with pytest.raises(InputError, match="port=0 takes a free one"):
-        ViewServer(server.page, [search], [], port=server.server_address[1])
+        ViewServer(server.page, searches[:1], [], port=server.server_address[1])
 
 
-def test_each_server_has_a_token_of_its_own(server: ViewServer, search: SceneSearch) -> None:
-    with ViewServer(server.page, [search], []) as other:
+def test_each_server_has_a_token_of_its_own(server: ViewServer, searches: list[SceneSearch]) -> None:
+    with ViewServer(server.page, searches[:1], []) as other:
         assert other.token != server.token
         assert len(other.token) >= 32
         assert other.server_address[0] == "127.0.0.1"
 
 
-def test_questions_from_many_threads_have_their_own_answers(server: ViewServer, search: SceneSearch) -> None:
+def test_questions_from_many_threads_have_their_own_answers(server: ViewServer, searches: list[SceneSearch]) -> None:
     words = ["mug", "ball", "lamp", "bowl"] * 3
     answers: dict[int, np.ndarray] = {}
 
@@ -224,99 +379,7 @@ def test_questions_from_many_threads_have_their_own_answers(server: ViewServer, 
     for thread in threads:
         thread.join()
     for number, word in enumerate(words):
-        np.testing.assert_array_equal(answers[number], search.ask(word).relevancy)
-
-
-def test_a_request_that_comes_byte_by_byte_is_ended(server: ViewServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer_server, "TIMEOUT", 0.4)
-    for text in ("G" * 100, head(server, "POST", "ask", "Content-Type: application/json", "Content-Length: 99") + "{"):
-        with connected(server) as stream:
-            begun = time.monotonic()
-            with suppress(ConnectionError):
-                stream.sendall(text.encode())
-                while time.monotonic() - begun < 5:
-                    time.sleep(0.05)
-                    stream.sendall(b"G")
-            assert 0.3 < time.monotonic() - begun < 4
-    # A request that is there in time is answered, whatever its answer takes.
-    assert call(server, "GET", at(server, ""))[0] == 200
-
-
-def test_strangers_take_no_place_from_the_page(server: ViewServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(viewer_server, "MAX_CONNECTIONS", 8)
-    threads = threading.active_count()
-    request = head(server, "GET", "").encode()
-    with ExitStack() as strangers, connected(server) as page:
-        for _ in range(2):
-            page.sendall(request)
-            answer = b""
-            while server.page[0] not in answer:
-                part = page.recv(1 << 16)
-                assert part
-                answer += part
-            for _ in range(30):
-                strangers.enter_context(connected(server))
-        assert call(server, "GET", at(server, ""))[0] == 200
-        # A thread ends a moment after its connection was shut down.
-        until = time.monotonic() + 10
-        while threading.active_count() > threads + 9 and time.monotonic() < until:
-            time.sleep(0.01)
-        assert threading.active_count() <= threads + 9
-
-
-def test_a_request_that_has_come_is_not_ended_while_it_is_answered(
-    server: ViewServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    real, now = ViewServer.search_of, time.monotonic
-
-    def slow(made: ViewServer, value: Any) -> SceneSearch:
-        with monkeypatch.context() as later:
-            later.setattr(viewer_server, "time", SimpleNamespace(monotonic=lambda: now() + 1000))
-            made.service_actions()
-        return real(made, value)
-
-    monkeypatch.setattr(ViewServer, "search_of", slow)
-    body = json.dumps({"scene": 0, "rows": [0]})
-    lines = ("Content-Type: application/json", f"Content-Length: {len(body)}")
-    with connected(server) as stream:
-        for text in (head(server, "GET", "labels/0"), head(server, "POST", "words", *lines) + body) * 2:
-            stream.sendall(text.encode())
-            response = http.client.HTTPResponse(stream)
-            response.begin()
-            assert (response.status, bool(response.read())) == (200, True)
-            time.sleep(0.03)
-
-
-def test_where_too_many_wait_those_are_ended_that_came_first_of_those_without_the_token(
-    search: SceneSearch, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(viewer_server, "MAX_CONNECTIONS", 3)
-    with ExitStack() as stack:
-        idle = stack.enter_context(ViewServer((b"", ""), [search], []))
-        ends = [stack.enter_context(end) for _ in range(5) for end in socket.socketpair()][::2]
-        for end in ends:
-            end.setblocking(False)
-
-        def is_ended(end: socket.socket) -> bool:
-            try:
-                return end.recv(1) == b""
-            except BlockingIOError:
-                return False
-
-        def ended() -> list[int]:
-            return [number for number, end in enumerate(ends) if is_ended(end)]
-
-        for number in range(5):
-            idle.wait_for(ends[number], number in (0, 3))
-            idle.service_actions()
-            assert ended() == ([], [], [], [1], [1, 2])[number]
-        idle.has_come(ends[3])
-        idle.service_actions()
-        assert ended() == [1, 2]
-        now = time.monotonic
-        monkeypatch.setattr(viewer_server, "time", SimpleNamespace(monotonic=lambda: now() + viewer_server.TIMEOUT))
-        idle.service_actions()
-        assert ended() == [0, 1, 2, 4]
+        np.testing.assert_array_equal(answers[number], searches[0].ask(word).relevancy)
 
 
 def test_a_client_that_resets_its_connection_prints_nothing(

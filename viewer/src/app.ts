@@ -14,6 +14,8 @@ import type { Answers, FoundBox, PageSettings } from "./types";
 
 const BEST_VIEWS = 4;
 const SAMPLED_ROWS = 1000;
+/** Milliseconds without a move of the slider after which boxes are asked for. */
+const SLIDER_REST = 150;
 
 export class App {
   mode: Mode = "photo";
@@ -26,6 +28,8 @@ export class App {
   private boxesShown = true;
   private chosenBox: FoundBox | null = null;
   private asked = 0;
+  private searched = 0;
+  private waiting: ReturnType<typeof setTimeout> | undefined;
   private readonly frames: Frames;
   private fast = false;
 
@@ -173,34 +177,39 @@ export class App {
       const shown = this.shown[number] as Shown;
       shown.problem = typeof answer === "string" ? answer : "";
       shown.answer = typeof answer === "string" ? null : answer;
-      shown.judged = null;
+      shown.found = null;
     });
     await this.color("word");
     await this.frame();
     this.timings.paint = performance.now() - begin;
     document.body.dataset.painted = word;
-    this.searchBoxes();
-    await Promise.all(
-      this.shown.map(async (shown) => {
-        if (!shown.answer) return;
-        const judged = await shown.answers.judge(shown.answer, shown.boxes);
-        if (turn === this.asked) shown.judged = judged;
-      }),
-    ).catch((error: unknown) => this.panel.showStatus([{ text: String(error), bad: true }]));
-    if (turn !== this.asked) return;
-    if (this.threshold === null) this.searchBoxes();
-    document.body.dataset.judged = word;
+    await this.findBoxes();
+    if (turn === this.asked) document.body.dataset.judged = word;
   }
 
   setThreshold(value: number | null): void {
     this.threshold = value;
     this.chosenBox = null;
     this.repaint();
-    this.searchBoxes();
+    this.showStatus();
+    clearTimeout(this.waiting);
+    this.waiting = setTimeout(() => void this.findBoxes(), SLIDER_REST);
   }
 
-  private searchBoxes(): void {
-    for (const shown of this.shown) shown.findBoxes(this.threshold);
+  /** Asks for the boxes at the threshold; what the last call found stays. */
+  private async findBoxes(): Promise<void> {
+    const turn = ++this.searched;
+    const failed = (error: unknown): string => (error instanceof Error ? error.message : String(error));
+    await Promise.all(
+      this.shown.map(async (shown) => {
+        if (!shown.answer) return;
+        const found = await shown.answers.boxes(shown.answer.word, this.threshold).catch(failed);
+        if (turn !== this.searched) return;
+        shown.problem = typeof found === "string" ? found : "";
+        shown.found = typeof found === "string" ? null : found;
+      }),
+    );
+    if (turn !== this.searched) return;
     this.showBoxes();
     this.showStatus();
   }
@@ -210,13 +219,13 @@ export class App {
     const lines = this.shown.flatMap((shown) => {
       const before = several ? `${shown.scene.meta.title}: ` : "";
       if (shown.problem) return [{ text: before + shown.problem, bad: true }];
-      const { answer, judged, boxes } = shown;
+      const { answer, found, boxes } = shown;
       if (!answer) return [];
       const cutoff = shown.cutoff(this.threshold);
       let picked = 0;
       for (const value of answer.relevancy) if (value >= cutoff) picked++;
-      if (judged && this.threshold === null && !judged.boxes.length) {
-        return [{ text: `${before}absent (probability ${judged.probability.toFixed(2)})` }];
+      if (found && this.threshold === null && !boxes.length) {
+        return [{ text: `${before}absent (probability ${found.probability.toFixed(2)})` }];
       }
       const number = boxes.length === 1 ? "1 box" : `${boxes.length} boxes`;
       return [{ text: `${before}${number}, ${picked.toLocaleString("en")} Gaussians` }];
@@ -231,7 +240,7 @@ export class App {
     const rows = this.shown.flatMap((shown) =>
       shown.boxes.map((box) => ({
         text: several ? `${shown.scene.meta.title}: ${box.word}` : box.word,
-        side: box.probability === null ? "" : box.probability.toFixed(2),
+        side: box.probability.toFixed(2),
         detail: sizeOf(box, shown.scene),
         chosen: box === this.chosenBox,
         choose: () => void this.chooseBox(box),
@@ -239,15 +248,13 @@ export class App {
     );
     this.panel.showBoxes(rows);
     for (const shown of this.shown) {
-      const { pane, boxes, judged } = shown;
-      const provisional = this.threshold === null && !judged;
+      const { pane, boxes } = shown;
       const visible = this.boxesShown ? boxes : [];
       pane.showBoxes(
         visible.map((box) => ({
           box,
-          label: box.probability === null ? box.word : `${box.word} ${box.probability.toFixed(2)}`,
+          label: `${box.word} ${box.probability.toFixed(2)}`,
           chosen: box === this.chosenBox,
-          provisional,
         })),
       );
     }
@@ -289,7 +296,7 @@ export class App {
     const { means, scales } = shown.scene.geometry;
     const center = means.subarray(3 * hit.row, 3 * hit.row + 3);
     const radius = Math.max(...scales.subarray(3 * hit.row, 3 * hit.row + 3), shown.scene.meta.spacing);
-    const within = shown.boxes.find((box) => box.rows?.includes(hit.row) || holds(box, center));
+    const within = shown.boxes.find((box) => holds(box, center));
     if (within && (shown.answer?.relevancy[hit.row] ?? 0) >= shown.cutoff(this.threshold)) {
       await this.chooseBox(within);
       return;
@@ -310,9 +317,9 @@ export class App {
     if (!shown || !geometry) return;
     this.chosenBox = box;
     this.showBoxes();
-    const rows = rowsIn(box, geometry.means, shown.answer?.relevancy ?? null, shown.cutoff(this.threshold), SAMPLED_ROWS);
+    const rows = rowsIn(box, geometry.means, shown.answer?.relevancy ?? new Float32Array(), shown.cutoff(this.threshold), SAMPLED_ROWS);
     const radius = Math.hypot(...box.size) / 2;
-    const probable = box.probability === null ? "" : `\nprobability ${box.probability.toFixed(2)}, score ${box.score.toFixed(2)}`;
+    const probable = `\nprobability ${box.probability.toFixed(2)}, score ${box.score.toFixed(2)}`;
     const detail = `${this.position(shown, box.center)}\n${sizeOf(box, shown.scene)}${probable}`;
     await this.describe(shown, rows, box.center, radius, box.word, detail);
   }

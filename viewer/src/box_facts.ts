@@ -1,7 +1,7 @@
-// What is asked of a box: which Gaussians it holds, and how large it is in words.
+// Boxes as they are sent, and what is asked of them: which Gaussians it holds, and how large it is in words.
 
 import type { Scene } from "./scene";
-import type { FoundBox } from "./types";
+import type { Found, FoundBox, SentBoxes } from "./types";
 
 export function holds(box: FoundBox, point: ArrayLike<number>): boolean {
   const slack = 1e-4 * Math.hypot(...box.size);
@@ -18,15 +18,24 @@ export function sizeOf(box: FoundBox, scene: Scene): string {
   return `${sides}${unit ? " m" : ""}, ${box.count.toLocaleString("en")} Gaussians`;
 }
 
-/** Gaussians of a box: those that it was made of, or those at or above a threshold that lie in it; evenly thinned. */
-export function rowsIn(box: FoundBox, means: Float32Array, relevancy: Float32Array | null, threshold: number, most: number): number[] {
-  let rows = box.rows ? [...box.rows] : [];
-  if (!box.rows && relevancy) {
-    relevancy.forEach((value, row) => {
-      if (value >= threshold && holds(box, means.subarray(3 * row, 3 * row + 3))) rows.push(row);
-    });
-  }
+/** Boxes as they were sent, in the coordinates of a scene with this origin. */
+export function foundOf(sent: SentBoxes, origin: number[]): Found {
+  const boxes = sent.boxes.map(({ query, obb, ...box }): FoundBox => ({
+    ...box,
+    word: query,
+    center: obb.center.map((value, axis) => value - (origin[axis] ?? 0)) as [number, number, number],
+    rotation: obb.rotation.flat(),
+    size: obb.size,
+  }));
+  return { boxes, probability: sent.probability };
+}
+
+/** The Gaussians at or above a threshold that lie in a box, evenly thinned. */
+export function rowsIn(box: FoundBox, means: Float32Array, relevancy: Float32Array, threshold: number, most: number): number[] {
+  const rows: number[] = [];
+  relevancy.forEach((value, row) => {
+    if (value >= threshold && holds(box, means.subarray(3 * row, 3 * row + 3))) rows.push(row);
+  });
   const step = Math.max(1, Math.ceil(rows.length / most));
-  rows = rows.filter((_, place) => place % step === 0);
-  return rows;
+  return rows.filter((_, place) => place % step === 0);
 }

@@ -1,9 +1,9 @@
-// Answers of a page that is one file: cosines from quantized coordinates, and the probability of boxes.
+// Answers of a page that is one file: cosines from quantized coordinates; boxes were found when it was written.
 
+import { foundOf } from "./box_facts";
 import { arrayOf, type Container } from "./container";
 import type { Scene } from "./scene";
-import { background, bestOf, thresholdOf } from "./threshold";
-import type { Answer, Answers, Coefficients, FileMeta, FoundBox, Judged, Labels } from "./types";
+import type { Answer, Answers, FileMeta, Found, Labels } from "./types";
 import { WordTable } from "./words";
 
 const WORD_STEP = 1 / 32767;
@@ -85,56 +85,20 @@ export class FileAnswers implements Answers {
   }
 
   async ask(word: string): Promise<Answer> {
-    const row = this.table.find(word);
-    if (row === null) {
-      const near = this.table.near(word, 6);
-      const hint = near.length ? ` Near: ${near.join(", ")}.` : "";
-      throw new Error(`“${word}” is not among the ${this.meta.words.length} words of this file.${hint}`);
-    }
-    const relevancy = this.relevancy(row);
-    return { word, relevancy, threshold: thresholdOf(relevancy, this.meta.localize.threshold) };
+    const { threshold } = this.answer(word);
+    return { word, relevancy: this.relevancy(this.table.find(word) as number), threshold };
   }
 
-  async judge(answer: Answer, found: FoundBox[]): Promise<Judged> {
-    const row = this.table.find(answer.word);
-    if (row === null) return { boxes: found, probability: 0 };
-    const { median, spread } = background(answer.relevancy);
-    const trained = this.meta.trained?.[row];
-    const kinds = this.meta.presence;
-    const coefficients = trained === undefined ? kinds.unknown : trained ? kinds.trained : kinds.untrained;
-    const synonyms = new Set([row, ...(this.meta.synonyms[String(row)] ?? [])]);
-    const total = (rows: Int32Array): number => rows.reduce((sum, each) => sum + this.scene.weight(each), 0);
-    let all = 0;
-    const cutoff = answer.threshold ?? Infinity;
-    answer.relevancy.forEach((value, each) => {
-      if (value >= cutoff) all += this.scene.weight(each);
-    });
-    const judged = found.map((box): FoundBox => {
-      const rows = box.rows ?? new Int32Array();
-      const direction = this.meanDirection(rows);
-      const mean = Math.min(this.dot(row, direction), 1);
-      let rival = -Infinity;
-      for (let other = 0; other < this.meta.words.length; other++) {
-        if (!synonyms.has(other)) rival = Math.max(rival, this.dot(other, direction));
-      }
-      const best = bestOf(Float32Array.from(rows, (each) => answer.relevancy[each] ?? 0));
-      const height = (best - median) / Math.max(spread, kinds.smallestSpread);
-      const evidence: Coefficients = {
-        mean,
-        margin: mean - rival,
-        prominence: Math.log(Math.max(height, 1e-3)),
-        size: Math.log10(rows.length),
-        share: total(rows) / all,
-      };
-      let logit = coefficients.intercept ?? 0;
-      for (const [name, value] of Object.entries(evidence)) {
-        if (Number.isFinite(value)) logit += (coefficients[name] ?? 0) * value;
-      }
-      return { ...box, probability: 0.5 * (1 + Math.tanh(logit / 2)) };
-    });
-    const probability = Math.max(0, ...judged.map((box) => box.probability ?? 0));
-    const boxes = judged.filter((box) => (box.probability ?? 0) >= this.meta.localize.minProbability);
-    return { boxes, probability };
+  private answer(word: string): FileMeta["answers"][number] {
+    const answer = this.meta.answers[this.table.find(word) ?? -1];
+    if (answer) return answer;
+    const near = this.table.near(word, 6);
+    const hint = near.length ? ` Near: ${near.join(", ")}.` : "";
+    throw new Error(`“${word}” is not among the ${this.meta.words.length} words of this file.${hint}`);
+  }
+
+  async boxes(word: string): Promise<Found> {
+    return foundOf(this.answer(word), this.meta.origin);
   }
 
   async bestWords(rows: number[]): Promise<[string, number][]> {

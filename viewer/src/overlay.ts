@@ -13,8 +13,6 @@ export interface ShownBox {
   box: FoundBox;
   label: string;
   chosen: boolean;
-  /** Not judged yet. */
-  provisional: boolean;
 }
 
 type Segment = [THREE.Vector3, THREE.Vector3];
@@ -78,7 +76,7 @@ export class Overlay {
     this.boxes = boxes.map((shown) => {
       const label = document.createElement("button");
       label.type = "button";
-      label.className = shown.chosen ? "label chosen" : shown.provisional ? "label provisional" : "label";
+      label.className = shown.chosen ? "label chosen" : "label";
       label.textContent = shown.label;
       label.addEventListener("click", () => this.clicked(shown.box));
       return { shown, edges: edgesOf(shown.box), corners: cornersOf(shown.box), label };
@@ -128,10 +126,8 @@ export class Overlay {
     for (const { shown, edges, corners, label } of [...this.boxes].reverse()) {
       const lines = path(edges);
       const thickness = shown.chosen ? 3 : shown.box.rank === 0 ? 2.2 : 1.5;
-      context.globalAlpha = shown.provisional ? 0.5 : 1;
       stroke(lines, SHADOW, thickness + 2.5);
       stroke(lines, shown.chosen ? CHOSEN_COLOR : BOX_COLOR, thickness);
-      context.globalAlpha = 1;
       const seen = corners.map((corner) => corner.clone().applyMatrix4(view)).filter((each) => each.z < -camera.near);
       const top = seen.map(place).reduce<Place | null>((a, b) => (a && a.y <= b.y ? a : b), null);
       const inside = top && top.x > 0 && top.x < width && top.y > -height / 2 && top.y < height;

@@ -1,17 +1,9 @@
 // Answers of the server that sent the page; see gsencoder/infer/page/server.py.
 
+import { foundOf } from "./box_facts";
 import { arrayOf, readContainer, type Container } from "./container";
 import { Scene } from "./scene";
-import type { Answer, Answers, FoundBox, Judged, Labels, SceneMeta } from "./types";
-
-interface SentBox {
-  query: string;
-  rank: number;
-  score: number;
-  probability: number;
-  count: number;
-  obb: { center: [number, number, number]; rotation: number[][]; size: [number, number, number] };
-}
+import type { Answer, Answers, Found, Labels, SceneMeta, SentBoxes } from "./types";
 
 async function checked(response: Response): Promise<Response> {
   if (response.ok) return response;
@@ -61,25 +53,9 @@ export class ServerAnswers implements Answers {
     return { word, relevancy, threshold };
   }
 
-  async judge(answer: Answer, _found: FoundBox[]): Promise<Judged> {
-    const response = await post("boxes", { scene: this.number, word: answer.word });
-    const sent = (await response.json()) as { boxes: SentBox[]; probability: number };
-    const origin = this.scene.meta.origin;
-    const boxes = sent.boxes.map((box): FoundBox => {
-      const center = box.obb.center.map((value, axis) => value - (origin[axis] ?? 0)) as [number, number, number];
-      return {
-        word: box.query,
-        rank: box.rank,
-        score: box.score,
-        probability: box.probability,
-        center,
-        rotation: box.obb.rotation.flat(),
-        size: box.obb.size,
-        rows: null,
-        count: box.count,
-      };
-    });
-    return { boxes, probability: sent.probability };
+  async boxes(word: string, threshold: number | null): Promise<Found> {
+    const response = await post("boxes", { scene: this.number, word, threshold });
+    return foundOf((await response.json()) as SentBoxes, this.scene.meta.origin);
   }
 
   async bestWords(rows: number[]): Promise<[string, number][]> {

@@ -1,17 +1,14 @@
 // A scene on the page, and what was found in it for the last word.
 
-import { boxAround } from "./boxes";
-import { findClusters } from "./clusters";
 import { paintLabels, paintObjects, paintPca, paintWeights, paintWord, type Legend, type Mode } from "./colors";
 import type { Pane } from "./pane";
 import type { Scene } from "./scene";
-import type { Answer, Answers, FoundBox, Judged, Labels } from "./types";
+import type { Answer, Answers, Found, FoundBox, Labels } from "./types";
 
 export class Shown {
   answer: Answer | null = null;
-  /** The boxes at the default threshold with their probabilities, once they are known. */
-  judged: Judged | null = null;
-  boxes: FoundBox[] = [];
+  /** The boxes of the last word, once they are known. */
+  found: Found | null = null;
   labels: Labels | null = null;
   /** Why the last word has no answer. */
   problem = "";
@@ -27,16 +24,8 @@ export class Shown {
     return threshold ?? this.answer?.threshold ?? Infinity;
   }
 
-  findBoxes(threshold: number | null): void {
-    const { answer, judged, scene } = this;
-    if (!answer || !scene.geometry) this.boxes = [];
-    else if (threshold === null && judged) this.boxes = judged.boxes;
-    else {
-      const means = scene.geometry.means;
-      const weight = (row: number): number => scene.weight(row);
-      const clusters = findClusters(answer.relevancy, this.cutoff(threshold), means, weight, scene.meta.localize);
-      this.boxes = clusters.map((each, rank) => boxAround(answer.word, rank, each, means, scene.up));
-    }
+  get boxes(): FoundBox[] {
+    return this.found?.boxes ?? [];
   }
 
   /** Colors the Gaussians, and tells what the colors mean; null where the mode has none and the splat's own are shown. */

@@ -1,25 +1,5 @@
 // What the page knows of a scene; see gsencoder/infer/page/page.py.
 
-export interface ThresholdSettings {
-  kind: "adaptive" | "fixed" | "relative" | "quantile" | "otsu";
-  fixed: number;
-  relative: number;
-  noise: number;
-  quantile: number;
-}
-
-export interface LocalizeSettings {
-  /** The radius of clusters, or the smallest one where it follows gaps. */
-  eps: number;
-  followsGaps: boolean;
-  minSamples: number;
-  minShare: number;
-  minWeight: number;
-  maxBoxes: number;
-  minProbability: number;
-  threshold: ThresholdSettings;
-}
-
 export interface SceneMeta {
   name: string;
   title: string;
@@ -36,19 +16,30 @@ export interface SceneMeta {
   views: string[];
   photographs: boolean;
   words: string[];
-  localize: LocalizeSettings;
   objects: string[];
 }
 
-export type Coefficients = Record<string, number>;
+/** A box as `gsencoder localize` writes it, in world coordinates. */
+export interface SentBox {
+  query: string;
+  rank: number;
+  score: number;
+  probability: number;
+  count: number;
+  obb: { center: number[]; rotation: number[][]; size: [number, number, number] };
+}
+
+export interface SentBoxes {
+  boxes: SentBox[];
+  probability: number;
+}
 
 export interface FileMeta extends SceneMeta {
   rank: number;
   floor: number;
   featureError: number;
-  synonyms: Record<string, number[]>;
-  trained: boolean[] | null;
-  presence: { unknown: Coefficients; trained: Coefficients; untrained: Coefficients; smallestSpread: number };
+  /** Of each known word, in their order. */
+  answers: (SentBoxes & { threshold: number | null })[];
   labels: string[];
   photographViews: number[];
   photographSizes: number[];
@@ -72,18 +63,16 @@ export interface FoundBox {
   word: string;
   rank: number;
   score: number;
-  /** Null until it is known. */
-  probability: number | null;
+  probability: number;
   center: [number, number, number];
   /** Columns are the axes; row-major. */
   rotation: number[];
   size: [number, number, number];
-  /** Gaussians in it, where the page found it itself. */
-  rows: Int32Array | null;
   count: number;
 }
 
-export interface Judged {
+/** The boxes of a word, and the probability that it is in the scene. */
+export interface Found {
   boxes: FoundBox[];
   probability: number;
 }
@@ -96,8 +85,8 @@ export interface Labels {
 /** Where answers come from: a server, or the file itself. */
 export interface Answers {
   ask(word: string): Promise<Answer>;
-  /** The boxes at the default threshold with probabilities, given what the page found. */
-  judge(answer: Answer, found: FoundBox[]): Promise<Judged>;
+  /** The boxes at a threshold, null = the default; a file knows those of the default alone. */
+  boxes(word: string, threshold: number | null): Promise<Found>;
   bestWords(rows: number[]): Promise<[string, number][]>;
   labels(): Promise<Labels>;
   /** The address of a view's photograph, or null. */

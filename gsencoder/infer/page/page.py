@@ -31,7 +31,6 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import plain
 from gsencoder.fusion.quantize import compact
-from gsencoder.infer import presence
 from gsencoder.infer.localize import LocalizeConfig, select_features
 from gsencoder.infer.page.search import SceneSearch, drawn_scene, object_numbers, pca_bytes, spz_bytes, weight_bytes
 from gsencoder.infer.relevancy import feature_axes, word_directions
@@ -69,7 +68,6 @@ def load_bundle(folder: Path | None = None) -> Bundle:
 
 
 MAGIC = b"GSVIEW01"
-TYPES = ("uint8", "int8", "uint16", "int16", "uint32", "int32", "float32")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -78,7 +76,7 @@ class Container:
 
     Attributes:
         meta: JSON values; numbers that are not finite become null.
-        arrays: by name, of the types in `TYPES`.
+        arrays: by name; 8- to 32-bit integers or float32.
     """
 
     meta: Mapping[str, Any]
@@ -90,8 +88,6 @@ class Container:
         parts: list[bytes] = []
         offset = 0
         for name, array in self.arrays.items():
-            if array.dtype.name not in TYPES:
-                raise InputError(f"Container: array {name!r} is {array.dtype.name}, expected one of {', '.join(TYPES)}")
             data = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
             listed[name] = {"type": array.dtype.name, "shape": list(array.shape), "offset": offset}
             padding = -len(data) % 8
@@ -196,7 +192,7 @@ def scene_container(search: SceneSearch, objects: tuple[SceneObject, ...], *, sh
         objects: labeled ones with boxes in world coordinates; may be empty.
         sh_degree: largest degree of spherical harmonics.
     """
-    shown, config = search.shown, search.config
+    shown = search.shown
     scene, gaussians, features = shown.scene, shown.gaussians, shown.features
     codes, lightest, heaviest = weight_bytes(features.weights)
     splat = np.frombuffer(spz_bytes(gaussians, sh_degree=sh_degree), np.uint8)
@@ -216,18 +212,6 @@ def scene_container(search: SceneSearch, objects: tuple[SceneObject, ...], *, sh
         "views": [] if scene.views is None else list(scene.views.names),
         "photographs": scene.views is not None and scene.views.images is not None,
         "words": [] if search.table is None else list(search.table.names),
-        "localize": {
-            "eps": config.radius(search.spacing),
-            "followsGaps": config.follows_gaps,
-            "minSamples": config.min_samples,
-            "minShare": config.min_share,
-            "minWeight": config.min_weight,
-            "maxBoxes": config.max_boxes,
-            "minProbability": config.min_probability,
-            "threshold": {
-                name: getattr(config.threshold, name) for name in ("kind", "fixed", "relative", "noise", "quantile")
-            },
-        },
         "objects": [each.name or "" for each in objects],
     }
     arrays: dict[str, np.ndarray] = {"splat": splat, "pca": pca_bytes(features), "weights": codes}
@@ -251,8 +235,6 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
     Features are coordinates z of the codes and levels of `gsencoder.fusion.quantize`. The relevancy of the word
     with vector t in `words` is z·t / √(|z|² + floor), since the basis is orthonormal and its mean is what centered
     cosines remove."""
-    if search.config.threshold.kind == "otsu":
-        raise InputError("localize.threshold.kind=otsu: a page does not compute it; use another, or leave out= out")
     base = scene_container(search, objects, sh_degree=options.sh_degree)
     compacted = compact(search.shown.features, error=options.error)
     table = search.table
@@ -261,13 +243,8 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
         directions = word_directions(table.embeddings, table.mean)
     seen = np.zeros(compacted.total, bool)
     seen[compacted.rows] = True
-    labels = search.labels()
+    labels = search.labels
     words = directions @ compacted.basis.components.astype(np.float64).T
-    likeness = directions @ directions.T
-    near = {
-        str(row): np.flatnonzero(likeness[row] >= presence.SYNONYM).tolist()
-        for row in np.flatnonzero((likeness >= presence.SYNONYM).sum(axis=1) > 1).tolist()
-    }
     views = search.shown.scene.views
     photographs, listed = photograph_bytes(views, options)
     meta = {
@@ -275,14 +252,7 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
         "rank": compacted.basis.rank,
         "floor": feature_axes(search.shown.features).floor,
         "featureError": compacted.error,
-        "synonyms": near,
-        "trained": None if table is None or table.trained is None else [table.is_trained(name) for name in table.names],
-        "presence": {
-            "unknown": dict(presence.WITH_RIVALS),
-            "trained": dict(presence.TRAINED),
-            "untrained": dict(presence.UNTRAINED),
-            "smallestSpread": presence.SMALLEST_SPREAD,
-        },
+        "answers": search.answers,
         "labels": list(labels.names),
         "photographs": bool(listed),
         "photographViews": listed,
@@ -364,6 +334,7 @@ def fitting_page(
     highest = max(_degree(scene) for scene, _, _ in scenes)
     largest = max(len(select_features(scene, None)[0]) for scene, _, _ in scenes)
     limit, degree = max_gaussians, min(options.sh_degree, highest)
+    searches: list[SceneSearch] = []
     while True:
         notes: list[str] = []
         if degree < highest:
@@ -378,10 +349,15 @@ def fitting_page(
             f"This file knows {word_count:,} words"
             + (", and gsencoder view FEATURES takes any phrase." if phrases else ".")
         )
-        containers = [
-            _container(scene, title, words, config, objects, replace(options, sh_degree=degree), limit)
+        searches = searches or [
+            SceneSearch(
+                shown=drawn_scene(scene, title, max_gaussians=limit, advice="megabytes= or max_gaussians= takes more"),
+                words=words,
+                config=config,
+            )
             for scene, title, words in scenes
         ]
+        containers = [file_container(search, objects, replace(options, sh_degree=degree)) for search in searches]
         settings = {"kind": "file", "scenes": len(containers), "notes": notes}
         page = file_page(bundle, f"{scenes[0][0].name} · gsencoder view", settings, containers)
         if len(page) <= max_bytes:
@@ -391,6 +367,7 @@ def fitting_page(
             continue
         fixed = len(file_page(bundle, "", settings, []))
         limit = int(THINNING * min(limit, largest) * max(0.0, max_bytes - fixed) / (len(page) - fixed))
+        searches = []
         if limit < FEWEST_GAUSSIANS:
             raise InputError(
                 f"megabytes={max_bytes / 1e6:g}: not even {FEWEST_GAUSSIANS:,} Gaussians fit beside the page itself, "
@@ -410,19 +387,3 @@ def fitting_page(
 
 def _degree(scene: Scene) -> int:
     return 0 if scene.gaussians is None else scene.gaussians.sh_degree
-
-
-def _container(
-    scene: Scene,
-    title: str,
-    words: Words | None,
-    config: LocalizeConfig,
-    objects: tuple[SceneObject, ...],
-    options: FileOptions,
-    limit: int,
-) -> Container:
-    advice = "megabytes= or max_gaussians= takes more"
-    search = SceneSearch(
-        shown=drawn_scene(scene, title, max_gaussians=limit, advice=advice), words=words, config=config
-    )
-    return file_container(search, objects, options)

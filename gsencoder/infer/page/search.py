@@ -5,6 +5,7 @@ import threading
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,10 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.packed import write_spz
 from gsencoder.data.splats.raw import RawSplat, logits_from_opacities, logs_from_scales
-from gsencoder.infer.boxes import localization_to_json
+from gsencoder.infer.boxes import box_to_json
 from gsencoder.infer.draw import fit_pca_colors, pca_picture
 from gsencoder.infer.localize import LocalizeConfig, localize, select_features, spacing_of
-from gsencoder.infer.relevancy import GaussianProducts, threshold, word_directions
+from gsencoder.infer.relevancy import GaussianProducts, ThresholdConfig, threshold, word_directions
 from gsencoder.text.table import TextTable, check_space
 from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.types import GaussianFeatures, Gaussians, Scene, SceneObject
@@ -166,6 +167,8 @@ LABELS = 40
 LEAST_LABEL = 0.3
 """A Gaussian whose best word has a smaller cosine than this is like none of them."""
 BEST_WORDS = 5
+WORD_BLOCK = 32
+"""Words that are localized at once."""
 LABEL_BLOCK = 4096
 """Gaussians whose words are compared at once."""
 
@@ -198,7 +201,7 @@ class Labels:
     numbers: UInt16[np.ndarray, " N"]
 
 
-@dataclass(slots=True, kw_only=True)
+@dataclass(kw_only=True, eq=False)
 class SceneSearch:
     """A scene that is asked many times; what does not depend on the word is computed once. May be asked from threads.
 
@@ -214,7 +217,6 @@ class SceneSearch:
     spacing: float = field(init=False)
     _lock: threading.Lock = field(init=False, default_factory=threading.Lock)
     _boxes_lock: threading.Lock = field(init=False, default_factory=threading.Lock)
-    _labels: Labels | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         if self.words is not None:
@@ -247,14 +249,37 @@ class SceneSearch:
         steps[seen] = np.rint(scores[seen] / np.float32(RELEVANCY_STEP)).astype(np.int16)
         return Answer(word=word, relevancy=steps, threshold=cutoff if np.isfinite(cutoff) else None)
 
-    def boxes(self, word: str) -> dict[str, Any]:
-        """The boxes of a word with their probabilities, as `gsencoder localize` writes them, and that of the word."""
-        words = self._encoder()
-        # The spacing, which takes most of the time, is known; what is asked meanwhile does not wait.
-        with self._boxes_lock, warnings.catch_warnings():
+    def boxes(self, word: str, cutoff: float | None = None) -> dict[str, Any]:
+        """The boxes of a word with their probabilities, as `gsencoder localize` writes them, and that of the word; at
+        a threshold, or at the default one."""
+        config = self.config
+        if cutoff is not None:
+            config = replace(config, threshold=ThresholdConfig(kind="fixed", fixed=cutoff))
+        # What is asked meanwhile does not wait.
+        with self._boxes_lock:
+            (found,) = self._localized([word], self._encoder(), config)
+        return {"boxes": found["boxes"], "probability": found["probability"]}
+
+    @cached_property
+    def answers(self) -> list[dict[str, Any]]:
+        """For each known word its boxes, its probability and its threshold, None where nothing was seen."""
+        names, table = ((), None) if self.table is None else (self.table.names, self.table)
+        blocks = [list(names[start : start + WORD_BLOCK]) for start in range(0, len(names), WORD_BLOCK)]
+        return [found for block in blocks if table for found in self._localized(block, table, self.config)]
+
+    def _localized(self, names: list[str], words: Words, config: LocalizeConfig) -> list[dict[str, Any]]:
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore", SceneWarning)
-            localized = localize(self.shown.scene, [word], words, self.config, spacing=self.spacing)
-        return {"boxes": localization_to_json(localized), "probability": float(localized.probabilities[0])}
+            # The spacing takes most of the time.
+            localized = localize(self.shown.scene, names, words, config, spacing=self.spacing)
+        return [
+            {
+                "boxes": [box_to_json(box) for box in localized.boxes if box.query == name],
+                "probability": float(localized.probabilities[row]),
+                "threshold": float(localized.thresholds[row]),
+            }
+            for row, name in enumerate(names)
+        ]
 
     def best_words(self, rows: Sequence[int]) -> list[tuple[str, float]]:
         """The known words nearest to the mean direction of some Gaussians, best first, with their cosines."""
@@ -266,22 +291,13 @@ class SceneSearch:
             return []
         weights = features.weights[chosen].astype(np.float64)
         mean = (weights / weights.sum()) @ self.products.axes.directions_of(features.stored(chosen))
-        cosines = word_directions(table.embeddings, table.mean) @ self._in_channels(mean)
+        cosines = self.products.axes.project(word_directions(table.embeddings, table.mean)) @ mean
         best = np.argsort(-cosines, kind="stable")[:BEST_WORDS]
         return [(table.names[row], float(cosines[row])) for row in best]
 
+    @cached_property
     def labels(self) -> Labels:
         """The best known word of every Gaussian, of the `LABELS` words that are the best of most weight."""
-        with self._boxes_lock:
-            if self._labels is None:
-                self._labels = self._find_labels()
-            return self._labels
-
-    def _in_channels(self, local: np.ndarray) -> np.ndarray:
-        axes = self.products.axes.axes
-        return local if axes is None else axes @ local
-
-    def _find_labels(self) -> Labels:
         features, table = self.shown.features, self.table
         if table is None:
             return Labels(names=(), numbers=np.full(len(features), NO_LABEL, np.uint16))

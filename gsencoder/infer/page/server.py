@@ -9,7 +9,7 @@ path names a file: there are
     GET   /labels/K              the best word of each Gaussian
     GET   /photograph/K/V        the photograph of a view, as JPEG
     POST  /ask                   {"scene", "word"}: relevancy of all Gaussians, and the threshold
-    POST  /boxes                 {"scene", "word"}: boxes and probabilities
+    POST  /boxes                 {"scene", "word", "threshold"}: boxes and probabilities; null = the default threshold
     POST  /words                 {"scene", "rows"}: the known words nearest to some Gaussians
 """
 
@@ -18,10 +18,7 @@ import json
 import secrets
 import socket
 import sys
-import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -38,11 +35,9 @@ MAX_WORD = 500
 MAX_ROWS = 4096
 PHOTOGRAPH_SIDE = 1280
 TIMEOUT = 30.0
-"""Seconds until a request must be complete, from the connection or the answer before it, and a chunk be taken."""
+"""Seconds that a connection may be silent."""
 CHUNK = 1 << 20
 """Bytes of an answer that are sent at once."""
-MAX_CONNECTIONS = 64
-"""Largest number of connections that wait for a request to come; a browser has six."""
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 BINARY = "application/octet-stream"
 
@@ -60,7 +55,6 @@ class ViewServer(ThreadingHTTPServer):
 
     daemon_threads = True
     allow_reuse_address = True
-    request_queue_size = MAX_CONNECTIONS
 
     def __init__(
         self,
@@ -78,7 +72,6 @@ class ViewServer(ThreadingHTTPServer):
         self.page, self.searches = page, tuple(searches)
         self.scene_bytes = [scene.to_bytes() for scene in scenes]
         self.token = secrets.token_urlsafe(24)
-        self._lock, self._waiting = threading.Lock(), dict[socket.socket, tuple[bool, float]]()
         if ":" in host:
             self.address_family = socket.AF_INET6
         try:
@@ -93,37 +86,6 @@ class ViewServer(ThreadingHTTPServer):
         self.hosts = frozenset(f"[{name}]:{number}" if ":" in name else f"{name}:{number}" for name in names)
         shown = f"[{host}]" if ":" in host else host
         self.address = f"http://{shown}:{number}/{self.token}/"
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        """Answers a connection in a thread."""
-        self.wait_for(request, False)
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        """Closes a connection."""
-        self.has_come(request)
-        super().shutdown_request(request)
-
-    def wait_for(self, connection: socket.socket, is_known: bool) -> None:
-        """Begins the time in which a request must come; `is_known`: one with the token came before it."""
-        with self._lock:
-            self._waiting[connection] = (is_known, time.monotonic() + TIMEOUT)
-
-    def has_come(self, connection: socket.socket) -> None:
-        """Ends what `wait_for` began."""
-        with self._lock:
-            self._waiting.pop(connection, None)
-
-    def service_actions(self) -> None:
-        """Lets late connections read no more, nor, where too many wait, unknown ones and those that wait longest."""
-        now = time.monotonic()
-        with self._lock:
-            ranked = sorted(self._waiting.items(), key=lambda entry: entry[1])
-            for row, (connection, (_, deadline)) in enumerate(ranked, MAX_CONNECTIONS - len(ranked)):
-                if row < 0 or deadline < now:
-                    del self._waiting[connection]
-                    with suppress(OSError):
-                        connection.shutdown(socket.SHUT_RD)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Reports a bug; a client that has gone is none."""
@@ -183,9 +145,9 @@ class _Handler(BaseHTTPRequestHandler):
                 self.send_header("Connection", "close")
             self.end_headers()
             if self.command != "HEAD":
+                # A time limit is one of each write.
                 for start in range(0, len(data), CHUNK):
                     self.wfile.write(memoryview(data)[start : start + CHUNK])
-            self.server.wait_for(self.connection, status == HTTPStatus.OK)
         except OSError:
             self.close_connection = True
 
@@ -202,7 +164,6 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _get(self, path: list[str]) -> tuple[bytes, str]:
         server = self.server
-        server.has_come(self.connection)
         match path:
             case [""]:
                 return server.page[0], "text/html; charset=utf-8"
@@ -210,7 +171,7 @@ class _Handler(BaseHTTPRequestHandler):
                 server.search_of(_whole(number))
                 return server.scene_bytes[_whole(number)], BINARY
             case ["labels", number]:
-                labels = server.search_of(_whole(number)).labels()
+                labels = server.search_of(_whole(number)).labels
                 return Container(meta={"names": labels.names}, arrays={"numbers": labels.numbers}).to_bytes(), BINARY
             case ["photograph", number, view]:
                 views = server.search_of(_whole(number)).shown.scene.views
@@ -229,10 +190,9 @@ class _Handler(BaseHTTPRequestHandler):
         search = self.server.search_of(request.get("scene"))
         if path == ["words"]:
             rows, count = request.get("rows"), len(search.shown.gaussians)
-            listed = isinstance(rows, list) and 0 < len(rows) <= MAX_ROWS
             if (
                 not isinstance(rows, list)
-                or not listed
+                or not 0 < len(rows) <= MAX_ROWS
                 or not all(type(row) is int and 0 <= row < count for row in rows)
             ):
                 raise RefusedError(
@@ -243,7 +203,10 @@ class _Handler(BaseHTTPRequestHandler):
         if not isinstance(word, str) or not word.strip() or len(word) > MAX_WORD:
             raise RefusedError(HTTPStatus.BAD_REQUEST, f"word: expected a text of 1 to {MAX_WORD} characters")
         if path == ["boxes"]:
-            return _json(search.boxes(word.strip()))
+            cutoff = request.get("threshold")
+            if cutoff is not None and not (isinstance(cutoff, (int, float)) and -1 <= cutoff <= 1):
+                raise RefusedError(HTTPStatus.BAD_REQUEST, "threshold: expected a relevancy in [-1, 1]")
+            return _json(search.boxes(word.strip(), cutoff))
         answer = search.ask(word.strip())
         meta = {"word": answer.word, "threshold": answer.threshold, "step": RELEVANCY_STEP, "unseen": UNSEEN}
         return Container(meta=meta, arrays={"relevancy": answer.relevancy}).to_bytes(), BINARY
@@ -260,7 +223,6 @@ class _Handler(BaseHTTPRequestHandler):
             request = json.loads(self.rfile.read(int(length)))
         except (ValueError, RecursionError, TimeoutError) as error:
             raise RefusedError(HTTPStatus.BAD_REQUEST, "the body is not JSON") from error
-        self.server.has_come(self.connection)
         if not isinstance(request, dict):
             raise RefusedError(HTTPStatus.BAD_REQUEST, "expected a JSON object")
         return request

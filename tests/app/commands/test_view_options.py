@@ -63,8 +63,9 @@ def test_options_of_features_boxes_and_words_reach_the_page(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     features = folder / "features"
-    (scene,), results = written(tmp_path / "a.html", features, "localize.max_boxes=3", "error=0.03", "megabytes=1")
-    assert scene.meta["localize"]["maxBoxes"] == 3
+    limit = ("localize.threshold.kind=fixed", "localize.threshold.fixed=0.9")
+    (scene,), results = written(tmp_path / "a.html", features, *limit, "error=0.03", "megabytes=1")
+    assert {answer["threshold"] for answer in scene.meta["answers"]} == {float(np.float32(0.9))}
     assert 0.01 < scene.meta["featureError"] <= 0.03
     assert results["feature_error"] == [scene.meta["featureError"]]
     assert (tmp_path / "a.html").stat().st_size <= 1e6
