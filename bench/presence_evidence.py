@@ -4,7 +4,7 @@
 
 Every room is asked words: the names of all objects of the house (`names`), other words for some of them (`others`),
 phrases that describe them (`phrases`, those of `bench/house_phrases.csv`), or a list of names ("mug,banana"). Features
-are fused labels without --weights. Each cluster of a word is a row (`gsencoder.infer.presence`), and is right
+are fused labels without --weights. Each cluster of a word is a row (`gsencoder.infer.relevancy`), and is right
 if more than half of its Gaussians lie in the box of an object that the word stands for, widened by 3 cm. OUT gets one
 .npy a room, and rooms that it has are not gathered again.
 """

@@ -13,8 +13,8 @@ from jaxtyping import Float64, Int32
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import check_written, read_foreign_text, write_json
 from gsencoder.data.splats.files import load_property, load_splat, save_splat
-from gsencoder.infer.boxes import box_around
 from gsencoder.infer.draw import word_color
+from gsencoder.infer.localize import box_around
 from gsencoder.infer.selection import Selection
 from gsencoder.types import Gaussians, Scene
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from gsencoder.data.seeding.points import scene_spacing
-from gsencoder.infer.boxes import Extents, box_around, oriented_axes, score_clusters
-from gsencoder.infer.localize import cluster
+from gsencoder.infer.localize import Extents, box_around, cluster, oriented_axes, score_clusters
 from gsencoder.types import Gaussians
 
 

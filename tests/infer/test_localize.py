@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.boxes import localization_to_json
 from gsencoder.infer.draw import EDGES, box_corners, write_boxes_ply
-from gsencoder.infer.localize import LocalizeConfig, localize, spacing_of
+from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize, spacing_of
 from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.text.table import TextEncoder, TextTable, make_text_table
 from gsencoder.types import Box, FeatureBasis, GaussianFeatures, Gaussians, Localization, Scene

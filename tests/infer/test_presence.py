@@ -10,9 +10,16 @@ import pytest
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.boxes import Cluster, localization_to_json, words_to_json
-from gsencoder.infer.localize import LocalizeConfig, find_candidates, localize, select_features
-from gsencoder.infer.presence import (
+from gsencoder.infer.localize import (
+    Cluster,
+    LocalizeConfig,
+    find_candidates,
+    localization_to_json,
+    localize,
+    select_features,
+    words_to_json,
+)
+from gsencoder.infer.relevancy import (
     LEAST_ATTAINABLE,
     SYNONYM,
     TRAINED,
@@ -21,9 +28,10 @@ from gsencoder.infer.presence import (
     WITHOUT_RIVALS,
     Evidence,
     Presence,
+    ThresholdConfig,
     probability,
+    relevancy,
 )
-from gsencoder.infer.relevancy import ThresholdConfig, relevancy
 from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, Localization, Scene
 

@@ -21,8 +21,7 @@ from viewer_containers import read_container
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat
 from gsencoder.fusion.quantize import compact
-from gsencoder.infer.boxes import box_to_json
-from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.localize import LocalizeConfig, box_to_json, localize
 from gsencoder.infer.page import search as module
 from gsencoder.infer.page.page import (
     SCRIPT,

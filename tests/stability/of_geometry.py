@@ -7,7 +7,7 @@ from stability.extremes import NEAR, Case
 from stability.registry import routine, worst
 
 from gsencoder import geometry
-from gsencoder.infer.boxes import box_around
+from gsencoder.infer.localize import box_around
 from gsencoder.types import Cameras, Gaussians
 
 

@@ -11,10 +11,17 @@ from stability.of_network import few
 from stability.registry import routine
 
 from gsencoder.infer import localize as clusters_module
-from gsencoder.infer.boxes import Cluster, score_clusters
-from gsencoder.infer.localize import cluster
-from gsencoder.infer.presence import SMALLEST_SPREAD, WITHOUT_RIVALS, Presence, probability
-from gsencoder.infer.relevancy import ThresholdConfig, otsu, relevancy, threshold
+from gsencoder.infer.localize import Cluster, cluster, score_clusters
+from gsencoder.infer.relevancy import (
+    SMALLEST_SPREAD,
+    WITHOUT_RIVALS,
+    Presence,
+    ThresholdConfig,
+    otsu,
+    probability,
+    relevancy,
+    threshold,
+)
 
 Wide = oracles.Wide
 

@@ -19,9 +19,8 @@ from gsencoder.data.synthetic import color_words, make_room, write_room
 from gsencoder.evaluate.boxes import aabb_iou
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.infer.boxes import localization_to_json
 from gsencoder.infer.draw import write_boxes_ply
-from gsencoder.infer.localize import LocalizeConfig, localize
+from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize
 from gsencoder.infer.page.page import FileOptions, fitting_page, load_bundle
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import text_table_of

@@ -18,9 +18,8 @@ from gsencoder.core.settings import option
 from gsencoder.core.threads import import_ahead
 from gsencoder.data.readers.transforms_json import read_cameras
 from gsencoder.data.scenes import SceneConfig
-from gsencoder.infer.boxes import localization_to_json, words_to_json
 from gsencoder.infer.draw import write_boxes_ply
-from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize
+from gsencoder.infer.localize import LocalizeConfig, describe_absent, localization_to_json, localize, words_to_json
 from gsencoder.text.table import TextEncoder
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Cameras, Localization, QueryMemory, Scene

@@ -15,8 +15,7 @@ from gsencoder.core.settings import option
 from gsencoder.core.threads import import_ahead
 from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.folder import load_features
-from gsencoder.infer.boxes import words_to_json
-from gsencoder.infer.localize import LocalizeConfig, describe_absent
+from gsencoder.infer.localize import LocalizeConfig, describe_absent, words_to_json
 from gsencoder.infer.select import select
 from gsencoder.infer.select_files import LABELS_JSON, LABELS_PLY, file_stems, labels_to_json, write_labels
 from gsencoder.infer.selection import SelectConfig, Selection

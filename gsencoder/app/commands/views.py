@@ -18,9 +18,15 @@ from gsencoder.core.settings import MEGABYTE, option
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.folder import check_heads_space
 from gsencoder.fusion.measured_heads import find_head, head_space, head_tokens
-from gsencoder.infer.boxes import box_to_json, words_to_json
 from gsencoder.infer.draw import Picture
-from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize, select_features
+from gsencoder.infer.localize import (
+    LocalizeConfig,
+    box_to_json,
+    describe_absent,
+    localize,
+    select_features,
+    words_to_json,
+)
 from gsencoder.infer.views.budget import (
     BudgetViews,
     ViewsBudget,

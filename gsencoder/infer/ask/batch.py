@@ -23,7 +23,7 @@ from gsencoder.data.splats.files import fingerprint
 from gsencoder.infer.ask.ask import THOUGHT, Asker, Prompt, Question, chosen_mark, encoded_picture, prompt_messages
 from gsencoder.infer.ask.questions import BatchQuestion, Benchmark, SetQuestion, read_answers
 from gsencoder.infer.ask.server import MODEL_VARIABLE, URL_VARIABLE, Reply, ServerError, VlmServer, request_body
-from gsencoder.infer.boxes import box_to_json
+from gsencoder.infer.localize import box_to_json
 from gsencoder.infer.views.pictures import Fit, feature_tokens, token_blends, views_to_json, write_pictures
 from gsencoder.infer.views.targets import ViewSet
 from gsencoder.render import BlendConfig

@@ -16,9 +16,8 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.packed import write_spz
 from gsencoder.data.splats.raw import RawSplat, logits_from_opacities, logs_from_scales
-from gsencoder.infer.boxes import box_to_json
 from gsencoder.infer.draw import fit_pca_colors, pca_picture
-from gsencoder.infer.localize import LocalizeConfig, localize, select_features, spacing_of
+from gsencoder.infer.localize import LocalizeConfig, box_to_json, localize, select_features, spacing_of
 from gsencoder.infer.relevancy import GaussianProducts, ThresholdConfig, threshold, word_directions
 from gsencoder.text.table import TextTable, check_space
 from gsencoder.text.vocabulary import Words, closed_table
