@@ -89,9 +89,9 @@ def evidence_of(
     protocol = AbsentProtocol()
     groups = words_to_ask(scene.objects, names, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
     present, absent = map(set, groups)
-    candidates = find_candidates(replace(scene, features={"": features}), list(words), table)
+    _, candidates = find_candidates(replace(scene, features={"": features}), list(words), table)
     rows = []
-    for number, (kinds, word) in enumerate(zip(words.values(), candidates.words, strict=True)):
+    for number, (kinds, word) in enumerate(zip(words.values(), candidates, strict=True)):
         state = 1 if present & set(kinds) else 0 if set(kinds) <= absent else -1
         for cluster, evidence in zip(word.clusters, word.evidence, strict=True):
             points = scene.gaussians.means[cluster.rows] + scene.origin

@@ -1,9 +1,14 @@
-"""Open-vocabulary localization: words to 3D boxes by relevancy, threshold and DBSCAN (SplatDistill, sec. 3.4)."""
+"""Open-vocabulary localization: words to 3D boxes by relevancy, threshold and DBSCAN (SplatDistill, sec. 3.4).
+
+The rule by which boxes are found is in this file: clusters, their scores, and the boxes around them. After a change of
+the clusters or of the threshold refit the probabilities (`bench/presence.py` prints the coefficients of
+`gsencoder.infer.relevancy`).
+"""
 
 import math
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property, partial
 from itertools import combinations, pairwise
@@ -13,33 +18,398 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, Integer
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.seeding.points import scene_spacing
-from gsencoder.infer.relevancy import Evidence, Presence, ThresholdConfig, probability, relevancy, threshold
+from gsencoder.infer.relevancy import Cluster, Evidence, Presence, ThresholdConfig, probability, relevancy, threshold
 from gsencoder.text.table import TextEncoder, TextTable, check_space
 from gsencoder.text.vocabulary import OpenVocabulary, closed_table
 from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scene
 from gsencoder.types.checks import perpendicular
 
 Extent = Literal["means", "sigma"]
-EMPTY_EXTENT = 1e-5
-"""Share of the largest extent below which a direction counts as empty (float32 coordinates are good to 1e-7)."""
+
+
+NEGATIVES = ("object", "things", "stuff", "texture")
+"""Negative words of LERF's contrast."""
+MIN_SAMPLES = 3
+"""Gaussians within the radius that make a core point of a cluster."""
+MIN_SHARE = 0.05
+"""Clusters with less than this share of the best cluster's weight are floaters."""
+MAX_BOXES = 10
+"""Boxes of a word, at most."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocalizeConfig:
+    """How words become boxes. Relative lengths are in units of the scene's spacing
+    (`gsencoder.data.seeding.points.scene_spacing`)."""
+
+    mode: Literal["centered", "raw"] = option("centered", "cosines after removing each side's mean, or as they are")
+    contrast: bool = option(
+        False,
+        "score by contrast with negative words and the other queries (LERF), not by cosine; use "
+        "localize.threshold.kind=fixed localize.threshold.fixed=0.9",
+    )
+    temperature: float = option(0.1, "temperature of the contrast's softmax", gt=0, lt=math.inf)
+    threshold: ThresholdConfig = field(
+        default_factory=ThresholdConfig, metadata={"help": "relevancy from which Gaussians are selected"}
+    )
+    min_weight: float = option(
+        0.0,
+        "Gaussians whose weight (summed blending weight, in pixels) is not above this are left out",
+        ge=0,
+        lt=math.inf,
+    )
+    eps: float | None = option(
+        None, "DBSCAN radius in world units; empty = eps_spacings times the spacing", gt=0, lt=math.inf
+    )
+    eps_spacings: float | None = option(
+        None,
+        "DBSCAN radius in spacings, where eps is not given; empty = 1.5, or more for words whose Gaussians are sparse, "
+        "and clusters whose gap is small beside their size are one",
+        gt=0,
+        lt=math.inf,
+    )
+    extent: Extent = option("means", "boxes around Gaussian means, or around their ellipsoids")
+    min_probability: float = option(
+        0.02,
+        "boxes that are less probable are left out, and words without a box are absent; 0 = every box that reaches the "
+        "threshold stays",
+        ge=0,
+        le=1,
+    )
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+    @property
+    def follows_gaps(self) -> bool:
+        """Whether clusters are joined (`cluster_by_gaps`): no radius was given."""
+        return self.eps is None and self.eps_spacings is None
+
+    def radius(self, spacing: float) -> float:
+        """The radius of DBSCAN, or the smallest one where clusters are joined, in the unit of the scene's spacing."""
+        return self.eps or (self.eps_spacings or EPS_SPACINGS) * spacing
+
+
+_DEFAULT = LocalizeConfig()
+
+
+def localize(
+    scene: Scene,
+    queries: Sequence[str],
+    text: TextEncoder,
+    config: LocalizeConfig = _DEFAULT,
+    *,
+    space: str | None = None,
+    rivals: TextTable | None = None,
+    spacing: float | None = None,
+) -> Localization:
+    """Finds words in a scene.
+
+    The Gaussians of a word at or above the threshold are clustered (DBSCAN), and clusters that are parts of one thing
+    joined (`cluster_by_gaps`); every one becomes a box with a score (`score_clusters`) and a probability
+    (`gsencoder.infer.relevancy`). Boxes that are less probable than `config.min_probability` are left out, and a word
+    that has no box is absent. Axis-aligned and oriented boxes are drawn around Gaussian means, unless `config.extent`
+    says "sigma"; one axis of oriented boxes follows the scene's up, where it is known. The scene's origin is added back
+    in float64. A word's boxes do not depend on the other queries, unless `config.contrast` is on.
+
+    Args:
+        text: turns words into the features' space.
+        space: name of the feature set; None where the scene has only one.
+        rivals: words that may fit the Gaussians better than those asked; None = the names that `text` knows, if any.
+        spacing: `spacing_of` the Gaussians, for callers that localize in one scene more than once; None = computed.
+
+    Returns:
+        Relevancy, thresholds, probabilities, and the boxes best first within each word.
+    """
+    gaussians, _ = select_features(scene, space)
+    scores, candidates = find_candidates(scene, queries, text, config, space=space, rivals=rivals, spacing=spacing)
+    probabilities = [[probability(each) for each in candidate.evidence] for candidate in candidates]
+    boxes = []
+    for word, candidate, values in zip(queries, candidates, probabilities, strict=True):
+        ranked = zip(candidate.clusters, values, strict=True)
+        probable = [(each, value) for each, value in ranked if value >= config.min_probability]
+        for rank, (each, value) in enumerate(probable):
+            around = box_around(gaussians, each.rows, extent=config.extent, up=scene.up)
+            boxes.append(
+                Box(
+                    query=word,
+                    rank=rank,
+                    score=each.score,
+                    probability=value,
+                    aabb_min=around.aabb_min + scene.origin,
+                    aabb_max=around.aabb_max + scene.origin,
+                    obb_center=around.center + scene.origin,
+                    obb_rotation=around.rotation,
+                    obb_size=around.size,
+                    rows=each.rows,
+                )
+            )
+    localization = Localization(
+        queries=tuple(queries),
+        relevancy=scores,
+        thresholds=np.array([candidate.threshold for candidate in candidates], np.float32),
+        probabilities=np.array([max(values, default=0.0) for values in probabilities], np.float32),
+        boxes=tuple(boxes),
+    )
+    _warn_about_absent(scene.name, localization)
+    return localization
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Cluster:
-    """A cluster of the Gaussians that were selected for a word.
+class WordCandidates:
+    """The clusters of one word before they are judged.
 
     Attributes:
-        rows: its Gaussians, ascending.
-        score: mean relevancy, weighted by the Gaussians' weights, times the fourth root of its share of the weight of
-            all that was selected for the word.
-        share: of this weight in that of all that was selected for the word.
+        threshold: the relevancy from which on Gaussians were taken.
+        clusters: best first.
+        evidence: for each cluster, that it is what the word says.
     """
 
-    rows: Int64[np.ndarray, " n"]
-    score: float
-    weight: float
-    share: float
+    threshold: float
+    clusters: tuple[Cluster, ...]
+    evidence: tuple[Evidence, ...]
+
+
+def find_candidates(
+    scene: Scene,
+    queries: Sequence[str],
+    text: TextEncoder,
+    config: LocalizeConfig = _DEFAULT,
+    *,
+    space: str | None = None,
+    rivals: TextTable | None = None,
+    spacing: float | None = None,
+) -> tuple[Float32[np.ndarray, "Q N"], list[WordCandidates]]:
+    """Relevancy of each word, and its clusters of Gaussians with the evidence for them; arguments are those of
+    `localize`."""
+    gaussians, features = select_features(scene, space)
+    if isinstance(queries, str) or not queries or any(not word.strip() for word in queries):
+        raise InputError(f"localize: expected a list of one or more words, got {queries!r}")
+    if rivals is None and isinstance(text, (TextTable, OpenVocabulary)):
+        rivals = closed_table(text)
+    check_space(features.space, text.space)
+    if rivals is not None:
+        check_space(features.space, rivals.space)
+    vectors = text.encode(list(queries))
+    trained = [None if rivals is None else rivals.is_trained(word) for word in queries]
+    cosines = scores = relevancy(features, vectors, text.mean)
+    if config.contrast or config.mode == "raw":
+        negatives = _negatives(text) if config.contrast else None
+        scores = relevancy(
+            features, vectors, text.mean, negatives=negatives, temperature=config.temperature, mode=config.mode
+        )
+    presence = Presence(features, text.mean, rivals)
+    radius = config.radius(spacing_of(gaussians) if spacing is None and config.eps is None else spacing or 1.0)
+    find_clusters = cluster_by_gaps if config.follows_gaps else cluster
+    candidates = []
+    for number, vector in enumerate(vectors):
+        cutoff = threshold(scores[number], config.threshold)
+        # Comparisons with NaN are false: Gaussians never seen are never taken.
+        rows = np.flatnonzero((scores[number] >= cutoff) & (features.weights > config.min_weight))
+        labels = find_clusters(gaussians.means[rows], radius, MIN_SAMPLES)
+        ranked = score_clusters(labels, rows, scores[number][rows], features.weights[rows], min_share=MIN_SHARE)
+        ranked = ranked[:MAX_BOXES]
+        evidence = presence.evidence(vector, cosines[number], ranked, trained=trained[number])
+        candidates.append(WordCandidates(threshold=cutoff, clusters=tuple(ranked), evidence=tuple(evidence)))
+    return scores, candidates
+
+
+def spacing_of(gaussians: Gaussians) -> float:
+    """The spacing that radii are multiples of; of Gaussians in one place their median size."""
+    return scene_spacing(gaussians.means) or (float(np.median(gaussians.scales)) if len(gaussians) else 1.0)
+
+
+def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, GaussianFeatures]:
+    """A scene's Gaussians and one of its feature sets.
+
+    Args:
+        space: name of the feature set, of its space, or of its teacher; None = the only one, or the only one that words
+            lead into.
+    """
+    if scene.gaussians is None or not scene.features:
+        missing = "Gaussians" if scene.gaussians is None else "features"
+        raise InputError(f"scene {scene.name} has no {missing}; run `gsencoder fuse` on it first")
+    if space is None:
+        with_words = [each for each in scene.features.values() if each.space.text_encoder]
+        candidates = list(scene.features.values()) if len(scene.features) == 1 else with_words
+        if len(candidates) == 1:
+            return scene.gaussians, candidates[0]
+    for attribute in ("name", "teacher"):
+        fitting = [each for each in scene.features.values() if getattr(each.space, attribute) == space]
+        if space is not None and space not in scene.features and len(fitting) == 1:
+            return scene.gaussians, fitting[0]
+    if space not in scene.features:
+        raise InputError(
+            f"scene {scene.name} has features of {', '.join(sorted(scene.features))}; "
+            + ("name one with space=" if space is None else f"none of {space!r}")
+        )
+    return scene.gaussians, scene.features[space]
+
+
+def _negatives(text: TextEncoder) -> Float32[np.ndarray, "M D"]:
+    """Vectors of the negative words that the encoder knows; the mean of the text side where it knows none."""
+    vectors, unknown = [], []
+    for word in NEGATIVES:
+        try:
+            vectors.append(text.encode([word]))
+        except InputError:
+            unknown.append(word)
+    if unknown:
+        instead = "" if vectors else "; the mean of its words stands for them"
+        warnings.warn(
+            f"{len(unknown)} of {len(NEGATIVES)} negative words are unknown to {text.space.text_encoder} "
+            f"({', '.join(unknown[:5])}) and left out{instead}",
+            SceneWarning,
+            stacklevel=4,
+        )
+    if unknown and not vectors:
+        vectors = [(text.mean / max(float(np.linalg.norm(text.mean)), 1e-12))[None].astype(np.float32)]
+    return np.concatenate(vectors) if vectors else np.zeros((0, text.space.channels), np.float32)
+
+
+def _warn_about_absent(scene: str, localization: Localization) -> None:
+    absent = localization.absent
+    if absent:
+        more = ", …" if len(absent) > 5 else ""
+        words = ", ".join(map(repr, list(absent)[:5])) + more
+        values = ", ".join(f"{value:.2f}" for value in list(absent.values())[:5]) + more
+        warnings.warn(
+            f"scene {scene}: {len(absent)} of {len(localization.queries)} words have no box ({words}): no cluster of "
+            f"Gaussians reaches their threshold and is probable enough (probability {values})",
+            SceneWarning,
+            stacklevel=3,
+        )
+
+
+def describe_absent(probability: float) -> str:
+    """What people read of a word without a box."""
+    return f"absent (probability {probability:.2f})"
+
+
+EPS_SPACINGS = 1.5
+"""Radius of clusters, in spacings: a surface on a square grid holds together at √2."""
+MAX_NEIGHBORS = 50_000_000
+"""Neighbors of all points together that are held in memory (8 bytes each); with more of them the cells of a grid of
+eps / 4 are clustered."""
+NEIGHBOR_CELLS = 4.2
+"""Volume of a ball of radius eps, in cubes of edge eps."""
+SPARSE, GROWTH, SPARSE_RADII = 0.25, 2**0.5, 6
+"""Where more than this share of the points is in no cluster of four neighbors within a spacing, they are sparser than
+the scene: the radius grows by this factor, at most this often (8 times)."""
+GAP = 0.25
+"""Clusters are one thing up to a gap of this share of the larger one's size."""
+STRAY = 0.02
+"""Clusters with less than this share of the larger one's points are not joined to it: strays would thicken a door."""
+WIDEST = 8
+"""No gap within a thing is wider than this many radii. In house rooms those of tables and sofas are up to 7.5 wide, and
+those between two things of a name 11 and more."""
+MAX_PARTS = 32
+"""The number of the largest clusters that are joined; others stay as they are."""
+
+
+def cluster_by_gaps(points: Float32[np.ndarray, "n 3"], smallest: float, min_samples: int) -> Int64[np.ndarray, " n"]:
+    """DBSCAN labels after joining clusters whose gap is small beside their size, −1 = noise.
+
+    One thing is seen or fitted in patches, and the gaps between these are small beside the thing: the legs of a table
+    and its top, the halves of a treadmill. The next thing of the name is farther away than a quarter of its size. The
+    size is that of what was joined so far, twice the root mean square distance from the center (0.6 of a rod's length,
+    0.8 of a square's side), which does not depend on the axes of the world.
+
+    Args:
+        smallest: radius of DBSCAN, in their unit, `EPS_SPACINGS` of the scene; larger where the points are sparser.
+    """
+    radius = smallest
+    for _ in range(SPARSE_RADII):
+        if np.count_nonzero(cluster(points, radius / EPS_SPACINGS, 5) < 0) <= SPARSE * len(points):
+            break
+        radius *= GROWTH
+    labels = cluster(points, radius, min_samples)
+    largest = np.argsort(-np.bincount(labels[labels >= 0]), kind="stable")[:MAX_PARTS]
+    parts = [_Part(points, np.flatnonzero(labels == label)) for label in largest]
+    belong = cache(partial(_belong_together, widest=WIDEST * radius))
+    while pair := next((pair for pair in combinations(parts, 2) if belong(*pair)), None):
+        rows = np.concatenate([part.rows for part in pair])
+        parts = [part for part in parts if part not in pair] + [_Part(points, rows)]
+        parts.sort(key=lambda part: -len(part.rows))
+    for part in parts:
+        labels[part.rows] = labels[part.rows].min()
+    return np.unique(np.append(labels, -1), return_inverse=True)[1][:-1].astype(np.int64) - 1
+
+
+class _Part:
+    """A cluster, or several that were joined."""
+
+    def __init__(self, points: Float32[np.ndarray, "N 3"], rows: Int64[np.ndarray, " n"]) -> None:
+        self.rows, self.points = rows, points[rows].astype(np.float64)
+        self.low, self.high = self.points.min(axis=0), self.points.max(axis=0)
+        self.size = 2 * float(np.sqrt(self.points.var(axis=0).sum()))
+
+    @cached_property
+    def tree(self) -> Any:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+
+
+def _belong_together(larger: _Part, smaller: _Part, widest: float) -> bool:
+    if len(smaller.rows) < STRAY * len(larger.rows):
+        return False
+    limit = min(GAP * max(larger.size, smaller.size), widest)
+    near = ((smaller.points >= larger.low - limit) & (smaller.points <= larger.high + limit)).all(axis=1)
+    return bool(np.isfinite(larger.tree.query(smaller.points[near], distance_upper_bound=limit)[0]).any())
+
+
+def cluster(points: Float32[np.ndarray, "n 3"], eps: float, min_samples: int) -> Int64[np.ndarray, " n"]:
+    """DBSCAN labels, −1 = noise; clusters are numbered in the order of the points.
+
+    Libraries keep the neighbors of every point, which on a dense splat grows with the square of the density. Where
+    these would not fit into memory, the occupied cells of a grid of eps / 4 are clustered instead, each weighted by its
+    number of points, and points take the label of their cell: distances are then off by up to 0.43 eps.
+
+    Args:
+        eps: radius, in their unit. Points at this distance are neighbors, also where their float32 coordinates round.
+        min_samples: points within the radius, the point itself included, that make it a core point.
+    """
+    if len(points) == 0:
+        return np.zeros(0, np.int64)
+    local = points.astype(np.float64) - points.min(axis=0)
+    # open3d looks for distances below the radius, not up to it.
+    eps = float(np.nextafter(eps + 2 * np.spacing(np.abs(points).max()), np.inf))
+    if _expected_neighbors(local, eps) <= MAX_NEIGHBORS:
+        return _dbscan(local, eps, min_samples)
+    from sklearn.cluster import DBSCAN
+
+    cells = np.floor(local * (4 / eps))
+    _, cell_of, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    cell_of = cell_of.ravel()
+    centers = np.stack([np.bincount(cell_of, local[:, axis]) for axis in range(3)], axis=1) / counts[:, None]
+    labels = DBSCAN(eps=eps, min_samples=min_samples).fit_predict(centers, sample_weight=counts)
+    return labels[cell_of].astype(np.int64)
+
+
+def _expected_neighbors(local: Float64[np.ndarray, "n 3"], eps: float) -> float:
+    """An estimate of the neighbors of all points together, by the cells of a grid of eps."""
+    cells = np.floor(local / eps).astype(np.int64)
+    size = cells.max(axis=0) + 1
+    if np.prod(size.astype(np.float64)) < 2**62:
+        counts = np.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_counts=True)[1]
+    else:
+        counts = np.unique(cells, axis=0, return_counts=True)[1]
+    return NEIGHBOR_CELLS * float(np.square(counts.astype(np.float64)).sum())
+
+
+def _dbscan(local: Float64[np.ndarray, "n 3"], eps: float, min_samples: int) -> Int64[np.ndarray, " n"]:
+    """Labels by open3d, which is the fastest, or by scikit-learn where open3d cannot be loaded."""
+    try:
+        import open3d
+    except (ImportError, OSError):
+        from sklearn.cluster import DBSCAN
+
+        return np.asarray(DBSCAN(eps=eps, min_samples=min_samples).fit_predict(local), np.int64)
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(local))
+    return np.asarray(cloud.cluster_dbscan(eps, min_samples), np.int64)
 
 
 def score_clusters(
@@ -81,6 +451,10 @@ def score_clusters(
     return [each for each in clusters if each.weight >= min_share * clusters[0].weight]
 
 
+EMPTY_EXTENT = 1e-5
+"""Share of the largest extent below which a direction counts as empty (float32 coordinates are good to 1e-7)."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Extents:
     """Axis-aligned and oriented box, in the frame of the points; float64.
@@ -103,15 +477,14 @@ def box_around(
     rows: Integer[np.ndarray, " n"],
     *,
     extent: Extent = "means",
-    sigmas: float = 1.0,
     up: Float64[np.ndarray, "3"] | None = None,
 ) -> Extents:
     """The axis-aligned and the oriented box of some Gaussians.
 
     Args:
         rows: at least one of its rows.
-        extent: "means" bounds the centers; "sigma" bounds the ellipsoids of `sigmas` standard deviations, whose
-            half-width along a unit vector a is sigmas·√(aᵀΣa).
+        extent: "means" bounds the centers; "sigma" bounds the ellipsoids of one standard deviation, whose half-width
+            along a unit vector a is √(aᵀΣa).
         up: direction of the last axis of the oriented box; None = the smallest box of any orientation.
     """
     from scipy.spatial.transform import Rotation
@@ -123,8 +496,8 @@ def box_around(
     if extent == "sigma":
         rotations = Rotation.from_quat(gaussians.quats[rows].astype(np.float64), scalar_first=True).as_matrix()
         stretched = rotations * gaussians.scales[rows].astype(np.float64)[:, None, :]
-        half_widths = sigmas * np.sqrt((stretched**2).sum(axis=2))
-        half_widths_rotated = sigmas * np.sqrt((np.einsum("ka,nkj->naj", rotation, stretched) ** 2).sum(axis=2))
+        half_widths = np.sqrt((stretched**2).sum(axis=2))
+        half_widths_rotated = np.sqrt((np.einsum("ka,nkj->naj", rotation, stretched) ** 2).sum(axis=2))
     # Coordinates about the middle: rotating those of a far-away scene would round.
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     rotated = (points - middle) @ rotation
@@ -136,41 +509,6 @@ def box_around(
         rotation=rotation,
         size=high - low,
     )
-
-
-def boxes_of_word(
-    word: str,
-    clusters: Iterable[tuple[Cluster, float]],
-    gaussians: Gaussians,
-    *,
-    origin: Float64[np.ndarray, "3"],
-    extent: Extent = "means",
-    sigmas: float = 1.0,
-    up: Float64[np.ndarray, "3"] | None = None,
-) -> list[Box]:
-    """The boxes of a word in world coordinates, ranked in the order of its clusters.
-
-    Args:
-        clusters: clusters and their probabilities, best first.
-    """
-    boxes = []
-    for rank, (cluster, likely) in enumerate(clusters):
-        extents = box_around(gaussians, cluster.rows, extent=extent, sigmas=sigmas, up=up)
-        boxes.append(
-            Box(
-                query=word,
-                rank=rank,
-                score=cluster.score,
-                probability=likely,
-                aabb_min=extents.aabb_min + origin,
-                aabb_max=extents.aabb_max + origin,
-                obb_center=extents.center + origin,
-                obb_rotation=extents.rotation,
-                obb_size=extents.size,
-                rows=cluster.rows,
-            )
-        )
-    return boxes
 
 
 def oriented_axes(
@@ -301,424 +639,3 @@ def words_to_json(localization: Localization) -> list[dict[str, Any]]:
             localization.queries, localization.probabilities, localization.thresholds, strict=True
         )
     ]
-
-
-EPS_SPACINGS = 1.5
-"""Radius of clusters, in spacings: a surface on a square grid holds together at √2."""
-MAX_NEIGHBORS = 50_000_000
-"""So many neighbors of all points together may be held in memory (8 bytes each); with more of them, clusters are
-computed on a grid of eps / 4."""
-NEIGHBOR_CELLS = 4.2
-"""Volume of a ball of radius eps, in cubes of edge eps."""
-SPARSE, GROWTH, SPARSE_RADII = 0.25, 2**0.5, 6
-"""Where more than this share of the points is in no cluster of four neighbors within a spacing, they are sparser than
-the scene: the radius grows by this factor, at most this often (8 times)."""
-GAP = 0.25
-"""Clusters are one thing up to a gap of this share of the larger one's size."""
-STRAY = 0.02
-"""Clusters with less than this share of the larger one's points are not joined to it: strays would thicken a door."""
-WIDEST = 8
-"""No gap within a thing is wider than this many radii. In house rooms those of tables and sofas are up to 7.5 wide, and
-those between two things of a name 11 and more."""
-MAX_PARTS = 32
-"""So many of the largest clusters are joined; others stay as they are."""
-
-
-def cluster_by_gaps(points: Float32[np.ndarray, "n 3"], smallest: float, min_samples: int) -> Int64[np.ndarray, " n"]:
-    """DBSCAN labels after joining clusters whose gap is small beside their size, −1 = noise.
-
-    One thing is seen or fitted in patches, and the gaps between these are small beside the thing: the legs of a table
-    and its top, the halves of a treadmill. The next thing of the name is farther away than a quarter of its size. The
-    size is that of what was joined so far, twice the root mean square distance from the center (0.6 of a rod's length,
-    0.8 of a square's side), which does not depend on the axes of the world.
-
-    Args:
-        smallest: radius of DBSCAN, in their unit, `EPS_SPACINGS` of the scene; larger where the points are sparser.
-    """
-    radius = smallest
-    for _ in range(SPARSE_RADII):
-        if np.count_nonzero(cluster(points, radius / EPS_SPACINGS, 5) < 0) <= SPARSE * len(points):
-            break
-        radius *= GROWTH
-    labels = cluster(points, radius, min_samples)
-    largest = np.argsort(-np.bincount(labels[labels >= 0]), kind="stable")[:MAX_PARTS]
-    parts = [_Part(points, np.flatnonzero(labels == label)) for label in largest]
-    belong = cache(partial(_belong_together, widest=WIDEST * radius))
-    while pair := next((pair for pair in combinations(parts, 2) if belong(*pair)), None):
-        rows = np.concatenate([part.rows for part in pair])
-        parts = [part for part in parts if part not in pair] + [_Part(points, rows)]
-        parts.sort(key=lambda part: -len(part.rows))
-    for part in parts:
-        labels[part.rows] = labels[part.rows].min()
-    return np.unique(np.append(labels, -1), return_inverse=True)[1][:-1].astype(np.int64) - 1
-
-
-class _Part:
-    """A cluster, or several that were joined."""
-
-    def __init__(self, points: Float32[np.ndarray, "N 3"], rows: Int64[np.ndarray, " n"]) -> None:
-        self.rows, self.points = rows, points[rows].astype(np.float64)
-        self.low, self.high = self.points.min(axis=0), self.points.max(axis=0)
-        self.size = 2 * float(np.sqrt(self.points.var(axis=0).sum()))
-
-    @cached_property
-    def tree(self) -> Any:
-        from scipy.spatial import cKDTree
-
-        return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
-
-
-def _belong_together(larger: _Part, smaller: _Part, widest: float) -> bool:
-    if len(smaller.rows) < STRAY * len(larger.rows):
-        return False
-    limit = min(GAP * max(larger.size, smaller.size), widest)
-    near = ((smaller.points >= larger.low - limit) & (smaller.points <= larger.high + limit)).all(axis=1)
-    return bool(np.isfinite(larger.tree.query(smaller.points[near], distance_upper_bound=limit)[0]).any())
-
-
-def cluster(points: Float32[np.ndarray, "n 3"], eps: float, min_samples: int) -> Int64[np.ndarray, " n"]:
-    """DBSCAN labels, −1 = noise; clusters are numbered in the order of the points.
-
-    Libraries keep the neighbors of every point, which on a dense splat grows with the square of the density. Where
-    these would not fit into memory, the occupied cells of a grid of eps / 4 are clustered instead, each weighted by its
-    number of points, and points take the label of their cell: distances are then off by up to 0.43 eps.
-
-    Args:
-        eps: radius, in their unit. Points at this distance are neighbors, also where their float32 coordinates round.
-        min_samples: points within the radius, the point itself included, that make it a core point.
-    """
-    if len(points) == 0:
-        return np.zeros(0, np.int64)
-    local = points.astype(np.float64) - points.min(axis=0)
-    # open3d looks for distances below the radius, not up to it.
-    eps = float(np.nextafter(eps + 2 * np.spacing(np.abs(points).max()), np.inf))
-    if _expected_neighbors(local, eps) <= MAX_NEIGHBORS:
-        return _dbscan(local, eps, min_samples)
-    from sklearn.cluster import DBSCAN
-
-    cells = np.floor(local * (4 / eps))
-    _, cell_of, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    cell_of = cell_of.ravel()
-    centers = np.stack([np.bincount(cell_of, local[:, axis]) for axis in range(3)], axis=1) / counts[:, None]
-    labels = DBSCAN(eps=eps, min_samples=min_samples).fit_predict(centers, sample_weight=counts)
-    return labels[cell_of].astype(np.int64)
-
-
-def _expected_neighbors(local: Float64[np.ndarray, "n 3"], eps: float) -> float:
-    """An estimate of the neighbors of all points together, from how full the cells of a grid of eps are."""
-    cells = np.floor(local / eps).astype(np.int64)
-    size = cells.max(axis=0) + 1
-    if np.prod(size.astype(np.float64)) < 2**62:
-        counts = np.unique((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2], return_counts=True)[1]
-    else:
-        counts = np.unique(cells, axis=0, return_counts=True)[1]
-    return NEIGHBOR_CELLS * float(np.square(counts.astype(np.float64)).sum())
-
-
-def _dbscan(local: Float64[np.ndarray, "n 3"], eps: float, min_samples: int) -> Int64[np.ndarray, " n"]:
-    """Labels by open3d, which is the fastest, or by scikit-learn where open3d cannot be loaded."""
-    try:
-        import open3d
-    except (ImportError, OSError):
-        from sklearn.cluster import DBSCAN
-
-        return np.asarray(DBSCAN(eps=eps, min_samples=min_samples).fit_predict(local), np.int64)
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(local))
-    return np.asarray(cloud.cluster_dbscan(eps, min_samples), np.int64)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LocalizeConfig:
-    """How words become boxes. Relative lengths are in units of the scene's spacing
-    (`gsencoder.data.seeding.points.scene_spacing`)."""
-
-    mode: Literal["centered", "raw"] = field(
-        default="centered", metadata={"help": "cosines after removing each side's mean, or as they are"}
-    )
-    contrast: bool = field(
-        default=False,
-        metadata={
-            "help": "score by contrast with negative words and the other queries (LERF), not by cosine; use "
-            "localize.threshold.kind=fixed localize.threshold.fixed=0.9"
-        },
-    )
-    negatives: tuple[str, ...] = field(
-        default=("object", "things", "stuff", "texture"), metadata={"help": "negative words for contrast"}
-    )
-    temperature: float = field(default=0.1, metadata={"help": "temperature of the contrast's softmax"})
-    threshold: ThresholdConfig = field(
-        default_factory=ThresholdConfig, metadata={"help": "relevancy from which Gaussians are selected"}
-    )
-    min_weight: float = field(
-        default=0.0,
-        metadata={"help": "Gaussians whose weight (summed blending weight, in pixels) is not above this are left out"},
-    )
-    eps: float | None = field(
-        default=None, metadata={"help": "DBSCAN radius in world units; empty = eps_spacings times the spacing"}
-    )
-    eps_spacings: float | None = field(
-        default=None,
-        metadata={
-            "help": "DBSCAN radius in spacings, where eps is not given; empty = 1.5, or more for words whose Gaussians "
-            "are sparse, and clusters whose gap is small beside their size are one"
-        },
-    )
-    min_samples: int = field(
-        default=3, metadata={"help": "Gaussians within the radius that make a core point of a cluster"}
-    )
-    min_share: float = field(
-        default=0.05, metadata={"help": "clusters with less than this share of the best cluster's weight are dropped"}
-    )
-    extent: Literal["means", "sigma"] = field(
-        default="means", metadata={"help": "boxes around Gaussian means, or around their ellipsoids"}
-    )
-    sigmas: float = field(default=1.0, metadata={"help": "size of the ellipsoids for extent=sigma"})
-    upright: bool = field(
-        default=True,
-        metadata={"help": "one axis of oriented boxes follows the scene's up direction, where it is known"},
-    )
-    max_boxes: int = field(default=10, metadata={"help": "largest number of boxes for each word"})
-    min_probability: float = field(
-        default=0.02,
-        metadata={
-            "help": "boxes that are less probable are left out, and words without a box are absent; 0 = every box that "
-            "reaches the threshold stays"
-        },
-    )
-
-    def __post_init__(self) -> None:
-        if self.mode not in ("centered", "raw"):
-            raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
-        if self.extent not in ("means", "sigma"):
-            raise InputError(f"extent: expected means or sigma, got {self.extent!r}")
-        for name in ("temperature", "eps", "eps_spacings"):
-            if getattr(self, name) is not None and not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("min_weight", "sigmas"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"{name}: expected zero or a positive number, got {getattr(self, name)}")
-        for name in ("min_samples", "max_boxes"):
-            if not 1 <= getattr(self, name) < 2**31:
-                raise InputError(f"{name}: expected 1 to 2³¹ − 1, got {getattr(self, name)}")
-        if not 0 <= self.min_share <= 1:
-            raise InputError(f"min_share: expected a share in [0, 1], got {self.min_share}")
-        if not 0 <= self.min_probability <= 1:
-            raise InputError(f"min_probability: expected a probability in [0, 1], got {self.min_probability}")
-
-    @property
-    def follows_gaps(self) -> bool:
-        """Whether clusters are joined (`gsencoder.infer.localize.cluster_by_gaps`): no radius was given."""
-        return self.eps is None and self.eps_spacings is None
-
-    def radius(self, spacing: float) -> float:
-        """The radius of DBSCAN, or the smallest one where clusters are joined, in the unit of the scene's spacing."""
-        return self.eps or (self.eps_spacings or EPS_SPACINGS) * spacing
-
-
-_DEFAULT = LocalizeConfig()
-
-
-def localize(
-    scene: Scene,
-    queries: Sequence[str],
-    text: TextEncoder,
-    config: LocalizeConfig = _DEFAULT,
-    *,
-    space: str | None = None,
-    rivals: TextTable | None = None,
-    spacing: float | None = None,
-) -> Localization:
-    """Finds words in a scene.
-
-    Each word's Gaussians at or above the threshold are clustered (DBSCAN), and clusters that are parts of one thing
-    joined (`gsencoder.infer.localize.cluster_by_gaps`); every one becomes a box with the score that
-    `gsencoder.infer.localize.score_clusters` and the probability that `gsencoder.infer.relevancy`
-    defines. Boxes that are less probable than `config.min_probability` are left out, and a word that has no box is
-    absent. Axis-aligned and oriented boxes are drawn around Gaussian means, unless `config.extent` says "sigma", and
-    have the scene's origin added back in float64. A word's boxes do not depend on the other queries, unless
-    `config.contrast` is on.
-
-    Args:
-        text: turns words into the features' space.
-        space: name of the feature set; None where the scene has only one.
-        rivals: words that may fit the Gaussians better than those asked; None = the names that
-            `text` knows, if it knows any.
-        spacing: `spacing_of` the Gaussians, for callers that localize in one scene more than once; None = computed.
-
-    Returns:
-        Relevancy, thresholds, probabilities, and the boxes best first within each word.
-    """
-    gaussians, _ = select_features(scene, space)
-    candidates = find_candidates(scene, queries, text, config, space=space, rivals=rivals, spacing=spacing)
-    probabilities = [[probability(each) for each in candidate.evidence] for candidate in candidates.words]
-    boxes = []
-    for word, candidate, values in zip(queries, candidates.words, probabilities, strict=True):
-        probable = [
-            (each, value)
-            for each, value in zip(candidate.clusters, values, strict=True)
-            if value >= config.min_probability
-        ]
-        boxes += boxes_of_word(
-            word,
-            probable,
-            gaussians,
-            origin=scene.origin,
-            extent=config.extent,
-            sigmas=config.sigmas,
-            up=scene.up if config.upright else None,
-        )
-    localization = Localization(
-        queries=tuple(queries),
-        relevancy=candidates.relevancy,
-        thresholds=np.array([candidate.threshold for candidate in candidates.words], np.float32),
-        probabilities=np.array([max(values, default=0.0) for values in probabilities], np.float32),
-        boxes=tuple(boxes),
-    )
-    _warn_about_absent(scene.name, localization)
-    return localization
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class WordCandidates:
-    """The clusters of one word before they are judged.
-
-    Attributes:
-        threshold: the relevancy from which on Gaussians were taken.
-        evidence: for each cluster, that it is what the word says.
-    """
-
-    threshold: float
-    clusters: tuple[Cluster, ...]
-    evidence: tuple[Evidence, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Candidates:
-    """What words select in a scene.
-
-    Attributes:
-        words: one for each word, in the order asked.
-    """
-
-    relevancy: Float32[np.ndarray, "Q N"]
-    words: tuple[WordCandidates, ...]
-
-
-def find_candidates(
-    scene: Scene,
-    queries: Sequence[str],
-    text: TextEncoder,
-    config: LocalizeConfig = _DEFAULT,
-    *,
-    space: str | None = None,
-    rivals: TextTable | None = None,
-    spacing: float | None = None,
-) -> Candidates:
-    """Clusters of Gaussians for each word, with the evidence for them; arguments and errors are those of `localize`."""
-    gaussians, features = select_features(scene, space)
-    if isinstance(queries, str) or not queries or any(not word.strip() for word in queries):
-        raise InputError(f"localize: expected a list of one or more words, got {queries!r}")
-    check_space(features.space, text.space)
-    if rivals is not None:
-        check_space(features.space, rivals.space)
-    elif isinstance(text, (TextTable, OpenVocabulary)):
-        rivals = closed_table(text)
-    vectors = text.encode(list(queries))
-    cosines = scores = relevancy(features, vectors, text.mean)
-    if config.contrast or config.mode == "raw":
-        scores = relevancy(
-            features,
-            vectors,
-            text.mean,
-            negatives=_negatives(text, config.negatives) if config.contrast else None,
-            temperature=config.temperature,
-            mode=config.mode,
-        )
-    presence = Presence(features, text.mean, rivals)
-    radius = config.radius(spacing_of(gaussians) if spacing is None and config.eps is None else spacing or 1.0)
-    find_clusters = cluster_by_gaps if config.follows_gaps else cluster
-    words = []
-    for number in range(len(queries)):
-        cutoff = threshold(scores[number], config.threshold)
-        # Comparisons with NaN are false: Gaussians never seen are never taken.
-        rows = np.flatnonzero((scores[number] >= cutoff) & (features.weights > config.min_weight))
-        labels = find_clusters(gaussians.means[rows], radius, config.min_samples)
-        ranked = score_clusters(labels, rows, scores[number][rows], features.weights[rows], min_share=config.min_share)[
-            : config.max_boxes
-        ]
-        trained = rivals.is_trained(queries[number]) if rivals is not None else None
-        evidence = presence.evidence(vectors[number], cosines[number], ranked, trained=trained)
-        words.append(WordCandidates(threshold=cutoff, clusters=tuple(ranked), evidence=tuple(evidence)))
-    return Candidates(relevancy=scores, words=tuple(words))
-
-
-def spacing_of(gaussians: Gaussians) -> float:
-    """The spacing that radii are multiples of; of Gaussians in one place their median size."""
-    return scene_spacing(gaussians.means) or (float(np.median(gaussians.scales)) if len(gaussians) else 1.0)
-
-
-def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, GaussianFeatures]:
-    """A scene's Gaussians and one of its feature sets.
-
-    Args:
-        space: name of the feature set, of its space, or of its teacher; None = the only one, or the only one that words
-            lead into.
-    """
-    if scene.gaussians is None or not scene.features:
-        missing = "Gaussians" if scene.gaussians is None else "features"
-        raise InputError(f"scene {scene.name} has no {missing}; run `gsencoder fuse` on it first")
-    if space is None:
-        with_words = [each for each in scene.features.values() if each.space.text_encoder]
-        candidates = list(scene.features.values()) if len(scene.features) == 1 else with_words
-        if len(candidates) == 1:
-            return scene.gaussians, candidates[0]
-    for attribute in ("name", "teacher"):
-        fitting = [each for each in scene.features.values() if getattr(each.space, attribute) == space]
-        if space is not None and space not in scene.features and len(fitting) == 1:
-            return scene.gaussians, fitting[0]
-    if space not in scene.features:
-        raise InputError(
-            f"scene {scene.name} has features of {', '.join(sorted(scene.features))}; "
-            + ("name one with space=" if space is None else f"none of {space!r}")
-        )
-    return scene.gaussians, scene.features[space]
-
-
-def _negatives(text: TextEncoder, words: Sequence[str]) -> Float32[np.ndarray, "M D"]:
-    """Vectors of the negative words that the encoder knows; the mean of the text side where it knows none."""
-    vectors, unknown = [], []
-    for word in words:
-        try:
-            vectors.append(text.encode([word]))
-        except InputError:
-            unknown.append(word)
-    if unknown:
-        instead = "" if vectors else "; the mean of its words stands for them"
-        warnings.warn(
-            f"{len(unknown)} of {len(words)} negative words are unknown to {text.space.text_encoder} "
-            f"({', '.join(unknown[:5])}) and left out{instead}",
-            SceneWarning,
-            stacklevel=3,
-        )
-    if unknown and not vectors:
-        vectors = [(text.mean / max(float(np.linalg.norm(text.mean)), 1e-12))[None].astype(np.float32)]
-    return np.concatenate(vectors) if vectors else np.zeros((0, text.space.channels), np.float32)
-
-
-def _warn_about_absent(scene: str, localization: Localization) -> None:
-    absent = localization.absent
-    if absent:
-        more = ", …" if len(absent) > 5 else ""
-        words = ", ".join(map(repr, list(absent)[:5])) + more
-        values = ", ".join(f"{value:.2f}" for value in list(absent.values())[:5]) + more
-        warnings.warn(
-            f"scene {scene}: {len(absent)} of {len(localization.queries)} words have no box ({words}): no cluster of "
-            f"Gaussians reaches their threshold and is probable enough (probability {values})",
-            SceneWarning,
-            stacklevel=3,
-        )
-
-
-def describe_absent(probability: float) -> str:
-    """How people are told of a word without a box."""
-    return f"absent (probability {probability:.2f})"

@@ -1,13 +1,8 @@
-"""How well each Gaussian's feature answers a word: cosines in basis coordinates, and contrast.
+"""How well each Gaussian's feature answers a word: cosines in basis coordinates, contrast, and the probability that a box
+holds what its word says. Q queries, M negative words, N Gaussians, R basis rank, D channels, S axes of the features.
 
-Q queries, M negative words, N Gaussians, R basis rank, D channels.
-
-Products of words with the features of Gaussians, for programs that ask many times; numpy only.
-
-Q words, N Gaussians, D channels, S axes of the features (see `FeatureAxes`).
-The probability that what a box holds is what its word says: a logistic model over evidence from relevancy alone.
-
-The evidence of a cluster c of the word q, with centered cosines cos and weights w normalized over the cluster:
+The probability is a logistic model over evidence from relevancy alone. For a cluster c of the word q, with centered
+cosines cos and weights w normalized over the cluster:
 
     mean        Σ wᵢ cos(fᵢ, q), relative to the best that a name of the vocabulary reaches
     margin      mean − max over rivals r of Σ wᵢ cos(fᵢ, r): negative where another word of the vocabulary fits better
@@ -28,15 +23,15 @@ The coefficients were fitted by `bench/presence.py`; `docs/measurements.md` has 
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.localize import Cluster
+from gsencoder.core.settings import check_limits, option
 from gsencoder.text.table import TextTable
 from gsencoder.types import GaussianFeatures
 
@@ -143,7 +138,7 @@ def relevancy(
     axes = feature_axes(features, mode)
     targets = axes.project(directions)
     shared = features.index is not None
-    rows = np.arange(len(features.features)) if shared else np.flatnonzero(features.seen)
+    rows = np.arange(len(features.features)) if shared else np.flatnonzero(features.weights > 0)
     scores = np.full((len(words), len(features.features) + shared), np.nan, np.float32)
     step = max(1, CHUNK_BYTES // (8 * (len(axes.offset) + len(words))))
     for start in range(0, len(rows), step):
@@ -239,37 +234,26 @@ NORMAL_MAD = 1.4826
 class ThresholdConfig:
     """Which relevancy a Gaussian needs to be taken, for each word on its own."""
 
-    kind: Kind = field(
-        default="adaptive",
-        metadata={
-            "help": "a share of the word's best, at most the fixed value and at least the noise of the scene "
-            "(adaptive); or one of: fixed value, share of the word's best, quantile of the scene, Otsu's split"
-        },
+    kind: Kind = option(
+        "adaptive",
+        "a share of the word's best, at most the fixed value and at least the noise of the scene (adaptive); or one of "
+        "fixed value, share of the word's best, quantile of the scene, Otsu's split",
     )
-    fixed: float = field(default=0.5, metadata={"help": "relevancy for kind=fixed, and the most for kind=adaptive"})
-    relative: float = field(
-        default=0.7, metadata={"help": "share of the word's highest relevancy for kind=adaptive and kind=relative"}
+    fixed: float = option(0.5, "relevancy for kind=fixed, and the most for kind=adaptive", ge=-1, le=1)
+    relative: float = option(
+        0.7, "share of the word's highest relevancy for kind=adaptive and kind=relative", gt=0, le=1
     )
-    noise: float = field(
-        default=2.0,
-        metadata={
-            "help": "kind=adaptive takes no Gaussian below the median relevancy of the word plus so many times its "
-            "spread (median absolute deviation, as a standard deviation) over the scene"
-        },
+    noise: float = option(
+        2.0,
+        "kind=adaptive takes no Gaussian below the median relevancy of the word plus so many times its spread (median "
+        "absolute deviation, as a standard deviation) over the scene",
+        ge=0,
+        lt=math.inf,
     )
-    quantile: float = field(default=0.995, metadata={"help": "share of the seen Gaussians left out, kind=quantile"})
+    quantile: float = option(0.995, "share of the seen Gaussians left out, kind=quantile", ge=0, le=1)
 
     def __post_init__(self) -> None:
-        if self.kind not in get_args(Kind):
-            raise InputError(f"kind: expected one of {', '.join(get_args(Kind))}, got {self.kind!r}")
-        if not -1 <= self.fixed <= 1:
-            raise InputError(f"fixed: expected a relevancy in [-1, 1], got {self.fixed}")
-        if not 0 < self.relative <= 1:
-            raise InputError(f"relative: expected a share in (0, 1], got {self.relative}")
-        if not 0 <= self.noise < math.inf:
-            raise InputError(f"noise: expected zero or a positive number, got {self.noise}")
-        if not 0 <= self.quantile <= 1:
-            raise InputError(f"quantile: expected a share in [0, 1], got {self.quantile}")
+        check_limits(self)
 
 
 def threshold(scores: Float32[np.ndarray, " N"], config: ThresholdConfig) -> float:
@@ -339,6 +323,23 @@ LEAST_ATTAINABLE = 0.3
 """A phrase whose best name has a smaller cosine than this is not understood, and not helped any further."""
 SMALLEST_SPREAD = 1e-3
 """Spread of relevancy below which that of the background counts as this: a scene of one kind alone has none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cluster:
+    """A cluster of the Gaussians that were selected for a word.
+
+    Attributes:
+        rows: its Gaussians, ascending.
+        score: mean relevancy, weighted by the Gaussians' weights, times the fourth root of its share of the weight of
+            all that was selected for the word.
+        share: of this weight in that of all that was selected for the word.
+    """
+
+    rows: Int64[np.ndarray, " n"]
+    score: float
+    weight: float
+    share: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -234,12 +234,12 @@ def test_one_two_and_three_points_have_boxes() -> None:
 def test_sigma_boxes_bound_the_ellipsoids(rng: np.random.Generator) -> None:
     quats = Rotation.random(20, rng=1).as_quat()[:, [3, 0, 1, 2]]
     gaussians = splat(rng.random((20, 3)), 0.05, quats)
-    box = box_around(gaussians, np.arange(20), extent="sigma", sigmas=2.0)
+    box = box_around(gaussians, np.arange(20), extent="sigma")
     directions = rng.normal(size=(20_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     turns = Rotation.from_quat(gaussians.quats[:, [1, 2, 3, 0]]).as_matrix()
     surface = np.concatenate(
-        [m + 2 * (directions * s) @ r.T for m, s, r in zip(gaussians.means, gaussians.scales, turns, strict=True)]
+        [m + (directions * s) @ r.T for m, s, r in zip(gaussians.means, gaussians.scales, turns, strict=True)]
     )
     assert inside(surface, box, slack=1e-6)
     np.testing.assert_allclose(surface.min(axis=0), box.aabb_min, atol=2e-3)

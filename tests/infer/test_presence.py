@@ -10,8 +10,8 @@ import pytest
 from jaxtyping import Float32
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.infer import localize as module
 from gsencoder.infer.localize import (
-    Cluster,
     LocalizeConfig,
     find_candidates,
     localization_to_json,
@@ -26,6 +26,7 @@ from gsencoder.infer.relevancy import (
     UNTRAINED,
     WITH_RIVALS,
     WITHOUT_RIVALS,
+    Cluster,
     Evidence,
     Presence,
     ThresholdConfig,
@@ -219,12 +220,11 @@ def test_rivals_of_another_space_are_refused() -> None:
         localize(SCENE, ["mug"], TABLE, rivals=other)
 
 
-def test_evidence_is_of_cosines_however_relevancy_is_scored() -> None:
+def test_evidence_is_of_cosines_however_relevancy_is_scored(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "NEGATIVES", ("lamp", "chair"))
     fixed = ThresholdConfig(kind="fixed", fixed=0.7)
     plain, contrast = (
-        find_candidates(
-            SCENE, ["mug"], TABLE, LocalizeConfig(contrast=contrast, negatives=("lamp", "chair"), threshold=fixed)
-        ).words[0]
+        find_candidates(SCENE, ["mug"], TABLE, LocalizeConfig(contrast=contrast, threshold=fixed))[1][0]
         for contrast in (False, True)
     )
     np.testing.assert_array_equal(plain.clusters[0].rows, contrast.clusters[0].rows)
@@ -261,10 +261,10 @@ def test_the_vocabulary_states_which_words_the_encoder_was_trained_on() -> None:
     trained = replace(TABLE, trained=("mug", "chair"))
     words = ["mugs", "spoon", "chair"]
     for table, stated in ((trained, [True, False, True]), (TABLE, [None, None, None])):
-        candidates = find_candidates(SCENE, words, table, EVERYTHING).words
+        candidates = find_candidates(SCENE, words, table, EVERYTHING)[1]
         assert [{each.trained for each in word.evidence} for word in candidates] == [{each} for each in stated]
     # Rivals that are given have the last word, as they say what else there is.
-    against_rivals = find_candidates(SCENE, words, Phrases(), EVERYTHING, rivals=trained).words
+    against_rivals = find_candidates(SCENE, words, Phrases(), EVERYTHING, rivals=trained)[1]
     assert against_rivals[1].evidence[0].trained is False
 
 

@@ -123,7 +123,7 @@ def test_seeds_are_the_labels_before_they_grew() -> None:
 @pytest.mark.filterwarnings("ignore:.*words have no box")
 def test_settings_of_boxes_are_those_that_are_given() -> None:
     with pytest.raises(InputError, match="no Gaussian of table is selected"):
-        select(SCENE, ("mug",), words(), localization=LocalizeConfig(min_samples=100_000))
+        select(SCENE, ("mug",), words(), localization=LocalizeConfig(min_weight=1e30))
 
 
 @pytest.mark.filterwarnings("ignore:.*words have no box")

@@ -11,10 +11,11 @@ from stability.of_network import few
 from stability.registry import routine
 
 from gsencoder.infer import localize as clusters_module
-from gsencoder.infer.localize import Cluster, cluster, score_clusters
+from gsencoder.infer.localize import cluster, score_clusters
 from gsencoder.infer.relevancy import (
     SMALLEST_SPREAD,
     WITHOUT_RIVALS,
+    Cluster,
     Presence,
     ThresholdConfig,
     otsu,

@@ -129,8 +129,6 @@ LOCALIZATION_KNOBS = (
     Knob(name="noise", key="threshold.noise", values=(1.0, 4.0)),
     Knob(name="kind", key="threshold.kind", values=("fixed", "relative", "otsu")),
     Knob(name="eps_spacings", key="eps_spacings", values=(1.0, 2.0, 3.0)),
-    Knob(name="min_samples", key="min_samples", values=(1, 5, 10)),
-    Knob(name="min_share", key="min_share", values=(0.0, 0.2)),
 )
 """Knobs of `gsencoder.infer.localize.LocalizeConfig`; nothing but labels says which is right."""
 

@@ -106,7 +106,7 @@ def test_a_box_that_is_asked_for_and_settings_of_boxes_reach_the_selection(
     run(folder, "query=mug", "box=1", f"out={tmp_path / 'out'}", "write=labels", "quiet=true")
     assert ((read_labels(tmp_path / "out").labels == 1) == (KINDS == 1)).mean() > 0.99
     common = ("select", str(features), "query=mug", f"out={tmp_path / 'none'}")
-    assert "no Gaussian of table is selected" in refusal(capsys, *common, "localize.min_samples=100000")
+    assert "no Gaussian of table is selected" in refusal(capsys, *common, "localize.min_weight=1e30")
     assert "siglip" in refusal(capsys, *common, "head=siglip")
 
 

@@ -170,12 +170,12 @@ def served(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 def test_the_server_gets_the_scene_as_it_is_to_be_searched(
     folder: Path, served: SimpleNamespace, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["max_gaussians=1500", "localize.max_boxes=3", "port=4321", "host=localhost"]
+    arguments = ["max_gaussians=1500", "localize.min_probability=0.1", "port=4321", "host=localhost"]
     assert cli.main(["view", str(folder / "features"), f"photos={folder / 'room'}", *arguments]) == 0
     assert served.options == {"host": "localhost", "port": 4321}
     (search,) = served.searches
     assert len(search.shown.gaussians) == 1500
-    assert search.config.max_boxes == 3
+    assert search.config.min_probability == 0.1
     assert search.shown.title == "features"
     assert any(served.scenes[0].meta["objects"])
     assert served.scenes[0].meta["photographs"] is True
