@@ -61,18 +61,13 @@ def events(*texts: str, finish: str | None = "stop", done: bool = True) -> bytes
 
 
 def answer(text: str) -> Callable[[Handler, Any], None]:
-    """Answers every request with a text, in pieces where that is asked for."""
+    """Answers every request with a text in pieces, and counts tokens."""
 
-    def behave(handler: Handler, body: Any) -> None:
-        if body["stream"]:
-            data = events(*(text[start : start + 3] for start in range(0, len(text), 3)), done=False)
-            if body.get("stream_options", {}).get("include_usage"):
-                usage = completion("")["usage"]
-                chunk = {"id": "1", "object": "chat.completion.chunk", "created": 0, "model": "tiny", "choices": []}
-                data += f"data: {json.dumps(chunk | {'usage': usage})}\n\n".encode()
-            handler.raw(200, data + b"data: [DONE]\n\n", "text/event-stream")
-        else:
-            handler.reply(200, completion(text))
+    def behave(handler: Handler, _: Any) -> None:
+        chunk = {"id": "1", "object": "chat.completion.chunk", "created": 0, "model": "tiny", "choices": []}
+        usage = json.dumps(chunk | {"usage": completion("")["usage"]})
+        data = events(*(text[start : start + 3] for start in range(0, len(text), 3)), done=False)
+        handler.raw(200, data + f"data: {usage}\n\ndata: [DONE]\n\n".encode(), "text/event-stream")
 
     return behave
 

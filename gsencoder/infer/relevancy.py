@@ -1,5 +1,5 @@
-"""How well each Gaussian's feature answers a word: cosines in basis coordinates, contrast, and the probability that a box
-holds what its word says. Q queries, M negative words, N Gaussians, R basis rank, D channels, S axes of the features.
+"""How well each Gaussian's feature answers a word: cosines in basis coordinates, contrast, and the probability that a
+box holds what its word says. Q queries, M negative words, N Gaussians, R basis rank, D channels, S axes of features.
 
 The probability is a logistic model over evidence from relevancy alone. For a cluster c of the word q, with centered
 cosines cos and weights w normalized over the cluster:

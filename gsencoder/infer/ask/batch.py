@@ -30,7 +30,7 @@ from gsencoder.render import BlendConfig
 from gsencoder.types import GaussianFeatures, Gaussians
 
 ANSWER, ANSWERS, PROMPT, REQUEST = "answer.json", "answers.jsonl", "prompt.txt", "request.json"
-TRANSPORT = ("key", "timeout", "longest", "retries", "stream")
+TRANSPORT = ("key", "timeout", "longest", "retries")
 """Settings of the server that no answer depends on."""
 
 

@@ -1,8 +1,6 @@
 """A vision-language model behind a server that speaks OpenAI's chat protocol: vLLM, transformers serve, llama.cpp's
-server, a cloud.
-"""
+server, a cloud. The key is never written: what a server sends passes `KeyFilter` before anybody sees it."""
 
-import importlib
 import itertools
 import os
 import re
@@ -10,110 +8,15 @@ import threading
 import time
 import traceback
 import weakref
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from html.entities import html5
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from gsencoder.core.errors import InputError
-
-LARGEST_REPLY = 1 << 22
-"""Bytes of any reply: error pages and lists of models take at most a megabyte or two. JSON of empty lists takes fifty
-times its bytes when it is parsed, so this is 200 MB of memory at worst."""
-BYTES_PER_TOKEN = 1 << 10
-"""Further bytes for each token of an answer: a streamed token comes in a JSON object of 200 to 500 bytes."""
-
-
-class ReplyGuard:
-    """A response hook of the HTTP client: it runs before the body is read and before a redirect is followed.
-
-    It never raises, as the openai client would send the request again.
-
-    Attributes:
-        fault: why the last response was refused; empty where it was not.
-    """
-
-    def __init__(self, max_tokens: int) -> None:
-        self.fault = ""
-        self._largest = LARGEST_REPLY + BYTES_PER_TOKEN * max_tokens
-
-    def __call__(self, response: Any) -> None:
-        self.fault = ""
-        self._check_redirect(response)
-        headers, coding = response.headers, response.headers.get("content-encoding", "identity").strip().lower()
-        length = headers.get("content-length", "")
-        if coding not in ("", "identity"):
-            # The client would unpack it before anybody could count its bytes.
-            self._refuse(response, f"compressed its reply ({coding[:40]}), although it was asked not to")
-            del headers["content-encoding"]
-        elif length.isdecimal() and int(length[:20]) > self._largest:
-            self._refuse(response, self._too_large())
-        response.stream = _stream(response, self._bounded(response, response.stream))
-
-    def _check_redirect(self, response: Any) -> None:
-        """Redirects within the server are followed; others would take question and pictures to whom nobody named."""
-        here, location = response.request.url, response.headers.get("location")
-        if location is None or not 300 <= response.status_code < 400:
-            return
-        try:
-            # Read as the client does, which mends an address without a host in its own way.
-            there = type(here)(location)
-            if there.scheme and not there.host:
-                raise ValueError("an address without a host")
-            there = here.join(there)
-            same = _origin(there) == _origin(here)
-            named = f"{there.scheme}://{there.netloc.decode('ascii', 'replace').rpartition('@')[2]}"
-        except Exception:  # the client has errors of its own for each part of an address
-            same, named = False, "what is no address"
-        if not same:
-            # Without the header nobody follows, and the client reports the status.
-            del response.headers["location"]
-            self._refuse(
-                response,
-                f"redirects to {named[:120]} ({response.status_code}), where nothing is sent; "
-                "give that address as vlm.base_url if you trust it",
-            )
-
-    def _refuse(self, response: Any, fault: str) -> None:
-        self.fault = self.fault or fault
-        # openai's own header: no status of a reply that was refused is a reason to ask again.
-        response.headers["x-should-retry"] = "false"
-
-    def _too_large(self) -> str:
-        return f"sent more than {self._largest:,} bytes, which no answer needs; the rest was not read"
-
-    def _bounded(self, response: Any, body: Iterable[bytes]) -> Iterator[bytes]:
-        """The parts of a body until they are too many; none of a reply that was refused."""
-        size = 0
-        for part in () if self.fault else body:
-            size += len(part)
-            if size > self._largest:
-                self._refuse(response, self._too_large())
-                return
-            yield part
-
-
-def _origin(url: Any) -> tuple[str, str, int | None]:
-    default = {"http": 80, "https": 443}.get(url.scheme)
-    return url.scheme, url.host, url.port or default
-
-
-def _stream(response: Any, parts: Iterator[bytes]) -> Any:
-    """A body of these parts that closes the response's own."""
-    library = importlib.import_module(type(response).__module__.partition(".")[0])
-    close: Callable[[], None] = response.stream.close
-
-    class Bounded(library.SyncByteStream):  # type: ignore[name-defined]
-        def __iter__(self) -> Iterator[bytes]:
-            return parts
-
-        def close(self) -> None:
-            close()
-
-    return Bounded()
-
+from gsencoder.core.settings import check_limits, option
 
 LEAST_KEY = 6
 """Shorter keys are placeholders, which servers at home are given; any text may hold their letters."""
@@ -175,10 +78,6 @@ def _spellings(letter: str) -> str:
     )
 
 
-MAX_TOKENS_COUNT = 1 << 53
-"""Larger counts are no counts, and no number that every reader of JSON knows."""
-
-
 class ServerError(InputError):
     """A fault of the server that another question would meet as well; any other `InputError` is about the question."""
 
@@ -202,83 +101,56 @@ class Reply:
 
 
 @dataclass(slots=True)
-class Heard:
-    """An answer as far as it has come.
-
-    Attributes:
-        refusal: the model's words where it refuses to answer.
-        thought: whether there was reasoning beside the answer.
-        parts: how many parts have come.
-        unstreamed: whether JSON came in place of the stream that was asked for.
-    """
+class _Heard:
+    """An answer as far as it has come."""
 
     text: str = ""
     model: str = ""
     finish: str = ""
     tokens: dict[str, int] | None = None
     refusal: str = ""
-    thought: bool = False
     parts: int = 0
-    unstreamed: bool = False
 
-    def hear(self, part: Any) -> None:
-        """Takes up a completion, or a chunk of one."""
-        choices = getattr(part, "choices", None)
-        if choices is None:
-            extra = getattr(part, "model_extra", None) or {}
-            # Whole, as half a key could not be recognized; who reports it takes the key out and then cuts it.
-            raise ValueError(str(extra.get("error") or extra.get("message") or extra.get("detail") or part))
+    def hear(self, chunk: Any) -> None:
+        if getattr(chunk, "choices", None) is None:
+            raise ValueError(str(getattr(chunk, "model_extra", None) or chunk))
         self.parts += 1
-        self.model = str(getattr(part, "model", "") or self.model)
-        self.tokens = _tokens(getattr(part, "usage", None)) or self.tokens
+        self.model = str(getattr(chunk, "model", "") or self.model)
+        self.tokens = _tokens(getattr(chunk, "usage", None)) or self.tokens
         # The last chunk of some servers counts tokens and has no choice.
-        for choice in choices[:1]:
-            message = getattr(choice, "delta", None) or getattr(choice, "message", None)
-            self.text += _words(getattr(message, "content", None))
-            self.refusal += _words(getattr(message, "refusal", None))
-            self.thought |= bool(getattr(message, "reasoning_content", None) or getattr(message, "reasoning", None))
+        for choice in chunk.choices[:1]:
+            for name, attribute in (("text", "content"), ("refusal", "refusal")):
+                part = getattr(choice.delta, attribute, None)
+                setattr(self, name, getattr(self, name) + (part if isinstance(part, str) else ""))
             self.finish = str(choice.finish_reason or self.finish)
 
-    def wrong(self) -> str | None:
-        """Why this is no answer, of a completion that has ended; None if it is one."""
+    def problem(self) -> str:
+        """Why an answer that has ended is none; empty if it is one."""
         if self.refusal:
             return f"the model refuses: {self.refusal}"
         if self.finish == "content_filter":
             return f"a filter cut the answer off after {len(self.text)} characters"
         if self.text.strip():
-            return None
-        hints = {
-            "length": f"it {'thought' if self.thought else 'went on'} until vlm.max_tokens; raise it",
-            "tool_calls": "it calls a tool, and none is offered; switch tools off on the server, or take another model",
-        }
-        hint = hints.get(self.finish, "")
-        return f"the answer holds no text (it ended with {self.finish!r})" + (f"; {hint}" if hint else "")
-
-
-def _words(content: Any) -> str:
-    """Text that comes as such, or in parts."""
-    if isinstance(content, list):
-        parts = [each.get("text") if isinstance(each, dict) else getattr(each, "text", None) for each in content]
-        return "".join(part for part in parts if isinstance(part, str))
-    return content if isinstance(content, str) else ""
+            return ""
+        hint = "; raise vlm.max_tokens" if self.finish == "length" else ""
+        return f"the answer holds no text (it ended with {self.finish!r}){hint}"
 
 
 def _tokens(usage: Any) -> dict[str, int]:
     counts = {"prompt": getattr(usage, "prompt_tokens", None), "answer": getattr(usage, "completion_tokens", None)}
-    return {name: count for name, count in counts.items() if isinstance(count, int) and 0 <= count < MAX_TOKENS_COUNT}
+    return {name: count for name, count in counts.items() if isinstance(count, int) and 0 <= count < 2**53}
 
 
-def cause(error: BaseException) -> str:
-    """What went wrong at the bottom: a server's message, or that of the first error."""
-    extra = getattr(error, "body", None)
+def _cause(error: BaseException) -> str:
+    """The server's message, or that of the first error."""
+    body = getattr(error, "body", None)
     for name in ("error", "message", "detail"):
-        extra = extra.get(name, extra) if isinstance(extra, dict) else extra
-    if extra:
-        return " ".join(str(extra).split())
-    deepest = error
-    while deepest.__cause__ is not None or deepest.__context__ is not None:
-        deepest = deepest.__cause__ or deepest.__context__  # type: ignore[assignment]
-    return " ".join(str(deepest).split()) or type(deepest).__name__
+        body = body.get(name, body) if isinstance(body, dict) else body
+    if body:
+        return " ".join(str(body).split())
+    while error.__cause__ is not None or error.__context__ is not None:
+        error = error.__cause__ or error.__context__  # type: ignore[assignment]
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 URL_VARIABLE, KEY_VARIABLE, MODEL_VARIABLE = "OPENAI_BASE_URL", "OPENAI_API_KEY", "GSENCODER_VLM_MODEL"
@@ -287,72 +159,44 @@ MAX_MESSAGE = 300
 MAX_NAME = 200
 """Characters of a server's name for its model, or for why an answer ended, that are written down."""
 MAX_MODELS_LISTED = 8
-"""Models of a server that an error lists."""
-
-Message = Mapping[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VlmConfig:
     """Where the model is and how it is asked."""
 
-    base_url: str = field(
-        default="", metadata={"help": f"of the server, such as http://localhost:8000/v1; empty = {URL_VARIABLE}"}
+    base_url: str = option("", f"of the server, such as http://localhost:8000/v1; empty = {URL_VARIABLE}")
+    key: str = option("", f"the server's key; empty = {KEY_VARIABLE}; it is never written anywhere", secret=True)
+    model: str = option("", f"the model's name on the server; empty = {MODEL_VARIABLE}")
+    timeout: float = option(60.0, "seconds that the server may be silent", gt=0, lt=float("inf"))
+    longest: float = option(600.0, "seconds that an answer may take in all, retries included", gt=0, lt=float("inf"))
+    retries: int = option(2, "times that a busy or failing server is asked again", ge=0, le=100)
+    max_tokens: int = option(512, "tokens of the answer", ge=1)
+    limit_by: Literal["max_tokens", "max_completion_tokens"] = option(
+        "max_tokens", "the name that the server has for max_tokens"
     )
-    key: str = field(
-        default="",
-        metadata={"help": f"the server's key; empty = {KEY_VARIABLE}; it is never written anywhere", "secret": True},
+    temperature: float | None = option(
+        0.0, "0 = the likeliest answer; empty = the server's, where it takes no other", ge=0, le=2
     )
-    model: str = field(default="", metadata={"help": f"the model's name on the server; empty = {MODEL_VARIABLE}"})
-    timeout: float = field(default=60.0, metadata={"help": "seconds that the server may be silent"})
-    longest: float = field(default=600.0, metadata={"help": "seconds that an answer may take in all, retries included"})
-    retries: int = field(default=2, metadata={"help": "times that a busy or failing server is asked again"})
-    stream: bool = field(default=True, metadata={"help": "take the answer word by word"})
-    max_tokens: int = field(default=512, metadata={"help": "tokens of the answer"})
-    limit_by: Literal["max_tokens", "max_completion_tokens"] = field(
-        default="max_tokens", metadata={"help": "the name that the server has for max_tokens"}
-    )
-    temperature: float | None = field(
-        default=0.0, metadata={"help": "0 = the likeliest answer; empty = the server's, where it takes no other"}
-    )
-    image_side: int = field(default=768, metadata={"help": "longer side of the pictures that are sent, pixels"})
-    image_format: Literal["jpeg", "png"] = field(
-        default="jpeg", metadata={"help": "of the pictures that are sent; png is exact and larger"}
-    )
+    image_side: int = option(768, "longer side of the pictures that are sent, pixels", ge=16, le=8192)
+    image_format: Literal["jpeg", "png"] = option("jpeg", "of the pictures that are sent; png is exact and larger")
 
     def __post_init__(self) -> None:
-        for name in ("timeout", "longest"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise InputError(f"{name}: expected a positive number of seconds, got {getattr(self, name)}")
-        if not 0 <= self.retries <= 100:
-            raise InputError(f"retries: expected 0 to 100, got {self.retries}")
-        if self.max_tokens < 1:
-            raise InputError(f"max_tokens: expected 1 or more, got {self.max_tokens}")
-        if self.temperature is not None and not 0 <= self.temperature <= 2:
-            raise InputError(f"temperature: expected 0 to 2, got {self.temperature}")
-        if not 16 <= self.image_side <= 8192:
-            raise InputError(f"image_side: expected 16 to 8192 pixels, got {self.image_side}")
+        check_limits(self)
         if self.base_url:
             check_url(self.base_url, "base_url")
 
 
-def request_body(messages: Sequence[Message], config: VlmConfig, *, named: bool = True) -> dict[str, Any]:
-    """What is sent, but for the key.
-
-    Args:
-        named: a model must be named; a dry run needs none.
-    """
+def request_body(messages: Sequence[Mapping[str, Any]], config: VlmConfig, *, named: bool = True) -> dict[str, Any]:
+    """What is sent, but for the key; a dry run needs no model's name (`named`)."""
     model = config.model or os.environ.get(MODEL_VARIABLE, "")
     if named and not model:
         raise InputError(f"vlm.model: name the model that the server has, here or in {MODEL_VARIABLE}")
     body: dict[str, Any] = {"model": model, "messages": list(messages), config.limit_by: config.max_tokens}
     if config.temperature is not None:
         body["temperature"] = config.temperature
-    body["stream"] = config.stream
-    if config.stream:
-        # Without it some servers count no tokens.
-        body["stream_options"] = {"include_usage": True}
-    return body
+    # Without stream_options some servers count no tokens.
+    return body | {"stream": True, "stream_options": {"include_usage": True}}
 
 
 def check_url(url: str, name: str) -> None:
@@ -394,101 +238,80 @@ class VlmServer:
         if not (key.isascii() and key.isprintable()):
             raise InputError(f"vlm.key (or {KEY_VARIABLE}): holds characters that no key has")
         self._key = KeyFilter(key)
-        self._guard = ReplyGuard(config.max_tokens)
         try:
-            # A transport of our own would have to read the settings of proxies itself; a hook does not.
-            http = openai.DefaultHttpxClient(event_hooks={"response": [self._guard]})
+            # Nothing is sent where a redirect leads: nobody named that server.
+            http = openai.DefaultHttpxClient(follow_redirects=False)
             # openai closes only the client that it makes itself.
             weakref.finalize(self, http.close)
-            # Servers at home take any key, but the client must have one.
             self._client = openai.OpenAI(
                 base_url=self.url,
+                # Servers at home take any key, but the client must have one.
                 api_key=key or "none",
                 timeout=config.timeout,
                 max_retries=config.retries,
-                default_headers={"Accept-Encoding": "identity"},
                 http_client=http,
             )
         except Exception as error:  # settings of proxies and certificates raise whatever they like
-            reason = self._key.clean(cause(error), MAX_MESSAGE)
-            raise InputError(f"vlm: no connection can be set up ({reason}){_proxies()}") from self._downscaled(error)
+            reason = self._key.clean(_cause(error), MAX_MESSAGE)
+            raise InputError(f"vlm: no connection can be set up ({reason})") from self._without_key(error)
 
     def ask(self, body: Mapping[str, Any]) -> Reply:
         """One answer."""
         begun = time.monotonic()
-        heard, failed = Heard(), list[BaseException]()
-        self._guard.fault = ""
+        heard, failed = _Heard(), list[BaseException]()
 
         def listen() -> None:
             try:
-                self._listen(body, heard)
+                with self._client.chat.completions.create(**body) as stream:
+                    for chunk in stream:
+                        heard.hear(chunk)
             except BaseException as error:
                 failed.append(error)
 
         if not _ends_within(self._config.longest, listen):
             raise self._fault(f"the answer took more than {self._config.longest:g} s (vlm.longest)", ServerError)
-        if self._guard.fault:
-            raise self._fault(self._guard.fault, ServerError)
         if failed:
-            raise self._failure(failed[0], heard) from self._downscaled(failed[0])
-        if heard.unstreamed:
-            raise self._fault(
-                "sent nothing that is a chat completion, but JSON in place of the stream that was asked for; give "
-                "vlm.stream=false, or an address that ends in /v1, as most do",
-                ServerError,
-            )
+            raise self._failure(failed[0], heard) from self._without_key(failed[0])
         if not heard.parts:
             raise self._fault("sent nothing that is a chat completion; such addresses mostly end in /v1", ServerError)
         if not heard.finish:
             raise self._fault(f"the answer was cut off after {len(heard.text)} characters", ServerError)
-        wrong = heard.wrong()
-        if wrong:
-            raise self._fault(wrong, InputError)
-        return self._reply(heard, str(body["model"]), time.monotonic() - begun)
-
-    def _reply(self, heard: Heard, model: str, seconds: float) -> Reply:
-        """What was heard, without the key in any of it."""
+        if problem := heard.problem():
+            raise self._fault(problem, InputError)
         return Reply(
             text=self._key.clean(heard.text),
-            model=self._key.clean(heard.model or model, MAX_NAME),
+            model=self._key.clean(heard.model or str(body["model"]), MAX_NAME),
             finish=self._key.clean(heard.finish, MAX_NAME),
             tokens={name: count for name, count in (heard.tokens or {}).items() if not self._key.is_in(str(count))},
-            seconds=seconds,
+            seconds=time.monotonic() - begun,
         )
 
-    def _listen(self, body: Mapping[str, Any], heard: Heard) -> None:
-        completion = self._client.chat.completions.create(**body)
-        if not body["stream"]:
-            heard.hear(completion)
-            return
-        with completion as stream:
-            for chunk in stream:
-                heard.hear(chunk)
-            kind = stream.response.headers.get("content-type", "")
-        heard.unstreamed = not heard.parts and kind.partition(";")[0].strip().lower() == "application/json"
-
-    def _failure(self, error: BaseException, heard: Heard) -> InputError:
+    def _failure(self, error: BaseException, heard: _Heard) -> InputError:
         """What went wrong, for people."""
         import openai
 
+        message = _cause(error)
         if isinstance(error, openai.APITimeoutError):
-            times = f", {self._config.retries + 1} times" if self._config.retries and not heard.parts else ""
-            return self._fault(f"was silent for {self._config.timeout:g} s{times} (vlm.timeout)", ServerError)
-        message = cause(error)
+            return self._fault(f"was silent for {self._config.timeout:g} s (vlm.timeout)", ServerError)
         if isinstance(error, openai.APIStatusError):
-            return self._status(error.status_code, message)
-        after = f" after {len(heard.text)} characters" if heard.text else ""
+            return self._status(error.status_code, message, error.response.headers.get("location", ""))
         if isinstance(error, openai.APIConnectionError) and not heard.parts:
             return self._fault(
-                f"no server answers there ({message}){_proxies()}; start one, or correct vlm.base_url; "
+                f"no server answers there ({message}); start one, or correct vlm.base_url; "
                 "dry_run=true writes the prompt and the pictures without one",
                 ServerError,
             )
-        if isinstance(error, openai.APIConnectionError):
-            return self._fault(f"the answer broke off{after}: {message}", ServerError)
-        return self._fault(f"the answer broke off{after}, or is no chat completion: {message}", ServerError)
+        return self._fault(
+            f"the answer broke off after {len(heard.text)} characters, or is no chat completion: {message}", ServerError
+        )
 
-    def _status(self, code: int, message: str) -> InputError:
+    def _status(self, code: int, message: str, location: str) -> InputError:
+        if 300 <= code < 400:
+            return self._fault(
+                f"redirects to {location[:120]} ({code}), where nothing is sent; give that address as vlm.base_url if "
+                "you trust it",
+                ServerError,
+            )
         if code in (401, 403):
             return self._fault(f"refuses the key ({code}: {message}); give vlm.key= or {KEY_VARIABLE}", ServerError)
         if code == 404:
@@ -510,14 +333,12 @@ class VlmServer:
             except Exception:  # it is only a hint
                 return
 
-        if not _ends_within(self._config.timeout, listen) or self._guard.fault or not names:
-            return ""
-        return f"; it has {', '.join(names)}"
+        return f"; it has {', '.join(names)}" if _ends_within(self._config.timeout, listen) and names else ""
 
     def _fault(self, message: str, kind: type[InputError]) -> InputError:
         return kind(self._key.clean(f"the server at {self.url}: ") + self._key.clean(message, MAX_MESSAGE))
 
-    def _downscaled(self, error: BaseException) -> BaseException | None:
+    def _without_key(self, error: BaseException) -> BaseException | None:
         """An error as the cause of ours, unless a traceback of it could show the key."""
         return None if self._key.is_in("".join(traceback.format_exception(error))) else error
 
@@ -529,15 +350,3 @@ def _ends_within(seconds: float, work: Callable[[], None]) -> bool:
     thread.start()
     thread.join(seconds)
     return not thread.is_alive()
-
-
-def _proxies() -> str:
-    """Which variables lead elsewhere."""
-    names = ("all_proxy", "http_proxy", "https_proxy")
-    variables = [name for each in names for name in (each, each.upper()) if os.environ.get(name)]
-    return (
-        f"; {' and '.join(variables)} {'lead' if len(variables) > 1 else 'leads'} through a proxy (NO_PROXY names "
-        "exceptions)"
-        if variables
-        else ""
-    )
