@@ -1,12 +1,10 @@
-"""What an encoder costs: time and memory by size, beside its matrix products alone, its plan, and the parts of a step.
+"""What an encoder costs: time and memory by size, beside its matrix products alone, and its plan.
 
     python bench/encoder.py [--model tiny|small|base] [--sizes 10000,100000] [--precision float32|bfloat16]
     python bench/encoder.py --chunked 1000000 [--chunk 250000]
-    python bench/encoder.py --step PREPARED [--steps 40]
 
 Splats are seeds of a long random floor with things on it, at the spacing that the encoder's grid expects. Every figure
-is the best of several runs in this process; ratios are of times taken in turn. The parts of a step are means over
-samples of `experiment=house_cpu`.
+is the best of several runs in this process; ratios are of times taken in turn.
 """
 
 import argparse
@@ -17,7 +15,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,11 +32,6 @@ from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.neighbors import _append_zero_row, _gather_neighborhoods, _row_blocks
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.plan import plan_cloud
-from gsencoder.train import samples
-from gsencoder.train.batch import Batch, join_samples
-from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.run import Distillation
-from gsencoder.train.samples import SampleDataset, SampleRecipe, TrainingScene
 from gsencoder.types import FeatureSpace, Gaussians
 
 CHANNELS = 64
@@ -157,78 +149,6 @@ def measure(config: TrainCommandConfig, size: int, precision: str) -> dict[str, 
     return seconds
 
 
-def timed(module: Any, name: str, spent: dict[str, float], label: str) -> None:
-    """Adds what every call of a module's function takes to `spent`."""
-    function = getattr(module, name)
-
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
-        start = time.perf_counter()
-        try:
-            return function(*args, **kwargs)
-        finally:
-            spent[label] = spent.get(label, 0.0) + time.perf_counter() - start
-
-    setattr(module, name, wrapped)
-
-
-def step_parts(config: TrainCommandConfig, prepared: Path, steps: int) -> dict[str, float]:
-    """Mean seconds of the parts of a training step on prepared scenes, one sample a step."""
-    folder = PreparedDataset(prepared)
-    outputs, _ = folder.load_space()
-    recipe = SampleRecipe(
-        encoder=config.model,
-        sampling=config.sampling,
-        augmentation=config.augment,
-        losses=config.loss,
-        teachers=(samples.TeacherRecipe(name="teacher", class_balance=folder.load_class_balance()),),
-        seed=0,
-    )
-    scenes = folder.scenes(sorted(path.stem for path in (prepared / "scenes").iterdir()))
-    dataset = SampleDataset([TrainingScene([scene]) for scene in scenes], recipe)
-    spent: dict[str, float] = {}
-    timed(samples, "choose_crop", spent, "selection")
-    timed(samples, "augment", spent, "augmentation")
-    timed(samples, "encoder_inputs", spent, "plan")
-    timed(samples, "restrict_rows", spent, "rows of B")
-    encoder = GaussianEncoder(config.model, outputs.channels).train()
-    optimizer = torch.optim.AdamW(encoder.parameters(), lr=1e-3, fused=True)
-    distillation = Distillation(encoder, config.loss, recipe.teachers)
-    dtype = autocast_dtype(config.train.precision, torch.device("cpu"))
-    gaussians = 0
-    # The first visit to a scene opens its file and looks up the classes of its targets.
-    first = -len(dataset.scenes)
-    for step in range(first, steps):
-        if step == 0:
-            spent.clear()
-            gaussians = 0
-        start = time.perf_counter()
-        sample = dataset.make(step - first)
-        made = time.perf_counter()
-        batch = join_samples([sample], config.model.transformer.patch)
-        assert isinstance(batch, Batch)
-        gaussians += len(batch.attributes)
-        marks = [time.perf_counter()]
-        with torch.autocast("cpu", dtype, enabled=dtype is not None):
-            predicted = encoder(batch.attributes, batch.opacities, batch.plan)
-        marks.append(time.perf_counter())
-        terms, divisors = distillation.terms(predicted, batch), distillation.divisors(batch)
-        loss = sum(weight * terms[name] / divisors[name] for name, weight in distillation.lambdas.items())
-        marks.append(time.perf_counter())
-        assert isinstance(loss, torch.Tensor)
-        loss.backward()
-        marks.append(time.perf_counter())
-        optimizer.step()
-        optimizer.zero_grad()
-        marks.append(time.perf_counter())
-        parts = {"join": marks[0] - made, "sample": made - start}
-        parts |= dict(zip(("forward", "loss", "backward", "optimiser"), np.diff(marks), strict=True))
-        for name, value in parts.items():
-            spent[name] = spent.get(name, 0.0) + float(value)
-    inner = ("selection", "augmentation", "rows of B")
-    spent["rest of the sample"] = spent.pop("sample") - sum(spent[name] for name in inner) - spent["plan"]
-    return {"gaussians": gaussians / steps} | {name: value / steps for name, value in spent.items()}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", default="tiny")
@@ -237,8 +157,6 @@ def main() -> None:
     parser.add_argument("--one", type=int, default=0, help="one size, its figures as JSON")
     parser.add_argument("--patch", type=int, default=0)
     parser.add_argument("--chunked", type=int, default=0)
-    parser.add_argument("--step", default="", help="prepared scenes: what the parts of a training step take")
-    parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--chunk", type=int, default=250_000)
     add_json_option(parser)
     chosen = parser.parse_args()
@@ -262,15 +180,6 @@ def main() -> None:
         )
         took = time.perf_counter() - start
         print(f"{len(splat):,} Gaussians in chunks of {chosen.chunk:,}: {took:.1f} s, {peak_gib():.2f} GiB at most")
-        return
-    if chosen.step:
-        config = compose("train", TrainCommandConfig, ["scene", "experiment=house_cpu"])
-        parts = step_parts(config, Path(chosen.step), chosen.steps)
-        size = parts.pop("gaussians")
-        total = sum(parts.values())
-        print(f"a step of {size:,.0f} Gaussians takes {total:.3f} s on {torch.get_num_threads()} threads")
-        for name, seconds in parts.items():
-            print(f"  {name}: {seconds * 1e3:.1f} ms, {seconds / total:.0%}")
         return
     if chosen.one:
         print(json.dumps(measure(config, chosen.one, chosen.precision)))
