@@ -44,7 +44,7 @@ def opaque(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Path]:
 
 def test_the_option_of_the_page_is_one_field_of_a_settings_class() -> None:
     scope: dict[str, object] = {}
-    exec(f"from dataclasses import field\n{OPTION}", scope)
+    exec(f"from gsencoder.core.settings import option\n{OPTION}", scope)
     cls = make_dataclass("Toy", [("views", int, scope["views"])], bases=(CommonConfig,), frozen=True, kw_only=True)
     assert [item.name for item in fields(cls)] == ["out", "overwrite", "preset", "quiet", "views"]
     assert compose("toy", cls, ["views=3"]) == cls(views=3)
@@ -66,6 +66,6 @@ def test_the_command_of_the_page_runs_as_it_says(opaque: Path, capsys: pytest.Ca
 
 def test_the_command_of_the_page_refuses_what_it_says(opaque: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["opaque", "room.ply", "min_opacity=2"]) == 2
-    assert capsys.readouterr().err == "error: min_opacity: expected a number from 0 to 1, got 2.0\n"
+    assert capsys.readouterr().err == "error: min_opacity: expected 0 or more and at most 1, got 2.0\n"
     assert cli.main(["opaque"]) == 2
     assert capsys.readouterr().err == "error: SPLAT is missing: splat files\n"
