@@ -22,7 +22,7 @@ from json_option import add_json_option, write_figures
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.evaluate.protocols.naming import compare_names, naming_scores
+from gsencoder.evaluate.benchmarks.naming import compare_names, naming_scores
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.load import load_encoder
 from gsencoder.memory.bank import MapStream, build_bank, memory_of_features
@@ -100,7 +100,7 @@ def main() -> None:
             made["per scene, queries of 16, optimized"] = (memory.features(), 32)
             seconds["per scene, queries of 16, optimized"].append(time.perf_counter() - start)
         for key, (features, size) in made.items():
-            counts = compare_names(scene.name, truth, features, teacher, {})
+            counts = compare_names(truth, features, teacher)
             results[key].append((counts, size))
     print(
         "| features | names | centered cosine with fused | bytes a Gaussian | seconds a room |\n|---|---|---|---|---|"

@@ -19,28 +19,28 @@ import test_flipped_bits
 
 from gsencoder.core import archive
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.captions import read_texts, read_view_captions
 from gsencoder.data.labels.classes import read_class_list, read_label_map
 from gsencoder.data.labels.expressions import read_nr3d, read_scanrefer
 from gsencoder.data.labels.files import read_mask, read_split, read_whole_numbers
-from gsencoder.data.labels.mesh import read_mesh, read_vertex_labels
-from gsencoder.data.labels.questions import Question, read_scanqa, read_sqa3d
+from gsencoder.data.labels.mesh import read_mesh
+from gsencoder.data.labels.questions import Question
+from gsencoder.data.labels.questions import read_questions as read_labeled_questions
 from gsencoder.data.labels.scans import read_axis_alignment, read_groups, read_segments
 from gsencoder.data.readers.transforms_json import read_cameras, read_objects
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.splats.files import gaussians_from_raw, load_splat, read_raw
 from gsencoder.data.splats.repair import inspect_splat, repair_splat
 from gsencoder.evaluate.benchmarks.answers import read_answer_predictions
-from gsencoder.evaluate.benchmarks.instances import read_instance_prediction, read_instance_truth
+from gsencoder.evaluate.benchmarks.instances import read_instance_ids, read_instance_prediction
 from gsencoder.evaluate.benchmarks.recognition import (
+    read_recognition_labels,
     read_recognition_predictions,
-    read_recognition_truth,
 )
 from gsencoder.evaluate.benchmarks.referring import (
+    read_referring_labels,
     read_referring_predictions,
-    read_referring_truth,
 )
-from gsencoder.evaluate.benchmarks.retrieval import read_scored_pairs
+from gsencoder.evaluate.benchmarks.retrieval import read_scored_pairs, read_texts, read_view_captions
 from gsencoder.infer.ask.questions import read_answers, read_questions
 from gsencoder.types import Scene
 
@@ -163,7 +163,7 @@ def npz(path: Path, **arrays: Any) -> bytes:
 def mesh(folder: Path, *, text: bool) -> Sample:
     faces = np.array([[0, 1, 2], [3, 4, 5]])
     path = labeled_scans.write_ply(folder / "m.ply", VERTICES, faces, labels=np.arange(6), text=text)
-    return Sample((path,), lambda: (read_mesh(path), read_vertex_labels(path)))
+    return Sample((path,), lambda: read_mesh(path))
 
 
 def instances(folder: Path) -> Sample:
@@ -183,9 +183,10 @@ def sqa3d(folder: Path) -> Sample:
         "position": {"x": 0.5, "y": 0.5, "z": 0},
         "rotation": {"_x": 0, "_y": 0, "_z": 0.6, "_w": 0.8},
     }
-    (folder / "q.json").write_text(json.dumps({"questions": [question]}))
-    (folder / "a.json").write_text(json.dumps({"annotations": [answer]}))
-    return Sample((folder / "q.json", folder / "a.json"), lambda: read_sqa3d(folder / "q.json", folder / "a.json"))
+    files = folder / "questions.json", folder / "sqa_annotations.json"
+    files[0].write_text(json.dumps({"questions": [question]}))
+    files[1].write_text(json.dumps({"annotations": [answer]}))
+    return Sample(files, lambda: read_labeled_questions(files[0]))
 
 
 KEY = {"scene_id": "s0", "object_id": "3", "ann_id": "0"}
@@ -229,7 +230,7 @@ KINDS: dict[str, Callable[[Path], Sample]] = {
     "split": lambda f: one(f, "s.txt", "scene0011_00\nscene0011_01\n", read_split),
     "whole numbers": lambda f: one(f, "n.txt", "4001\n4002\n0\n5001\n", read_whole_numbers),
     "mask of numbers": lambda f: one(f, "n.txt", "0\n1\n1\n0\n", read_mask),
-    "instance truth": lambda f: one(f, "s0.txt", "4001\n4001\n0\n5001\n", read_instance_truth),
+    "instance truth": lambda f: one(f, "s0.txt", "4001\n4001\n0\n5001\n", read_instance_ids),
     "instance predictions": instances,
     "instance predictions, npz": lambda f: one(
         f,
@@ -239,15 +240,15 @@ KINDS: dict[str, Callable[[Path], Sample]] = {
     ),
     "ScanRefer": lambda f: one(f, "s.json", [SENTENCE, SENTENCE | {"ann_id": "1"}], read_scanrefer),
     "Nr3D": lambda f: one(f, "nr3d.csv", NR3D, read_nr3d),
-    "sentences, truth": lambda f: one(f, "t.json", [SENTENCE], read_referring_truth),
+    "sentences, truth": lambda f: one(f, "t.json", [SENTENCE], read_referring_labels),
     "sentences, predictions": lambda f: one(f, "p.json", [PREDICTED], read_referring_predictions),
     "names, truth": lambda f: one(
-        f, "t.json", [{"scene_id": "s0", "object_id": 3, "label": "chair"}], read_recognition_truth
+        f, "t.json", [{"scene_id": "s0", "object_id": 3, "label": "chair"}], read_recognition_labels
     ),
     "names, predictions": lambda f: one(
         f, "p.json", [{"scene_id": "s0", "object_id": 3, "labels": ["chair", "bed"]}], read_recognition_predictions
     ),
-    "ScanQA": lambda f: one(f, "q.json", [SCANQA], read_scanqa),
+    "ScanQA": lambda f: one(f, "q.json", [SCANQA], read_labeled_questions),
     "SQA3D": sqa3d,
     "answers": lambda f: one(
         f,

@@ -11,7 +11,7 @@ from json_option import add_json_option, write_figures
 
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
+from gsencoder.evaluate.benchmarks.localization import LocalizationProtocol, score_queries, scores
 from gsencoder.evaluate.sources import fusion_source, with_features
 from gsencoder.fusion.package import PACKAGE_FILE, open_package, save_package
 from gsencoder.infer.localize import LocalizeConfig

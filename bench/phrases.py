@@ -24,7 +24,7 @@ from sklearn.metrics import roc_auc_score
 from gsencoder.core.errors import SceneWarning
 from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import seed
-from gsencoder.evaluate.boxes import aabb_iou
+from gsencoder.evaluate.benchmarks.localization import aabb_iou
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.teachers.build import build_teacher

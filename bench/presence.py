@@ -20,7 +20,7 @@ from errors import existing_folder, one_line_errors
 from presence_evidence import KEYS
 
 from gsencoder.core.errors import InputError, listed
-from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error, reliability
+from gsencoder.evaluate.benchmarks.absent import auroc, auroc_standard_error, calibration_error, reliability
 
 WITHOUT_RIVALS = tuple(key for key in KEYS if key != "margin")
 

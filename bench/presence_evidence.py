@@ -22,7 +22,7 @@ from gsencoder.core.errors import listed
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.protocols.absent import AbsentProtocol, names_of, words_to_ask
+from gsencoder.evaluate.benchmarks.absent import AbsentProtocol, names_of, words_to_ask
 from gsencoder.evaluate.sources import encoder_source, fusion_source, with_features
 from gsencoder.infer.load import load_encoder
 from gsencoder.infer.localize import find_candidates

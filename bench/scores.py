@@ -21,7 +21,6 @@ from gsencoder.data.labels.classes import ClassTable
 from gsencoder.data.labels.files import write_whole_numbers
 from gsencoder.evaluate.benchmarks.instances import (
     InstancePrediction,
-    InstanceTruth,
     instance_scores,
     match_instance_files,
     match_instances,
@@ -39,7 +38,7 @@ CLASSES = ClassTable(
 FILE_SCENES = 3
 
 
-def random_scene(seed: int, instances: int, mask: int) -> tuple[InstanceTruth, InstancePrediction]:
+def random_scene(seed: int, instances: int, mask: int) -> tuple[np.ndarray, InstancePrediction]:
     """A scene of `instances` runs of `mask` vertices, and as many masks of as many vertices."""
     vertices = instances * mask
     rng = np.random.default_rng(seed)
@@ -50,12 +49,11 @@ def random_scene(seed: int, instances: int, mask: int) -> tuple[InstanceTruth, I
     prediction = InstancePrediction(
         scene=f"scene{seed:04d}_00",
         num_vertices=vertices,
-        vertices=(begins[:, None] + np.arange(mask)).ravel(),
-        offsets=np.arange(instances + 1) * mask,
+        masks=tuple(begins[:, None] + np.arange(mask)),
         labels=np.where(rng.random(instances) < 0.7, labels, rng.integers(1, 199, instances)),
         scores=rng.random(instances),
     )
-    return InstanceTruth(scene=prediction.scene, ids=ids), prediction
+    return ids, prediction
 
 
 def main() -> None:
@@ -70,9 +68,9 @@ def main() -> None:
     for mask in kinds:
         matches, seconds = [], 0.0
         for seed in range(options.scenes):
-            truth, made = random_scene(seed, options.instances, mask)
+            ids, made = random_scene(seed, options.instances, mask)
             start = time.perf_counter()
-            matches.append(match_instances(truth, replace(made), CLASSES))
+            matches.append(match_instances(ids, replace(made), CLASSES))
             seconds += time.perf_counter() - start
         start = time.perf_counter()
         scores = instance_scores(matches, CLASSES)
@@ -88,9 +86,9 @@ def main() -> None:
             for folder in folders:
                 folder.mkdir(parents=True)
             for seed in range(FILE_SCENES):
-                truth, prediction = random_scene(seed, options.instances, kinds[0])
+                ids, prediction = random_scene(seed, options.instances, kinds[0])
                 write_instance_prediction(folders[0], prediction, form=form)
-                write_whole_numbers(folders[1] / f"{truth.scene}.txt", truth.ids)
+                write_whole_numbers(folders[1] / f"{prediction.scene}.txt", ids)
             start = time.perf_counter()
             instance_scores(list(match_instance_files(*folders, CLASSES)), CLASSES)
             seconds = (time.perf_counter() - start) / FILE_SCENES

@@ -42,7 +42,7 @@ from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.evaluate.boxes import is_seen, queryable_objects, score_boxes
+from gsencoder.evaluate.benchmarks.localization import is_seen, queryable_objects, score_boxes
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.lift import VisibilityConfig, keep_visible
 from gsencoder.infer.load import load_encoder

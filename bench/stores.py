@@ -25,8 +25,7 @@ from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.evaluate.boxes import Hit
-from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
+from gsencoder.evaluate.benchmarks.localization import Hit, LocalizationProtocol, score_queries, scores
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import FEATURES_FILE, MEMORY_FILE, load_features, save_features, save_memories
 from gsencoder.fusion.fuse import FuseConfig, fuse

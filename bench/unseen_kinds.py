@@ -40,8 +40,8 @@ from gsencoder.core.errors import InputError, SceneWarning, listed
 from gsencoder.core.process import retain_freed_memory
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.boxes import aabb_iou, queryable_objects
-from gsencoder.evaluate.protocols.absent import auroc, auroc_standard_error, calibration_error, names_of
+from gsencoder.evaluate.benchmarks.absent import auroc, auroc_standard_error, calibration_error, names_of
+from gsencoder.evaluate.benchmarks.localization import aabb_iou, queryable_objects
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, table_beside, with_features
 from gsencoder.infer.load import load_encoder
 from gsencoder.infer.localize import LocalizeConfig, localize

@@ -21,7 +21,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.pretrained import find_file
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.evaluate.boxes import queryable_objects
+from gsencoder.evaluate.benchmarks.localization import queryable_objects
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.localize import localize
 from gsencoder.infer.views.candidates import FreeSpace

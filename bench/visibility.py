@@ -18,8 +18,7 @@ from gsencoder.core.errors import SceneWarning
 from gsencoder.core.files import csv_text
 from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
-from gsencoder.evaluate.boxes import Hit
-from gsencoder.evaluate.protocols.localization import LocalizationProtocol, score_queries, scores
+from gsencoder.evaluate.benchmarks.localization import Hit, LocalizationProtocol, score_queries, scores
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import VisibilityConfig
 from gsencoder.infer.localize import LocalizeConfig

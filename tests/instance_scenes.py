@@ -6,7 +6,6 @@ from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.benchmarks.instances import (
     InstancePrediction,
     InstanceScores,
-    InstanceTruth,
     instance_scores,
     match_instances,
     prediction_of_masks,
@@ -21,12 +20,12 @@ Mask = tuple[int, int, int, float]
 """First vertex, one past the last, class id, score."""
 
 
-def truth_of(*parts: tuple[int, int, int], scene: str = "a") -> InstanceTruth:
+def truth_of(*parts: tuple[int, int, int]) -> np.ndarray:
     """A scene of 2,000 vertices with runs of vertices (first, one past the last, id); the others have the id 0."""
     ids = np.zeros(VERTICES, np.int64)
     for first, last, number in parts:
         ids[first:last] = number
-    return InstanceTruth(scene=scene, ids=ids)
+    return ids
 
 
 def masks_of(*masks: Mask, scene: str = "a") -> InstancePrediction:
@@ -40,7 +39,7 @@ def masks_of(*masks: Mask, scene: str = "a") -> InstancePrediction:
     )
 
 
-def scored(truth: InstanceTruth, *masks: Mask, class_agnostic: bool = False) -> InstanceScores:
+def scored(truth: np.ndarray, *masks: Mask, class_agnostic: bool = False) -> InstanceScores:
     matches = match_instances(truth, masks_of(*masks), CLASSES, class_agnostic=class_agnostic)
     return instance_scores([matches], CLASSES)
 

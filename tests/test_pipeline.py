@@ -12,7 +12,7 @@ import pytest
 from gsencoder.app import main as cli
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.splats.files import load_splat
-from gsencoder.evaluate.boxes import aabb_iou
+from gsencoder.evaluate.benchmarks.localization import aabb_iou
 from gsencoder.fusion.folder import load_features
 
 pytestmark = pytest.mark.slow

@@ -11,8 +11,9 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files import plain
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.evaluate.boxes import aabb_iou
-from gsencoder.evaluate.protocols.naming import evaluate_naming, naming_scores
+from gsencoder.evaluate.benchmarks.localization import aabb_iou
+from gsencoder.evaluate.benchmarks.naming import NamingProtocol, naming_scores
+from gsencoder.evaluate.benchmarks.protocol import Evaluation
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import load_tables
 from gsencoder.infer.chunks import EncodeConfig
@@ -85,8 +86,8 @@ def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path, na
     accuracies, features = [], []
     for chunk in (0, 40_000):
         given = encoder.encode(scene.gaussians, EncodeConfig(chunk=chunk), space="labels")
-        named = evaluate_naming([(scene, 0.0)], lambda _, given=given: (given, {}), words)
-        accuracies.append(naming_scores(named)["accuracy"])
+        counts = NamingProtocol().start(Evaluation(words=words)).predict(scene, given)
+        accuracies.append(naming_scores([counts])["accuracy"])
         features.append(given)
     assert accuracies[0] >= 0.7
     assert accuracies[1] >= accuracies[0] - 0.01

@@ -247,30 +247,6 @@ def report_words(folder: Path, scene: Scene, localization: Localization, summary
     report.write(folder / REPORT)
 
 
-def report_scores(folder: Path, summary: Summary) -> None:
-    """Writes the page of an evaluation: its scores, of all scenes and names, and of each.
-
-    Args:
-        summary: of the command, with the results of a protocol.
-    """
-    results = summary.results
-    report = HtmlReport(f"Evaluation: {results['protocol']}")
-    _facts(report, {name: value for name, value in results.items() if _is_figure(value)}, summary)
-    names = results["names"]
-    if names:
-        report.section("Names", "The hardest first.")
-        columns = _columns(next(iter(names.values())))
-        report.table(("name", *columns), [(name, *(row[column] for column in columns)) for name, row in names.items()])
-    scenes = [scene for scene in results["scenes"] if isinstance(scene, Mapping)]
-    if scenes:
-        report.section("Scenes")
-        columns = _columns(scenes[0])
-        rows = [(scene["scene"], *(scene.get(column, "–") for column in columns)) for scene in scenes]
-        report.table(("scene", *columns), rows)
-    _timings(report, summary)
-    report.write(folder / REPORT)
-
-
 def report_benchmark(folder: Path, scores: ScoreReport, summary: Summary) -> None:
     """Writes the page of a benchmark: measured rows above those of papers, and the rows by scene and class."""
     table = scores.table.without_classes()
@@ -308,7 +284,3 @@ def _timings(report: HtmlReport, summary: Summary) -> None:
 
 def _is_figure(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _columns(row: Mapping[str, Any]) -> list[str]:
-    return [name for name, value in row.items() if _is_figure(value)]

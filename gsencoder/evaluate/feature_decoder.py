@@ -16,7 +16,8 @@ from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import EXTRA, load_companion, load_pretrained, quiet_transformers
-from gsencoder.evaluate.benchmarks.retrieval import Pooling, view_scores
+from gsencoder.evaluate.benchmarks.files import Pooling
+from gsencoder.evaluate.benchmarks.retrieval import view_scores
 
 LABEL = "captions"
 CONNECTORS = ("connector", "multi_modal_projector")

@@ -31,14 +31,6 @@ def test_a_command_without_work_to_share_says_so(
     assert not out.exists()
 
 
-@pytest.mark.parametrize("protocol", ["localization", "naming", "absent", "grounding"])
-def test_a_protocol_that_processes_do_not_share_says_so_before_anything_is_read(
-    protocol: str, second_of_three: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    line = refusal(capsys, "evaluate", str(tmp_path / "none"), f"protocol={protocol}", "teacher.words=none")
-    assert line.startswith(f"error: protocol={protocol}: runs in one process, and this is process 1 of 3")
-
-
 def test_one_scene_is_not_for_several_processes(
     second_of_three: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,19 +6,18 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.protocols.absent import (
+from gsencoder.evaluate.benchmarks.absent import (
     AbsentProtocol,
     AskedWord,
-    SceneWords,
     absent_scores,
     auroc,
     auroc_standard_error,
     calibration_error,
-    names_of,
     probabilities_by_word,
     reliability,
     words_to_ask,
 )
+from gsencoder.evaluate.benchmarks.protocol import names_of
 from gsencoder.types import Scene, SceneObject
 
 
@@ -29,12 +28,12 @@ def thing(name: str | None, views: int = 9, max_pixels: int = 900, *, placed: bo
     )
 
 
-def asked(scene: str, word: str, present: bool, probability: float) -> AskedWord:
-    return AskedWord(scene=scene, word=word, present=present, probability=probability, boxed=probability >= 0.5)
+def asked(word: str, present: bool, probability: float) -> AskedWord:
+    return AskedWord(word=word, present=present, probability=probability, boxed=probability >= 0.5)
 
 
-def scene_of(name: str, *rows: tuple[str, bool, float]) -> SceneWords:
-    return SceneWords(scene=name, words=tuple(asked(name, *row) for row in rows), seconds={})
+def scene_of(*rows: tuple[str, bool, float]) -> tuple[AskedWord, ...]:
+    return tuple(asked(*row) for row in rows)
 
 
 def test_words_hardly_seen_are_neither_present_nor_absent() -> None:
@@ -108,8 +107,8 @@ def test_the_calibration_error_averages_the_bins_by_their_words() -> None:
 
 def test_the_scores_of_scenes_are_those_of_all_their_words() -> None:
     scenes = [
-        scene_of("a", ("mug", True, 0.9), ("lamp", False, 0.1)),
-        scene_of("b", ("lamp", True, 0.4), ("mug", False, 0.6)),
+        scene_of(("mug", True, 0.9), ("lamp", False, 0.1)),
+        scene_of(("lamp", True, 0.4), ("mug", False, 0.6)),
     ]
     scores = absent_scores(scenes)
     assert (scores["present"], scores["absent"]) == (2, 2)
@@ -120,7 +119,7 @@ def test_the_scores_of_scenes_are_those_of_all_their_words() -> None:
 
 
 def test_words_that_are_told_least_apart_come_first() -> None:
-    scenes = [scene_of("a", ("mug", True, 0.9), ("lamp", False, 0.1)), scene_of("b", ("mug", False, 0.6))]
+    scenes = [scene_of(("mug", True, 0.9), ("lamp", False, 0.1)), scene_of(("mug", False, 0.6))]
     table = probabilities_by_word(scenes)
     assert list(table) == ["mug", "lamp"]
     assert table["mug"] == {
@@ -132,7 +131,7 @@ def test_words_that_are_told_least_apart_come_first() -> None:
 def test_scores_need_words_of_both_kinds() -> None:
     for present in (True, False):
         with pytest.raises(InputError, match="present and words that are absent, got"):
-            absent_scores([scene_of("a", ("mug", present, 0.5))])
+            absent_scores([scene_of(("mug", present, 0.5))])
 
 
 def test_a_protocol_out_of_range_is_named() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.protocols.grounding import GroundedPair, ground, grounding_scores, otsu_threshold
+from gsencoder.evaluate.benchmarks.grounding import GroundedPair, ground, grounding_scores, otsu_threshold
 
 
 def best_variance(values: np.ndarray) -> tuple[float, list[float]]:

@@ -15,16 +15,16 @@ from rooms import room
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.evaluate.protocols.grounding import (
+from gsencoder.evaluate.benchmarks.grounding import (
     GroundedPair,
     GroundingProtocol,
-    evaluate_grounding,
     ground_scene,
     ids_by_name,
     masks_of,
     phrase_mean,
     scores_by_phrase,
 )
+from gsencoder.evaluate.benchmarks.protocol import Evaluation, predict_scenes
 from gsencoder.memory.bank import memory_of_features
 from gsencoder.render import blend
 from gsencoder.text.table import make_text_table
@@ -137,14 +137,17 @@ def test_scenes_without_labels_and_words_of_other_spaces_are_refused() -> None:
     def source(_: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         return features, {}
 
-    (result,) = evaluate_grounding([(scene, 0.5)], source, WORDS, protocol=GroundingProtocol(min_pixels=5))
+    benchmark = GroundingProtocol(min_pixels=5).start(Evaluation(words=WORDS))
+    (result,) = predict_scenes(benchmark, [(scene, 0.5)], source)
     assert result.seconds["load"] == 0.5
     assert result.gaussians == len(features)
     for bad in (replace(scene, objects=()), replace(scene, views=None)):
         with pytest.raises(InputError, match="needs views with instance maps"):
-            evaluate_grounding([(bad, 0.0)], source, WORDS)
+            predict_scenes(benchmark, [(bad, 0.0)], source)
+    large = GroundingProtocol(min_pixels=100000).start(Evaluation(words=WORDS))
+    results = predict_scenes(large, [(scene, 0.0)], source)
     with pytest.raises(InputError, match="no view of 1 scenes shows a named object with 100000 pixels"):
-        evaluate_grounding([(scene, 0.0)], source, WORDS, protocol=GroundingProtocol(min_pixels=100000))
+        large.report(results)
     other = make_text_table(["wall", "mug"], np.eye(2, dtype=np.float32), "others")
     with pytest.raises(InputError, match="use the text encoder 'words'"):
         ground_scene(scene, features, other)

@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.captions import ViewCaption, read_texts, read_view_captions, write_view_captions
+from gsencoder.evaluate.benchmarks.files import ScoreOptions
 from gsencoder.evaluate.benchmarks.retrieval import (
     ScoredPairs,
-    image_to_text,
-    read_scored_pairs,
+    ViewCaption,
+    read_texts,
+    read_view_captions,
     retrieve,
-    score_retrieval,
-    text_to_image,
+    score,
     write_scored_pairs,
+    write_view_captions,
 )
 
 NAMES = [f"room/frame_{number}" for number in range(7)]
@@ -59,24 +60,6 @@ def test_a_score_that_is_not_finite_comes_last() -> None:
     assert there.not_finite == back.not_finite == 1
 
 
-@pytest.mark.parametrize("count", [0, 5])
-@pytest.mark.parametrize("pooling", ["max", "mean"])
-def test_features_in_a_file_have_the_ranks_that_the_functions_for_features_give(
-    count: int, pooling: Any, tmp_path: Path
-) -> None:
-    views, texts = vectors(7, 4, 6, seed=0), vectors(7, 6, seed=1)
-    more, others = vectors(20, 6, seed=2), vectors(30, 3, 6, seed=3)
-    arrays = {"views": views, "texts": texts, "text_distractors": more, "view_distractors": others}
-    np.savez(tmp_path / "a.npz", queries=np.array(NAMES), **arrays)
-    sides = retrieve(read_scored_pairs(tmp_path / "a.npz", pooling=pooling), list("abcdefg"), count=count, seed=4)
-    options = {"seed": 4, "pooling": pooling}
-    there = image_to_text(NAMES, list(views), texts, more, count=count or 20, **options)
-    back = text_to_image(NAMES, texts, list(views), others, count=count or 30, **options)
-    for side, expected in zip(sides, (there, back), strict=True):
-        assert side.ranks.tolist() == expected.ranks.tolist()
-        assert side.distractors == expected.distractors
-
-
 def test_the_order_of_queries_in_the_file_does_not_matter(tmp_path: Path) -> None:
     truth = captions(tmp_path, [f"text {number}" for number in range(7)])
     pairs = scored(vectors(7, 9, seed=5), vectors(4, 7, seed=6))
@@ -89,7 +72,7 @@ def test_the_order_of_queries_in_the_file_does_not_matter(tmp_path: Path) -> Non
     reports = []
     for name, each in (("a", pairs), ("b", turned)):
         write_scored_pairs(tmp_path / f"{name}.npz", each)
-        reports.append(score_retrieval(tmp_path / f"{name}.npz", truth))
+        reports.append(score(tmp_path / f"{name}.npz", truth, ScoreOptions()))
     assert reports[0].results == reports[1].results
     assert reports[0].rows == reports[1].rows
     assert reports[0].results["pools"] == {
@@ -119,7 +102,7 @@ def test_predictions_that_do_not_fit_are_refused(arrays: dict[str, Any], message
     count = len(next(iter(arrays.values()), "abc"))
     np.savez(tmp_path / "a.npz", **{"queries": np.array(NAMES[:count])} | arrays)
     with pytest.raises(InputError, match=message) as error:
-        score_retrieval(tmp_path / "a.npz", truth)
+        score(tmp_path / "a.npz", truth, ScoreOptions())
     assert str(tmp_path / "a.npz") in str(error.value)
 
 
@@ -127,11 +110,11 @@ def test_swapped_files_and_more_distractors_than_there_are_are_refused(tmp_path:
     truth = captions(tmp_path, ["a", "b"])
     write_scored_pairs(tmp_path / "a.npz", scored(np.ones((2, 5))))
     with pytest.raises(InputError, match="expected an .npz with queries and scores"):
-        score_retrieval(truth, truth)
+        score(truth, truth, ScoreOptions())
     with pytest.raises(InputError, match="is an archive"):
-        score_retrieval(tmp_path / "a.npz", tmp_path / "a.npz")
+        score(tmp_path / "a.npz", tmp_path / "a.npz", ScoreOptions())
     with pytest.raises(InputError, match="4 distractors are asked for, and there are 3"):
-        score_retrieval(tmp_path / "a.npz", truth, count=4)
+        score(tmp_path / "a.npz", truth, ScoreOptions(distractors=4))
 
 
 @pytest.mark.parametrize(

@@ -151,7 +151,7 @@ def test_captions_that_do_not_fit_are_refused_before_features_are_made(
         (tmp_path / "c.json").write_text(json.dumps(rows))
         return f"protocol.captions={tmp_path / 'c.json'}"
 
-    monkeypatch.setattr("gsencoder.evaluate.benchmarks.retrieval.with_features", None)
+    monkeypatch.setattr("gsencoder.evaluate.benchmarks.protocol.with_features", None)
     assert "protocol.captions= is missing" in refused()
     hall = {"scene_id": "hall", "view": "1", "caption": "wall"}
     assert "none of the captions in " in refused(write(hall))

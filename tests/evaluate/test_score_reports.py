@@ -9,18 +9,12 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.classes import ClassTable, write_classes
 from gsencoder.data.labels.files import write_whole_numbers
-from gsencoder.evaluate.benchmarks.instances import prediction_of_masks, write_instance_prediction
-from gsencoder.evaluate.benchmarks.referring import score_referring
-from gsencoder.evaluate.benchmarks.score import (
-    EQUAL_SCORES,
-    score_answer_files,
-    score_caption_files,
-    score_instances,
-    score_recognition,
-    score_semantics,
-)
+from gsencoder.evaluate.benchmarks import answers, captions, recognition, referring
+from gsencoder.evaluate.benchmarks.files import ScoreOptions
+from gsencoder.evaluate.benchmarks.instances import prediction_of_masks, score_instances, write_instance_prediction
+from gsencoder.evaluate.benchmarks.semantics import score_semantics
 from gsencoder.evaluate.tables import spread
 
 CLASSES = ClassTable(
@@ -87,7 +81,7 @@ def test_average_precision_is_reported_by_threshold_class_group_and_scene(tmp_pa
     assert results["ap"] == pytest.approx(((1 + 8 / 2) / 9 + 0) / 2)
     assert (results["ap_head"], results["ap_tail"]) == (pytest.approx(5 / 9), 0)
     assert (results["truths"], results["predictions"], results["other_classes"]) == (3, 3, 1)
-    assert (results["min_region"], results["class_agnostic"], results["equal_scores"]) == (100, False, False)
+    assert (results["class_agnostic"], results["equal_scores"]) == (False, False)
     assert results["thresholds"] == [0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.25]
     assert table(report) == {
         "mine": pytest.approx({"ap_25": 100, "ap_50": 50, "ap": 250 / 9, "ap_head": 500 / 9, "ap_tail": 0})
@@ -115,14 +109,15 @@ def test_equal_scores_masks_over_several_objects_and_smaller_regions_are_told(tm
     folders = instance_folders(tmp_path, truths, {"a": [(40, 160, 5, 1.0), (0, 100, 5, 1.0)]})
     report = score_instances(*folders, CLASSES, class_agnostic=True)
     assert [row.source for row in report.table.rows] == ["measured"]
-    assert report.table.notes[0] == EQUAL_SCORES
+    assert report.table.notes[0].startswith("All predictions have one score")
     assert report.table.notes[1].startswith("All masks are of one class")
     assert report.table.notes[2].startswith(
         "Of the masks 1 overlap several true objects by more than 0.25; AP at 0.25 depends"
     )
     assert report.line.endswith(" without classes")
-    with pytest.raises(InputError, match="no object of the 3 classes has 101 vertices or more in 1 scene"):
-        score_instances(*folders, CLASSES, min_region=101)
+    write_whole_numbers(folders[1] / "a.txt", np.repeat([4001, 0], [99, 901]))
+    with pytest.raises(InputError, match="no object of the 3 classes has 100 vertices or more in 1 scene"):
+        score_instances(*folders, CLASSES)
 
 
 # Labels
@@ -158,12 +153,18 @@ def test_iou_and_accuracy_are_reported_over_all_classes_and_the_foreground(tmp_p
     )
     assert table(report)["mine"]["f_miou"] == pytest.approx(100 * results["f_miou"])
     assert report.line == "6 labels in 2 scenes: mIoU 0.556, mAcc 0.722, f-mIoU 0.583; 1 without a prediction"
-    all_in = score_semantics(tmp_path / "predictions", tmp_path / "truth", CLASSES, excluded=(), scenes=["a"])
-    assert all_in.results["f_miou"] == all_in.results["miou"] == first["miou"]
-    assert all_in.table.notes == ()
+    furniture = CLASSES.without(("wall",))
+    all_in = score_semantics(tmp_path / "predictions", tmp_path / "truth", furniture, scenes=["a"])
+    assert all_in.results["f_miou"] == all_in.results["miou"]
+    assert all_in.table.notes[0].startswith("1 of 3 vertices")
 
 
 # Recognition
+
+
+def classes_file(folder: Path, *names: str) -> str:
+    write_classes(folder / "c.csv", ClassTable(names=names, ids=tuple(range(len(names)))))
+    return str(folder / "c.csv")
 
 
 def test_recognition_is_reported_for_each_k_by_class_and_scene(tmp_path: Path) -> None:
@@ -172,29 +173,28 @@ def test_recognition_is_reported_for_each_k_by_class_and_scene(tmp_path: Path) -
     truth = written(tmp_path / "truth.json", [{"scene_id": s, "object_id": o, "label": n} for s, o, n in names])
     rows = [{"scene_id": s, "object_id": o, "labels": r} for (s, o, _), r in zip(names, ranked, strict=True)]
     predictions = written(tmp_path / "predictions.json", rows)
-    report = score_recognition(predictions, truth, method="mine", ks=(2, 1, 3))
+    report = recognition.score(predictions, truth, ScoreOptions(method="mine"))
     results = report.results
     # Beds: places 1, 2, none. Chairs: place 3. Lamps: place 1.
     assert (results["mean_1"], results["overall_1"]) == (pytest.approx((1 / 3 + 0 + 1) / 3), pytest.approx(2 / 5))
-    assert (results["mean_2"], results["overall_2"]) == (pytest.approx((2 / 3 + 0 + 1) / 3), pytest.approx(3 / 5))
-    assert (results["mean_3"], results["overall_3"]) == (pytest.approx((2 / 3 + 1 + 1) / 3), pytest.approx(4 / 5))
+    assert (results["mean_5"], results["overall_5"]) == (pytest.approx((2 / 3 + 1 + 1) / 3), pytest.approx(4 / 5))
     assert (results["objects"], results["unanswered"], results["other_classes"]) == (5, 1, 0)
-    # The table has the first of the ks.
-    assert report.table.title == "Recognition of given objects, top-2"
-    assert table(report)["mine"] == pytest.approx({"mean": 500 / 9, "bed": 200 / 3, "chair": 0, "lamp": 100})
-    assert report.rows["scenes"][0] == {"scene": "s", "objects": 2, "top_2": 1.0, "top_1": 0.5, "top_3": 1.0}
+    assert table(report)["mine"] == pytest.approx({"mean": 400 / 9, "bed": 100 / 3, "chair": 0, "lamp": 100})
+    assert report.rows["scenes"][0] == {"scene": "s", "objects": 2, "top_1": 0.5, "top_5": 1.0}
     assert report.rows["classes"][0] == {"class": "bed", "objects": 3} | {
-        f"top_{k}": pytest.approx(share) for k, share in ((1, 1 / 3), (2, 2 / 3), (3, 2 / 3))
+        f"top_{k}": pytest.approx(share) for k, share in ((1, 1 / 3), (5, 2 / 3))
     }
     assert results["spread"]["top_1"]["mean"] == pytest.approx((1 / 2 + 1 / 3) / 2)
-    assert report.line.endswith("top-2 0.556 (0.600), top-1 0.444 (0.400), top-3 0.889 (0.800)")
+    assert report.line.endswith("top-1 0.444 (0.400), top-5 0.889 (0.800)")
     # Classes that are given leave out the others, and keep those without objects.
     with pytest.raises(InputError, match="is predicted as 'lamp', which is no class"):
-        score_recognition(predictions, truth, classes=["bed", "chair"])
+        recognition.score(predictions, truth, ScoreOptions(classes=classes_file(tmp_path, "bed", "chair")))
+    others = ScoreOptions(classes=classes_file(tmp_path, "a", "b", "c"))
     with pytest.raises(InputError, match="nothing to score: it holds no object of the 3 classes"):
-        score_recognition(written(tmp_path / "none.json", []), truth, classes=["a", "b", "c"])
+        recognition.score(written(tmp_path / "none.json", []), truth, others)
     first_file = written(tmp_path / "kept.json", rows[:1])
-    some = score_recognition(first_file, truth, classes=["bed", "chair", "sofa"], allow_missing=True)
+    options = ScoreOptions(classes=classes_file(tmp_path, "bed", "chair", "sofa"), allow_missing=True)
+    some = recognition.score(first_file, truth, options)
     assert (some.results["objects"], some.results["unanswered"], some.results["other_classes"]) == (4, 3, 1)
     assert some.rows["classes"][2]["objects"] == 0
     assert math.isnan(some.rows["classes"][2]["top_1"])
@@ -232,20 +232,19 @@ def test_boxes_of_sentences_are_reported_by_kind_threshold_and_number(tmp_path: 
         for each in truth
     ]
     files = written(tmp_path / "predictions.json", rows), written(tmp_path / "truth.json", truth)
-    report = score_referring(*files, method="mine", ks=(2, 3))
+    report = referring.score(*files, ScoreOptions(method="mine"))
     results = report.results
     assert (results["acc_25"], results["acc_50"]) == (2 / 4, 1 / 4)
     assert (results["sentences"], results["without_box"], results["not_scored"]) == (4, 1, {})
     assert results["thresholds"] == [0.25, 0.5]
     assert results["best_of"] == {
-        "2": {"acc_25": 2 / 4, "acc_50": 1 / 4},
-        "3": {"acc_25": 2 / 4, "acc_50": 2 / 4},
+        "5": {"acc_25": 2 / 4, "acc_50": 2 / 4},
         "all": {"acc_25": 2 / 4, "acc_50": 2 / 4},
     }
     mine = {"acc_25": 50, "acc_50": 25, "unique_25": 100, "unique_50": 100, "multiple_25": 50, "multiple_50": 0}
     best = mine | {"acc_50": 50, "multiple_50": 50}
-    names = ["mine", "mine, best of 2", "mine, best of 3", "mine, best of all"]
-    assert table(report) == dict(zip(names, map(pytest.approx, (mine, mine, best, best)), strict=True))
+    names = ["mine", "mine, best of 5", "mine, best of all"]
+    assert table(report) == dict(zip(names, map(pytest.approx, (mine, best, best)), strict=True))
     assert results["tables"]["top_1"]["multiple"]["overall"] == {"sentences": 2, "acc25": 0.5, "acc50": 0.0}
     assert results["tables"]["best"]["multiple"]["overall"]["acc50"] == 0.5
     assert report.rows["scenes"] == [
@@ -268,23 +267,24 @@ def test_what_is_scored_where_nothing_else_is_asked_for(tmp_path: Path) -> None:
     truth = written(tmp_path / "t.json", [{"scene_id": "s", "object_id": 1, "label": "bed"}])
     ranked = written(tmp_path / "p.json", [{"scene_id": "s", "object_id": 1, "labels": ["bed"]}])
     none = written(tmp_path / "n.json", [])
-    results = score_recognition(ranked, truth).results
+    results = recognition.score(ranked, truth, ScoreOptions()).results
     assert {name for name in results if name.startswith(("mean_", "overall_"))} == {
         f"{kind}_{k}" for kind in ("mean", "overall") for k in (1, 5)
     }
     with pytest.raises(InputError, match="object 1 of s has no prediction"):
-        score_recognition(none, truth)
+        recognition.score(none, truth, ScoreOptions())
     keys = {"scene_id": "s", "object_id": 1, "ann_id": "0"}
     expressions = written(
         tmp_path / "d.json", [keys | {"object_name": "x", "description": "x", "token": [], "bbox": cube(0)}]
     )
-    boxes = score_referring(written(tmp_path / "b.json", [keys | {"bbox": cube(0)}]), expressions)
+    boxes = referring.score(written(tmp_path / "b.json", [keys | {"bbox": cube(0)}]), expressions, ScoreOptions())
     assert set(boxes.results["best_of"]) == {"5", "all"}
     with pytest.raises(InputError, match="sentence 0 about object 1 of s has no prediction"):
-        score_referring(none, expressions)
+        referring.score(none, expressions, ScoreOptions())
     questions = written(tmp_path / "q.json", [{"scene_id": "s", "question_id": "q", "question": "x", "answers": ["a"]}])
     with pytest.raises(InputError, match="1 question without a prediction, first q; allow_missing=true counts"):
-        score_answer_files(none, questions, java=False)
+        answers.score(none, questions, ScoreOptions(java=False))
     with pytest.raises(InputError, match="1 object without a prediction, first 1 of s"):
-        score_caption_files(written(tmp_path / "c.json", {}), expressions, java=False)
-    assert score_caption_files(tmp_path / "c.json", expressions, java=False, allow_missing=True).results["missing"] == 1
+        captions.score(written(tmp_path / "c.json", {}), expressions, ScoreOptions(java=False))
+    silent = captions.score(tmp_path / "c.json", expressions, ScoreOptions(java=False, allow_missing=True))
+    assert silent.results["missing"] == 1

@@ -8,8 +8,15 @@ import pytest
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import csv_text
 from gsencoder.core.process import memory_growth
-from gsencoder.evaluate.boxes import Hit, aabb_iou, accuracy, queryable_objects, score_boxes
-from gsencoder.evaluate.protocols.localization import scores, scores_by_name
+from gsencoder.evaluate.benchmarks.localization import (
+    Hit,
+    aabb_iou,
+    accuracy,
+    queryable_objects,
+    score_boxes,
+    scores,
+    scores_by_name,
+)
 from gsencoder.fusion.errors import field_error
 from gsencoder.types import Box, FeatureBasis, FeatureSpace, GaussianFeatures, Localization, Scene, SceneObject
 

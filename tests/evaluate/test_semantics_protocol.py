@@ -8,8 +8,7 @@ from splats import random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.evaluate.benchmarks.instances import true_instances
-from gsencoder.evaluate.benchmarks.semantics import SemanticsProtocol, predict_semantics, semantic_truth
+from gsencoder.evaluate.benchmarks.semantics import SemanticsProtocol, class_ids, predict_semantics
 from gsencoder.evaluate.sources import LabeledPoints, labeled_points
 from gsencoder.text.table import make_text_table
 from gsencoder.types import GaussianFeatures, Gaussians, MeshLabels, Scene
@@ -84,7 +83,7 @@ def test_vertices_lie_in_the_frame_of_the_gaussians_and_take_masks_from_the_near
     points = labeled_points(Scene(name="s", gaussians=gaussians, origin=origin), mesh)
     assert points.gaussians.tolist() == [0, 1, -1]
     assert points.positions == pytest.approx(mesh.vertices - origin)
-    assert semantic_truth(points, CLASSES).tolist() == [4, 0, 0]
+    assert class_ids(points, CLASSES).tolist() == [4, 0, 0]
 
 
 def test_a_class_may_have_the_id_0_among_labels_and_not_among_instances() -> None:
@@ -93,6 +92,6 @@ def test_a_class_may_have_the_id_0_among_labels_and_not_among_instances() -> Non
     points = points_at(None, 2)
     # Points of no class then have ScanNet++'s ignore label.
     assert predict_semantics(points, gaussians, features, classes, WORDS).tolist() == [0, -100]
-    assert -100 in semantic_truth(points, classes).tolist()
+    assert -100 in class_ids(points, classes).tolist()
     with pytest.raises(InputError, match="classes: 'bed' has the id 0, which files of instances cannot hold"):
-        true_instances(points, classes)
+        classes.check_instance_ids()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from splats import random_gaussians
 
-from gsencoder.app import evaluate_settings as evaluate_sources
+from gsencoder.app.commands import evaluate as evaluate_sources
 from gsencoder.app.main import main
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, space_of_words

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gsencoder.evaluate.benchmarks import answers as answers_of_questions
+from gsencoder.evaluate.benchmarks import captions
 from gsencoder.evaluate.benchmarks import text_metrics as sentences
-from gsencoder.evaluate.benchmarks.score import score_answer_files, score_caption_files
+from gsencoder.evaluate.benchmarks.files import ScoreOptions
 
 
 def written(path: Path, content: Any) -> Path:
@@ -32,7 +34,9 @@ def test_answers_are_reported_by_kind_and_scene_with_what_is_absent(tmp_path: Pa
     answers = {"q0": ["brown"], "q1": ["table", "on the table"], "q2": ["two"], "q3": ["?"]}
     rows = [{"scene_id": "st"[int(key[1]) // 2], "question_id": key, "answer_top10": a} for key, a in answers.items()]
     truth = written(tmp_path / "truth.json", questions)
-    report = score_answer_files(written(tmp_path / "p.json", rows), truth, method="mine", java=False)
+    report = answers_of_questions.score(
+        written(tmp_path / "p.json", rows), truth, ScoreOptions(method="mine", java=False)
+    )
     results = report.results
     figures = {name: results[name] for name in ("em_1", "em_10", "em_cleaned", "em_refined")}
     assert figures == {"em_1": 1 / 4, "em_10": 2 / 4, "em_cleaned": 2 / 4, "em_refined": 1.0}
@@ -49,7 +53,9 @@ def test_answers_are_reported_by_kind_and_scene_with_what_is_absent(tmp_path: Pa
     assert "METEOR is absent: Java was not asked for (java=false)." in report.table.notes
     assert "1 answer without a word once cleaned: right in the refined match." in report.table.notes
     assert len(report.rows["questions"]) == 4
-    single = score_answer_files(written(tmp_path / "p.json", [rows[0]]), truth, java=False, allow_missing=True)
+    single = answers_of_questions.score(
+        written(tmp_path / "p.json", [rows[0]]), truth, ScoreOptions(java=False, allow_missing=True)
+    )
     assert math.isnan(single.results["em_10"])
     assert (single.results["missing"], single.results["em_1"]) == (3, 1 / 4)
     assert single.line.startswith("4 questions, 3 without an answer: EM@1 0.250, refined 0.250, CIDEr ")
@@ -72,7 +78,7 @@ def test_captions_are_reported_with_their_k(tmp_path: Path, min_iou: float, endi
         "t": [{"caption": "a lamp", "box": cube(30)}],
     }
     files = written(tmp_path / "p.json", boxes), written(tmp_path / "t.json", truth)
-    report = score_caption_files(*files, min_iou=min_iou, java=False)
+    report = captions.score(*files, ScoreOptions(min_iou=min_iou, java=False))
     results, (first, second, third) = report.results, report.rows["objects"]
     assert (results["objects"], results["predictions"], results["min_iou"]) == (3, 3, min_iou)
     assert results["missing"] == (2 if min_iou == 0.5 else 1)
@@ -93,7 +99,7 @@ def test_captions_are_reported_with_their_k(tmp_path: Path, min_iou: float, endi
     assert report.table.title == f"Captions at an IoU of {min_iou}"
     assert any(row.source == "published" for row in report.table.rows) is published
     # A k of one half is what is taken where none is given.
-    assert (score_caption_files(*files, java=False).results["missing"] == results["missing"]) is published
+    assert (captions.score(*files, ScoreOptions(java=False)).results["missing"] == results["missing"]) is published
 
 
 def test_java_is_looked_for_unless_it_is_not_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,8 +108,8 @@ def test_java_is_looked_for_unless_it_is_not_asked_for(tmp_path: Path, monkeypat
     truth_file = written(tmp_path / "t.json", questions), [{"question_id": "q", "answer_top10": ["a"]}]
     described = [{"scene_id": "s", "object_id": 1, "object_name": "x", "ann_id": 0, "description": "a", "token": ["a"]}]
     captioned = written(tmp_path / "d.json", described), {"s|1": ["a"]}
-    for score, (truth, rows) in ((score_answer_files, truth_file), (score_caption_files, captioned)):
+    for benchmark, (truth, rows) in ((answers_of_questions, truth_file), (captions, captioned)):
         predictions = written(tmp_path / "p.json", rows)
-        assert score(predictions, truth).results["absent"]["METEOR"] == "there is none"
-        refused = score(predictions, truth, java=False).results["absent"]["METEOR"]
+        assert benchmark.score(predictions, truth, ScoreOptions()).results["absent"]["METEOR"] == "there is none"
+        refused = benchmark.score(predictions, truth, ScoreOptions(java=False)).results["absent"]["METEOR"]
         assert refused == "Java was not asked for (java=false)"

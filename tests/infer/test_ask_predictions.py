@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.labels.captions import wrapped_caption
+from gsencoder.data.labels.expressions import wrapped_caption
 from gsencoder.data.labels.files import box_corners
 from gsencoder.infer.ask.ask import Question
 from gsencoder.infer.ask.batch import answer_text, predictions, short_answer, target_corners

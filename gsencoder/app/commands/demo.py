@@ -16,7 +16,7 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import color_words, make_room, write_room
-from gsencoder.evaluate.boxes import aabb_iou
+from gsencoder.evaluate.benchmarks.localization import aabb_iou
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.infer.draw import write_boxes_ply

@@ -1,310 +1,239 @@
-"""`gsencoder evaluate SCENE… protocol=…`: a metric on labeled scenes, of fused features or of an encoder's."""
+"""`gsencoder evaluate SCENE… protocol=…`: a benchmark on labeled scenes, of fused features or of an encoder's.
 
-from dataclasses import asdict, replace
+Several processes (torchrun, SLURM) share the scenes: each predicts its own, and the first one scores all.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from rich.table import Table
+import numpy as np
 
-from gsencoder.app.evaluate_settings import (
-    EvaluateConfig,
-    scenes_of,
-    source_of_head,
-    stored_features,
-    stored_memory,
-    teacher_or_encoder,
-)
-from gsencoder.app.run import Run
-from gsencoder.core.errors import InputError, about, counted
-from gsencoder.core.files import csv_text, write_bytes
-from gsencoder.core.process import refuse_several
-from gsencoder.data.scenes import check_names, find_scenes
-from gsencoder.evaluate.benchmark_files import BenchmarkProtocol
-from gsencoder.evaluate.benchmarks.retrieval import RetrievalProtocol
-from gsencoder.evaluate.protocols.absent import (
-    AbsentProtocol,
-    absent_scores,
-    evaluate_absent,
-    names_of,
-    probabilities_by_word,
-)
-from gsencoder.evaluate.protocols.grounding import (
-    GroundingProtocol,
-    evaluate_grounding,
-    grounding_scores,
-    phrase_mean,
-    scores_by_phrase,
-)
-from gsencoder.evaluate.protocols.localization import (
-    LocalizationProtocol,
-    SceneOutcome,
-    evaluate_localization,
-    scores,
-    scores_by_name,
-)
-from gsencoder.evaluate.protocols.naming import NamingProtocol, evaluate_naming, naming_scores
+from gsencoder.app.commands.score import print_report, write_report
+from gsencoder.app.heads import words_of_head
+from gsencoder.app.options import CommonConfig
+from gsencoder.app.run import Progress, Run
+from gsencoder.app.scenes import folder_of, memory_of, queried_scene
+from gsencoder.core.errors import InputError
+from gsencoder.core.process import retain_freed_memory
+from gsencoder.core.settings import option
+from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene, scene_name
+from gsencoder.data.seeding.seed import SeedConfig
+from gsencoder.data.splats.files import READABLE
+from gsencoder.evaluate.benchmarks.localization import LocalizationProtocol
+from gsencoder.evaluate.benchmarks.protocol import Evaluation, predict_scenes
+from gsencoder.evaluate.benchmarks.protocols import AnyProtocol
 from gsencoder.evaluate.sources import (
     FeatureSource,
+    encoder_source,
+    fused_head_source,
+    fusion_source,
+    head_source,
+    load_scenes,
+    space_of_words,
+    table_beside,
 )
-from gsencoder.text.vocabulary import Words, check_known
+from gsencoder.fusion.folder import heads_beside, load_features
+from gsencoder.fusion.fuse import FuseConfig
+from gsencoder.fusion.measured_heads import find_head, load_heads
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.load import file_of_encoder, load_encoder
+from gsencoder.infer.localize import LocalizeConfig
+from gsencoder.teachers.build import TeacherConfig, load_teacher_heads, words_of
+from gsencoder.teachers.labels import LabelsConfig
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, stating_trained, words_of_table
+from gsencoder.train.distributed import fail_together, value_of_first, values_of_all
 from gsencoder.types import QueryMemory, Scene
 
 
-def localization(
-    config: EvaluateConfig,
-    protocol: LocalizationProtocol,
-    source: FeatureSource,
-    words: Words,
-    folder: Path,
-    run: Run,
-) -> None:
-    outcomes = evaluate_localization(
-        scenes_of(config), source, words, protocol=protocol, seeds=config.seeds, localization=config.localize
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluateConfig(CommonConfig):
+    """Settings of `evaluate`."""
+
+    paths: tuple[str, ...] = option((), "labeled scenes, or folders of scenes", metavar="SCENE", required=True)
+    weights: str = option(
+        "", "encoder whose features are evaluated (see encode); empty = the fused features of the teacher"
     )
-    record(outcomes, run)
-    hits = [hit for outcome in outcomes for hit in outcome.hits]
-    rows = [{"scene": h.scene, "name": h.name, "iou": h.iou, "oracle_iou": h.oracle_iou} for h in hits]
-    write_bytes(folder / "hits.csv", csv_text(rows).encode())
-    names = [{"name": name, **row} for name, row in scores_by_name(hits).items()]
-    write_bytes(folder / "names.csv", csv_text(names).encode())
-
-
-def naming(
-    config: EvaluateConfig,
-    protocol: NamingProtocol,
-    source: FeatureSource,
-    words: Words,
-    folder: Path,
-    run: Run,
-) -> None:
-    scenes = evaluate_naming(scenes_of(config), source, words, seeds=config.seeds, fusion=config.fusion)
-    scores = naming_scores(scenes, protocol)
-    for scene in scenes:
-        run.add_seconds(scene.seconds)
-    each = []
-    for scene in scenes:
-        totals = {name: count for name, count in scene.total.items() if name in scores["names"]}
-        scene_scores = naming_scores([replace(scene, total=totals)]) if totals else {}
-        each.append({"scene": scene.scene, "gaussians": sum(scene.total.values()), **scene_scores})
-    run.results.update(protocol="naming", **scores, names_table="names.csv", scenes=each)
-    rows = [{"name": name, **row} for name, row in scores["names"].items()]
-    write_bytes(folder / "names.csv", csv_text(rows).encode())
-
-
-def absent(
-    config: EvaluateConfig,
-    protocol: AbsentProtocol,
-    source: FeatureSource,
-    words: Words,
-    folder: Path,
-    run: Run,
-) -> None:
-    with about("protocol.vocabulary"):
-        check_known(words, protocol.vocabulary)
-    vocabulary = protocol.vocabulary or names_of(scene for scene, _ in scenes_of(config))
-    scenes = evaluate_absent(
-        scenes_of(config),
-        source,
-        words,
-        vocabulary,
-        protocol=protocol,
-        seeds=config.seeds,
-        localization=config.localize,
+    features: str = option(
+        "",
+        "features that are evaluated in place of those: a folder written by fuse, encode, pack or memory, "
+        "or one with such a folder for each scene",
     )
-    for scene in scenes:
-        run.add_seconds(scene.seconds)
-    run.results.update(
-        protocol="absent",
-        **absent_scores(scenes),
-        names=probabilities_by_word(scenes),
-        scenes=[scene.scene for scene in scenes],
-        words_table="words.csv",
+    space: str = option(
+        "", "of an encoder or features of several teachers, the one that is evaluated; empty = that of the words"
     )
-    rows = [
-        {"scene": w.scene, "word": w.word, "present": w.present, "probability": w.probability, "boxed": w.boxed}
-        for scene in scenes
-        for w in scene.words
-    ]
-    write_bytes(folder / "words.csv", csv_text(rows).encode())
-
-
-def grounding(
-    config: EvaluateConfig,
-    protocol: GroundingProtocol,
-    source: FeatureSource,
-    words: Words,
-    folder: Path,
-    run: Run,
-) -> None:
-    def memory_of(scene: Scene) -> QueryMemory | None:
-        # Outputs of a head are features of their own; the memory holds those of the teacher.
-        return stored_memory(config.features, scene) if config.features and not config.head else None
-
-    scenes = evaluate_grounding(
-        scenes_of(config), source, words, protocol=protocol, seeds=config.seeds, memory_of=memory_of
+    head: str = option(
+        "",
+        "adapter head whose outputs are evaluated, such as siglip, with the words of text=; empty = the "
+        "features themselves",
     )
-    for scene in scenes:
-        run.add_seconds(scene.seconds)
-    pairs = [pair for scene in scenes for pair in scene.pairs]
-    names = scores_by_phrase(pairs)
-    run.results.update(
-        protocol="grounding",
-        **asdict(grounding_scores(pairs)),
-        miou_names=phrase_mean(names),
-        small=sum(scene.small for scene in scenes),
-        names=names,
-        scenes=[
-            {
-                "scene": scene.scene,
-                "views": scene.views,
-                "gaussians": scene.gaussians,
-                "small": scene.small,
-                **asdict(grounding_scores(scene.pairs)),
-            }
-            for scene in scenes
-        ],
-        pairs_table="pairs.csv",
-        names_table="names.csv",
+    protocol: AnyProtocol = field(default_factory=LocalizationProtocol)
+    classes: str = option(
+        "",
+        "of recognition, instances and semantics: scannet20, scannet200, a CSV file with the columns id, "
+        "name and group, or ScanNet++'s top100.txt; empty = the names of the scenes' objects",
     )
-    rows = [
-        {"scene": scene.scene, "view": pair.view, "name": pair.phrase, "iou": pair.iou, "finite": pair.finite}
-        for scene in scenes
-        for pair in scene.pairs
-    ]
-    write_bytes(folder / "pairs.csv", csv_text(rows).encode())
-    write_bytes(folder / "names.csv", csv_text([{"name": name, **row} for name, row in names.items()]).encode())
-
-
-def record(outcomes: list[SceneOutcome], run: Run) -> None:
-    """Adds scores, scenes and seconds to the run."""
-    hits = [hit for outcome in outcomes for hit in outcome.hits]
-    for outcome in outcomes:
-        run.add_seconds(outcome.seconds)
-    run.results.update(
-        protocol="localization",
-        **scores(hits),
-        boxless=sum(outcome.boxless for outcome in outcomes),
-        names=scores_by_name(hits),
-        scenes=[
-            {
-                "scene": outcome.scene,
-                "gaussians": outcome.gaussians,
-                "seen": outcome.seen,
-                "rank": outcome.rank,
-                "seconds": sum(outcome.seconds.values()),
-                **scores(outcome.hits),
-            }
-            for outcome in outcomes
-        ],
-        hits="hits.csv",
-        names_table="names.csv",
+    label_map: str = option(
+        "",
+        "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv, which gives the raw names of "
+        "objects a class of classes=, and of referring tells unique from multiple",
     )
-
-
-SHOWN_NAMES = 15
-COLUMNS = {
-    "localization": {
-        "objects": "objects",
-        "Acc@0.25": "acc_25",
-        "Acc@0.5": "acc_50",
-        "mean IoU": "mean_iou",
-        "best box": "oracle_mean_iou",
-    },
-    "naming": {"gaussians": "gaussians", "accuracy": "accuracy"},
-    "grounding": {"views": "pairs", "mIoU": "miou", "cIoU": "ciou", "P@0.5": "p50", "P@0.6": "p60"},
-    "absent": {
-        "present in": "present",
-        "absent in": "absent",
-        "probability where present": "probability_present",
-        "where absent": "probability_absent",
-    },
-}
-"""Columns of the table of names, and the fields of a row that they show, by protocol."""
-
-
-def scores_line(results: dict) -> str:
-    """The main figures in one line."""
-    if results["protocol"] == "naming":
-        return (
-            f"{counted(len(results['names']), 'name')} in {counted(len(results['scenes']), 'scene')}: accuracy "
-            f"{results['accuracy']:.3f} "
-            f"averaged over names, {results['accuracy_gaussians']:.3f} over Gaussians, centered cosine "
-            f"{results['cosine']:.3f}"
-        )
-    if results["protocol"] == "absent":
-        return (
-            f"{results['present']} present and {counted(results['absent'], 'absent word')} in "
-            f"{counted(len(results['scenes']), 'scene')}: "
-            f"AUROC {results['auroc']:.3f} ± {results['auroc_se']:.3f}, calibration error "
-            f"{results['calibration_error']:.3f}, Brier {results['brier']:.3f}; given a box: "
-            f"{results['boxed_present']:.3f} of the present, {results['boxed_absent']:.3f} of the absent"
-        )
-    if results["protocol"] == "grounding":
-        faults = f", {counted(results['not_finite'], 'map')} not finite" if results["not_finite"] else ""
-        return (
-            f"{counted(results['pairs'], 'pair')} of a view and a name in "
-            f"{counted(len(results['scenes']), 'scene')}: mIoU "
-            f"{results['miou']:.3f} (averaged over names {results['miou_names']:.3f}), cIoU {results['ciou']:.3f}, "
-            f"P@0.5 {results['p50']:.3f}, P@0.6 {results['p60']:.3f}; {counted(results['small'], 'pair')} too "
-            f"small{faults}"
-        )
-    return (
-        f"{counted(results['objects'], 'object')} in {counted(len(results['scenes']), 'scene')}: Acc@0.25 "
-        f"{results['acc_25']:.3f}, "
-        f"Acc@0.5 {results['acc_50']:.3f}, mean IoU {results['mean_iou']:.3f} (best of all boxes: "
-        f"{results['oracle_acc_25']:.3f}, {results['oracle_acc_50']:.3f}, {results['oracle_mean_iou']:.3f})"
-    )
-
-
-def names_table(results: dict) -> Table:
-    """A table of the names with the lowest scores."""
-    names = results["names"]
-    table = Table(title="hardest names" if len(names) > SHOWN_NAMES else "names", title_justify="left")
-    columns = COLUMNS[results["protocol"]]
-    for title in ("name", *columns):
-        table.add_column(title, justify="left" if title == "name" else "right")
-    for name, row in list(names.items())[:SHOWN_NAMES]:
-        figures = (row[key] for key in columns.values())
-        table.add_row(name, *(f"{figure:,}" if isinstance(figure, int) else f"{figure:.3f}" for figure in figures))
-    return table
-
-
-__all__ = ["EvaluateConfig", "run"]
+    splat: str = option("", f"Gaussians of the scenes; empty = seeds. {READABLE}")
+    report: bool = option(False, "write report.html, a page with pictures and figures")
+    data: SceneConfig = field(default_factory=SceneConfig)
+    seeds: SeedConfig = field(default_factory=SeedConfig)
+    fusion: FuseConfig = field(default_factory=FuseConfig)
+    teacher: TeacherConfig = field(default_factory=LabelsConfig)
+    text: TextConfig = field(default_factory=TableTextConfig)
+    encode: EncodeConfig = field(default_factory=EncodeConfig)
+    localize: LocalizeConfig = field(default_factory=LocalizeConfig)
 
 
 def run(config: EvaluateConfig, run: Run) -> None:
-    """Evaluates, prints the scores, and writes them with one row for each object, name or class."""
-    if not isinstance(config.protocol, BenchmarkProtocol):
-        advice = "start it once; recognition, instances, semantics and referring are what processes share the scenes of"
-        refuse_several(f"protocol={config.protocol.name}", advice)
+    """Predicts the scenes of this process; the first process scores those of all, prints and writes the scores."""
     if config.space and not (config.weights or config.features):
         raise InputError("space: names a teacher of weights= or features=; leave it out, or give one of the two")
-    check_names(find_scenes(config.paths))
-    if config.features:
-        source, words = stored_features(config)
-    else:
-        source, words = source_of_head(config) if config.head else teacher_or_encoder(config)
+    paths = find_scenes(config.paths)
+    check_names(paths)
+    source, words = source_and_words(config)
     out = run.out("evaluate", config.protocol.name)
-    if isinstance(config.protocol, BenchmarkProtocol):
-        from gsencoder.app.commands.evaluate_benchmarks import run_benchmark
+    with run.processes("cpu", out) as group:
+        process, folder = group.process, None
+        with fail_together():
+            folder = group.folder()
+        shared = Path(value_of_first(str(folder)))
+        with fail_together():
+            benchmark = config.protocol.start(
+                Evaluation(
+                    words=words,
+                    scenes=lambda: (load_scene(path, options=config.data) for path in paths),
+                    scene_names=tuple(map(scene_name, paths)),
+                    folder=shared,
+                    method=method_name(config),
+                    classes=config.classes,
+                    label_map=config.label_map,
+                    fusion=config.fusion,
+                    localization=config.localize,
+                    memory_of=lambda scene: stored_memory(config, scene),
+                )
+            )
+            scenes = scenes_of(config, paths[process.rank :: process.world_size], quiet=not process.is_first)
+            predicted = predict_scenes(benchmark, scenes, source, config.seeds)
+        parts = values_of_all(predicted)
+        if folder is None:
+            return
+        # Process k has the k-th scene, and every n-th from there on.
+        results = [parts[row % len(parts)][row // len(parts)] for row in range(len(paths))]
+        for each in results:
+            run.add_seconds(each.seconds)
+        report = benchmark.report(results)
+        write_report(folder, report, run, page=config.report)
+        run.results["gaussians"] = {each.scene: each.gaussians for each in results}
+    print_report(out, report, run)
 
-        run_benchmark(config, config.protocol, source, words, out, run)
-        return
-    if isinstance(config.protocol, RetrievalProtocol):
-        from gsencoder.app.commands.evaluate_benchmarks import run_retrieval
 
-        run_retrieval(config, config.protocol, source, words, out, run)
-        return
-    with run.folder(out) as folder:
-        if isinstance(config.protocol, NamingProtocol):
-            naming(config, config.protocol, source, words, folder, run)
-        elif isinstance(config.protocol, AbsentProtocol):
-            absent(config, config.protocol, source, words, folder, run)
-        elif isinstance(config.protocol, GroundingProtocol):
-            grounding(config, config.protocol, source, words, folder, run)
-        else:
-            localization(config, config.protocol, source, words, folder, run)
-        if config.report:
-            from gsencoder.app.reports import report_scores
+def source_and_words(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
+    """The source of the features, and the words that they are compared with."""
+    if config.features:
+        return stored_features(config)
+    return source_of_head(config) if config.head else teacher_or_encoder(config)
 
-            report_scores(folder, run)
-    run.print(names_table(run.results), f"{out}: {scores_line(run.results)}")
+
+def teacher_or_encoder(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
+    """Features of a teacher or an encoder, with the words of teacher= and text=, or where neither is given, those of
+    the weights."""
+    if not config.weights:
+        words = _given_words(config)
+        return fusion_source(config.teacher, words, config.fusion), words
+    retain_freed_memory()
+    encoder = load_encoder(config.weights, config.encode.device)
+    table = table_beside(encoder, config.space)
+    if table is not None and config.teacher == LabelsConfig() and config.text == TableTextConfig():
+        words = words_of_table(table)
+    else:
+        words = _given_words(config)
+    space = config.space or space_of_words(encoder, words)
+    words = stating_trained(words, table_beside(encoder, space))
+    return encoder_source(encoder, config.encode, space), words
+
+
+def stored_features(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
+    """Features of a folder, and its words."""
+    if config.weights or config.splat or config.teacher != LabelsConfig():
+        raise InputError("features: a folder has its own Gaussians and words; leave out weights=, splat= and teacher=")
+    folder = folder_of(config.features, scene_name(find_scenes(config.paths)[0]))
+    _, words = queried_scene(load_features(folder), folder, head=config.head, space=config.space, text=config.text)
+    return lambda scene: (next(iter(scene.features.values())), {}), words
+
+
+def _given_words(config: EvaluateConfig) -> Words:
+    words = words_of(config.teacher, config.text)
+    if words is None:
+        raise InputError(
+            f"evaluate: no words lead into the space of teacher {config.teacher.name}; give teacher.words= or text="
+        )
+    return words
+
+
+def source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
+    """Outputs of an adapter head, and the words that they are compared with."""
+    table = getattr(config.teacher, "words", "") if isinstance(config.text, TableTextConfig) else ""
+    if not config.weights:
+        (measured_head,) = load_teacher_heads(config.teacher, [config.head], "head")
+        words = words_of_head(measured_head, table, config.text)
+        return fused_head_source(config.teacher, measured_head, words.space.text_encoder, config.fusion), words
+    path = heads_beside(file_of_encoder(config.weights))
+    if path is None:
+        raise InputError(
+            f"head={config.head}: no adapter heads lie beside the weights {config.weights}; train with "
+            f"heads=[{config.head}]"
+        )
+    heads = load_heads(path)
+    head = find_head(heads, config.head)
+    words = words_of_head(head.head, table, config.text)
+    retain_freed_memory()
+    encoder = load_encoder(config.weights, config.encode.device)
+    source = encoder_source(encoder, config.encode, config.space or heads.space.name)
+    return head_source(source, heads, head, words.space.text_encoder), words
+
+
+def scenes_of(config: EvaluateConfig, paths: list[Path], *, quiet: bool) -> Iterator[tuple[Scene, float]]:
+    """Scenes with their features where these are stored, and the seconds of loading."""
+    scenes = load_scenes(paths, config.data, config.splat, Progress(quiet=config.quiet or quiet))
+    return with_stored_features(scenes, config) if config.features else scenes
+
+
+def with_stored_features(
+    scenes: Iterable[tuple[Scene, float]], config: EvaluateConfig
+) -> Iterator[tuple[Scene, float]]:
+    """Labeled scenes with the Gaussians and features of a folder, as `load_scenes` yields scenes.
+
+    The features may have been made from other views of the scene, such as all but those that are evaluated; the origin,
+    which is the mean of the cameras, is then another one.
+    """
+    for scene, seconds in scenes:
+        folder = folder_of(config.features, scene.name)
+        stored = load_features(folder)
+        if stored.name != scene.name:
+            raise InputError(
+                f"features: {folder} holds those of scene {stored.name}, and {scene.name} is evaluated; give a folder "
+                f"that has the features of each scene in a folder of its name"
+            )
+        queried, _ = queried_scene(stored, folder, head=config.head, space=config.space, text=config.text)
+        assert queried.gaussians is not None
+        means = (queried.gaussians.means + (stored.origin - scene.origin)).astype(np.float32)
+        gaussians = replace(queried.gaussians, means=means)
+        yield replace(scene, gaussians=gaussians, features=queried.features), seconds
+
+
+def stored_memory(config: EvaluateConfig, scene: Scene) -> QueryMemory | None:
+    """The memory that the features of a scene were read from. Outputs of a head are features of their own; it holds
+    those of the teacher."""
+    return memory_of(folder_of(config.features, scene.name), scene) if config.features and not config.head else None
+
+
+def method_name(config: EvaluateConfig) -> str:
+    """What the row of the table is called."""
+    if config.features:
+        return Path(config.features).resolve().name
+    return "encoded" if config.weights else "fused"

@@ -16,7 +16,7 @@ from gsencoder.core.files import csv_text, json_bytes, write_bytes
 from gsencoder.core.settings import check_limits, option
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.protocols.localization import LocalizationProtocol
+from gsencoder.evaluate.benchmarks.localization import LocalizationProtocol
 from gsencoder.evaluate.tradeoff.measure import Records
 from gsencoder.evaluate.tradeoff.plots import page, picture, to_json
 from gsencoder.evaluate.tradeoff.scaling import ScalingConfig, ScalingResult, scaling

@@ -30,6 +30,7 @@ from jaxtyping import Int32, Int64
 
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, SceneWarning, about
+from gsencoder.core.files import csv_text, write_bytes
 from gsencoder.data.labels.files import read_checked_text
 
 
@@ -111,6 +112,10 @@ DEFAULT_COLUMN = "id"
 """That of other classes."""
 MAX_MAP_BYTES = 16 << 20
 MAX_CLASS_LIST_BYTES = 4 << 20
+STUFF = ("wall", "floor")
+"""Classes of ScanNet's benchmarks that have labels and no instances."""
+IDS_PER_CLASS = 1000
+"""A line of the labels of instances holds the class id times this plus the number of the instance."""
 
 
 @cache
@@ -270,3 +275,115 @@ def ids_of_benchmark(path: Path, classes: ClassTable) -> dict[str, int]:
     if not ids:
         raise InputError(f"{path}: no name leads to one of the {len(classes)} classes; compare it with classes=")
     return ids
+
+
+def is_scannetpp_map(label_map: str) -> bool:
+    """Whether a label map is ScanNet++'s map_benchmark.csv, and not scannetv2-labels.combined.tsv."""
+    return Path(label_map).suffix.lower() == ".csv"
+
+
+def ids_of_raw_names(label_map: str, classes: str) -> dict[str, int]:
+    """Class id of each raw name of ScanNet's or ScanNet++'s objects, by a label map and `classes` of `load_classes`."""
+    if is_scannetpp_map(label_map):
+        return ids_of_benchmark(Path(label_map), load_classes(classes))
+    return read_label_map(Path(label_map), COLUMNS.get(classes, DEFAULT_COLUMN))
+
+
+def load_classes(classes: str, *, instances: bool = False) -> ClassTable:
+    """The classes of a benchmark, or of a file.
+
+    Args:
+        classes: scannet20, scannet200, a CSV file with the columns id, name and group where classes have groups, or a
+            list of names (.txt) such as ScanNet++'s top100.txt, whose ids count its lines from 0.
+        instances: whether instances are scored: the benchmarks then leave out wall and floor, so that 18 and 198
+            classes remain. Of a list those in NAME_instance.txt beside it; those of a CSV file are all scored.
+    """
+    table = _table(classes, instances)
+    if instances:
+        table.check_instance_ids()
+    return table
+
+
+def _table(classes: str, instances: bool) -> ClassTable:
+    if classes in COLUMNS:
+        every = scannet_classes(classes)
+        return every.without(STUFF) if instances else every
+    path = Path(classes)
+    if not path.is_file():
+        raise InputError(
+            f"classes: {classes} is no file; expected {', '.join(COLUMNS)}, a CSV file with the columns id and name, "
+            "or a list of names (.txt)"
+        )
+    if path.suffix.lower() == ".txt":
+        return read_instance_classes(path) if instances else read_class_list(path)
+    return _read_table(path)
+
+
+def _read_table(path: Path) -> ClassTable:
+    """The classes of a CSV file with the columns id, name and group."""
+    text = read_checked_text(path, max_bytes=MAX_CLASS_LIST_BYTES)
+    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+    try:
+        rows = list(reader)
+    except csv.Error as error:
+        raise InputError(f"{path}: not a readable CSV file ({error})") from error
+    if not {"id", "name"} <= set(reader.fieldnames or ()):
+        raise InputError(
+            f"{path}: expected the columns id and name, got {', '.join(reader.fieldnames or ()) or 'none'}"
+        )
+    ids: list[int] = []
+    names: list[str] = []
+    groups: dict[str, list[str]] = {}
+    for number, row in enumerate(rows, start=2):
+        word, name = row["id"] or "", row["name"] or ""
+        if not (word.isascii() and word.isdigit() and len(word) <= 9 and name.strip()):
+            raise InputError(
+                f"{path}: line {number}: expected a whole number and a name, got {word[:40]!r}, {name[:40]!r}"
+            )
+        ids.append(int(word))
+        names.append(name.strip())
+        if row.get("group"):
+            groups.setdefault(row["group"], []).append(name.strip())
+    with about(path):
+        return ClassTable(
+            names=tuple(names), ids=tuple(ids), groups={group: tuple(members) for group, members in groups.items()}
+        )
+
+
+def write_classes(path: Path, classes: ClassTable) -> None:
+    """Writes the table as `load_classes` reads it."""
+    group_of = {name: group for group, members in classes.groups.items() for name in members}
+    rows = [{"id": number, "name": name, "group": group_of.get(name, "")} for number, name in classes.name_of.items()]
+    write_bytes(path, csv_text(rows).encode())
+
+
+def instance_ids(
+    instances: Int32[np.ndarray, " V"], names: Mapping[int, str], class_of: Mapping[str, int]
+) -> Int64[np.ndarray, " V"]:
+    """Class id · 1000 + number of the instance, and 0 of vertices without an object.
+
+    The number is the id of the object, as ScanNet's script has it. Where an id is 1000 or more, which would read as
+    another class, objects are numbered from 1 within their class, in the order of their ids: scores are the same. An
+    object without a class has its number alone, which evaluation takes for a region that does not count.
+
+    Args:
+        instances: the object of each vertex, 0 = none.
+        names: the name of each object, such as `dict(MeshLabels.objects)`.
+        class_of: class id of each name, as `ids_of_names` gives it.
+    """
+    classes = vertex_classes(instances, names, class_of).astype(np.int64)
+    objects, first, codes = np.unique(instances, return_index=True, return_inverse=True)
+    numbers = objects.astype(np.int64)
+    if int(numbers.max(initial=0)) >= IDS_PER_CLASS:
+        classes_of_objects = classes[first]
+        for number in np.unique(classes_of_objects):
+            rows = np.flatnonzero((classes_of_objects == number) & (objects > 0))
+            if len(rows) >= IDS_PER_CLASS and number:
+                name = names[int(objects[rows[0]])]
+                raise InputError(
+                    f"{name[:40]!r}: {len(rows):,} objects are of its class; up to {IDS_PER_CLASS - 1} fit into class "
+                    "id · 1000 + number"
+                )
+            # The numbers of objects without a class mean nothing.
+            numbers[rows] = np.arange(1, len(rows) + 1) if number else 0
+    return classes * IDS_PER_CLASS + numbers[codes]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int, Int64
+from jaxtyping import Bool, Float64, Int, Int64
 
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, readable
@@ -311,6 +311,27 @@ def box_corners(lower: Corner, upper: Corner) -> list[list[float]]:
     around the top, then around the bottom (utils/box_util.py).
     """
     return [[(lower, upper)[side][axis] for axis, side in enumerate(sides)] for sides in _SIGNS]
+
+
+VOLUME_EPSILON = 1e-8
+"""Volume that both add to a union, in cubic world units (metres, in ScanNet)."""
+
+
+def box_ious(boxes: Float64[np.ndarray, "K 2 3"], box: Float64[np.ndarray, "2 3"]) -> Float64[np.ndarray, " K"]:
+    """IoU of boxes with one: common volume / (volume + volume - common volume + 1e-8).
+
+    So boxes without volume overlap nothing, and a box that is one quarter of another is below 0.25.
+
+    Args:
+        boxes: lower and upper corners, world units.
+        box: the same of one box.
+    """
+    common = np.maximum(np.minimum(boxes[:, 1], box[1]) - np.maximum(boxes[:, 0], box[0]), 0)
+    sizes, size = boxes[:, 1] - boxes[:, 0], box[1] - box[0]
+    volume = common[:, 0] * common[:, 1] * common[:, 2]
+    # The order of the operations decides ties at a threshold.
+    union = sizes[:, 0] * sizes[:, 1] * sizes[:, 2] + size[0] * size[1] * size[2] - volume + VOLUME_EPSILON
+    return volume / union
 
 
 MAX_BYTES = 16 << 20

@@ -21,7 +21,6 @@ Reference: Li et al., SceneSplat, 2025; SceneSplat's pointcept/utils/misc.py (ne
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, no_type_check
@@ -61,18 +60,6 @@ def read_mesh(path: Path) -> tuple[Float32[np.ndarray, "V 3"], Int32[np.ndarray,
         row, column = (int(each[0]) for each in np.nonzero(outside))
         raise InputError(f"{path}: face {row:,} names vertex {rows[row, column]:,} of {len(vertices):,}")
     return vertices.astype(np.float32), rows.astype(np.int32)
-
-
-def read_vertex_labels(path: Path) -> Int32[np.ndarray, " V"]:
-    """The property `label` of each vertex of a mesh, such as the nyu40 ids of ScanNet's _vh_clean_2.labels.ply."""
-    with _opened(path) as stream:
-        header, size = _header(path, stream)
-        values = read_property(path, stream, header, size, "label")
-    good = (np.abs(values) < 2**31) & (values == np.round(values))
-    if not good.all():
-        row = int(np.flatnonzero(~good)[0])
-        raise InputError(f"{path}: the label of vertex {row:,} is {values[row]:g}; expected a whole number")
-    return values.astype(np.int32)
 
 
 def _opened(path: Path) -> BinaryIO:
@@ -248,51 +235,11 @@ def draw_triangles(local, faces, labels, K, near, inverse, instances):
 
 VOTERS = 25
 """Gaussians that vote for the label of a vertex, as in SceneSplat's benchmark."""
-MAX_DISTANCE = 0.25
-"""Largest distance from a Gaussian to the vertex whose label it takes, metres, as in SceneSplat's preparation."""
+
 CHUNK = 1 << 16
 """Points of one query."""
 MAX_VOTES = 1 << 22
 """Counters of votes that exist at once: points times distinct labels."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GaussianLabels:
-    """Labels of Gaussians from a mesh.
-
-    Attributes:
-        labels: of each Gaussian; `none` where no vertex is near enough.
-        vertices: the nearest vertex of each Gaussian, -1 where it is too far.
-        far: number of Gaussians without a vertex near enough.
-    """
-
-    labels: Int32[np.ndarray, " N"]
-    vertices: Int64[np.ndarray, " N"]
-    far: int
-
-
-def labels_of_gaussians(
-    means: Float[np.ndarray, "N 3"],
-    vertices: Float[np.ndarray, "V 3"],
-    labels: Int[np.ndarray, " V"],
-    *,
-    max_distance: float = MAX_DISTANCE,
-    none: int = 0,
-) -> GaussianLabels:
-    """The label of the nearest vertex for each Gaussian.
-
-    Args:
-        means: centers of the Gaussians, in the frame of the vertices (`Scene.origin` added back).
-        max_distance: largest distance, itself included, in the unit of both.
-        none: label of Gaussians that are farther from every vertex.
-    """
-    _check(means, "Gaussians")
-    _check(vertices, "vertices")
-    nearest = nearest_rows(means, vertices, max_distance=max_distance)
-    near = nearest >= 0
-    result = np.full(len(means), none, np.int32)
-    result[near] = labels[nearest[near]]
-    return GaussianLabels(labels=result, vertices=nearest, far=int(len(means) - near.sum()))
 
 
 def labels_of_vertices(

@@ -86,30 +86,6 @@ def read_questions(path: str | Path, *, answered: bool = True) -> tuple[Question
     )
 
 
-def read_scanqa(path: str | Path, *, answered: bool = True) -> tuple[Question, ...]:
-    """Reads a file of ScanQA.
-
-    Args:
-        answered: whether every question must have answers.
-    """
-    return _scanqa(read_benchmark_json(Path(path)), Path(path), answered)
-
-
-def read_sqa3d(
-    questions: str | Path, annotations: str | Path | None = None, *, answered: bool = True
-) -> tuple[Question, ...]:
-    """Reads SQA3D's questions and their answers.
-
-    Args:
-        annotations: the file of answers; None = the one beside it whose name has `sqa_annotations` for `questions`.
-    """
-    file = Path(questions)
-    content = read_benchmark_json(file)
-    if not isinstance(content, dict) or "questions" not in content:
-        raise InputError(f"{file}: expected SQA3D's object with questions, got {shown(content)}")
-    return _sqa3d(content, file, None if annotations is None else Path(annotations), answered)
-
-
 def write_scanqa(path: str | Path, questions: Sequence[Question]) -> None:
     """Writes questions as ScanQA's files have them."""
     _refuse_repeated(Path(path), [each.id for each in questions])

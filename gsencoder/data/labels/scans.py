@@ -381,6 +381,13 @@ def find_labels(folder: Path, *, names: Collection[str] | None = None) -> MeshLa
     return None if scannetpp is None else read_scannetpp_labels(scannetpp, names=names)
 
 
+def labels_of_scan(folder: Path, raw_names: Collection[str]) -> MeshLabels:
+    """The labels of a scan; of ScanNet++ those of the objects whose raw name has a class, as its toolkit takes them."""
+    if find_scannet_files(folder) is None and find_scannetpp_files(folder) is not None:
+        return read_scannetpp_labels(folder, names=raw_names)
+    return read_scannet_labels(folder)
+
+
 def labels_of_layout(folder: Path, layout: str) -> MeshLabels | None:
     """The labels that lie beside the photographs of a scene, in the world of its poses.
 

@@ -10,26 +10,22 @@
 
 A question without a prediction scores 0 everywhere, and counts.
 
-Predicted answers in the files of ScanQA and SQA3D.
-
-ScanQA (scripts/predict.py; its benchmark's submission): a list of {scene_id, question_id, answer_top10, bbox}, the box
-being optional. SQA3D (LLM/eval_sqa3d_llm.py): a list of {scene_id, situation, question, answer, agent_rot, agent_pos},
-which are recognized by these five, or by a question_id where there is one; equal questions are
-answered in their order. Both scripts write pickles besides; those are refused.
+Labels are a question set of ScanQA or SQA3D with its answers. Predictions are ScanQA's (scripts/predict.py; its
+benchmark's submission), a list of {scene_id, question_id, answer_top10, bbox}, the box being optional; or SQA3D's
+(LLM/eval_sqa3d_llm.py), a list of {scene_id, situation, question, answer, agent_rot, agent_pos}, which are found by
+these five, or by a question_id where there is one; equal questions are answered in their order. `ask` writes both.
 """
 
+import math
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from gsencoder.core.errors import InputError, SceneWarning, counted
-from gsencoder.core.files import write_json
 from gsencoder.data.labels.files import (
-    Corner,
-    box_corners,
     entries_of,
     id_value,
     number,
@@ -41,7 +37,8 @@ from gsencoder.data.labels.files import (
     text_list,
     text_value,
 )
-from gsencoder.data.labels.questions import Question
+from gsencoder.data.labels.questions import Question, read_questions
+from gsencoder.evaluate.benchmarks.files import ScoreOptions, refuse_missing
 from gsencoder.evaluate.benchmarks.text_metrics import (
     JavaTools,
     Lemmatize,
@@ -49,9 +46,12 @@ from gsencoder.evaluate.benchmarks.text_metrics import (
     Tokens,
     f_value,
     score_sentences,
+    sentence_figures,
     wordnet_lemmatizer,
 )
+from gsencoder.evaluate.tables import ScoreReport, spread, table_of
 
+OPTIONS = ("java", "allow_missing")
 TOP = 10
 """Most answers of a question."""
 _NUMBERS = (
@@ -91,12 +91,14 @@ _CLEANING = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnswerRow:
-    """The scores of one question.
+    """The scores of one question; all are 0 without an answer.
 
     Attributes:
-        predicted: whether there is an answer; if not, all scores are 0.
+        predicted: whether there is an answer.
         em1: whether the first answer is right, letter for letter.
         em10: whether one of at most ten is.
+        em_cleaned: LEO's exact match.
+        em_refined: LEO's refined exact match.
         f_value: None where WordNet is missing.
     """
 
@@ -113,12 +115,11 @@ class AnswerRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AnswerMeans:
-    """Means over some questions; fractions, NaN without questions.
+    """Means of `AnswerRow`s over some questions; fractions, NaN without questions.
 
     Attributes:
-        missing: of them, those without an answer.
-        em1: see `AnswerRow`, as all others.
-        f_value: None where WordNet is missing.
+        missing: questions without an answer.
+        f_value: NaN where WordNet is missing.
     """
 
     count: int
@@ -127,7 +128,17 @@ class AnswerMeans:
     em10: float
     em_cleaned: float
     em_refined: float
-    f_value: float | None
+    f_value: float
+
+    def figures(self) -> dict[str, float]:
+        """The means by column."""
+        return {
+            "em_1": self.em1,
+            "em_10": self.em10,
+            "em_cleaned": self.em_cleaned,
+            "em_refined": self.em_refined,
+            "f_value": self.f_value,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -136,10 +147,11 @@ class AnswerScores:
 
     Attributes:
         rows: one a question, in the order of the questions.
+        overall: means over all.
         by_kind: means over each kind of question, in the order of the kinds; kinds without questions are not there.
         by_scene: means over each scene, by name.
         blank: answers that are empty when cleaned, and count as right in the refined match.
-        sentences: None where they were not asked for.
+        sentences: of the first answers.
         absent: why a column has no value.
     """
 
@@ -148,20 +160,46 @@ class AnswerScores:
     by_kind: dict[str, AnswerMeans]
     by_scene: dict[str, AnswerMeans]
     blank: int
-    sentences: SentenceScores | None
+    sentences: SentenceScores
     absent: dict[str, str]
 
-    def columns(self) -> dict[str, float | None]:
-        """Head and value of each column over all questions; None where it is absent."""
-        means = self.overall
-        values: dict[str, float | None] = {
-            "EM@1": means.em1,
-            "EM@10": None if "EM@10" in self.absent else means.em10,
-            "EM (cleaned)": means.em_cleaned,
-            "EM (refined)": means.em_refined,
-            "F-value": means.f_value,
-        }
-        return values | (self.sentences.columns() if self.sentences else {})
+
+def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport:
+    """Scores of answers to a question set."""
+    questions = read_questions(labels)
+    if not questions:
+        raise InputError(f"{labels}: nothing to score: it holds no questions")
+    answers = read_answer_predictions(predictions, questions)
+    refuse_missing([each.id for each in questions if each.id not in answers], "question", predictions, options)
+    tools = None if options.java else "Java was not asked for (java=false)"
+    scores = score_answers(questions, answers, tokens="auto" if options.java else "python", tools=tools)
+    means = scores.overall.figures() | ({"em_10": math.nan} if "EM@10" in scores.absent else {})
+    overall = means | sentence_figures(scores.sentences)
+    by_scene = [{"scene": name, "questions": each.count, **each.figures()} for name, each in scores.by_scene.items()]
+    by_kind = [{"kind": name, "questions": each.count, **each.figures()} for name, each in scores.by_kind.items()]
+    notes = [f"{column} is absent: {reason}." for column, reason in scores.absent.items()]
+    if scores.blank:
+        notes.append(f"{counted(scores.blank, 'answer')} without a word once cleaned: right in the refined match.")
+    # Measured columns, then those of papers that rest on other tokens.
+    columns = dict.fromkeys((*overall, "em_1", "em_refined", "bleu_4", "meteor", "rouge_l", "cider"))
+    return ScoreReport(
+        results={
+            "protocol": "answers",
+            "questions": scores.overall.count,
+            "missing": scores.overall.missing,
+            "tokens": scores.sentences.tokens,
+            "absent": dict(scores.absent),
+            **overall,
+            "kinds": {row["kind"]: row for row in by_kind},
+            "spread": spread(by_scene, list(means)),
+        },
+        table=table_of(
+            "Answers", {options.method: overall}, published="splatdistill_3_answers", columns=columns, notes=notes
+        ),
+        rows={"scenes": by_scene, "kinds": by_kind, "questions": [asdict(row) for row in scores.rows]},
+        line=f"{counted(scores.overall.count, 'question')}, {scores.overall.missing} without an answer: EM@1 "
+        f"{overall['em_1']:.3f}, refined {overall['em_refined']:.3f}, CIDEr {100 * scores.sentences.cider:.1f}",
+    )
 
 
 def clean_answer(text: str) -> str:
@@ -213,7 +251,6 @@ def score_answers(
     questions: Sequence[Question],
     predictions: Mapping[str, Sequence[str]],
     *,
-    sentences: bool = True,
     tokens: Tokens = "auto",
     tools: JavaTools | str | None = None,
     lemmatize: Lemmatize | str | None = None,
@@ -221,21 +258,20 @@ def score_answers(
     """Scores the answers to all questions of a set.
 
     Args:
+        questions: with right answers, each id once.
         predictions: by the id of the question, one to ten answers, best first; a question that is missing scores 0.
-        sentences: whether to compute BLEU, METEOR, ROUGE-L and CIDEr of the first answers.
+        tokens: see `Tokens`.
+        tools: see `score_sentences`.
         lemmatize: of `wordnet_lemmatizer`, a reason for going without, or None = look for it.
     """
-    _check(questions, predictions)
     lemmatize = wordnet_lemmatizer() if lemmatize is None else lemmatize
     rows = tuple(_row(each, predictions.get(each.id, ()), lemmatize) for each in questions)
     absent = {"F-value": lemmatize} if isinstance(lemmatize, str) else {}
     if all(len(answers) == 1 for answers in predictions.values()):
         absent["EM@10"] = "no question has more than one predicted answer"
     spoken = [str(predictions[each.id][0]) if each.id in predictions else "" for each in questions]
-    scored = None
-    if sentences:
-        scored = score_sentences(spoken, [each.answers for each in questions], tokens=tokens, tools=tools)
-        absent |= scored.absent
+    sentences = score_sentences(spoken, [each.answers for each in questions], tokens=tokens, tools=tools)
+    absent |= sentences.absent
     kinds = [*SQA3D_KINDS, *SCANQA_KINDS, "other", "Other"]
     return AnswerScores(
         rows=rows,
@@ -243,7 +279,7 @@ def score_answers(
         by_kind=dict(sorted(_grouped(rows, lambda row: row.kind).items(), key=lambda item: kinds.index(item[0]))),
         by_scene=dict(sorted(_grouped(rows, lambda row: row.scene).items())),
         blank=sum(not clean_answer(answers[0]).split() for answers in predictions.values()),
-        sentences=scored,
+        sentences=sentences,
         absent=absent,
     )
 
@@ -263,7 +299,7 @@ def mean_answers(rows: Sequence[AnswerRow]) -> AnswerMeans:
         em10=mean([row.em10 for row in rows]),
         em_cleaned=mean([row.em_cleaned for row in rows]),
         em_refined=mean([row.em_refined for row in rows]),
-        f_value=mean(values) if len(values) == count else None,
+        f_value=mean(values) if len(values) == count else math.nan,
     )
 
 
@@ -292,25 +328,10 @@ def _grouped(rows: Sequence[AnswerRow], key: Callable[[AnswerRow], str]) -> dict
     return {name: mean_answers(group) for name, group in groups.items()}
 
 
-def _check(questions: Sequence[Question], predictions: Mapping[str, Sequence[str]]) -> None:
-    ids = {each.id for each in questions}
-    if len(ids) < len(questions):
-        raise InputError(f"{len(questions) - len(ids)} questions have the id of another one; expected each once")
-    silent = next((each.id for each in questions if not each.answers), None)
-    if silent is not None:
-        raise InputError(f"question {silent[:60]} has no right answers; it cannot be scored")
-    other = next((name for name in predictions if name not in ids), None)
-    if other is not None:
-        raise InputError(f"an answer is predicted for {other[:60]}, which is no question of the set")
-    wrong = next((name for name, answers in predictions.items() if not 1 <= len(answers) <= TOP), None)
-    if wrong is not None:
-        raise InputError(f"question {wrong[:60]} has {len(predictions[wrong])} answers; expected 1 to {TOP}")
-
-
 EXPECTED = "question_id and answer_top10, or scene_id, situation, question and answer"
 
 
-def read_answer_predictions(path: str | Path, questions: Sequence[Question]) -> dict[str, tuple[str, ...]]:
+def read_answer_predictions(path: Path, questions: Sequence[Question]) -> dict[str, tuple[str, ...]]:
     """Reads predicted answers to a question set.
 
     Args:
@@ -320,63 +341,25 @@ def read_answer_predictions(path: str | Path, questions: Sequence[Question]) -> 
     Returns:
         One to ten answers, best first, by the id of the question. Questions without an entry are not there.
     """
-    file = Path(path)
-    rows = read_benchmark_json(file)
+    rows = read_benchmark_json(path)
     if isinstance(rows, dict) and ("questions" in rows or "annotations" in rows):
         raise InputError(
-            f"{file}: expected a list of objects with {EXPECTED}, got SQA3D's truth; were predictions and truth "
+            f"{path}: expected a list of objects with {EXPECTED}, got SQA3D's truth; were predictions and truth "
             "swapped?"
         )
     finder = _Finder(questions)
     answers = [
-        (finder.question(entry, where).id, _answers(entry, where)) for entry, where in entries_of(rows, file, EXPECTED)
+        (finder.question(entry, where).id, _answers(entry, where)) for entry, where in entries_of(rows, path, EXPECTED)
     ]
     if finder.equal:
         warnings.warn(
-            f"{file}: {counted(finder.equal, 'entry', 'entries')} without question_id could be those of several equal "
+            f"{path}: {counted(finder.equal, 'entry', 'entries')} without question_id could be those of several equal "
             "questions, and were taken in the order of the truth",
             SceneWarning,
             stacklevel=2,
         )
-    refuse_repeated(file, [name for name, _ in answers], lambda name: name[:60], what="question_id")
+    refuse_repeated(path, [name for name, _ in answers], lambda name: name[:60], what="question_id")
     return dict(answers)
-
-
-def write_answer_predictions(
-    path: str | Path,
-    questions: Sequence[Question],
-    predictions: Mapping[str, Sequence[str]],
-    *,
-    boxes: Mapping[str, tuple[Corner, Corner]] | None = None,
-) -> None:
-    """Writes predicted answers as the data set's own scripts take them; SQA3D's entries have the question_id besides.
-
-    Args:
-        questions: of one data set; those without a prediction are left out.
-        predictions: by the id of the question, one to ten answers, best first. SQA3D's files have the first alone.
-        boxes: by the id of the question, of the object that ScanQA asks for, where there is one.
-    """
-    ids = {each.id for each in questions}
-    wrong = next((name for name in [*predictions, *(boxes or {})] if name not in ids), None)
-    if wrong is not None:
-        raise InputError(f"{path}: question {wrong[:60]} is predicted and is none of the set")
-    counts = next((name for name, answers in predictions.items() if not 1 <= len(answers) <= TOP), None)
-    if counts is not None:
-        raise InputError(f"{path}: question {counts[:60]} has {len(predictions[counts])} answers; expected 1 to {TOP}")
-    answered = [each for each in questions if each.id in predictions]
-    write_json(path, [_written(each, predictions[each.id], (boxes or {}).get(each.id)) for each in answered])
-
-
-def _written(question: Question, answers: Sequence[str], box: tuple[Corner, Corner] | None) -> dict[str, Any]:
-    entry: dict[str, Any] = {"scene_id": question.scene, "question_id": question.id}
-    if question.dataset == "scanqa":
-        return entry | {"answer_top10": list(answers)} | ({"bbox": box_corners(*box)} if box else {})
-    entry |= {"situation": question.situation, "question": question.text, "answer": answers[0]}
-    if question.position is not None and question.rotation is not None:
-        w, x, y, z = question.rotation
-        entry["agent_rot"] = {"_x": x, "_y": y, "_z": z, "_w": w}
-        entry["agent_pos"] = dict(zip("xyz", question.position, strict=True))
-    return entry
 
 
 def _answers(entry: Mapping[str, Any], where: str) -> tuple[str, ...]:

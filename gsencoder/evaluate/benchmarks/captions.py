@@ -9,11 +9,10 @@ The script takes for each box the object that its detector was trained to assign
 of boxes does not have. The benchmark (benchmark/eval.py) assigns by generalized IoU, one box to one object, and takes
 an IoU of k, too; where each object has one box of its own near it, all three agree.
 
-Predicted captions in the files of Scan2Cap.
-
-Captions of boxes (benchmark/predict.py): {scene: [{caption, box, sem_prob, obj_prob}]}, where a box is eight corners,
-and the probabilities may be absent. Captions of given objects (lib/eval_helper.py): {"scene|object_id|object_name":
-[caption]}, the name being optional.
+Labels are ScanRefer's file of expressions, with boxes where captions are of boxes. Predictions are Scan2Cap's captions
+of boxes (benchmark/predict.py), {scene: [{caption, box, sem_prob, obj_prob}]}, where a box is eight corners and the
+probabilities decide nothing; or its captions of given objects (lib/eval_helper.py), {"scene|object_id|object_name":
+[caption]}, the name being optional. `ask task=caption` writes them.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,18 +23,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.core.arrays import first_repeated
-from gsencoder.core.errors import InputError
-from gsencoder.core.files import write_json
-from gsencoder.data.labels.captions import wrapped_caption
-from gsencoder.data.labels.expressions import Expression
+from gsencoder.core.errors import InputError, counted
+from gsencoder.data.labels.expressions import Expression, read_scanrefer, wrapped_caption
 from gsencoder.data.labels.files import (
     Corner,
     Entry,
-    box_corners,
+    box_ious,
     corner_bounds,
     entries_of,
-    number,
     object_id,
     read_benchmark_json,
     scene_name,
@@ -43,23 +38,27 @@ from gsencoder.data.labels.files import (
     text_list,
     text_value,
 )
-from gsencoder.evaluate.benchmarks.referring import box_ious
-from gsencoder.evaluate.benchmarks.text_metrics import JavaTools, SentenceScores, score_sentences
+from gsencoder.evaluate.benchmarks.files import ScoreOptions, refuse_missing
+from gsencoder.evaluate.benchmarks.text_metrics import JavaTools, SentenceScores, score_sentences, sentence_figures
+from gsencoder.evaluate.tables import ScoreReport, spread, table_of
 
+OPTIONS = ("min_iou", "java", "allow_missing")
 MAX_TOKENS = 30
 """Tokens of a reference that Scan2Cap keeps (lib/config.py, MAX_DES_LEN)."""
 EMPTY = "sos eos"
+EXPECTED = (
+    "an object from scenes to lists of {caption, box}, or from scene|object_id|object_name to lists of one caption"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaptionedObject:
-    """A true object and what was written of it.
+    """A labeled object and what was written of it.
 
     Attributes:
         object_id: `objectId` of ScanNet's aggregation file, from 0.
-        object_name: as the file writes it.
         captions: wrapped in sos and eos, tokens with blanks between them.
-        aabb: lower and upper corner; None where the truth has no boxes.
+        aabb: lower and upper corner; None where the labels have no boxes.
     """
 
     scene: str
@@ -68,31 +67,23 @@ class CaptionedObject:
     captions: tuple[str, ...]
     aabb: tuple[Corner, Corner] | None = None
 
+    @property
+    def key(self) -> tuple[str, int]:
+        return self.scene, self.object_id
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaptionedBox:
-    """A predicted box and its caption.
-
-    Attributes:
-        caption: with or without sos and eos.
-        objectness: probability that there is an object; it decides nothing here, and is kept in files.
-        class_probabilities: of the detector; the same.
-    """
+    """A predicted box and its caption, with or without sos and eos."""
 
     scene: str
     caption: str
     aabb: tuple[Corner, Corner]
-    objectness: float = 1.0
-    class_probabilities: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NamedCaption:
-    """A predicted caption of a true object, where proposals are given and no boxes are predicted.
-
-    Attributes:
-        caption: with or without sos and eos.
-    """
+    """A predicted caption of a labeled object, where proposals are given and no boxes are predicted."""
 
     scene: str
     object_id: int
@@ -101,37 +92,84 @@ class NamedCaption:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DenseCaptionScores:
-    """Scores of captions; one sample an object.
+    """Scores of captions; one sample an object, in their order.
 
     Attributes:
-        min_iou: k, which the IoU must be above; None where captions belong to objects by their ids.
         missing: objects whose caption counts as empty: no box overlaps them enough, or none is predicted for their id.
         ious: of each object and its best box, 0 without one; None where captions belong to objects by their ids.
-        sentences: scores of the corpus and of each object, in this order.
+        sentences: scores of the corpus and of each object.
     """
 
-    min_iou: float | None
-    objects: tuple[CaptionedObject, ...]
-    predictions: int
     missing: int
     ious: Float64[np.ndarray, "N"] | None
     sentences: SentenceScores
 
-    def columns(self) -> dict[str, float | None]:
-        """Head and value of each column, such as CIDEr@0.5IoU; None where it is absent."""
-        suffix = "" if self.min_iou is None else f"@{self.min_iou:g}IoU"
-        return {f"{name}{suffix}": value for name, value in self.sentences.columns().items()}
+
+def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport:
+    """Scores of captions of boxes or of given objects."""
+    objects = captioned_objects(read_scanrefer(labels))
+    if not objects:
+        raise InputError(f"{labels}: nothing to score: it holds no descriptions")
+    captions = read_caption_predictions(predictions, objects)
+    tools = None if options.java else "Java was not asked for (java=false)"
+    boxes = [each for each in captions if isinstance(each, CaptionedBox)]
+    if boxes:
+        silent = sorted({each.scene for each in objects} - {each.scene for each in boxes})
+        refuse_missing(silent, "scene", predictions, options)
+        scores = score_box_captions(objects, boxes, min_iou=options.min_iou, tools=tools)
+    else:
+        named = [each for each in captions if isinstance(each, NamedCaption)]
+        keys = {(each.scene, each.object_id) for each in named}
+        missing = [f"{each.object_id} of {each.scene}" for each in objects if each.key not in keys]
+        refuse_missing(missing, "object", predictions, options)
+        scores = score_named_captions(objects, named, tools=tools)
+    sentences = scores.sentences
+    ending = f"_{round(100 * options.min_iou)}" if boxes else ""
+    overall = {f"{name}{ending}": value for name, value in sentence_figures(sentences).items()}
+    rows = [
+        {
+            "scene": each.scene,
+            "object": each.object_id,
+            "name": each.object_name,
+            "iou": None if scores.ious is None else float(scores.ious[row]),
+            "cider": float(sentences.cider_each[row]),
+            "rouge_l": float(sentences.rouge_l_each[row]),
+            "bleu_4": float(sentences.bleu_each[row, 3]),
+        }
+        for row, each in enumerate(objects)
+    ]
+    by_scene = [
+        {"scene": scene, "objects": len(of_scene)}
+        | {name: float(np.mean([row[name] for row in of_scene])) for name in ("cider", "rouge_l", "bleu_4")}
+        for scene in dict.fromkeys(row["scene"] for row in rows)
+        for of_scene in ([row for row in rows if row["scene"] == scene],)
+    ]
+    return ScoreReport(
+        results={
+            "protocol": "captions",
+            "objects": len(objects),
+            "predictions": len(captions),
+            "missing": scores.missing,
+            "min_iou": options.min_iou if boxes else None,
+            "tokens": sentences.tokens,
+            "absent": dict(sentences.absent),
+            **overall,
+            "spread": spread(by_scene, ["cider", "rouge_l", "bleu_4"]),
+        },
+        table=table_of(
+            f"Captions at an IoU of {options.min_iou:g}" if boxes else "Captions of given objects",
+            {options.method: overall},
+            published="splatdistill_4_captions" if ending == "_50" else "",
+            notes=[f"{column} is absent: {reason}." for column, reason in sentences.absent.items()],
+        ),
+        rows={"objects": rows, "scenes": by_scene},
+        line=f"{counted(len(objects), 'object')}, {scores.missing} without a caption that counts: CIDEr "
+        f"{100 * sentences.cider:.1f}, BLEU-4 {100 * sentences.bleu[3]:.1f}, ROUGE-L {100 * sentences.rouge_l:.1f}",
+    )
 
 
-def captioned_objects(
-    expressions: Sequence[Expression], *, max_tokens: int | None = MAX_TOKENS
-) -> tuple[CaptionedObject, ...]:
-    """The objects of ScanRefer's or Nr3D's expressions with all their captions, in the order of the first ones.
-
-    Args:
-        max_tokens: tokens of a caption that are kept, as Scan2Cap's lib/eval_helper.py does; None = all, as its
-            benchmark does.
-    """
+def captioned_objects(expressions: Sequence[Expression]) -> tuple[CaptionedObject, ...]:
+    """The objects of expressions with all their captions, each cut to `MAX_TOKENS`, in the order of the first ones."""
     objects: dict[tuple[str, int], list[Expression]] = {}
     for each in expressions:
         objects.setdefault((each.scene, each.object_id), []).append(each)
@@ -140,7 +178,7 @@ def captioned_objects(
             scene=scene,
             object_id=number,
             object_name=group[0].object_name,
-            captions=tuple(f"sos {' '.join(each.tokens[:max_tokens])} eos" for each in group),
+            captions=tuple(f"sos {' '.join(each.tokens[:MAX_TOKENS])} eos" for each in group),
             aabb=group[0].aabb,
         )
         for (scene, number), group in objects.items()
@@ -157,17 +195,17 @@ def score_box_captions(
     """m@kIoU of predicted boxes with captions.
 
     Args:
+        objects: with boxes, each once.
         boxes: of the same scenes, any number a scene, in any order.
+        min_iou: k.
+        tools: see `score_sentences`.
     """
-    if not 0 <= min_iou <= 1:
-        raise InputError(f"the smallest IoU must lie in [0, 1], got {min_iou}")
-    _check(objects, {each.scene for each in boxes})
     bare = next((each for each in objects if each.aabb is None), None)
     if bare is not None:
         raise InputError(f"object {bare.object_id} of {bare.scene} has no box; captions of boxes need true boxes")
     ious, best = _best_boxes(objects, boxes)
     captions = [boxes[row].caption if iou > min_iou else None for row, iou in zip(best, ious, strict=True)]
-    return _scores(objects, captions, len(boxes), min_iou, ious, tools)
+    return _scores(objects, captions, ious, tools)
 
 
 def score_named_captions(
@@ -176,37 +214,20 @@ def score_named_captions(
     *,
     tools: JavaTools | str | None = None,
 ) -> DenseCaptionScores:
-    """The same scores where every caption says which object it is about, and none is dropped for its box.
-
-    Args:
-        captions: at most one an object.
-    """
-    _check(objects, {each.scene for each in captions})
-    caption_of: dict[tuple[str, int], str] = {}
-    keys = {(each.scene, each.object_id) for each in objects}
-    for each in captions:
-        key = each.scene, each.object_id
-        if key in caption_of or key not in keys:
-            wrong = "has two captions" if key in caption_of else "is no object of the truth"
-            raise InputError(f"object {each.object_id} of {each.scene} {wrong}")
-        caption_of[key] = each.caption
-    spoken = [caption_of.get((each.scene, each.object_id)) for each in objects]
-    return _scores(objects, spoken, len(captions), None, None, tools)
+    """The same scores where every caption says which object it is about, at most one an object, and none is dropped for
+    its box."""
+    caption_of = {(each.scene, each.object_id): each.caption for each in captions}
+    return _scores(objects, [caption_of.get(each.key) for each in objects], None, tools)
 
 
 def _scores(
     objects: Sequence[CaptionedObject],
     captions: Sequence[str | None],
-    predictions: int,
-    min_iou: float | None,
     ious: np.ndarray | None,
     tools: JavaTools | str | None,
 ) -> DenseCaptionScores:
     spoken = [EMPTY if caption is None else wrapped_caption(caption) for caption in captions]
     return DenseCaptionScores(
-        min_iou=min_iou,
-        objects=tuple(objects),
-        predictions=predictions,
         missing=sum(caption is None for caption in captions),
         ious=ious,
         sentences=score_sentences(spoken, [each.captions for each in objects], tokens="given", tools=tools),
@@ -228,93 +249,35 @@ def _best_boxes(objects: Sequence[CaptionedObject], boxes: Sequence[CaptionedBox
     return ious, best
 
 
-def _check(objects: Sequence[CaptionedObject], scenes: set[str]) -> None:
-    if repeated := first_repeated((each.scene, each.object_id) for each in objects):
-        scene, number = repeated[0]
-        raise InputError(f"object {number} of {scene} is there twice; expected each once")
-    other = min(scenes - {each.scene for each in objects}, default=None)
-    if other is not None:
-        raise InputError(f"captions are predicted for {other}, which is no scene of the truth")
-
-
-EXPECTED = (
-    "an object from scenes to lists of {caption, box}, or from scene|object_id|object_name to lists of one caption"
-)
-
-
 def read_caption_predictions(
-    path: str | Path, objects: Sequence[CaptionedObject]
+    path: Path, objects: Sequence[CaptionedObject]
 ) -> tuple[CaptionedBox, ...] | tuple[NamedCaption, ...]:
-    """Reads predicted captions of boxes or of given objects, by what is in the file."""
-    file = Path(path)
-    content = read_benchmark_json(file)
+    """Reads predicted captions of boxes or of given objects, by what is in the file, for labeled objects."""
+    content = read_benchmark_json(path)
     if not isinstance(content, dict):
-        truth = isinstance(content, list) and bool(content) and isinstance(content[0], dict) and "ann_id" in content[0]
-        hint = "; this is truth: were predictions and truth swapped?" if truth else ""
-        raise InputError(f"{file}: expected {EXPECTED}, got {shown(content)}{hint}")
+        swapped = isinstance(content, list) and content and isinstance(content[0], dict) and "ann_id" in content[0]
+        hint = "; this is truth: were predictions and truth swapped?" if swapped else ""
+        raise InputError(f"{path}: expected {EXPECTED}, got {shown(content)}{hint}")
     if any("|" in key for key in content):
-        return _named(content, file, objects)
+        return _named(content, path, objects)
     scenes = {each.scene for each in objects}
     boxes = []
     for key, rows in content.items():
-        where = f"{file}: {shown(key)}"
+        where = f"{path}: {shown(key)}"
         if scene_name(key, where) not in scenes:
             raise InputError(f"{where}: is no scene of the truth")
-        boxes += [_box(row, key) for row in entries_of(rows, file, "caption and box", key=key)]
+        boxes += [_box(row, key) for row in entries_of(rows, path, "caption and box", key=key)]
     return tuple(boxes)
-
-
-def write_box_captions(path: str | Path, boxes: Sequence[CaptionedBox]) -> None:
-    """Writes captions of boxes as Scan2Cap's benchmark takes them, wrapped in sos and eos."""
-    scenes: dict[str, list[dict[str, Any]]] = {}
-    for each in boxes:
-        scenes.setdefault(each.scene, []).append(
-            {
-                "caption": wrapped_caption(each.caption),
-                "box": box_corners(*each.aabb),
-                "sem_prob": list(each.class_probabilities),
-                "obj_prob": [1 - each.objectness, each.objectness],
-            }
-        )
-    write_json(path, scenes)
-
-
-def write_named_captions(
-    path: str | Path, objects: Sequence[CaptionedObject], captions: Sequence[NamedCaption]
-) -> None:
-    """Writes captions of given objects as Scan2Cap's evaluation writes them, wrapped in sos and eos."""
-    names = {(each.scene, each.object_id): each.object_name for each in objects}
-    captions_of: dict[str, list[str]] = {}
-    for each in captions:
-        if (each.scene, each.object_id) not in names:
-            raise InputError(f"{path}: object {each.object_id} of {each.scene} is captioned and is not in the truth")
-        key = f"{each.scene}|{each.object_id}|{names[each.scene, each.object_id]}"
-        if key in captions_of:
-            raise InputError(f"{path}: {key[:80]} has two captions; expected one")
-        captions_of[key] = [wrapped_caption(each.caption)]
-    write_json(path, captions_of)
 
 
 def _box(row: Entry, scene: str) -> CaptionedBox:
     entry, where = row
-    return CaptionedBox(
-        scene=scene,
-        caption=text_value(entry.get("caption"), where, "caption", empty=True),
-        aabb=corner_bounds(entry.get("box"), where, "box"),
-        objectness=(_probabilities(entry, "obj_prob", where) or (1.0,))[-1],
-        class_probabilities=_probabilities(entry, "sem_prob", where),
-    )
-
-
-def _probabilities(entry: Mapping[str, Any], key: str, where: str) -> tuple[float, ...]:
-    values = entry.get(key, [])
-    if not isinstance(values, list):
-        raise InputError(f"{where}: {key} must be a list of numbers, got {shown(values)}")
-    return tuple(number(value, where, f"{key}[{index}]") for index, value in enumerate(values))
+    caption = text_value(entry.get("caption"), where, "caption", empty=True)
+    return CaptionedBox(scene=scene, caption=caption, aabb=corner_bounds(entry.get("box"), where, "box"))
 
 
 def _named(content: Mapping[str, Any], path: Path, objects: Sequence[CaptionedObject]) -> tuple[NamedCaption, ...]:
-    names = {(each.scene, each.object_id): each.object_name for each in objects}
+    names = {each.key: each.object_name for each in objects}
     scenes = {scene for scene, _ in names}
     key_of: dict[tuple[str, int], str] = {}
     captions = []

@@ -1,86 +1,102 @@
-"""Classes that are scored: those of ScanNet's benchmarks, or of a CSV file with the columns id, name and group."""
+"""Files that a benchmark is scored from: the options of `score`, and one file a scene for predictions and labels."""
 
-import csv
-import io
 import os
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
-from gsencoder.core.errors import InputError, about, counted, listed, readable
-from gsencoder.core.files import check_foreign, csv_text, write_bytes
-from gsencoder.data.labels.classes import COLUMNS, ClassTable, read_class_list, read_instance_classes, scannet_classes
-from gsencoder.data.labels.files import PICKLE_SUFFIXES, read_checked_text
+from gsencoder.core.errors import InputError, counted, listed, readable
+from gsencoder.core.files import check_foreign
+from gsencoder.data.labels.classes import ids_of_raw_names
+from gsencoder.data.labels.files import PICKLE_SUFFIXES, read_split
 from gsencoder.data.labels.scans import AGGREGATION, ANNOTATION
 
-MAX_CLASS_BYTES = 4 << 20
+Pooling = Literal["max", "mean"]
 
 
-STUFF = ("wall", "floor")
-"""Classes of ScanNet's benchmarks that have labels and no instances."""
+@dataclass(frozen=True, kw_only=True)
+class ScoreOptions:
+    """Options of scores; `OPTIONS` of a module names those that it takes. Without slots, for a command to inherit."""
+
+    method: str = field(default="predictions", metadata={"help": "name of the predictions in the table"})
+    classes: str = field(
+        default="",
+        metadata={
+            "help": "of instances, semantics and recognition: scannet20, scannet200, a CSV file with the columns id, "
+            "name and, if there are any, group, or ScanNet++'s top100.txt; empty for recognition = all names of the "
+            "truth"
+        },
+    )
+    label_map: str = field(
+        default="",
+        metadata={
+            "help": "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv: of instances and semantics it "
+            "gives the objects of truth=SCANS a class, of referring it tells unique from multiple where "
+            "the truth does not"
+        },
+    )
+    scans: str = field(
+        default="",
+        metadata={"help": "of referring: folder of ScanNet's scans, whose labels have the boxes that truth= has not"},
+    )
+    scenes: str = field(
+        default="",
+        metadata={"help": "of instances and semantics: a split, one scene a line; empty = all scenes of the truth"},
+    )
+    allow_missing: bool = field(
+        default=False,
+        metadata={
+            "help": "of recognition, referring, answers and captions: count what has no prediction as wrong, instead "
+            "of refusing the file"
+        },
+    )
+    min_iou: float = field(
+        default=0.5, metadata={"help": "of captions: IoU that a box must be above for its caption to count"}
+    )
+    distractors: int = field(
+        default=0,
+        metadata={"help": "of retrieval: texts or pictures of others in a query's pool, drawn by its name; 0 = all"},
+    )
+    pooling: Pooling = field(
+        default="max", metadata={"help": "of retrieval, where predictions are features: over the cells of a view"}
+    )
+    java: bool = field(
+        default=True,
+        metadata={
+            "help": "of answers and captions: use Java's tokenizer and METEOR where they are there; without, columns "
+            "say so"
+        },
+    )
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_iou <= 1:
+            raise InputError(f"min_iou: expected a share in [0, 1], got {self.min_iou}")
+        if self.distractors < 0:
+            raise InputError(f"distractors: expected 0 or more, got {self.distractors}")
+
+    def given_classes(self) -> str:
+        """The classes, which must be given."""
+        if not self.classes:
+            raise InputError("classes= is missing: scannet20, scannet200, or a CSV file with the columns id and name")
+        return self.classes
+
+    def raw_ids(self) -> dict[str, int] | None:
+        """Class id of each raw name of ScanNet's or ScanNet++'s objects, where labels are those of scans."""
+        return ids_of_raw_names(self.label_map, self.given_classes()) if self.label_map else None
+
+    def split(self) -> tuple[str, ...] | None:
+        """Names of the scenes to score; None = all of the labels."""
+        return read_split(Path(self.scenes)) if self.scenes else None
 
 
-def load_classes(classes: str, *, instances: bool = False) -> ClassTable:
-    """The classes of a benchmark, or of a file.
-
-    Args:
-        classes: scannet20, scannet200, a CSV file with the columns id, name and group where classes have groups, or a
-            list of names (.txt) such as ScanNet++'s top100.txt, whose ids count its lines from 0.
-        instances: whether instances are scored: the benchmarks then leave out wall and floor, so that 18 and 198
-            classes remain. Of a list those in NAME_instance.txt beside it; those of a CSV file are all scored.
-    """
-    table = _table(classes, instances)
-    if instances:
-        table.check_instance_ids()
-    return table
-
-
-def _table(classes: str, instances: bool) -> ClassTable:
-    if classes in COLUMNS:
-        every = scannet_classes(classes)
-        return every.without(STUFF) if instances else every
-    path = Path(classes)
-    if not path.is_file():
+def refuse_missing(missing: Sequence[str], subject: str, predictions: Path, options: ScoreOptions) -> None:
+    """Refuses samples without a prediction, unless they count as wrong."""
+    if missing and not options.allow_missing:
         raise InputError(
-            f"classes: {classes} is no file; expected {', '.join(COLUMNS)}, a CSV file with the columns id and name, "
-            "or a list of names (.txt)"
+            f"{predictions}: {counted(len(missing), subject)} without a prediction, first {missing[0][:60]}; "
+            "allow_missing=true counts them as wrong"
         )
-    if path.suffix.lower() == ".txt":
-        return read_instance_classes(path) if instances else read_class_list(path)
-    text = read_checked_text(path, max_bytes=MAX_CLASS_BYTES)
-    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
-    try:
-        rows = list(reader)
-    except csv.Error as error:
-        raise InputError(f"{path}: not a readable CSV file ({error})") from error
-    if not {"id", "name"} <= set(reader.fieldnames or ()):
-        raise InputError(
-            f"{path}: expected the columns id and name, got {', '.join(reader.fieldnames or ()) or 'none'}"
-        )
-    ids: list[int] = []
-    names: list[str] = []
-    groups: dict[str, list[str]] = {}
-    for number, row in enumerate(rows, start=2):
-        word, name = row["id"] or "", row["name"] or ""
-        if not (word.isascii() and word.isdigit() and len(word) <= 9 and name.strip()):
-            raise InputError(
-                f"{path}: line {number}: expected a whole number and a name, got {word[:40]!r}, {name[:40]!r}"
-            )
-        ids.append(int(word))
-        names.append(name.strip())
-        if row.get("group"):
-            groups.setdefault(row["group"], []).append(name.strip())
-    with about(path):
-        return ClassTable(
-            names=tuple(names), ids=tuple(ids), groups={group: tuple(members) for group, members in groups.items()}
-        )
-
-
-def write_classes(path: Path, classes: ClassTable) -> None:
-    """Writes the table as `load_classes` reads it."""
-    group_of = {name: group for group, members in classes.groups.items() for name in members}
-    rows = [{"id": number, "name": name, "group": group_of.get(name, "")} for number, name in classes.name_of.items()]
-    write_bytes(path, csv_text(rows).encode())
 
 
 RESULT_FILES = ("semantic_instance_evaluation.txt", "semantic_label_evaluation.txt")
@@ -89,21 +105,16 @@ RESULT_FILES = ("semantic_instance_evaluation.txt", "semantic_label_evaluation.t
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneFiles:
-    """The files of one scene.
-
-    Attributes:
-        scene: its name, that of both files without the suffix.
-        truth: what it is held against: a file, or the folder of a scan.
-    """
+    """The prediction of one scene, and its labels: a file, or the folder of a scan."""
 
     scene: str
     prediction: Path
-    truth: Path
+    labels: Path
 
 
 def scene_files(
     predictions: Path,
-    truth: Path,
+    labels: Path,
     *,
     scenes: Collection[str] | None = None,
     suffixes: Collection[str] = (".txt",),
@@ -116,14 +127,15 @@ def scene_files(
 
     Args:
         predictions: folder with SCENE.txt, or what `suffixes` allows.
-        truth: folder with SCENE.txt, or of scans.
-        scenes: those to score, such as the ones of a split; None = all of the truth.
-        scans: whether `truth` has the folders of ScanNet's scans, each with the label files of its scene.
+        labels: folder with SCENE.txt, or of scans.
+        scenes: those to score, such as the ones of a split; None = all of the labels.
+        suffixes: of prediction files.
+        scans: whether `labels` has the folders of ScanNet's scans, each with the label files of its scene.
     """
-    for folder in (predictions, truth):
+    for folder in (predictions, labels):
         if not folder.is_dir():
             raise InputError(f"{folder}: expected a folder with a file for each scene")
-    if predictions.resolve() == truth.resolve():
+    if predictions.resolve() == labels.resolve():
         raise InputError(f"{predictions}: predictions and truth are the same folder")
     predicted: dict[str, Path] = {}
     for path in _files(predictions, suffixes):
@@ -137,47 +149,44 @@ def scene_files(
         because = f"; {pickled[0]} is a pickle, which is refused since reading it can run code" if pickled else ""
         expected = " or ".join(f"SCENE{suffix}" for suffix in suffixes)
         raise InputError(f"{predictions}: no predictions; expected {expected} for each scene{because}")
-    true_files = _true_files(truth, scans)
-    foreign = [scene for scene in predicted if scene not in true_files]
+    label_files = _label_files(labels, scans)
+    foreign = [scene for scene in predicted if scene not in label_files]
     if foreign:
-        some = listed(sorted(true_files), 3)
-        raise InputError(f"{predicted[foreign[0]]}: there is no truth of this scene in {truth}; it has {some}")
-    names = sorted(true_files if scenes is None else set(scenes))
-    unknown = [scene for scene in names if scene not in true_files]
+        some = listed(sorted(label_files), 3)
+        raise InputError(f"{predicted[foreign[0]]}: there is no truth of this scene in {labels}; it has {some}")
+    names = sorted(label_files if scenes is None else set(scenes))
+    unknown = [scene for scene in names if scene not in label_files]
     if unknown:
-        raise InputError(f"{truth}: no truth of {counted(len(unknown), 'scene')} to score: {listed(unknown)}")
+        raise InputError(f"{labels}: no truth of {counted(len(unknown), 'scene')} to score: {listed(unknown)}")
     missing = [scene for scene in names if scene not in predicted]
     if missing:
         raise InputError(f"{predictions}: no prediction of {counted(len(missing), 'scene')}: {listed(missing)}")
-    return tuple(SceneFiles(scene=s, prediction=predicted[s], truth=true_files[s]) for s in names)
+    return tuple(SceneFiles(scene=s, prediction=predicted[s], labels=label_files[s]) for s in names)
 
 
-def _true_files(truth: Path, scans: bool) -> dict[str, Path]:
-    """The file or the scan's folder of each scene with truth, by its name."""
-    files = {path.stem: path for path in _files(truth, (".txt",))}
+def _label_files(labels: Path, scans: bool) -> dict[str, Path]:
+    """The file or the scan's folder of each labeled scene, by its name."""
+    files = {path.stem: path for path in _files(labels, (".txt",))}
     folders = {
         path.name: path
-        for path in sorted(truth.iterdir())
+        for path in sorted(labels.iterdir())
         if any(os.path.lexists(path / name) for name in (f"{path.name}{AGGREGATION}", f"scans/{ANNOTATION}"))
     }
-    if scans:
-        if not folders:
-            instead = "; SCENE.txt has ids of classes and needs no label map" if files else ""
-            raise InputError(
-                f"{truth}: no scans; expected SCENE/SCENE{AGGREGATION} or SCENE/scans/{ANNOTATION}, and the "
-                f"files beside it{instead}"
-            )
-        return folders
-    if not files:
+    if scans and not folders:
+        instead = "; SCENE.txt has ids of classes and needs no label map" if files else ""
+        raise InputError(
+            f"{labels}: no scans; expected SCENE/SCENE{AGGREGATION} or SCENE/scans/{ANNOTATION}, and the files beside "
+            f"it{instead}"
+        )
+    if not scans and not files:
         instead = (
             f"; the labels of {counted(len(folders), 'scan')} that it holds become truth by "
-            f"scannetv2-labels.combined.tsv "
-            "or ScanNet++'s map_benchmark.csv (label_map=)"
+            "scannetv2-labels.combined.tsv or ScanNet++'s map_benchmark.csv (label_map=)"
             if folders
             else ""
         )
-        raise InputError(f"{truth}: no truth; expected SCENE.txt for each scene{instead}")
-    return files
+        raise InputError(f"{labels}: no truth; expected SCENE.txt for each scene{instead}")
+    return folders if scans else files
 
 
 def _files(folder: Path, suffixes: Collection[str]) -> list[Path]:

@@ -1,48 +1,34 @@
 """Average precision of instances, as ScanNet's `evaluate_semantic_instance.py` counts it (Dai et al. 2017).
 
-`gsencoder.evaluate.benchmarks.instances` decides which predictions match a truth, are wrong, or are ignored.
-Precision p and recall r are taken at each distinct score, from the lowest, and the point (1, 0) is added; AP sums
-p[i] · (r[i - 1] - r[i + 1]) / 2, with r[-1] = r[0] and a 0 after the last. Predictions of one score are one step of the
-curve, whatever their order.
-
-AP of a class is the mean over the thresholds 0.50, 0.55, …, 0.90; AP50 and AP25 are those at 0.5 and 0.25. Without
-truths a class has none, and means leave it out; with truths and no predictions it is 0.
-
-Files of instances: ScanNet's submission format and truth, and .npz in place of the pickles that others use.
-
-Truth is SCENE.txt with one number a line: class id · 1000 + number of the instance, and 0 for none. A prediction is
-SCENE.txt with "mask file, class id, score" in each line, where the mask file lies below the same folder and has one
-number a line, 0 outside of the mask; or SCENE.npz with pred_masks (bool, vertices × masks), pred_classes (integers) and
-pred_scores (floating point), as OpenMask3D and Mask3D name them.
-
-Which predicted instances match true ones, as ScanNet's `evaluate_semantic_instance.py` decides it (Dai et al. 2017).
-
-A truth is an instance of a scored class with 100 vertices or more. A prediction is a mask of vertices with a class and
+A true instance is one of a scored class with 100 vertices or more. A prediction is a mask of vertices with a class and
 a score; masks of fewer than 100 vertices are left out, as are those of classes that are not scored. At a threshold of
 the IoU:
 
-* Truths, in the order of their ids, take the predictions of their class whose IoU is strictly above the threshold, in
-  the order in which these are listed, unless another truth has them already. The highest score is that of the match,
-  and each further prediction is a false positive.
+* True instances, in the order of their ids, take the predictions of their class whose IoU is strictly above the
+  threshold, in the order in which these are listed, unless another instance has them already. The highest score is that
+  of the match, and each further prediction is a false positive.
 * A prediction that is above the threshold with no instance of its class is a false positive, unless more than that
   share of its vertices is ignored: vertices without a scored class, and those of its class's instances that have fewer
   than 100.
 
-From 0.5 on a prediction can match one truth only, and the order in which predictions are listed means nothing; at 0.25
-one may lie on several truths, and the order counts there, as in the official script, whatever the scores are.
+From 0.5 on a prediction can match one instance only, and the order in which predictions are listed means nothing; at
+0.25 one may lie on several, and the order counts there, as in the official script, whatever the scores are.
 
-Without classes, truths and predictions are all of one class; what truth labels as no class remains ignored.
+Precision p and recall r are taken at each distinct score, from the lowest, and the point (1, 0) is added; AP sums
+p[i] · (r[i - 1] - r[i + 1]) / 2, with r[-1] = r[0] and a 0 after the last. AP of a class is the mean over the
+thresholds 0.50, 0.55, …, 0.90; AP50 and AP25 are those at 0.5 and 0.25. Without true instances a class has none, and
+means leave it out; with some and no predictions it is 0. Without classes, all masks and instances are of one class;
+what is labeled as no class remains ignored.
 
-Truth of instances and of semantic labels from the labels of scans of ScanNet or ScanNet++, without files in between.
+Files: labels are SCENE.txt with one number a line, class id · 1000 + number of the instance, and 0 for none, or the
+folders of scans. A prediction is SCENE.txt with "mask file, class id, score" in each line, where the mask file lies
+below the same folder and has one number a line, 0 outside of the mask; or SCENE.npz with pred_masks (bool, vertices ×
+masks), pred_classes (integers) and pred_scores (floating point), as OpenMask3D and Mask3D name them.
 
-It is what `gsencoder.data.labels.expressions` writes, and what ScanNet's own export writes: class id · 1000 + objectId
-+ 1, and class ids.
-
-The instances protocol: average precision of masks with a class and a score (SplatDistill sec. 4.2, tables 2 and 7).
-
-Masks are the clusters of Gaussians that `localize` finds for the name of each class, with the probability of their box
-as the score. Or the true objects are given as class-agnostic proposals: their class is recognized by the mean feature,
-and the score is the class's share in a softmax over the cosines of all classes.
+`evaluate protocol=instances` (SplatDistill sec. 4.2, tables 2 and 7) takes the clusters of Gaussians that `localize`
+finds for the name of each class as masks, with the probability of their box as the score. Or the true objects are given
+as class-agnostic proposals: their class is recognized by the mean feature, and the score is the class's share in a
+softmax over the cosines of all classes.
 """
 
 import io
@@ -56,35 +42,98 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from gsencoder.core.archive import read_npz
-from gsencoder.core.arrays import first_repeated
-from gsencoder.core.errors import InputError, about
+from gsencoder.core.errors import InputError, about, counted
 from gsencoder.core.files import write_bytes
-from gsencoder.data.labels.classes import ClassTable, ids_of_names, vertex_classes
-from gsencoder.data.labels.expressions import IDS_PER_CLASS, instance_truth
-from gsencoder.data.labels.files import mask_bytes, read_checked_text, read_mask, read_whole_numbers
-from gsencoder.data.labels.scans import (
-    find_scannet_files,
-    find_scannetpp_files,
-    read_scannet_labels,
-    read_scannetpp_labels,
+from gsencoder.data.labels.classes import (
+    IDS_PER_CLASS,
+    ClassTable,
+    ids_of_names,
+    instance_ids,
+    load_classes,
+    write_classes,
 )
-from gsencoder.evaluate.benchmarks.files import scene_files
+from gsencoder.data.labels.files import (
+    mask_bytes,
+    read_checked_text,
+    read_mask,
+    read_whole_numbers,
+    write_whole_numbers,
+)
+from gsencoder.data.labels.scans import labels_of_scan
+from gsencoder.evaluate.benchmarks.files import ScoreOptions, scene_files
+from gsencoder.evaluate.benchmarks.protocol import (
+    CLASS_IDS,
+    LABELS,
+    PREDICTIONS,
+    Benchmark,
+    Evaluation,
+    Protocol,
+    SceneResult,
+    predicted_classes,
+)
 from gsencoder.evaluate.sources import LabeledPoints, class_cosines
+from gsencoder.evaluate.tables import ScoreReport, spread, table_of
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.text.table import TextEncoder
-from gsencoder.types import GaussianFeatures, MeshLabels, Scene
+from gsencoder.types import GaussianFeatures, Scene
+
+OPTIONS = ("classes", "label_map", "scenes")
+OVERLAPS = np.append(np.arange(0.5, 0.95, 0.05), 0.25)
+"""Thresholds of IoU. Their floating-point values decide ties: 0.6 here is 0.6000000000000001."""
+MIN_REGION = 100
+"""Smallest number of vertices of an instance and of a mask that count."""
+MAX_TABLE = 1 << 22
+"""Largest range of ids that are counted in a table; ScanNet200's reach 1,191,000."""
+TEMPERATURE = 0.1
+"""Of the softmax over classes, as for relevancy (LERF)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class InstanceTruth:
-    """The instance of each vertex of a scene.
+class InstancesProtocol(Protocol):
+    """Where masks come from, and whether classes count."""
 
-    Attributes:
-        ids: class id · 1000 + number of the instance; other ids, such as 0, are no instance.
-    """
+    name: Literal["instances"] = "instances"
+    proposals: Literal["clusters", "truth"] = field(
+        default="clusters",
+        metadata={
+            "help": "masks: clusters = what localize finds for each class; truth = the true objects, to be named"
+        },
+    )
+    class_agnostic: bool = field(default=False, metadata={"help": "leave the classes of masks out of account"})
 
-    scene: str
-    ids: Int64[np.ndarray, " V"]
+    def start(self, given: Evaluation) -> "InstancesBenchmark":
+        return InstancesBenchmark(self, given)
+
+
+class InstancesBenchmark(Benchmark[None]):
+    """Each scene has its own two files, which are written as it is predicted."""
+
+    def __init__(self, protocol: InstancesProtocol, given: Evaluation) -> None:
+        self.protocol, self.given = protocol, given
+        self.classes = predicted_classes(given, instances=True)
+        self.classes.table.check_instance_ids()
+
+    def predict(self, scene: Scene, features: GaussianFeatures) -> None:
+        points, classes = self.classes.points(scene), self.classes.table
+        masks = predict_instances(
+            scene, points, features, classes, self.given.words, self.protocol, self.given.localization
+        )
+        with about(f"scene {scene.name}"):
+            ids = instance_ids(points.objects, points.names, classes.id_of)
+        for name in (LABELS, PREDICTIONS):
+            self.given.file(name).mkdir(exist_ok=True)
+        write_whole_numbers(self.given.file(LABELS) / f"{scene.name}.txt", ids)
+        write_instance_prediction(self.given.file(PREDICTIONS), masks, form="npz")
+
+    def report(self, results: Sequence[SceneResult[None]]) -> ScoreReport:  # noqa: ARG002 - files hold all
+        write_classes(self.given.file(CLASS_IDS), self.classes.table)
+        return score_instances(
+            self.given.file(PREDICTIONS),
+            self.given.file(LABELS),
+            self.classes.table,
+            method=self.given.method,
+            class_agnostic=self.protocol.class_agnostic,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,75 +141,179 @@ class InstancePrediction:
     """Masks of a scene, each with a class and a score; masks may overlap.
 
     Attributes:
-        vertices: of all masks, one mask after the other; ascending within a mask.
-        offsets: where each mask begins in `vertices`, and at last their number.
+        scene: its name.
+        num_vertices: of the scene, V.
+        masks: the vertices of each, ascending, each once.
+        labels: class ids.
         scores: finite; predictions are ranked by them.
     """
 
     scene: str
     num_vertices: int
-    vertices: Int64[np.ndarray, " E"]
-    offsets: Int64[np.ndarray, " M_1"]
+    masks: tuple[Int64[np.ndarray, " _n"], ...]
     labels: Int64[np.ndarray, " M"]
     scores: Float64[np.ndarray, " M"]
-
-    def __post_init__(self) -> None:
-        masks, ends = len(self.labels), self.offsets
-        if len(self.scores) != masks or len(ends) != masks + 1:
-            raise InputError(
-                f"{self.scene}: expected as many labels as scores and masks, got {masks} labels, {len(self.scores)} "
-                f"scores and {len(ends) - 1} masks"
-            )
-        if ends[0] != 0 or ends[-1] != len(self.vertices) or (np.diff(ends) < 0).any():
-            raise InputError(
-                f"{self.scene}: the offsets of the masks do not divide their {len(self.vertices):,} vertices"
-            )
-        if not np.isfinite(self.scores).all():
-            worst = int(np.flatnonzero(~np.isfinite(self.scores))[0])
-            raise InputError(
-                f"{self.scene}: prediction {worst} has the score {self.scores[worst]}; expected finite scores"
-            )
-        rising = np.diff(self.vertices) > 0
-        rising[ends[(ends > 0) & (ends < len(self.vertices))] - 1] = True
-        if not rising.all():
-            raise InputError(f"{self.scene}: the vertices of a mask are not ascending, each once")
-        if len(self.vertices) and not (self.vertices.min() >= 0 and self.vertices.max() < self.num_vertices):
-            raise InputError(f"{self.scene}: a mask has a vertex outside of the scene's {self.num_vertices:,}")
-
-    def mask(self, index: int) -> Int64[np.ndarray, " n"]:
-        """The vertices of one mask."""
-        return self.vertices[self.offsets[index] : self.offsets[index + 1]]
 
 
 def prediction_of_masks(
     scene: str,
-    masks: Sequence[Bool[np.ndarray, " V"]] | Bool[np.ndarray, "M V"],
+    masks: Sequence[Bool[np.ndarray, " _V"]] | Bool[np.ndarray, "M V"],
     labels: Sequence[int],
     scores: Sequence[float],
     *,
     num_vertices: int,
 ) -> InstancePrediction:
     """The prediction of masks that say for each vertex whether it belongs to them."""
-    for index, mask in enumerate(masks):
+    for index, (mask, score) in enumerate(zip(masks, scores, strict=True)):
         if len(mask) != num_vertices:
             raise InputError(f"{scene}: mask {index} has {len(mask):,} vertices, and the scene {num_vertices:,}")
-    parts = [np.flatnonzero(mask) for mask in masks]
+        if not math.isfinite(score):
+            raise InputError(f"{scene}: prediction {index} has the score {score}; expected finite scores")
     return InstancePrediction(
         scene=scene,
         num_vertices=num_vertices,
-        vertices=np.concatenate([np.zeros(0, np.int64), *parts]),
-        offsets=np.cumsum([0, *(len(part) for part in parts)], dtype=np.int64),
+        masks=tuple(np.flatnonzero(mask) for mask in masks),
         labels=np.array(labels, np.int64),
         scores=np.array(scores, np.float64),
     )
 
 
-OVERLAPS = np.append(np.arange(0.5, 0.95, 0.05), 0.25)
-"""Thresholds of IoU. Their floating-point values decide ties: 0.6 here is 0.6000000000000001."""
-MIN_REGION = 100
-"""Smallest number of vertices of a truth and of a prediction that count."""
-MAX_TABLE = 1 << 22
-"""Largest range of ids that are counted in a table; ScanNet200's reach 1,191,000."""
+def predict_instances(
+    scene: Scene,
+    points: LabeledPoints,
+    features: GaussianFeatures,
+    classes: ClassTable,
+    text: TextEncoder,
+    protocol: InstancesProtocol = InstancesProtocol(),
+    localization: LocalizeConfig = LocalizeConfig(),
+) -> InstancePrediction:
+    """Masks of a scene's points, each with a class and a score.
+
+    Args:
+        classes: whose names are looked for.
+        localization: settings of `localize`, for clusters.
+    """
+    ids = classes.id_of
+    if protocol.proposals == "clusters":
+        queried = replace(scene, features={features.space.name: features})
+        boxes = localize(queried, classes.names, text, localization).boxes
+        masks = [points.masked(box.rows.astype(np.int64), len(features)) for box in boxes]
+        labels, scores = [ids[box.query] for box in boxes], [float(box.probability) for box in boxes]
+    else:
+        numbers = list(points.named_ids())
+        cosines = class_cosines(features, [points.rows_of(number) for number in numbers], classes.names, text)
+        rows = np.flatnonzero(np.isfinite(cosines).all(axis=1))
+        shares = np.exp((cosines[rows] - cosines[rows].max(axis=1, keepdims=True, initial=-1)) / TEMPERATURE)
+        shares /= shares.sum(axis=1, keepdims=True)
+        masks = [points.objects == numbers[row] for row in rows]
+        labels = [classes.ids[number] for number in shares.argmax(axis=1)]
+        scores = [float(each) for each in shares.max(axis=1, initial=0)]
+    return prediction_of_masks(scene.name, masks, labels, scores, num_vertices=len(points))
+
+
+def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport:
+    """Average precision of the masks in a folder of SCENE.txt or SCENE.npz."""
+    return score_instances(
+        predictions,
+        labels,
+        load_classes(options.given_classes(), instances=True),
+        method=options.method,
+        scenes=options.split(),
+        raw_ids=options.raw_ids(),
+    )
+
+
+def score_instances(
+    predictions: Path,
+    labels: Path,
+    classes: ClassTable,
+    *,
+    method: str = "predictions",
+    scenes: Collection[str] | None = None,
+    raw_ids: Mapping[str, int] | None = None,
+    class_agnostic: bool = False,
+) -> ScoreReport:
+    """`score`, with classes or without.
+
+    Args:
+        predictions: folder of SCENE.txt or SCENE.npz.
+        labels: folder of SCENE.txt, or of scans.
+        classes: that are scored.
+        method: name of the predictions' row in the table.
+        scenes: names of those to score; None = all that are labeled.
+        raw_ids: class id of each raw name where the labels are those of scans.
+        class_agnostic: leave the classes of masks out of account.
+    """
+    files = match_instance_files(
+        predictions, labels, classes, scenes=scenes, raw_ids=raw_ids, class_agnostic=class_agnostic
+    )
+    matches = list(files)
+    scores = instance_scores(matches, classes)
+    instances = int(scores.instances.sum())
+    if not instances:
+        raise InputError(
+            f"{labels}: nothing to score: no object of the {len(classes.names)} classes has {MIN_REGION} vertices or "
+            f"more in {counted(len(matches), 'scene')}; compare its ids with those of classes="
+        )
+    overall = _precisions(scores.overall)
+    groups = {f"ap_{group}": values.ap for group, values in scores.groups.items()}
+    by_scene = [
+        {"scene": each.scene, **_precisions(alone.overall), "truths": int(alone.instances.sum())}
+        for each in matches
+        for alone in (instance_scores([each], classes),)
+    ]
+    by_class = [
+        {"class": name, **_precisions(values), "truths": int(number), "predictions": int(count)}
+        for (name, values), number, count in zip(
+            scores.classes.items(), scores.instances, scores.predictions, strict=True
+        )
+    ]
+    others = sum(each.other_classes for each in matches)
+    notes = []
+    if scores.equal_scores:
+        notes.append(
+            "All predictions have one score, so that their ranking is undefined, and average precision is that of one "
+            "step."
+        )
+    if class_agnostic:
+        notes.append("All masks are of one class; published figures, which are of classes, do not stand beside it.")
+    if others:
+        notes.append(
+            f"Not counted: {counted(others, 'mask')} with a class id that is none of the {len(classes.names)} that are "
+            "scored."
+        )
+    if scores.shared:
+        notes.append(
+            f"Of the masks {scores.shared:,} overlap several true objects by more than 0.25; AP at 0.25 depends on "
+            "the order in which they are listed, as in ScanNet's script."
+        )
+    return ScoreReport(
+        results={
+            "protocol": "instances",
+            "class_agnostic": class_agnostic,
+            "thresholds": [round(float(value), 2) for value in OVERLAPS],
+            "truths": instances,
+            "predictions": int(scores.predictions.sum()),
+            "other_classes": others,
+            "equal_scores": scores.equal_scores,
+            **overall,
+            **groups,
+            "spread": spread(by_scene, list(overall)),
+        },
+        table=table_of(
+            "Instances",
+            {method: overall | groups},
+            published="" if class_agnostic else "splatdistill_2_instances",
+            notes=notes,
+        ),
+        rows={"scenes": by_scene, "classes": by_class},
+        line=f"{counted(instances, 'object')} in {counted(scores.scenes, 'scene')}: AP {overall['ap']:.3f}, AP50 "
+        f"{overall['ap_50']:.3f}, AP25 {overall['ap_25']:.3f}" + (" without classes" if class_agnostic else ""),
+    )
+
+
+def _precisions(averages: "InstanceAverages") -> dict[str, float]:
+    return {"ap_25": averages.ap25, "ap_50": averages.ap50, "ap": averages.ap}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,9 +322,9 @@ class SceneMatches:
 
     Attributes:
         class_agnostic: whether classes were looked at.
-        truths: numbers of truths by class (one class where they were not looked at).
+        instances: numbers of instances by class (one class where they were not looked at).
         predictions: numbers of predictions that count, by class.
-        shared: number of these predictions that are above the lowest threshold with several truths.
+        shared: number of these predictions that are above the lowest threshold with several instances.
         other_classes: number of predictions whose class is not scored.
         rows: class of each outcome; those of ignored predictions are left out.
         thresholds: index in `OVERLAPS` of each outcome.
@@ -180,7 +333,7 @@ class SceneMatches:
 
     scene: str
     class_agnostic: bool
-    truths: Int64[np.ndarray, " C"]
+    instances: Int64[np.ndarray, " C"]
     predictions: Int64[np.ndarray, " C"]
     scores: Float64[np.ndarray, " n"]
     shared: int
@@ -200,49 +353,48 @@ class _Pairs(NamedTuple):
 
 
 def match_instances(
-    truth: InstanceTruth,
+    ids_of_vertices: Int64[np.ndarray, " V"],
     prediction: InstancePrediction,
     classes: ClassTable,
     *,
     class_agnostic: bool = False,
-    min_region: int = MIN_REGION,
 ) -> SceneMatches:
-    """Decides at each threshold which predictions of a scene match a truth, are wrong, or are ignored.
+    """Decides at each threshold which predictions of a scene match an instance, are wrong, or are ignored.
 
     Args:
-        prediction: of the same scene and vertices. The order of its masks matters where one of them lies on several
-            truths (see the module).
+        ids_of_vertices: class id · 1000 + number of the instance; other ids, such as 0, are no instance.
+        prediction: of the same vertices. The order of its masks matters where one of them lies on several instances
+            (see the module).
+        classes: that are scored.
         class_agnostic: leave the classes out of account; labels of predictions are then not looked at.
-        min_region: smallest number of vertices of a truth and of a prediction that count.
     """
-    if truth.scene != prediction.scene:
-        raise InputError(f"the prediction is of the scene {prediction.scene!r}, and the truth of {truth.scene!r}")
-    if len(truth.ids) != prediction.num_vertices:
+    if len(ids_of_vertices) != prediction.num_vertices:
         raise InputError(
-            f"{truth.scene}: the masks have {prediction.num_vertices:,} vertices, and the truth {len(truth.ids):,}; "
-            "expected those of the same mesh"
+            f"{prediction.scene}: the masks have {prediction.num_vertices:,} vertices, and the truth "
+            f"{len(ids_of_vertices):,}; expected those of the same mesh"
         )
-    ids, codes, sizes = _distinct(truth.ids)
+    ids, codes, sizes = _distinct(ids_of_vertices)
     instance_rows, rows = classes.rows(ids // IDS_PER_CLASS), classes.rows(prediction.labels)
     if class_agnostic:
         instance_rows, rows = np.where(instance_rows < 0, -1, 0), np.zeros_like(rows)
     number = 1 if class_agnostic else len(classes.names)
     void = instance_rows < 0
     instance_rows = np.where(ids == 0, -1, instance_rows)
-    in_score = (instance_rows >= 0) & (ids >= IDS_PER_CLASS) & (sizes >= min_region)
+    in_score = (instance_rows >= 0) & (ids >= IDS_PER_CLASS) & (sizes >= MIN_REGION)
     other_classes = int((rows < 0).sum())
-    large = np.flatnonzero((rows >= 0) & (np.diff(prediction.offsets) >= min_region))
-    rows, scores, areas = rows[large], prediction.scores[large], np.diff(prediction.offsets)[large]
+    areas = np.array([len(mask) for mask in prediction.masks], np.int64)
+    large = np.flatnonzero((rows >= 0) & (areas >= MIN_REGION))
+    rows, scores, areas = rows[large], prediction.scores[large], areas[large]
     common = np.zeros((len(large), len(ids)), np.int64)
     for row, index in enumerate(large.tolist()):
-        common[row] = np.bincount(codes[prediction.mask(index)], minlength=len(ids))
+        common[row] = np.bincount(codes[prediction.masks[index]], minlength=len(ids))
 
     same = rows[:, None] == instance_rows
     first, second = np.nonzero(same & (common > 0))
     shared = common[first, second]
     pairs = _Pairs(first, second, shared / (sizes[second] + areas[first] - shared))
     # The official script adds an instance that is small and a group (an id below 1000) twice.
-    small = same & (sizes < min_region)
+    small = same & (sizes < MIN_REGION)
     groups = same & (ids < IDS_PER_CLASS)
     ignored = (common * (void + small.astype(np.int64) + groups)).sum(axis=1) / np.maximum(areas, 1)
 
@@ -251,9 +403,9 @@ def match_instances(
     hits = np.concatenate([right for _, right, _ in outcomes])
     multiple = np.bincount(pairs.predictions[(pairs.ious > OVERLAPS.min()) & in_score[pairs.instances]], minlength=1)
     return SceneMatches(
-        scene=truth.scene,
+        scene=prediction.scene,
         class_agnostic=class_agnostic,
-        truths=np.bincount(instance_rows[in_score], minlength=number),
+        instances=np.bincount(instance_rows[in_score], minlength=number),
         predictions=np.bincount(rows, minlength=number),
         scores=scores,
         shared=int((multiple > 1).sum()),
@@ -321,7 +473,7 @@ def _outcomes(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InstanceAverages:
-    """AP over 0.5 to 0.9, at 0.5 and at 0.25; NaN without truths."""
+    """AP over 0.5 to 0.9, at 0.5 and at 0.25; NaN without instances."""
 
     ap: float
     ap50: float
@@ -333,14 +485,14 @@ class InstanceScores:
     """The scores of scenes.
 
     Attributes:
-        overall: mean over the classes that have truths.
+        overall: mean over the classes that have instances.
         classes: by name; the one class of a class-agnostic score is called "any".
-        groups: mean over the classes of each group that have truths.
-        recall: share of the truths that are matched, by class and threshold of `OVERLAPS`; NaN without truths.
+        groups: mean over the classes of each group that have instances.
+        recall: share of the instances that are matched, by class and threshold of `OVERLAPS`; NaN without instances.
         equal_scores: whether there are several predictions, all with one score. Their ranking is then undefined, and AP
             is recall · (precision + 1) / 2 at each threshold.
-        shared: predictions that are above 0.25 with several truths; AP25 depends on the order of the predictions where
-            there are any.
+        shared: predictions that are above 0.25 with several instances; AP25 depends on the order of the predictions
+            where there are any.
     """
 
     scenes: int
@@ -348,28 +500,28 @@ class InstanceScores:
     classes: dict[str, InstanceAverages]
     groups: dict[str, InstanceAverages]
     recall: Float64[np.ndarray, "C T"]
-    truths: Int64[np.ndarray, " C"]
+    instances: Int64[np.ndarray, " C"]
     predictions: Int64[np.ndarray, " C"]
     equal_scores: bool
     shared: int
 
 
 def average_precision(
-    scores: Float64[np.ndarray, " n"], hits: Bool[np.ndarray, " n"], truths: int
+    scores: Float64[np.ndarray, " n"], hits: Bool[np.ndarray, " n"], instances: int
 ) -> tuple[float, float]:
     """AP and recall of ranked predictions (the module has the equation); predictions of one score are one step.
 
     Args:
         scores: of predictions that are not ignored.
         hits: which of them match a truth.
-        truths: number of truths, one or more.
+        instances: number of instances, one or more.
     """
     order = np.argsort(scores, kind="stable")
     _, starts = np.unique(scores[order], return_index=True)
     hits_before = np.concatenate([[0], np.cumsum(hits[order])])
     right = hits_before[-1] - hits_before[starts]
     precision = np.append(right / (len(scores) - starts), 1.0)
-    recall = np.append(right / truths, 0.0)
+    recall = np.append(right / instances, 0.0)
     around = np.concatenate([recall[:1], recall, [0.0]])
     return float(precision @ ((around[:-2] - around[2:]) / 2)), float(recall[0])
 
@@ -378,18 +530,12 @@ def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> Ins
     """The scores of scenes together; of one scene, its own.
 
     Args:
-        matches: of the scenes, in any order.
+        matches: of one scene or more, in any order, each once.
         classes: with which they were matched.
     """
-    if not matches:
-        raise InputError("instances: no scene to score")
-    if repeated := first_repeated(scene.scene for scene in matches):
-        raise InputError(f"instances: the scene {repeated[0]} is there twice; each is scored once")
     agnostic = matches[0].class_agnostic
     labels = ("any",) if agnostic else classes.names
-    if any(m.class_agnostic != agnostic or len(m.truths) != len(labels) for m in matches):
-        raise InputError("instances: the scenes were matched with different classes")
-    truths = np.sum([m.truths for m in matches], axis=0)
+    instances = np.sum([m.instances for m in matches], axis=0)
     predictions = np.sum([m.predictions for m in matches], axis=0)
     keys = np.concatenate([m.rows * len(OVERLAPS) + m.thresholds for m in matches])
     order = np.argsort(keys, kind="stable")
@@ -397,11 +543,11 @@ def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> Ins
     hits = np.concatenate([m.hits for m in matches])[order]
     scores = np.concatenate([m.outcome_scores for m in matches])[order]
     table, recall = np.full((2, len(labels), len(OVERLAPS)), math.nan)
-    for row in np.flatnonzero(truths):
+    for row in np.flatnonzero(instances):
         for column in range(len(OVERLAPS)):
             cell = row * len(OVERLAPS) + column
             part = slice(starts[cell], starts[cell + 1])
-            table[row, column], recall[row, column] = average_precision(scores[part], hits[part], int(truths[row]))
+            table[row, column], recall[row, column] = average_precision(scores[part], hits[part], int(instances[row]))
     ranked = np.concatenate([m.scores for m in matches])
     # A group's names are rows of the table; none of them are scored without classes.
     members = {} if agnostic else {g: [labels.index(name) for name in n] for g, n in classes.groups.items()}
@@ -411,7 +557,7 @@ def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> Ins
         classes={name: _averages(table[row : row + 1]) for row, name in enumerate(labels)},
         groups={group: _averages(table[rows]) for group, rows in members.items()},
         recall=recall,
-        truths=truths,
+        instances=instances,
         predictions=predictions,
         equal_scores=len(ranked) > 1 and bool((ranked == ranked[0]).all()),
         shared=sum(m.shared for m in matches),
@@ -419,7 +565,7 @@ def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> Ins
 
 
 def _averages(table: Float64[np.ndarray, "c T"]) -> InstanceAverages:
-    """Means over the classes of a table that have truths."""
+    """Means over the classes of a table that have instances."""
     present = table[~np.isnan(table[:, 0])]
     if not len(present):
         return InstanceAverages(ap=math.nan, ap50=math.nan, ap25=math.nan)
@@ -428,87 +574,49 @@ def _averages(table: Float64[np.ndarray, "c T"]) -> InstanceAverages:
     return InstanceAverages(ap=ap, ap50=ap50, ap25=ap25)
 
 
-NONE = -1
-"""Of vertices of no class."""
-
-
-def instances_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> InstanceTruth:
-    """The instance of each vertex of a scan's mesh; the scene is named as its folder.
-
-    Args:
-        raw_ids: class id of each raw name, of `read_label_map`.
-        classes: that are scored; objects of others do not count.
-    """
-    classes.check_instance_ids()
-    labels = _labels(folder, raw_ids)
-    names = dict(labels.objects)
-    class_of = ids_of_names(names.values(), raw_ids, classes)
-    return InstanceTruth(scene=folder.name, ids=instance_truth(labels.instances, names, class_of))
-
-
-def classes_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> Int64[np.ndarray, " V"]:
-    """The class id of each vertex of a scan's mesh, −1 = none; arguments and errors as of `instances_of_scan`."""
-    labels = _labels(folder, raw_ids)
-    names = dict(labels.objects)
-    ids = ids_of_names(names.values(), raw_ids, classes)
-    # 0 stands for none there, unless a raw name leads to it.
-    class_of = {name: number for name, number in ids.items() if number or (raw_ids.get(name) == 0 and 0 in classes.ids)}
-    return vertex_classes(labels.instances, names, class_of, none=NONE).astype(np.int64)
-
-
-def _labels(folder: Path, raw_ids: Mapping[str, int]) -> MeshLabels:
-    """The labels of a scan; of ScanNet++ those of the objects that have a class, as its toolkit takes them."""
-    if find_scannet_files(folder) is None and find_scannetpp_files(folder) is not None:
-        return read_scannetpp_labels(folder, names=raw_ids)
-    return read_scannet_labels(folder)
-
-
 MASK_FOLDER = "predicted_masks"
 MAX_LIST_BYTES = 64 << 20
+"""Largest size of the list of a scene's masks."""
 MAX_PATH = 1000
 """Largest number of characters of the path of a mask."""
-"""Largest size of the list of a scene's masks."""
 MAX_ID = 2**31 - 1
+
+
+def instance_ids_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> Int64[np.ndarray, " V"]:
+    """The instance of each vertex of a scan's mesh; objects of no scored class have their number alone."""
+    labels = labels_of_scan(folder, raw_ids)
+    names = dict(labels.objects)
+    return instance_ids(labels.instances, names, ids_of_names(names.values(), raw_ids, classes))
 
 
 def match_instance_files(
     predictions: Path,
-    truth: Path,
+    labels: Path,
     classes: ClassTable,
     *,
     scenes: Collection[str] | None = None,
     raw_ids: Mapping[str, int] | None = None,
     class_agnostic: bool = False,
-    min_region: int = MIN_REGION,
 ) -> Iterator[SceneMatches]:
-    """Matches the predictions of a folder with the truth of another, one scene in memory at a time.
-
-    Args:
-        predictions: folder of SCENE.txt or SCENE.npz.
-        truth: folder of SCENE.txt, or of ScanNet's scans.
-        scenes: to score; None = all of the truth.
-        raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
-        class_agnostic: leave the classes out of account.
-        min_region: smallest number of vertices that counts.
-    """
-    suffixes, scans = (".txt", ".npz"), raw_ids is not None
-    for files in scene_files(predictions, truth, scenes=scenes, suffixes=suffixes, scans=scans):
+    """Matches the predictions of a folder with the labels of another, one scene in memory at a time; arguments as of
+    `score_instances`."""
+    suffixes = (".txt", ".npz")
+    for files in scene_files(predictions, labels, scenes=scenes, suffixes=suffixes, scans=raw_ids is not None):
         if raw_ids is None:
-            instances = read_instance_truth(files.truth)
+            ids = read_instance_ids(files.labels)
         else:
-            instances = instances_of_scan(files.truth, raw_ids, classes)
-        masks = read_instance_prediction(files.prediction, num_vertices=len(instances.ids))
+            ids = instance_ids_of_scan(files.labels, raw_ids, classes)
+        masks = read_instance_prediction(files.prediction, num_vertices=len(ids))
         with about(files.prediction):
-            matches = match_instances(instances, masks, classes, class_agnostic=class_agnostic, min_region=min_region)
-        yield matches
+            yield match_instances(ids, masks, classes, class_agnostic=class_agnostic)
 
 
-def read_instance_truth(path: Path) -> InstanceTruth:
-    """Reads the instance of each vertex; the scene is named as the file."""
+def read_instance_ids(path: Path) -> Int64[np.ndarray, " V"]:
+    """Reads the instance of each vertex of a scene: class id · 1000 + number."""
     ids = read_whole_numbers(path, hint="; predictions and truth may be swapped")
     if not len(ids):
         raise InputError(f"{path}: no vertices; expected one whole number for each")
-    return InstanceTruth(scene=path.stem, ids=ids)
+    return ids
 
 
 def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePrediction:
@@ -547,8 +655,7 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
     return InstancePrediction(
         scene=path.stem,
         num_vertices=num_vertices,
-        vertices=np.concatenate([np.zeros(0, np.int64), *vertices]),
-        offsets=np.cumsum([0, *(len(part) for part in vertices)], dtype=np.int64),
+        masks=tuple(vertices),
         labels=np.array(labels, np.int64),
         scores=np.array(scores, np.float64),
     )
@@ -568,7 +675,7 @@ def write_instance_prediction(
     """
     masks = np.zeros((len(prediction.labels), prediction.num_vertices), bool)
     for index, mask in enumerate(masks):
-        mask[prediction.mask(index)] = True
+        mask[prediction.masks[index]] = True
     if form == "npz":
         data = io.BytesIO()
         np.savez_compressed(data, pred_masks=masks.T, pred_classes=prediction.labels, pred_scores=prediction.scores)
@@ -625,69 +732,3 @@ def _number(word: str) -> float | None:
         return None if "_" in word else float(word)
     except ValueError:
         return None
-
-
-Proposals = Literal["clusters", "truth"]
-TEMPERATURE = 0.1
-"""Of the softmax over classes, as for relevancy (LERF)."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InstancesProtocol:
-    """Where masks come from, and which count."""
-
-    name: Literal["instances"] = "instances"
-    proposals: Proposals = field(
-        default="clusters",
-        metadata={
-            "help": "masks: clusters = what localize finds for each class; truth = the true objects, to be named"
-        },
-    )
-    min_region: int = field(
-        default=MIN_REGION, metadata={"help": "smallest number of points of a true object and of a mask that count"}
-    )
-    class_agnostic: bool = field(default=False, metadata={"help": "leave the classes of masks out of account"})
-
-    def __post_init__(self) -> None:
-        if self.min_region < 1:
-            raise InputError(f"min_region: expected 1 or more, got {self.min_region}")
-
-
-def true_instances(points: LabeledPoints, classes: ClassTable) -> InstanceTruth:
-    """The true instances of a scene."""
-    classes.check_instance_ids()
-    with about(f"scene {points.scene}"):
-        return InstanceTruth(scene=points.scene, ids=instance_truth(points.objects, points.names, classes.id_of))
-
-
-def predict_instances(
-    scene: Scene,
-    points: LabeledPoints,
-    features: GaussianFeatures,
-    classes: ClassTable,
-    text: TextEncoder,
-    protocol: InstancesProtocol = InstancesProtocol(),
-    localization: LocalizeConfig = LocalizeConfig(),
-) -> InstancePrediction:
-    """Masks of a scene's points, each with a class and a score.
-
-    Args:
-        classes: whose names are looked for.
-        localization: settings of `localize`, for clusters.
-    """
-    ids = classes.id_of
-    if protocol.proposals == "clusters":
-        queried = replace(scene, features={features.space.name: features})
-        boxes = localize(queried, classes.names, text, localization).boxes
-        masks = [points.masked(box.rows.astype(np.int64), len(features)) for box in boxes]
-        labels, scores = [ids[box.query] for box in boxes], [float(box.probability) for box in boxes]
-    else:
-        numbers = list(points.named_ids())
-        cosines = class_cosines(features, [points.rows_of(number) for number in numbers], classes.names, text)
-        rows = np.flatnonzero(np.isfinite(cosines).all(axis=1))
-        shares = np.exp((cosines[rows] - cosines[rows].max(axis=1, keepdims=True, initial=-1)) / TEMPERATURE)
-        shares /= shares.sum(axis=1, keepdims=True)
-        masks = [points.objects == numbers[row] for row in rows]
-        labels = [classes.ids[number] for number in shares.argmax(axis=1)]
-        scores = [float(each) for each in shares.max(axis=1, initial=0)]
-    return prediction_of_masks(scene.name, masks, labels, scores, num_vertices=len(points))

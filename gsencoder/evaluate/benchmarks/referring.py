@@ -1,33 +1,25 @@
 """Objects that a sentence refers to: the share of the sentences whose box has an IoU of 0.25, or 0.5, or more.
 
-ScanRefer's metric (Chen et al. 2020; `benchmark/eval.py` and `scripts/eval.py`), with the IoU of axis-aligned boxes
-that `gsencoder.evaluate.benchmarks.referring` defines, also for the unique, the multiple and the other sentences of
-`gsencoder.evaluate.benchmarks.referring` alone. A sentence without a predicted box has the IoU 0.
-
-A method that finds several boxes is also scored by the best of the first k, or of all of them, as the paper does for
-its table 5 (sec. 4.5). A user cannot know which box that is.
-
-Files of boxes of sentences: truth in ScanRefer's own format, and predictions in that of its benchmark.
-
-Truth is ScanRefer's list of {scene_id, object_id, object_name, ann_id, description, token}, which `read_scanrefer`
-reads. The box of the object may stand there as bbox, and unique_multiple and others as in predictions; what is not
-there comes from the labels of the scans and from ScanNet's label map. A prediction is {scene_id, object_id, ann_id,
-bbox, unique_multiple, others}; the last two are optional, and are taken where the truth does not say them, as
-ScanRefer's own tool takes them. A bbox is a list of the eight corners of an axis-aligned box, or of its lower and upper
-corner. A prediction may have bboxes, a list of boxes with the likeliest first, in place of or beside bbox, which is
-then the first of them; [] or null stands for no box.
-
-Which sentences are unique, multiple, and about others, as ScanRefer's lib/dataset.py says (Chen et al. 2020).
+ScanRefer's metric (Chen et al. 2020; `benchmark/eval.py` and `scripts/eval.py`), also for the unique, the multiple and
+the other sentences alone. A sentence without a predicted box has the IoU 0. A method that finds several boxes is also
+scored by the best of the first five, and of all, as SplatDistill does for its table 5 (sec. 4.5). A user cannot know
+which box that is.
 
 The class of an object is that of its raw name: one of 17 named classes, or *others*, which is one class. A sentence is
 *unique* if its object is the only one of its class among the objects that the sentences of its scene describe, else
-*multiple*.
+*multiple* (ScanRefer's lib/dataset.py).
 
-The referring protocol: boxes of what sentences describe (ScanRefer; SplatDistill sec. 4.5, table 5).
+Labels are ScanRefer's list of {scene_id, object_id, object_name, ann_id, description, token}, which `read_scanrefer`
+reads. The box of the object may stand there as bbox, and unique_multiple and others as in predictions; what is not
+there comes from the labels of the scans and from ScanNet's label map. A prediction is {scene_id, object_id, ann_id,
+bbox, unique_multiple, others}; the last two are optional, and are taken where the labels do not say them, as in
+ScanRefer's own tool. A bbox is a list of the eight corners of an axis-aligned box, or of its lower and upper corner. A
+prediction may have bboxes, a list of boxes with the likeliest first, in place of bbox, which is then the first of them;
+[] or null stands for no box.
 
-A sentence is answered by the boxes of the words that the text table knows in it, the first of them first, or of the
-whole sentence where a text tower can embed it. Without a file of sentences, the names of the scene's objects are asked,
-one sentence an object.
+`evaluate protocol=referring` answers a sentence with the boxes of the words that the text table knows in it, the first
+of them first, or of the whole sentence where a text tower can embed it. Without a file of sentences, the names of the
+scene's objects are asked, one sentence an object.
 """
 
 import math
@@ -41,16 +33,24 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.core.arrays import first_repeated
-from gsencoder.core.errors import InputError, SceneWarning, about, counted
+from gsencoder.core.errors import InputError, SceneWarning, about, counted, listed
 from gsencoder.core.files import write_json
 from gsencoder.data.labels.classes import COLUMNS, ids_of_names, read_label_map, scannet_classes
-from gsencoder.data.labels.expressions import Expression, boxes_from_scans, described, read_nr3d, read_scanrefer
+from gsencoder.data.labels.expressions import (
+    Expression,
+    boxes_from_labels,
+    boxes_from_scans,
+    described,
+    read_nr3d,
+    read_scanrefer,
+    write_scanrefer,
+)
 from gsencoder.data.labels.files import (
     Corner,
     Entry,
     annotation_id,
     box_corners,
+    box_ious,
     corner_bounds,
     entries_of,
     flag_value,
@@ -60,521 +60,35 @@ from gsencoder.data.labels.files import (
     scene_name,
     shown,
 )
+from gsencoder.data.labels.scans import find_labels, find_scannet_files
+from gsencoder.evaluate.benchmarks.files import ScoreOptions
+from gsencoder.evaluate.benchmarks.protocol import LABELS, PREDICTIONS, Benchmark, Evaluation, Protocol, SceneResult
 from gsencoder.evaluate.tables import ScoreReport, spread, table_of
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.text.question_words import words_in
 from gsencoder.text.vocabulary import Words, closed_table
-from gsencoder.types import GaussianFeatures, Localization, Scene
+from gsencoder.types import GaussianFeatures, Localization, MeshLabels, Scene
 
-VOLUME_EPSILON = 1e-8
-"""Volume that both add to a union, in cubic world units (metres, in ScanNet)."""
-
-
-def box_ious(boxes: Float64[np.ndarray, "K 2 3"], box: Float64[np.ndarray, "2 3"]) -> Float64[np.ndarray, " K"]:
-    """IoU of boxes with one: common volume / (volume + volume - common volume + 1e-8).
-
-    So boxes without volume overlap nothing, and a box that is one quarter of another is below 0.25.
-
-    Args:
-        boxes: lower and upper corners, world units.
-        box: the same of one box.
-    """
-    common = np.maximum(np.minimum(boxes[:, 1], box[1]) - np.maximum(boxes[:, 0], box[0]), 0)
-    sizes, size = boxes[:, 1] - boxes[:, 0], box[1] - box[0]
-    volume = common[:, 0] * common[:, 1] * common[:, 2]
-    # The order of the operations decides ties at a threshold.
-    union = sizes[:, 0] * sizes[:, 1] * sizes[:, 2] + size[0] * size[1] * size[2] - volume + VOLUME_EPSILON
-    return volume / union
-
-
+OPTIONS = ("label_map", "scans", "allow_missing")
 IOUS = (0.25, 0.5)
 """IoUs from which on a box counts."""
-NO_TRUE_BOX = "the object has no box in the truth"
-"""Reason for which a sentence is not scored."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sentence:
-    """Which sentence something is about.
-
-    Attributes:
-        object: id of the object that it means.
-        annotation: number of the sentence about this object.
-    """
-
-    scene: str
-    object: str
-    annotation: str
-
-    @property
-    def key(self) -> tuple[str, str, str]:
-        return self.scene, self.object, self.annotation
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReferredObject(Sentence):
-    """The truth of one sentence.
-
-    Attributes:
-        box: lower and upper corner; None if the object has none, and the sentence is not scored.
-        multiple: whether its scene has several objects of its class; None if that is not known.
-        others: whether its class is none of the named ones; None if that is not known.
-    """
-
-    box: Float64[np.ndarray, "2 3"] | None
-    multiple: bool | None = None
-    others: bool | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PredictedBoxes(Sentence):
-    """The boxes predicted for one sentence.
-
-    Attributes:
-        boxes: lower and upper corners, the likeliest box first; none where there is none.
-        multiple: what the prediction's file says of the truth's `multiple`, as ScanRefer's own files do.
-    """
-
-    boxes: Float64[np.ndarray, "K 2 3"]
-    multiple: bool | None = None
-    others: bool | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReferringResult(Sentence):
-    """One sentence, scored.
-
-    Attributes:
-        ious: of the predicted boxes with that of the object, in the order of the predictions.
-        multiple: whether its scene has several objects of its class; None if that is not known.
-        others: whether its class is none of the named ones; None if that is not known.
-    """
-
-    ious: tuple[float, ...]
-    multiple: bool | None
-    others: bool | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReferringCell:
-    """The accuracy of some sentences; NaN without any, where the official script prints 0."""
-
-    sentences: int
-    acc25: float
-    acc50: float
-
-
-ReferringTable = dict[str, dict[str, ReferringCell]]
-"""Cells by "unique", "multiple" and "overall", and there by "not_in_others", "in_others" and "overall"."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReferringScores:
-    """The scores of sentences.
-
-    Attributes:
-        without_box: of them, those without a predicted box.
-        best_of: of the best among the first k boxes, by k.
-        best: of the best among all boxes.
-    """
-
-    sentences: int
-    without_box: int
-    top1: ReferringTable
-    best_of: dict[int, ReferringTable]
-    best: ReferringTable
-
-
-def referred_objects(expressions: Sequence[Expression]) -> tuple[ReferredObject, ...]:
-    """The truth of expressions, in order."""
-    return tuple(
-        ReferredObject(
-            scene=each.scene,
-            object=str(each.object_id),
-            annotation=each.annotation,
-            box=None if each.aabb is None else np.array(each.aabb, np.float64),
-            multiple=each.multiple,
-            others=each.others,
-        )
-        for each in expressions
-    )
-
-
-def compare_boxes(
-    predictions: Sequence[PredictedBoxes], truth: Sequence[ReferredObject], *, allow_missing: bool = False
-) -> tuple[tuple[ReferringResult, ...], dict[str, int]]:
-    """Computes the IoUs of every sentence of the truth.
-
-    Args:
-        predictions: in any order. What they say of `multiple` and `others` is taken where the truth does not say it.
-        allow_missing: count sentences without a prediction as ones without a box; else they are refused.
-
-    Returns:
-        The sentences that are scored, in the order of the truth; and how many are not, by the reason.
-    """
-    _refuse_repeated([item.key for item in truth], "is there twice in the truth; expected each once")
-    _refuse_repeated([item.key for item in predictions], "is predicted twice; expected each once")
-    prediction_of = {prediction.key: prediction for prediction in predictions}
-    keys = {item.key for item in truth}
-    unknown = next((key for key in prediction_of if key not in keys), None)
-    if unknown is not None:
-        raise InputError(f"{described(unknown)} is predicted, and not in the truth")
-    results, skipped = [], 0
-    for item in truth:
-        if item.box is None:
-            skipped += 1
-            continue
-        if item.key not in prediction_of and not allow_missing:
-            raise InputError(f"{described(item.key)} has no prediction")
-        prediction = prediction_of.get(item.key) or PredictedBoxes(
-            scene=item.scene, object=item.object, annotation=item.annotation, boxes=np.zeros((0, 2, 3))
-        )
-        results.append(
-            ReferringResult(
-                scene=item.scene,
-                object=item.object,
-                annotation=item.annotation,
-                ious=tuple(box_ious(prediction.boxes, item.box).tolist()),
-                multiple=_agreed(item.multiple, prediction.multiple, "unique_multiple", item.key),
-                others=_agreed(item.others, prediction.others, "others", item.key),
-            )
-        )
-    return tuple(results), {NO_TRUE_BOX: skipped} if skipped else {}
-
-
-def referring_scores(results: Sequence[ReferringResult], *, ks: Sequence[int] = (5,)) -> ReferringScores:
-    """The scores of sentences of any scenes. Those whose `multiple` or `others` is not known count in "overall" alone.
-
-    Args:
-        ks: numbers of boxes of which the best counts.
-    """
-    _refuse_repeated([item.key for item in results], "is there twice; each is scored once")
-    if min(ks, default=1) < 1:
-        raise InputError(f"referring: expected k of 1 or more, got {min(ks)}")
-
-    def table(k: int | None) -> ReferringTable:
-        ious = np.array([max(item.ious[:k], default=0.0) for item in results], np.float64)
-        return _table(ious, results)
-
-    return ReferringScores(
-        sentences=len(results),
-        without_box=sum(not item.ious for item in results),
-        top1=table(1),
-        best_of={k: table(k) for k in ks},
-        best=table(None),
-    )
-
-
-def _refuse_repeated(keys: Sequence[tuple[str, str, str]], problem: str) -> None:
-    if repeated := first_repeated(keys):
-        raise InputError(f"{described(repeated[0])} {problem}")
-
-
-def _agreed(true: bool | None, predicted: bool | None, subject: str, key: tuple[str, str, str]) -> bool | None:
-    if true is not None and predicted is not None and true != predicted:
-        raise InputError(
-            f"{described(key)}: {subject} is {int(predicted)} in the prediction, and {int(true)} in the truth"
-        )
-    return predicted if true is None else true
-
-
-def _table(ious: Float64[np.ndarray, " n"], results: Sequence[ReferringResult]) -> ReferringTable:
-    everything = np.ones(len(results), bool)
-    subsets = {
-        "unique": np.array([item.multiple is False for item in results], bool),
-        "multiple": np.array([item.multiple is True for item in results], bool),
-        "overall": everything,
-    }
-    kinds: Mapping[str, np.ndarray] = {
-        "not_in_others": np.array([item.others is False for item in results], bool),
-        "in_others": np.array([item.others is True for item in results], bool),
-        "overall": everything,
-    }
-    return {
-        subset: {kind: _cell(ious[inside & of_kind]) for kind, of_kind in kinds.items()}
-        for subset, inside in subsets.items()
-    }
-
-
-def _cell(ious: Float64[np.ndarray, " n"]) -> ReferringCell:
-    acc25, acc50 = (float((ious >= least).mean()) if len(ious) else math.nan for least in IOUS)
-    return ReferringCell(sentences=len(ious), acc25=acc25, acc50=acc50)
-
-
+BEST_OF = 5
+"""Number of boxes of which the best counts in the paper's table."""
+CANDIDATES = 10
+"""Boxes that are predicted for each sentence."""
+MAX_BOXES = 10_000
+"""Largest number of boxes of one sentence."""
 OTHERS = "others"
 """Class of the objects that are of none of the 17 named ones."""
 UNNAMED = ("wall", "floor", "otherfurniture")
 """Those of ScanNet's 20 classes that are not among the 17."""
-
-
-def named_classes(names: Iterable[str], nyu40_ids: Mapping[str, int]) -> dict[str, str]:
-    """ScanRefer's class of each raw name: one of 17 of ScanNet's 20 classes, or `OTHERS`.
-
-    Its `lib/dataset.py` takes the column nyu40class of scannetv2-labels.combined.tsv, of which nyu40id is the number.
-
-    Args:
-        names: raw names, with underscores or blanks between words.
-        nyu40_ids: `read_label_map` of the column nyu40id.
-
-    Warns:
-        SceneWarning: names that the map does not have; they are counted, and are others.
-    """
-    plain = {name: name.replace("_", " ") for name in names}
-    classes = scannet_classes("scannet20").without(UNNAMED)
-    ids, name_of = ids_of_names(plain.values(), nyu40_ids, classes), classes.name_of
-    return {name: name_of.get(ids[raw], OTHERS) for name, raw in plain.items()}
-
-
-def with_kinds(expressions: Sequence[Expression], class_of: Mapping[str, str]) -> tuple[Expression, ...]:
-    """Expressions that say `multiple` and `others`; those that say it already keep it.
-
-    Args:
-        expressions: all of a benchmark's split, since these are counted.
-        class_of: class of each name of an object.
-    """
-    kinds = [class_of[each.object_name] for each in expressions]
-    keys = [(each.scene, str(each.object_id), kind) for each, kind in zip(expressions, kinds, strict=True)]
-    return tuple(
-        replace(
-            each,
-            multiple=multiple if each.multiple is None else each.multiple,
-            others=kind == OTHERS if each.others is None else each.others,
-        )
-        for each, kind, multiple in zip(expressions, kinds, several_of_their_class(keys), strict=True)
-    )
-
-
-def several_of_their_class(objects: Sequence[tuple[str, str, str]]) -> tuple[bool, ...]:
-    """Whether the scene of each sentence has several objects of its class, as ScanRefer counts them.
-
-    Args:
-        objects: scene, id of the object, and its class for each sentence of the benchmark's split; `OTHERS` is one
-            class. An object counts once, with the class of its first sentence; objects without sentences do not count.
-
-    Returns:
-        For each sentence, whether the objects of its scene that are of its class are not exactly one.
-    """
-    first: dict[tuple[str, str], str] = {}
-    for scene, item, name in objects:
-        first.setdefault((scene, item), name)
-    counts = Counter((scene, name) for (scene, _), name in first.items())
-    return tuple(counts[scene, name] != 1 for scene, _, name in objects)
-
-
-MAX_BOXES = 10_000
-"""Largest number of boxes of one sentence."""
 EXPECTED = "scene_id, object_id, ann_id and bbox"
-
-
-def compare_box_files(
-    predictions: Path,
-    truth: Path,
-    *,
-    label_map: Path | None = None,
-    scans: Path | None = None,
-    allow_missing: bool = False,
-) -> tuple[tuple[ReferringResult, ...], dict[str, int]]:
-    """Reads predictions and truth, and computes the IoUs of every sentence, as `compare_boxes` does.
-
-    Args:
-        predictions: JSON of boxes by sentence.
-    """
-    boxes = read_referring_predictions(predictions)
-    objects = read_referring_truth(truth, label_map=label_map, scans=scans)
-    with about(predictions):
-        return compare_boxes(boxes, objects, allow_missing=allow_missing)
-
-
-def read_referring_truth(
-    path: Path, *, label_map: Path | None = None, scans: Path | None = None
-) -> tuple[ReferredObject, ...]:
-    """Reads the objects of ScanRefer's sentences.
-
-    Args:
-        path: ScanRefer's JSON of a whole split, whose sentences say which objects are alone in their class.
-        label_map: scannetv2-labels.combined.tsv, which gives raw names ScanRefer's classes where the file does not say
-            unique_multiple; without it, sentences are neither unique nor multiple.
-        scans: folder of ScanNet's scans, whose labels have the boxes that the file does not have.
-    """
-    expressions = read_scanrefer(path)
-    if scans is not None:
-        expressions = boxes_from_scans(expressions, scans)
-    if expressions and all(each.aabb is None for each in expressions):
-        raise InputError(
-            f"{path}: no sentence has a box (bbox), as in ScanRefer's own files; the folder of ScanNet's scans has "
-            "them (scans=)"
-        )
-    if label_map is not None:
-        mapping = read_label_map(label_map, COLUMNS["scannet20"])
-        expressions = with_kinds(expressions, named_classes((each.object_name for each in expressions), mapping))
-    return referred_objects(expressions)
-
-
-def read_referring_predictions(path: Path) -> tuple[PredictedBoxes, ...]:
-    """Reads the boxes predicted for each sentence."""
-    boxes = []
-    for row in entries_of(read_benchmark_json(path), path, EXPECTED):
-        entry, where = row
-        for key in ("description", "token", "object_name"):
-            if key in entry:
-                raise InputError(f"{where}: unexpected key {key!r} of the truth; predictions and truth may be swapped")
-        boxes.append(
-            PredictedBoxes(
-                scene=scene_name(entry.get("scene_id"), where),
-                object=str(object_id(entry.get("object_id"), where)),
-                annotation=annotation_id(entry.get("ann_id"), where),
-                boxes=_boxes(row),
-                multiple=flag_value(entry.get("unique_multiple"), where, "unique_multiple"),
-                others=flag_value(entry.get("others"), where, "others"),
-            )
-        )
-    refuse_repeated(path, [each.key for each in boxes], described)
-    return tuple(boxes)
-
-
-def write_referring_predictions(path: Path, predictions: Sequence[PredictedBoxes]) -> None:
-    """Writes predictions, boxes as eight corners. ScanRefer's tool takes the file if each sentence has a box and both
-    `multiple` and `others`."""
-    rows = []
-    for item in predictions:
-        corners = [box_corners(_corner(lower), _corner(upper)) for lower, upper in item.boxes]
-        flags = {"unique_multiple": item.multiple, "others": item.others}
-        rows.append(
-            {
-                "scene_id": item.scene,
-                "object_id": item.object,
-                "ann_id": item.annotation,
-                "bbox": corners[0] if corners else None,
-                "bboxes": corners,
-                **{key: int(value) for key, value in flags.items() if value is not None},
-            }
-        )
-    write_json(path, rows)
-
-
-def _corner(values: Float64[np.ndarray, "3"]) -> Corner:
-    x, y, z = values.tolist()
-    return x, y, z
-
-
-def _boxes(row: Entry) -> Float64[np.ndarray, "K 2 3"]:
-    entry, where = row
-    if "bbox" not in entry and "bboxes" not in entry:
-        raise InputError(f"{where}: bbox is missing; expected a box, or null if there is none")
-    first, several = entry.get("bbox"), entry.get("bboxes")
-    single = [] if first is None else [corner_bounds(first, where, "bbox")]
-    if several is None:
-        boxes = single
-    else:
-        if not isinstance(several, list) or len(several) > MAX_BOXES:
-            actual = f"{len(several):,}" if isinstance(several, list) else shown(several)
-            raise InputError(f"{where}: bboxes must be a list of at most {MAX_BOXES:,} boxes, got {actual}")
-        boxes = [corner_bounds(box, where, f"bboxes[{index}]") for index, box in enumerate(several)]
-        if single and single != boxes[:1]:
-            raise InputError(f"{where}: bbox is not the first of bboxes")
-    return np.array(boxes, np.float64).reshape(len(boxes), 2, 3)
-
-
-def score_referring(
-    predictions: Path,
-    truth: Path,
-    *,
-    method: str = "predictions",
-    ks: Sequence[int] = (5,),
-    label_map: Path | None = None,
-    scans: Path | None = None,
-    allow_missing: bool = False,
-) -> ScoreReport:
-    """Accuracy of the boxes of sentences (`gsencoder.evaluate.benchmarks.referring`).
-
-    Args:
-        predictions: JSON of boxes by sentence.
-        method: name of the predictions' rows in the table.
-        ks: numbers of boxes of which the best counts, besides the first and all.
-        label_map: scannetv2-labels.combined.tsv, which tells unique from multiple where the truth does not.
-        scans: folder of ScanNet's scans, whose labels have the boxes that the truth does not have.
-        allow_missing: count sentences without a prediction as wrong, instead of refusing them.
-    """
-    sentences, unscored = compare_box_files(
-        predictions, truth, label_map=label_map, scans=scans, allow_missing=allow_missing
-    )
-    if not sentences:
-        raise InputError(f"{truth}: nothing to score: it holds no sentence about an object with a box")
-    scores = referring_scores(sentences, ks=ks)
-    by_scene_name = defaultdict(list)
-    for each in sentences:
-        by_scene_name[each.scene].append(each)
-    by_scene = [
-        {"scene": scene, "sentences": len(each), **_accuracies(referring_scores(each, ks=ks).top1)}
-        for scene, each in by_scene_name.items()
-    ]
-    kinds = {method: scores.top1}
-    kinds |= {f"{method}, best of {k}": scores.best_of[k] for k in ks}
-    kinds |= {f"{method}, best of all": scores.best}
-    measured = {name: _accuracies(table) | _by_uniqueness(table) for name, table in kinds.items()}
-    overall, best = measured[method], measured[f"{method}, best of all"]
-    notes = [f"{counted(count, 'sentence')} not scored: {reason}." for reason, count in unscored.items()]
-    if unknown := sum(each.multiple is None for each in sentences):
-        notes.append(
-            f"{counted(unknown, 'sentence')} in the overall columns alone: neither file says what is unique and what "
-            "multiple, which ScanNet's label map tells (label_map=)."
-        )
-    return ScoreReport(
-        results={
-            "protocol": "referring",
-            "sentences": scores.sentences,
-            "without_box": scores.without_box,
-            "not_scored": unscored,
-            "thresholds": list(IOUS),
-            **overall,
-            "best_of": {str(k): _accuracies(scores.best_of[k]) for k in ks} | {"all": _accuracies(scores.best)},
-            "tables": {"top_1": _plain(scores.top1), "best": _plain(scores.best)},
-            "spread": spread(by_scene, ["acc_25", "acc_50"]),
-        },
-        table=table_of("Referring", measured, published="splatdistill_5_referring", notes=notes),
-        rows={
-            "scenes": by_scene,
-            "sentences": [
-                {
-                    "scene": each.scene,
-                    "object": each.object,
-                    "annotation": each.annotation,
-                    "iou": each.ious[0] if each.ious else 0.0,
-                    "best_iou": max(each.ious, default=0.0),
-                    "multiple": each.multiple,
-                }
-                for each in sentences
-            ],
-        },
-        line=f"{counted(scores.sentences, 'sentence')}: Acc@0.25 {overall['acc_25']:.3f}, Acc@0.5 "
-        f"{overall['acc_50']:.3f}; "
-        f"{scores.without_box} without a box; of all boxes the best: {best['acc_25']:.3f}, {best['acc_50']:.3f}",
-    )
-
-
-def _accuracies(table: ReferringTable) -> dict[str, float]:
-    cell = table["overall"]["overall"]
-    return {"acc_25": cell.acc25, "acc_50": cell.acc50}
-
-
-def _by_uniqueness(table: ReferringTable) -> dict[str, float]:
-    return {
-        f"{kind}_{name}": getattr(table[kind]["overall"], field)
-        for kind in ("unique", "multiple")
-        for name, field in (("25", "acc25"), ("50", "acc50"))
-    }
-
-
-def _plain(table: ReferringTable) -> dict[str, Any]:
-    return {kind: {subset: asdict(cell) for subset, cell in cells.items()} for kind, cells in table.items()}
-
-
-CANDIDATES = 10
-"""Boxes that are predicted for each sentence."""
+NO_BOX = "the object has no box in the truth"
+"""Reason for which a sentence is not scored."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReferringProtocol:
+class ReferringProtocol(Protocol):
     """Which sentences are asked, and how."""
 
     name: Literal["referring"] = "referring"
@@ -587,9 +101,90 @@ class ReferringProtocol:
         metadata={"help": "what of a sentence is looked for: the names of the text table in it, or the whole"},
     )
 
-    def __post_init__(self) -> None:
-        if self.query not in ("names", "sentence"):
-            raise InputError(f"query: expected names or sentence, got {self.query!r}")
+    def start(self, given: Evaluation) -> "ReferringBenchmark":
+        return ReferringBenchmark(self, given)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictedBoxes:
+    """The boxes predicted for one sentence, which is known by scene, object and annotation as `Expression` is.
+
+    Attributes:
+        boxes: lower and upper corners, the likeliest box first; none where there is none.
+        multiple: what the prediction's file says of the sentence's `multiple`, as ScanRefer's own files do.
+        others: the same of `others`.
+    """
+
+    scene: str
+    object_id: int
+    annotation: str
+    boxes: Float64[np.ndarray, "K 2 3"]
+    multiple: bool | None = None
+    others: bool | None = None
+
+    @property
+    def key(self) -> tuple[str, int, str]:
+        return self.scene, self.object_id, self.annotation
+
+
+Referred = tuple[tuple[Expression, ...], list[PredictedBoxes]]
+
+
+class ReferringBenchmark(Benchmark[Referred]):
+    def __init__(self, protocol: ReferringProtocol, given: Evaluation) -> None:
+        self.protocol, self.given = protocol, given
+        self.raw_ids = read_label_map(Path(given.label_map), COLUMNS["scannet20"]) if given.label_map else None
+        self.sentences: tuple[Expression, ...] = ()
+        self.others: list[str] = []
+        if protocol.expressions:
+            self.sentences = read_expressions(Path(protocol.expressions))
+            self.others = [each.scene for each in self.sentences if each.scene not in given.scene_names]
+        if self.others and len(self.others) == len(self.sentences):
+            raise InputError(
+                f"protocol.expressions: none of the {len(self.sentences)} sentences of {protocol.expressions} is about "
+                f"a scene that is evaluated ({listed(sorted(given.scene_names), 3)}); first {self.others[0]}"
+            )
+
+    def predict(self, scene: Scene, features: GaussianFeatures) -> Referred:
+        mesh = None if scene.folder is None else find_labels(scene.folder)
+        expressions = self._expressions(scene, mesh)
+        # Boxes of a file are in the aligned frame of its scans, those of a scene's objects in its world.
+        aligned = mesh.aligned_from_world if mesh is not None and self.sentences else None
+        words, localization = self.given.words, self.given.localization
+        return expressions, predict_referring(
+            scene, features, expressions, words, self.protocol, localization, aligned_from_world=aligned
+        )
+
+    def report(self, results: Sequence[SceneResult[Referred]]) -> ScoreReport:
+        """Writes and scores both lists."""
+        if self.others:
+            warnings.warn(
+                f"{len(self.others)} of {len(self.sentences)} sentences do not count: they are about "
+                f"{len(set(self.others))} scenes that are not evaluated (first: {self.others[0]})",
+                SceneWarning,
+                stacklevel=2,
+            )
+        ordered = sorted(results, key=lambda result: result.scene)
+        labels, predictions = (self.given.file(f"{name}.json") for name in (LABELS, PREDICTIONS))
+        write_scanrefer(labels, [each for result in ordered for each in result.value[0]])
+        write_referring_predictions(predictions, [each for result in ordered for each in result.value[1]])
+        report = score(predictions, labels, ScoreOptions(method=self.given.method))
+        more = {"other_scenes": len(self.others)} if self.others else {}
+        return replace(report, results={**report.results, **more})
+
+    def _expressions(self, scene: Scene, mesh: MeshLabels | None) -> tuple[Expression, ...]:
+        """The sentences about a scene, with the boxes of a ScanNet scan's labels where they have none, and with what is
+        known of their kinds: by ScanNet's label map, or by the names themselves where the names are what is asked."""
+        if not self.sentences:
+            expressions = expressions_of_objects(scene)
+            return with_kinds(expressions, {each.object_name: each.object_name for each in expressions})
+        expressions = tuple(each for each in self.sentences if each.scene == scene.name)
+        lacking = any(each.aabb is None for each in expressions)
+        if lacking and mesh is not None and scene.folder is not None and find_scannet_files(scene.folder) is not None:
+            expressions = boxes_from_labels(expressions, mesh)
+        if self.raw_ids is None:
+            return expressions
+        return with_kinds(expressions, named_classes((each.object_name for each in expressions), self.raw_ids))
 
 
 def read_expressions(path: Path) -> tuple[Expression, ...]:
@@ -649,7 +244,7 @@ def predict_referring(
     return [
         PredictedBoxes(
             scene=each.scene,
-            object=str(each.object_id),
+            object_id=each.object_id,
             annotation=each.annotation,
             boxes=np.array(boxes[each], np.float64).reshape(-1, 2, 3),
         )
@@ -672,3 +267,369 @@ def corners_of_words(
             pair = np.stack([points.min(axis=0), points.max(axis=0)])
         corners.setdefault(box.query, []).append(pair)
     return corners
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferringResult:
+    """One sentence, scored.
+
+    Attributes:
+        ious: of the predicted boxes with that of the object, in the order of the predictions.
+        multiple: whether its scene has several objects of its class; None if that is not known.
+        others: whether its class is none of the named ones; None if that is not known.
+    """
+
+    scene: str
+    object_id: int
+    annotation: str
+    ious: tuple[float, ...]
+    multiple: bool | None
+    others: bool | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferringCell:
+    """The accuracy of some sentences; NaN without any, where the official script prints 0."""
+
+    sentences: int
+    acc25: float
+    acc50: float
+
+
+ReferringTable = dict[str, dict[str, ReferringCell]]
+"""Cells by "unique", "multiple" and "overall", and there by "not_in_others", "in_others" and "overall"."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReferringScores:
+    """The scores of sentences.
+
+    Attributes:
+        without_box: sentences without a predicted box.
+        top1: of the first box.
+        best_of: of the best among the first k boxes, by k.
+        best: of the best among all boxes.
+    """
+
+    without_box: int
+    top1: ReferringTable
+    best_of: dict[int, ReferringTable]
+    best: ReferringTable
+
+
+def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport:
+    """Accuracy of the boxes of sentences."""
+    boxes = read_referring_predictions(predictions)
+    expressions = read_referring_labels(
+        labels,
+        label_map=Path(options.label_map) if options.label_map else None,
+        scans=Path(options.scans) if options.scans else None,
+    )
+    with about(predictions):
+        sentences = compare_boxes(boxes, expressions, allow_missing=options.allow_missing)
+    if not sentences:
+        raise InputError(f"{labels}: nothing to score: it holds no sentence about an object with a box")
+    scores = referring_scores(sentences)
+    of_scene = defaultdict(list)
+    for each in sentences:
+        of_scene[each.scene].append(each)
+    by_scene = [
+        {"scene": scene, "sentences": len(each), **_accuracies(referring_scores(each).top1)}
+        for scene, each in of_scene.items()
+    ]
+    best_of = scores.best_of[BEST_OF]
+    tables = {"": scores.top1, f", best of {BEST_OF}": best_of, ", best of all": scores.best}
+    measured = {f"{options.method}{kind}": _accuracies(each) | _by_uniqueness(each) for kind, each in tables.items()}
+    overall, best = measured[options.method], measured[f"{options.method}, best of all"]
+    unscored = {NO_BOX: len(expressions) - len(sentences)} if len(sentences) < len(expressions) else {}
+    notes = [f"{counted(count, 'sentence')} not scored: {reason}." for reason, count in unscored.items()]
+    if unknown := sum(each.multiple is None for each in sentences):
+        notes.append(
+            f"{counted(unknown, 'sentence')} in the overall columns alone: neither file says what is unique and what "
+            "multiple, which ScanNet's label map tells (label_map=)."
+        )
+    return ScoreReport(
+        results={
+            "protocol": "referring",
+            "sentences": len(sentences),
+            "without_box": scores.without_box,
+            "not_scored": unscored,
+            "thresholds": list(IOUS),
+            **overall,
+            "best_of": {str(BEST_OF): _accuracies(best_of), "all": _accuracies(scores.best)},
+            "tables": {"top_1": _plain(scores.top1), "best": _plain(scores.best)},
+            "spread": spread(by_scene, ["acc_25", "acc_50"]),
+        },
+        table=table_of("Referring", measured, published="splatdistill_5_referring", notes=notes),
+        rows={
+            "scenes": by_scene,
+            "sentences": [
+                {
+                    "scene": each.scene,
+                    "object": str(each.object_id),
+                    "annotation": each.annotation,
+                    "iou": each.ious[0] if each.ious else 0.0,
+                    "best_iou": max(each.ious, default=0.0),
+                    "multiple": each.multiple,
+                }
+                for each in sentences
+            ],
+        },
+        line=f"{counted(len(sentences), 'sentence')}: Acc@0.25 {overall['acc_25']:.3f}, Acc@0.5 "
+        f"{overall['acc_50']:.3f}; {scores.without_box} without a box; of all boxes the best: {best['acc_25']:.3f}, "
+        f"{best['acc_50']:.3f}",
+    )
+
+
+def _accuracies(table: ReferringTable) -> dict[str, float]:
+    cell = table["overall"]["overall"]
+    return {"acc_25": cell.acc25, "acc_50": cell.acc50}
+
+
+def _by_uniqueness(table: ReferringTable) -> dict[str, float]:
+    return {
+        f"{kind}_{name}": getattr(table[kind]["overall"], field)
+        for kind in ("unique", "multiple")
+        for name, field in (("25", "acc25"), ("50", "acc50"))
+    }
+
+
+def _plain(table: ReferringTable) -> dict[str, Any]:
+    return {kind: {subset: asdict(cell) for subset, cell in cells.items()} for kind, cells in table.items()}
+
+
+def compare_boxes(
+    predictions: Sequence[PredictedBoxes], sentences: Sequence[Expression], *, allow_missing: bool = False
+) -> tuple[ReferringResult, ...]:
+    """The IoUs of every sentence whose object has a box, in order.
+
+    Args:
+        predictions: in any order. What they say of `multiple` and `others` is taken where the sentences do not say it,
+            and must not contradict them.
+        sentences: in any order.
+        allow_missing: count sentences without a prediction as ones without a box; else they are refused.
+    """
+    prediction_of = {prediction.key: prediction for prediction in predictions}
+    keys = {item.key for item in sentences}
+    unknown = next((key for key in prediction_of if key not in keys), None)
+    if unknown is not None:
+        raise InputError(f"{described(unknown)} is predicted, and not in the truth")
+    results = []
+    for item in sentences:
+        if item.aabb is None:
+            continue
+        prediction = prediction_of.get(item.key)
+        if prediction is None and not allow_missing:
+            raise InputError(f"{described(item.key)} has no prediction")
+        ious: tuple[float, ...] = ()
+        multiple, others = item.multiple, item.others
+        if prediction is not None:
+            ious = tuple(box_ious(prediction.boxes, np.array(item.aabb, np.float64)).tolist())
+            multiple = _agreed(multiple, prediction.multiple, "unique_multiple", item.key)
+            others = _agreed(others, prediction.others, "others", item.key)
+        results.append(
+            ReferringResult(
+                scene=item.scene,
+                object_id=item.object_id,
+                annotation=item.annotation,
+                ious=ious,
+                multiple=multiple,
+                others=others,
+            )
+        )
+    return tuple(results)
+
+
+def referring_scores(results: Sequence[ReferringResult], *, ks: Sequence[int] = (BEST_OF,)) -> ReferringScores:
+    """The scores of sentences of any scenes. Those whose `multiple` or `others` is not known count in "overall" alone.
+
+    Args:
+        results: as `compare_boxes` gives them.
+        ks: numbers of boxes of which the best counts.
+    """
+
+    def table(k: int | None) -> ReferringTable:
+        ious = np.array([max(item.ious[:k], default=0.0) for item in results], np.float64)
+        return _table(ious, results)
+
+    return ReferringScores(
+        without_box=sum(not item.ious for item in results),
+        top1=table(1),
+        best_of={k: table(k) for k in ks},
+        best=table(None),
+    )
+
+
+def _agreed(true: bool | None, predicted: bool | None, subject: str, key: tuple[str, int, str]) -> bool | None:
+    if true is not None and predicted is not None and true != predicted:
+        raise InputError(
+            f"{described(key)}: {subject} is {int(predicted)} in the prediction, and {int(true)} in the truth"
+        )
+    return predicted if true is None else true
+
+
+def _table(ious: Float64[np.ndarray, " n"], results: Sequence[ReferringResult]) -> ReferringTable:
+    everything = np.ones(len(results), bool)
+    subsets = {
+        "unique": np.array([item.multiple is False for item in results], bool),
+        "multiple": np.array([item.multiple is True for item in results], bool),
+        "overall": everything,
+    }
+    kinds: Mapping[str, np.ndarray] = {
+        "not_in_others": np.array([item.others is False for item in results], bool),
+        "in_others": np.array([item.others is True for item in results], bool),
+        "overall": everything,
+    }
+    return {
+        subset: {kind: _cell(ious[inside & of_kind]) for kind, of_kind in kinds.items()}
+        for subset, inside in subsets.items()
+    }
+
+
+def _cell(ious: Float64[np.ndarray, " n"]) -> ReferringCell:
+    acc25, acc50 = (float((ious >= least).mean()) if len(ious) else math.nan for least in IOUS)
+    return ReferringCell(sentences=len(ious), acc25=acc25, acc50=acc50)
+
+
+def named_classes(names: Iterable[str], nyu40_ids: Mapping[str, int]) -> dict[str, str]:
+    """ScanRefer's class of each raw name: one of 17 of ScanNet's 20 classes, or `OTHERS`.
+
+    Its `lib/dataset.py` takes the column nyu40class of scannetv2-labels.combined.tsv, of which nyu40id is the number.
+
+    Args:
+        names: raw names, with underscores or blanks between words.
+        nyu40_ids: `read_label_map` of the column nyu40id.
+
+    Warns:
+        SceneWarning: names that the map does not have; they are counted, and are others.
+    """
+    plain = {name: name.replace("_", " ") for name in names}
+    classes = scannet_classes("scannet20").without(UNNAMED)
+    ids, name_of = ids_of_names(plain.values(), nyu40_ids, classes), classes.name_of
+    return {name: name_of.get(ids[raw], OTHERS) for name, raw in plain.items()}
+
+
+def with_kinds(expressions: Sequence[Expression], class_of: Mapping[str, str]) -> tuple[Expression, ...]:
+    """Expressions that say `multiple` and `others`; those that say it already keep it.
+
+    Args:
+        expressions: all of a benchmark's split, since these are counted.
+        class_of: class of each name of an object.
+    """
+    kinds = [class_of[each.object_name] for each in expressions]
+    keys = [(each.scene, str(each.object_id), kind) for each, kind in zip(expressions, kinds, strict=True)]
+    return tuple(
+        replace(
+            each,
+            multiple=multiple if each.multiple is None else each.multiple,
+            others=kind == OTHERS if each.others is None else each.others,
+        )
+        for each, kind, multiple in zip(expressions, kinds, several_of_their_class(keys), strict=True)
+    )
+
+
+def several_of_their_class(objects: Sequence[tuple[str, str, str]]) -> tuple[bool, ...]:
+    """Whether the scene of each sentence has several objects of its class, as ScanRefer counts them.
+
+    Args:
+        objects: scene, id of the object, and its class for each sentence of the benchmark's split; `OTHERS` is one
+            class. An object counts once, with the class of its first sentence; objects without sentences do not count.
+
+    Returns:
+        For each sentence, whether the objects of its scene that are of its class are not exactly one.
+    """
+    first: dict[tuple[str, str], str] = {}
+    for scene, item, name in objects:
+        first.setdefault((scene, item), name)
+    counts = Counter((scene, name) for (scene, _), name in first.items())
+    return tuple(counts[scene, name] != 1 for scene, _, name in objects)
+
+
+def read_referring_labels(
+    path: Path, *, label_map: Path | None = None, scans: Path | None = None
+) -> tuple[Expression, ...]:
+    """Reads ScanRefer's sentences with the boxes and kinds of their objects.
+
+    Args:
+        path: ScanRefer's JSON of a whole split, whose sentences say which objects are alone in their class.
+        label_map: scannetv2-labels.combined.tsv, which gives raw names ScanRefer's classes where the file does not say
+            unique_multiple; without it, sentences are neither unique nor multiple.
+        scans: folder of ScanNet's scans, whose labels have the boxes that the file does not have.
+    """
+    expressions = read_scanrefer(path)
+    if scans is not None:
+        expressions = boxes_from_scans(expressions, scans)
+    if expressions and all(each.aabb is None for each in expressions):
+        raise InputError(
+            f"{path}: no sentence has a box (bbox), as in ScanRefer's own files; the folder of ScanNet's scans has "
+            "them (scans=)"
+        )
+    if label_map is None:
+        return expressions
+    raw_ids = read_label_map(label_map, COLUMNS["scannet20"])
+    return with_kinds(expressions, named_classes((each.object_name for each in expressions), raw_ids))
+
+
+def read_referring_predictions(path: Path) -> tuple[PredictedBoxes, ...]:
+    """Reads the boxes predicted for each sentence."""
+    boxes = []
+    for row in entries_of(read_benchmark_json(path), path, EXPECTED):
+        entry, where = row
+        for key in ("description", "token", "object_name"):
+            if key in entry:
+                raise InputError(f"{where}: unexpected key {key!r} of the truth; predictions and truth may be swapped")
+        boxes.append(
+            PredictedBoxes(
+                scene=scene_name(entry.get("scene_id"), where),
+                object_id=object_id(entry.get("object_id"), where),
+                annotation=annotation_id(entry.get("ann_id"), where),
+                boxes=_boxes(row),
+                multiple=flag_value(entry.get("unique_multiple"), where, "unique_multiple"),
+                others=flag_value(entry.get("others"), where, "others"),
+            )
+        )
+    refuse_repeated(path, [each.key for each in boxes], described)
+    return tuple(boxes)
+
+
+def write_referring_predictions(path: Path, predictions: Sequence[PredictedBoxes]) -> None:
+    """Writes predictions, boxes as eight corners. ScanRefer's tool takes the file if each sentence has a box and both
+    `multiple` and `others`."""
+    rows = []
+    for item in predictions:
+        corners = [box_corners(_corner(lower), _corner(upper)) for lower, upper in item.boxes]
+        flags = {"unique_multiple": item.multiple, "others": item.others}
+        rows.append(
+            {
+                "scene_id": item.scene,
+                "object_id": str(item.object_id),
+                "ann_id": item.annotation,
+                "bbox": corners[0] if corners else None,
+                "bboxes": corners,
+                **{key: int(value) for key, value in flags.items() if value is not None},
+            }
+        )
+    write_json(path, rows)
+
+
+def _corner(values: Float64[np.ndarray, "3"]) -> Corner:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def _boxes(row: Entry) -> Float64[np.ndarray, "K 2 3"]:
+    entry, where = row
+    if "bbox" not in entry and "bboxes" not in entry:
+        raise InputError(f"{where}: bbox is missing; expected a box, or null if there is none")
+    first, several = entry.get("bbox"), entry.get("bboxes")
+    single = [] if first is None else [corner_bounds(first, where, "bbox")]
+    if several is None:
+        boxes = single
+    else:
+        if not isinstance(several, list) or len(several) > MAX_BOXES:
+            actual = f"{len(several):,}" if isinstance(several, list) else shown(several)
+            raise InputError(f"{where}: bboxes must be a list of at most {MAX_BOXES:,} boxes, got {actual}")
+        boxes = [corner_bounds(box, where, f"bboxes[{index}]") for index, box in enumerate(several)]
+        if single and single != boxes[:1]:
+            raise InputError(f"{where}: bbox is not the first of bboxes")
+    return np.array(boxes, np.float64).reshape(len(boxes), 2, 3)

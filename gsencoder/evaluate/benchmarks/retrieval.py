@@ -1,18 +1,17 @@
 """Retrieval between rendered views and texts, as M3 measures it (sec. 4.1, table 2): recall at 1, 5 and 10.
 
-A query is one view or one text. Its pool is what belongs to it and distractors, which M3 takes from COCO. The score of
-a view with a text is the largest cosine of one of its rendered cells with it.
+A query is one view or one text. Its pool is what belongs to it and distractors, which M3 takes from COCO; without any,
+what belongs to the other queries. The score of a view with a text is the largest cosine of one of its rendered cells
+with it, or their mean.
 
-Predictions of retrieval between views and texts, as .npz. There is no official format.
-
-Either scores, however a method makes them:
+Labels are a list of {scene_id, view, caption}. Predictions are an .npz (there is no official format) of scores,
 
     queries             text [Q], "SCENE/VIEW" of each view that has a caption
     scores              float [Q, Q + M]: each view with the captions of the queries, in their order, then with M texts
                         of other pictures
     distractor_scores   float [M', Q], optional: other pictures, each with the captions of the queries
 
-or features, whose cosines are the scores:
+or of features, whose cosines are the scores:
 
     queries             the same
     views               float [Q, n, D]: n cells of each view
@@ -20,17 +19,15 @@ or features, whose cosines are the scores:
     text_distractors    float [M, D], optional: of texts of other pictures
     view_distractors    float [M', n', D], optional: cells of other pictures
 
-The retrieval protocol: whether rendered views and their captions have each other's best scores (M3 table 2).
-
-The score of a view with a text is the largest cosine of its pixels with the text, or their mean
-(`gsencoder.evaluate.benchmarks.retrieval`). Texts are the captions of all views, and distractors where a file has them.
+`evaluate protocol=retrieval` scores the pixels of views with the captions of all views, and with distractors where a
+file has them.
 """
 
 import hashlib
 import io
 import math
-import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+import warnings
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -40,28 +37,92 @@ from jaxtyping import Float32, Float64, Int64
 
 from gsencoder.core.archive import read_npz
 from gsencoder.core.arrays import first_repeated
-from gsencoder.core.errors import InputError, about, counted, listed
-from gsencoder.core.files import write_bytes
-from gsencoder.data.labels.captions import ViewCaption, read_view_captions
-from gsencoder.data.labels.files import PICKLE_SUFFIXES
-from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.sources import FeatureSource, with_features
+from gsencoder.core.errors import InputError, SceneWarning, about, advised, counted, listed
+from gsencoder.core.files import write_bytes, write_json
+from gsencoder.data.labels.files import (
+    MAX_TEXT,
+    PICKLE_SUFFIXES,
+    entries_of,
+    name_value,
+    read_benchmark_json,
+    read_checked_text,
+    refuse_repeated,
+    scene_name,
+    text_value,
+)
+from gsencoder.evaluate.benchmarks.files import Pooling, ScoreOptions
+from gsencoder.evaluate.benchmarks.protocol import LABELS, PREDICTIONS, Benchmark, Evaluation, Protocol, SceneResult
 from gsencoder.evaluate.tables import ScoreReport, spread, table_of
 from gsencoder.infer.pictures import pixel_features
 from gsencoder.infer.relevancy import GaussianProducts, Mode, word_directions
 from gsencoder.render import blend
-from gsencoder.text.table import TextEncoder, check_space
+from gsencoder.text.table import check_space
+from gsencoder.text.vocabulary import check_known
 from gsencoder.types import GaussianFeatures, QueryMemory, Scene
 
-Pooling = Literal["max", "mean"]
-DISTRACTORS = 1999
-"""Number of distractors of M3's released code."""
+OPTIONS = ("distractors", "pooling")
 RECALLS = (1, 5, 10)
+NAMES = tuple(f"{direction}_{k}" for direction in ("i2t", "t2i") for k in RECALLS)
 TIE = 1e-9
 """Cosines of float32 vectors that differ by less are the same but for rounding."""
 CHUNK_VALUES = 1 << 22
 """Cosines that are in memory at a time."""
+BLOCK_TEXTS = 64
+"""Texts whose cosines with all pixels of a view are in memory at a time."""
 EPS = 1e-60
+EXPECTED = "an .npz with queries and scores, or with queries, views and texts"
+CAPTION_KEYS = "scene_id, view and caption"
+MAX_LIST_BYTES = 256 << 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RetrievalProtocol(Protocol):
+    """Which texts belong to views, and how both are compared."""
+
+    name: Literal["retrieval"] = "retrieval"
+    captions: str = field(default="", metadata={"help": "JSON: a list of {scene_id, view, caption}"})
+    distractors: str = field(
+        default="",
+        metadata={"help": "texts of other pictures, one a line; empty = the pool of a view is the other views' texts"},
+    )
+    count: int = field(default=0, metadata={"help": "of these, texts in a view's pool, drawn by its name; 0 = all"})
+    stride: int = field(
+        default=4, metadata={"help": "pixels from one rendered pixel to the next, along both sides of a view"}
+    )
+    pooling: Pooling = field(default="max", metadata={"help": "of the cosines of a view's pixels: max (M3) or mean"})
+    mode: Mode = field(
+        default="centered", metadata={"help": "cosines less the mean of features and words, or raw as in M3"}
+    )
+
+    def __post_init__(self) -> None:
+        for name, least in (("stride", 1), ("count", 0)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+
+    def start(self, given: Evaluation) -> "RetrievalBenchmark":
+        return RetrievalBenchmark(self, given)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewCaption:
+    """What was written of a view.
+
+    Attributes:
+        view: name of the view in it, as transforms.json or its image file has it.
+    """
+
+    scene: str
+    view: str
+    caption: str
+
+    @property
+    def name(self) -> str:
+        """Scene and view, which together have one caption."""
+        return f"{self.scene}/{self.view}"
+
+
+Retrieved = tuple[tuple[ViewCaption, ...], Float64[np.ndarray, "Q T"]]
+"""The captions of a scene's views, and the scores of these views with all texts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,10 +141,6 @@ class Retrieval:
     def recall(self, k: int) -> float:
         """The share of the queries whose own is among the first k; NaN without queries."""
         return float((self.ranks <= k).mean()) if len(self.ranks) else math.nan
-
-    def recalls(self) -> dict[str, float]:
-        """Recall at 1, 5 and 10, by "recall_1" and so on."""
-        return {f"recall_{k}": self.recall(k) for k in RECALLS}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,7 +169,186 @@ class ScoredPairs:
             raise InputError(f"retrieval: the query {repeated[0][:80]!r} is there twice; expected each once")
 
 
-def retrieve(pairs: ScoredPairs, texts: Sequence[str], *, count: int = 0, seed: int = 0) -> tuple[Retrieval, Retrieval]:
+class RetrievalBenchmark(Benchmark[Retrieved]):
+    def __init__(self, protocol: RetrievalProtocol, given: Evaluation) -> None:
+        self.protocol, self.given = protocol, given
+        if not protocol.captions:
+            raise InputError("protocol.captions= is missing: a JSON list of {scene_id, view, caption}")
+        self.provided = read_view_captions(Path(protocol.captions))
+        self.captions = [each for name in given.scene_names for each in self.provided if each.scene == name]
+        if not self.captions:
+            raise InputError(
+                f"protocol.captions: none of the captions in {protocol.captions} is about a scene that is evaluated "
+                f"({listed(given.scene_names, 3)}); first {self.provided[0].scene}"
+            )
+        own = [each.caption for each in self.captions]
+        others = read_texts(Path(protocol.distractors)) if protocol.distractors else ()
+        others = tuple(text for text in others if text not in {*own})
+        if protocol.count > len(others):
+            raise InputError(
+                f"protocol.count: {protocol.count:,} distractors are asked for, and protocol.distractors= has "
+                f"{len(others):,}"
+            )
+        texts, words = [*own, *others], given.words
+        with advised("sentences need the tower that made the words (text=)"):
+            check_known(words, texts)
+        for scene in given.scenes():
+            views_of(scene, self._about(scene))
+        self.directions = word_directions(words.encode(texts), words.mean, protocol.mode)
+
+    def predict(self, scene: Scene, features: GaussianFeatures) -> Retrieved:
+        captions = self._about(scene)
+        check_space(features.space, self.given.words.space)
+        memory = self.given.memory_of(scene)
+        rows = views_of(scene, captions)
+        return captions, score_views(scene, features, rows, self.directions, self.protocol, memory=memory)
+
+    def report(self, results: Sequence[SceneResult[Retrieved]]) -> ScoreReport:
+        """Writes and scores what `score` takes."""
+        if len(self.captions) < len(self.provided):
+            warnings.warn(
+                f"{len(self.provided) - len(self.captions)} of {counted(len(self.provided), 'caption')} do not count: "
+                "they are about scenes that are not evaluated",
+                SceneWarning,
+                stacklevel=2,
+            )
+        pairs = ScoredPairs(
+            queries=tuple(each.name for result in results for each in result.value[0]),
+            scores=np.concatenate([result.value[1] for result in results]),
+            distractors=np.zeros((0, len(self.captions))),
+        )
+        predictions, labels = self.given.file(f"{PREDICTIONS}.npz"), self.given.file(f"{LABELS}.json")
+        write_scored_pairs(predictions, pairs)
+        write_view_captions(labels, self.captions)
+        return score(predictions, labels, ScoreOptions(method=self.given.method, distractors=self.protocol.count))
+
+    def _about(self, scene: Scene) -> tuple[ViewCaption, ...]:
+        return tuple(each for each in self.captions if each.scene == scene.name)
+
+
+def views_of(scene: Scene, captions: Collection[ViewCaption]) -> list[int]:
+    """The numbers of the views that captions are about."""
+    names = [] if scene.views is None else list(scene.views.names)
+    if not names or not captions:
+        lacking = "views" if not names else "a caption of one of its views in protocol.captions="
+        raise InputError(f"retrieval: scene {scene.name} needs {lacking}")
+    unknown = [each.view for each in captions if each.view not in names]
+    if unknown:
+        raise InputError(
+            f"retrieval: scene {scene.name} has no view called {listed(unknown, 3)}; its views are {listed(names, 3)}"
+        )
+    return [names.index(each.view) for each in captions]
+
+
+def score_views(
+    scene: Scene,
+    features: GaussianFeatures,
+    views: Sequence[int],
+    directions: Float64[np.ndarray, "T D"],
+    protocol: RetrievalProtocol = RetrievalProtocol(),
+    *,
+    memory: QueryMemory | None = None,
+) -> Float64[np.ndarray, "Q T"]:
+    """The scores of views with texts; NaN of a view that shows no Gaussian with a feature.
+
+    Args:
+        directions: of the texts, unit vectors (`word_directions`).
+        memory: that the features come from; its queries are rendered, and attend to its bank at each pixel.
+    """
+    assert scene.gaussians is not None
+    assert scene.views is not None
+    products = GaussianProducts(features, protocol.mode)
+    scores = np.full((len(views), len(directions)), np.nan)
+    for row, view in enumerate(views):
+        b = blend(scene.gaussians, scene.views.cameras, view, stride=protocol.stride)
+        pixels = pixel_features(products, b, memory=memory, mode=protocol.mode)
+        covered = pixels.alpha > 0
+        if not covered.any():
+            continue
+        for start in range(0, len(directions), BLOCK_TEXTS):
+            block = slice(start, start + BLOCK_TEXTS)
+            cosines = np.clip(pixels.cosines(directions[block])[:, covered], -1, 1)
+            scores[row, block] = cosines.max(axis=1) if protocol.pooling == "max" else cosines.mean(axis=1)
+    return scores
+
+
+def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport:
+    """Recall at 1, 5 and 10 of texts for views and of views for texts."""
+    captions = read_view_captions(labels)
+    pairs = read_scored_pairs(predictions, pooling=options.pooling)
+    row_of = {name: row for row, name in enumerate(pairs.queries)}
+    missing = [each.name for each in captions if each.name not in row_of]
+    if missing:
+        raise InputError(
+            f"{predictions}: no query of {counted(len(missing), 'view')} with a caption: {listed(missing, 3)}"
+        )
+    foreign = sorted(set(pairs.queries) - {each.name for each in captions})
+    if foreign:
+        raise InputError(
+            f"{predictions}: {counted(len(foreign), 'query', 'queries')} of no view with a caption in {labels}: "
+            f"{listed(foreign, 3)}"
+        )
+    rows = np.array([row_of[each.name] for each in captions])
+    number = len(captions)
+    columns = np.concatenate([rows, np.arange(number, pairs.scores.shape[1])])
+    ordered = ScoredPairs(
+        queries=tuple(each.name for each in captions),
+        scores=pairs.scores[np.ix_(rows, columns)],
+        distractors=pairs.distractors[:, rows],
+    )
+    found = retrieve(ordered, [each.caption for each in captions], count=options.distractors)
+    sides = dict(zip(("i2t", "t2i"), found, strict=True))
+    overall = {f"{name}_{k}": side.recall(k) for name, side in sides.items() for k in RECALLS}
+    ranks = [
+        {"scene": each.scene, "view": each.view, "i2t_rank": int(there), "t2i_rank": int(back)}
+        for each, there, back in zip(captions, sides["i2t"].ranks, sides["t2i"].ranks, strict=True)
+    ]
+    by_scene = []
+    for scene in dict.fromkeys(each.scene for each in captions):
+        of_scene = np.array([each.scene == scene for each in captions])
+        recalls = {
+            f"{name}_{k}": float((side.ranks[of_scene] <= k).mean()) for name, side in sides.items() for k in RECALLS
+        }
+        by_scene.append({"scene": scene, "views": int(of_scene.sum()), **recalls})
+    candidates = {"i2t": pairs.scores.shape[1] - number, "t2i": len(pairs.distractors)}
+    same = number - len({each.caption for each in captions})
+    notes = [_pool(name, side, candidates[name]) for name, side in sides.items()]
+    if same and not all(candidates.values()):
+        notes.append("Views with the same text are no rivals of each other.")
+    not_finite = sum(side.not_finite for side in sides.values())
+    if not_finite:
+        notes.append(f"{counted(not_finite, 'score')} of a view with its own text not finite: last in its pool.")
+    return ScoreReport(
+        results={
+            "protocol": "retrieval",
+            "views": number,
+            "pools": {
+                name: {"distractors": side.distractors, "of": "distractors" if candidates[name] else "queries"}
+                for name, side in sides.items()
+            },
+            "not_finite": not_finite,
+            **overall,
+            "spread": spread(by_scene, NAMES),
+        },
+        table=table_of(
+            "Retrieval", {options.method: overall}, published="m3_2_grounding_and_retrieval", columns=NAMES, notes=notes
+        ),
+        rows={"scenes": by_scene, "ranks": ranks},
+        line=f"{counted(number, 'view')} in {counted(len(by_scene), 'scene')}: image to text R@1 "
+        f"{overall['i2t_1']:.3f}, "
+        f"R@5 {overall['i2t_5']:.3f}, R@10 {overall['i2t_10']:.3f}; text to image {overall['t2i_1']:.3f}, "
+        f"{overall['t2i_5']:.3f}, {overall['t2i_10']:.3f}",
+    )
+
+
+def _pool(name: str, side: Retrieval, others: int) -> str:
+    media = "texts" if name == "i2t" else "pictures"
+    if others:
+        return f"Pools of {name}: {side.distractors:,} of {others:,} {media} of others (M3: 1,999 of COCO)."
+    return f"Pools of {name}: the {media} of the other queries, and none of COCO as in M3, so that they are smaller."
+
+
+def retrieve(pairs: ScoredPairs, texts: Sequence[str], *, count: int = 0) -> tuple[Retrieval, Retrieval]:
     """The ranks of texts for views, and of views for texts.
 
     The pool of a query is what belongs to it and distractors, where there are any (M3); else what belongs to the other
@@ -139,9 +375,7 @@ def retrieve(pairs: ScoredPairs, texts: Sequence[str], *, count: int = 0, seed: 
         ranks = []
         for query, name in enumerate(pairs.queries):
             pool = (
-                others[query, draw(name, available, count or available, seed)]
-                if available
-                else scores[query, rivals[query]]
+                others[query, draw(name, available, count or available)] if available else scores[query, rivals[query]]
             )
             ranks.append(rank_of_first(np.concatenate([scores[query, query : query + 1], pool])))
         sides.append(
@@ -183,95 +417,18 @@ def view_scores(
     return largest if pooling == "max" else total / len(cells)
 
 
-def image_to_text(
-    names: Sequence[str],
-    views: Sequence[Float32[np.ndarray, "_n _channels"]],
-    texts: Float32[np.ndarray, "Q D"],
-    distractors: Float32[np.ndarray, "M _channels"],
-    *,
-    count: int = DISTRACTORS,
-    seed: int = 0,
-    pooling: Pooling = "max",
-) -> Retrieval:
-    """For each view the rank of its text among the texts of its pool.
-
-    Args:
-        names: of the queries, each once. They decide, with the seed, which distractors are drawn, so that a query has
-            the same pool in any order of queries, and for any method.
-        views: rendered features of each query's view.
-        texts: the text of each view.
-        pooling: over the cells of a view.
-    """
-    _check(names, len(views), texts, distractors, count)
-    ranks, not_finite = [], 0
-    for name, cells, text in zip(names, views, texts, strict=True):
-        picks = draw(name, len(distractors), count, seed)
-        scores = view_scores(cells, np.concatenate([text[None], distractors[picks]]), pooling)
-        ranks.append(rank_of_first(scores))
-        not_finite += not np.isfinite(scores[0])
-    return Retrieval(ranks=np.array(ranks, np.int64), distractors=count, not_finite=not_finite)
-
-
-def text_to_image(
-    names: Sequence[str],
-    texts: Float32[np.ndarray, "Q D"],
-    views: Sequence[Float32[np.ndarray, "_n _channels"]],
-    distractors: Float32[np.ndarray, "M *cells _channels"],
-    *,
-    count: int = DISTRACTORS,
-    seed: int = 0,
-    pooling: Pooling = "max",
-) -> Retrieval:
-    """For each text the rank of its view among the pictures of its pool.
-
-    Args:
-        names: of the queries; see `image_to_text`.
-        views: rendered features of the view that belongs to each text.
-        distractors: other pictures: one vector each, as in M3, or the cells of each. The maximum over many cells is
-            larger than the cosine of one vector, so that one vector each favors the views.
-        pooling: over the cells of a picture.
-    """
-    pictures = distractors.reshape(len(distractors), math.prod(distractors.shape[1:-1]), distractors.shape[-1])
-    _check(names, len(views), texts, pictures, count)
-    others = np.stack([view_scores(cells, texts, pooling) for cells in pictures]) if len(pictures) and names else None
-    ranks, not_finite = [], 0
-    for number, (name, text, cells) in enumerate(zip(names, texts, views, strict=True)):
-        scores = view_scores(cells, text[None], pooling)
-        picks = draw(name, len(pictures), count, seed)
-        ranks.append(rank_of_first(scores if others is None else np.concatenate([scores, others[picks, number]])))
-        not_finite += not np.isfinite(scores[0])
-    return Retrieval(ranks=np.array(ranks, np.int64), distractors=count, not_finite=not_finite)
-
-
 def rank_of_first(scores: Float64[np.ndarray, " n"]) -> int:
     """The rank of the first of some scores, from 1. All that are as high come before it, and all that are NaN, or all
     others where it is NaN itself: a method that gives everything one score finds nothing."""
     return 1 + int((~(scores[1:] < scores[0] - TIE)).sum())
 
 
-def draw(name: str, available: int, count: int, seed: int) -> Int64[np.ndarray, " count"]:
-    """Different numbers below `available`, which depend on the query's name and on the seed alone."""
+def draw(name: str, available: int, count: int) -> Int64[np.ndarray, " count"]:
+    """Different numbers below `available`, which depend on the query's name alone: a query has the same pool in any
+    order of queries, and for any method."""
     digest = hashlib.blake2b(name.encode(), digest_size=16).digest()
-    rng = np.random.default_rng([seed, int.from_bytes(digest, "little")])
+    rng = np.random.default_rng([0, int.from_bytes(digest, "little")])
     return rng.choice(available, size=count, replace=False).astype(np.int64)
-
-
-def _check(names: Sequence[str], views: int, texts: np.ndarray, distractors: np.ndarray, count: int) -> None:
-    if not len(names) == views == len(texts) or len(set(names)) != len(names):
-        raise InputError(
-            f"retrieval: expected a name, a view and a text for each query and no name twice, got {len(names)} names "
-            f"({len(set(names))} different), {views} views and {len(texts)} texts"
-        )
-    if texts.shape[-1] != distractors.shape[-1]:
-        raise InputError(f"retrieval: expected distractors of {texts.shape[-1]} channels, got {distractors.shape[-1]}")
-    if not 0 <= count <= len(distractors):
-        raise InputError(
-            f"retrieval: {count:,} distractors are asked for, and there are {len(distractors):,}; give more, or ask "
-            "for fewer (count=)"
-        )
-    for noun, vectors in (("texts", texts), ("distractors", distractors)):
-        if not np.isfinite(vectors).all():
-            raise InputError(f"retrieval: expected finite {noun}, got NaN or Inf")
 
 
 def _unit(vectors: Float32[np.ndarray, "n D"]) -> Float64[np.ndarray, "n D"]:
@@ -279,9 +436,6 @@ def _unit(vectors: Float32[np.ndarray, "n D"]) -> Float64[np.ndarray, "n D"]:
     # The largest entry is taken out of the root, so that short vectors have directions as well.
     rows = rows / np.maximum(np.abs(rows).max(axis=1, initial=0, keepdims=True), np.finfo(np.float64).tiny)
     return np.asarray(rows / np.sqrt((rows**2).sum(axis=1, keepdims=True) + EPS))
-
-
-EXPECTED = "an .npz with queries and scores, or with queries, views and texts"
 
 
 def read_scored_pairs(path: Path, *, pooling: Pooling = "max") -> ScoredPairs:
@@ -351,227 +505,34 @@ def _from_features(
         )
 
 
-NAMES = tuple(f"{direction}_{k}" for direction in ("i2t", "t2i") for k in RECALLS)
-
-
-def score_retrieval(
-    predictions: Path,
-    truth: Path,
-    *,
-    method: str = "predictions",
-    count: int = 0,
-    seed: int = 0,
-    pooling: Pooling = "max",
-) -> ScoreReport:
-    """Recall at 1, 5 and 10 of texts for views and of views for texts (M3 table 2).
-
-    Args:
-        predictions: .npz of scores or features (`gsencoder.evaluate.benchmarks.retrieval`).
-        truth: JSON of captions of views.
-        method: name of the predictions' row in the table.
-        count: distractors in a query's pool; 0 = all.
-        pooling: over the cells of a view, where predictions are features.
-    """
-    captions = read_view_captions(truth)
-    pairs = read_scored_pairs(predictions, pooling=pooling)
-    row_of = {name: row for row, name in enumerate(pairs.queries)}
-    missing = [each.name for each in captions if each.name not in row_of]
-    if missing:
-        raise InputError(
-            f"{predictions}: no query of {counted(len(missing), 'view')} with a caption: {listed(missing, 3)}"
+def read_view_captions(path: Path) -> tuple[ViewCaption, ...]:
+    """Reads captions of views."""
+    captions = tuple(
+        ViewCaption(
+            scene=scene_name(entry.get("scene_id"), where),
+            view=name_value(entry.get("view"), where, "view"),
+            caption=text_value(entry.get("caption"), where, "caption"),
         )
-    foreign = sorted(set(pairs.queries) - {each.name for each in captions})
-    if foreign:
-        raise InputError(
-            f"{predictions}: {counted(len(foreign), 'query', 'queries')} of no view with a caption in {truth}: "
-            f"{listed(foreign, 3)}"
-        )
-    rows = np.array([row_of[each.name] for each in captions])
-    number = len(captions)
-    columns = np.concatenate([rows, np.arange(number, pairs.scores.shape[1])])
-    ordered = ScoredPairs(
-        queries=tuple(each.name for each in captions),
-        scores=pairs.scores[np.ix_(rows, columns)],
-        distractors=pairs.distractors[:, rows],
+        for entry, where in entries_of(read_benchmark_json(path), path, CAPTION_KEYS)
     )
-    sides = dict(
-        zip(("i2t", "t2i"), retrieve(ordered, [each.caption for each in captions], count=count, seed=seed), strict=True)
-    )
-    overall = {f"{name}_{k}": side.recall(k) for name, side in sides.items() for k in RECALLS}
-    ranks = [
-        {"scene": each.scene, "view": each.view, "i2t_rank": int(there), "t2i_rank": int(back)}
-        for each, there, back in zip(captions, sides["i2t"].ranks, sides["t2i"].ranks, strict=True)
-    ]
-    by_scene = []
-    for scene in dict.fromkeys(each.scene for each in captions):
-        of_scene = np.array([each.scene == scene for each in captions])
-        recalls = {
-            f"{name}_{k}": float((side.ranks[of_scene] <= k).mean()) for name, side in sides.items() for k in RECALLS
-        }
-        by_scene.append({"scene": scene, "views": int(of_scene.sum()), **recalls})
-    candidates = {"i2t": pairs.scores.shape[1] - number, "t2i": len(pairs.distractors)}
-    same = number - len({each.caption for each in captions})
-    notes = [_pool(name, side, candidates[name]) for name, side in sides.items()]
-    if same and not all(candidates.values()):
-        notes.append("Views with the same text are no rivals of each other.")
-    not_finite = sum(side.not_finite for side in sides.values())
-    if not_finite:
-        notes.append(f"{counted(not_finite, 'score')} of a view with its own text not finite: last in its pool.")
-    return ScoreReport(
-        results={
-            "protocol": "retrieval",
-            "views": number,
-            "pools": {
-                name: {"distractors": side.distractors, "of": "distractors" if candidates[name] else "queries"}
-                for name, side in sides.items()
-            },
-            "not_finite": not_finite,
-            **overall,
-            "spread": spread(by_scene, NAMES),
-        },
-        table=table_of(
-            "Retrieval", {method: overall}, published="m3_2_grounding_and_retrieval", columns=NAMES, notes=notes
-        ),
-        rows={"scenes": by_scene, "ranks": ranks},
-        line=f"{counted(number, 'view')} in {counted(len(by_scene), 'scene')}: image to text R@1 "
-        f"{overall['i2t_1']:.3f}, "
-        f"R@5 {overall['i2t_5']:.3f}, R@10 {overall['i2t_10']:.3f}; text to image {overall['t2i_1']:.3f}, "
-        f"{overall['t2i_5']:.3f}, {overall['t2i_10']:.3f}",
-    )
+    refuse_repeated(path, [each.name for each in captions], lambda name: name[:80], what="view")
+    if not captions:
+        raise InputError(f"{path}: holds no captions; expected a list of objects with {CAPTION_KEYS}")
+    return captions
 
 
-def _pool(name: str, side: Retrieval, others: int) -> str:
-    media = "texts" if name == "i2t" else "pictures"
-    if others:
-        return f"Pools of {name}: {side.distractors:,} of {others:,} {media} of others (M3: 1,999 of COCO)."
-    return f"Pools of {name}: the {media} of the other queries, and none of COCO as in M3, so that they are smaller."
+def write_view_captions(path: Path, captions: Sequence[ViewCaption]) -> None:
+    """Writes captions as `read_view_captions` reads them."""
+    write_json(path, [{"scene_id": each.scene, "view": each.view, "caption": each.caption} for each in captions])
 
 
-BLOCK_TEXTS = 64
-"""Texts whose cosines with all pixels of a view are in memory at a time."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RetrievalProtocol:
-    """Which texts belong to views, and how both are compared."""
-
-    name: Literal["retrieval"] = "retrieval"
-    captions: str = field(default="", metadata={"help": "JSON: a list of {scene_id, view, caption}"})
-    distractors: str = field(
-        default="",
-        metadata={"help": "texts of other pictures, one a line; empty = the pool of a view is the other views' texts"},
-    )
-    count: int = field(default=0, metadata={"help": "of these, texts in a view's pool, drawn by its name; 0 = all"})
-    seed: int = field(default=0, metadata={"help": "of their draw"})
-    stride: int = field(
-        default=4, metadata={"help": "pixels from one rendered pixel to the next, along both sides of a view"}
-    )
-    pooling: Pooling = field(default="max", metadata={"help": "of the cosines of a view's pixels: max (M3) or mean"})
-    mode: Mode = field(
-        default="centered", metadata={"help": "cosines less the mean of features and words, or raw as in M3"}
-    )
-
-    def __post_init__(self) -> None:
-        for name, least in (("stride", 1), ("count", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SceneRetrieval:
-    """The result of the protocol on one scene.
-
-    Attributes:
-        captions: of its views, in the order of the file.
-        scores: of these views with all texts.
-    """
-
-    scene: str
-    captions: tuple[ViewCaption, ...]
-    scores: Float64[np.ndarray, "Q T"]
-    gaussians: int
-    seconds: dict[str, float]
-
-
-def evaluate_retrieval(
-    scenes: Iterable[tuple[Scene, float]],
-    source: FeatureSource,
-    words: TextEncoder,
-    captions: Sequence[ViewCaption],
-    texts: Sequence[str],
-    *,
-    protocol: RetrievalProtocol = RetrievalProtocol(),
-    seeds: SeedConfig = SeedConfig(),
-    memory_of: Callable[[Scene], QueryMemory | None] = lambda _: None,
-) -> list[SceneRetrieval]:
-    """Scores the views of each scene that have captions with all texts; one scene is in memory at a time.
-
-    Args:
-        scenes: scenes with views, and the seconds of loading, as `load_scenes` yields them.
-        source: computes the features of a scene.
-        words: turns texts into the features' space.
-        captions: of views; those of other scenes are passed over.
-        texts: that views are compared with.
-        seeds: how Gaussians are made for scenes without.
-        memory_of: the memory that the features of a scene come from, or None where there is none.
-    """
-    directions = word_directions(words.encode(list(texts)), words.mean, protocol.mode)
-    results = []
-    for loaded, load_seconds in scenes:
-        of_scene = tuple(each for each in captions if each.scene == loaded.name)
-        rows = views_of(loaded, of_scene)
-        scene, features, seconds = with_features(loaded, source, seeds)
-        check_space(features.space, words.space)
-        start = time.perf_counter()
-        scores = score_views(scene, features, rows, directions, protocol, memory=memory_of(scene))
-        seconds = {"load": load_seconds, **seconds, "retrieve": time.perf_counter() - start}
-        results.append(
-            SceneRetrieval(scene=scene.name, captions=of_scene, scores=scores, gaussians=len(features), seconds=seconds)
-        )
-    return results
-
-
-def views_of(scene: Scene, captions: Collection[ViewCaption]) -> list[int]:
-    """The numbers of the views that captions are about."""
-    names = [] if scene.views is None else list(scene.views.names)
-    if not names or not captions:
-        lacking = "views" if not names else "a caption of one of its views in protocol.captions="
-        raise InputError(f"retrieval: scene {scene.name} needs {lacking}")
-    unknown = [each.view for each in captions if each.view not in names]
-    if unknown:
-        raise InputError(
-            f"retrieval: scene {scene.name} has no view called {listed(unknown, 3)}; its views are {listed(names, 3)}"
-        )
-    return [names.index(each.view) for each in captions]
-
-
-def score_views(
-    scene: Scene,
-    features: GaussianFeatures,
-    views: Sequence[int],
-    directions: Float64[np.ndarray, "T D"],
-    protocol: RetrievalProtocol = RetrievalProtocol(),
-    *,
-    memory: QueryMemory | None = None,
-) -> Float64[np.ndarray, "Q T"]:
-    """The scores of views with texts; NaN of a view that shows no Gaussian with a feature.
-
-    Args:
-        directions: of the texts, unit vectors (`word_directions`).
-        memory: that the features come from; its queries are rendered, and attend to its bank at each pixel.
-    """
-    assert scene.gaussians is not None
-    assert scene.views is not None
-    products = GaussianProducts(features, protocol.mode)
-    scores = np.full((len(views), len(directions)), np.nan)
-    for row, view in enumerate(views):
-        b = blend(scene.gaussians, scene.views.cameras, view, stride=protocol.stride)
-        pixels = pixel_features(products, b, memory=memory, mode=protocol.mode)
-        covered = pixels.alpha > 0
-        if not covered.any():
-            continue
-        for start in range(0, len(directions), BLOCK_TEXTS):
-            block = slice(start, start + BLOCK_TEXTS)
-            cosines = np.clip(pixels.cosines(directions[block])[:, covered], -1, 1)
-            scores[row, block] = cosines.max(axis=1) if protocol.pooling == "max" else cosines.mean(axis=1)
-    return scores
+def read_texts(path: Path) -> tuple[str, ...]:
+    """The lines of a text file that are not blank, each once, such as captions of COCO's pictures."""
+    lines = [line.strip() for line in read_checked_text(path, max_bytes=MAX_LIST_BYTES).splitlines()]
+    long = next((number for number, line in enumerate(lines, start=1) if len(line) > MAX_TEXT), None)
+    if long is not None:
+        raise InputError(f"{path}: line {long} has more than {MAX_TEXT:,} characters")
+    texts = tuple(dict.fromkeys(line for line in lines if line))
+    if not texts:
+        raise InputError(f"{path}: holds no text; expected one a line")
+    return texts

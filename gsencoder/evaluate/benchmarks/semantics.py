@@ -6,50 +6,219 @@ Vertices whose true label is no class are left out. Of the others, over all scen
     accuracy of a class = right / (right + missed)
 
 where *missed* vertices of the class are predicted as another class, or as none, and *wrong* ones are of another class
-and predicted as this one (ScanNet's `evaluate_semantic_label.py`). mIoU is the mean over the classes that are in truth
-or predictions, mAcc that over the classes in truth, and accuracy the share of all vertices that are right (SceneSplat's
-`ZeroShotSemSegTester`, Li et al. 2025; the 1e-10 that it adds to denominators is left out). A class that is predicted
-and not in truth has the IoU 0; the evaluation that SceneSplat runs during training leaves it out, and so does
-`miou_present`. f-mIoU, f-mAcc and f-accuracy are the same over the foreground: all classes but wall, floor and ceiling.
-Vertices of these still count as wrong where they are predicted as another class.
+and predicted as this one (ScanNet's `evaluate_semantic_label.py`). mIoU is the mean over the classes that are labeled
+or predicted, mAcc that over the classes that are labeled, and accuracy the share of all vertices that are right
+(SceneSplat's `ZeroShotSemSegTester`, Li et al. 2025; the 1e-10 that it adds to denominators is left out). A class that
+is predicted and not labeled has the IoU 0; the evaluation that SceneSplat runs during training leaves it out, and so
+does `miou_present`. f-mIoU, f-mAcc and f-accuracy are the same over the foreground: all classes but wall, floor and
+ceiling. Vertices of these still count as wrong where they are predicted as another class.
 
-Files of semantic labels, in ScanNet's format: SCENE.txt with one class id a line, for predictions and truth.
+Files are ScanNet's: SCENE.txt with one class id a line, for predictions and labels. Both look the same, so that nothing
+tells whether they are swapped.
 
-Both look the same, so that nothing tells whether they are swapped.
-
-The semantics protocol: the class of each point by the nearest word to its feature (mIoU, mAcc, f-mIoU).
-
-Each Gaussian is given the class whose name is nearest to its feature, among the classes of all scenes or of a
-benchmark. A vertex of a labeled mesh has the class that is most frequent among the nearest Gaussians with a feature,
-however far they are, as SceneSplat's benchmark counts (Li et al. 2025; pointcept/utils/misc.py, neighbor_voting).
-Points without a named object are ignored.
+`evaluate protocol=semantics` gives each Gaussian the class whose name is nearest to its feature. A vertex of a labeled
+mesh has the class that is most frequent among the nearest Gaussians with a feature, however far they are, as
+SceneSplat's benchmark counts (pointcept/utils/misc.py, neighbor_voting). Points without a named object are ignored.
 """
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from difflib import get_close_matches
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Int32, Int64
 
-from gsencoder.core.arrays import first_repeated
-from gsencoder.core.errors import InputError, about, listed
-from gsencoder.data.labels.classes import ClassTable, vertex_classes
-from gsencoder.data.labels.expressions import IDS_PER_CLASS
-from gsencoder.data.labels.files import read_whole_numbers
+from gsencoder.core.errors import InputError, about, counted
+from gsencoder.data.labels.classes import (
+    IDS_PER_CLASS,
+    ClassTable,
+    ids_of_names,
+    load_classes,
+    vertex_classes,
+    write_classes,
+)
+from gsencoder.data.labels.files import read_whole_numbers, write_whole_numbers
 from gsencoder.data.labels.mesh import VOTERS, labels_of_vertices
-from gsencoder.evaluate.benchmarks.files import scene_files
-from gsencoder.evaluate.benchmarks.instances import classes_of_scan
+from gsencoder.data.labels.scans import labels_of_scan
+from gsencoder.evaluate.benchmarks.files import ScoreOptions, scene_files
+from gsencoder.evaluate.benchmarks.protocol import (
+    CLASS_IDS,
+    LABELS,
+    PREDICTIONS,
+    Benchmark,
+    Evaluation,
+    Protocol,
+    SceneResult,
+    predicted_classes,
+)
 from gsencoder.evaluate.sources import LabeledPoints, nearest_class
-from gsencoder.evaluate.tables import mean_of
+from gsencoder.evaluate.tables import ScoreReport, mean_of, spread, table_of
 from gsencoder.text.table import TextEncoder
-from gsencoder.types import GaussianFeatures, Gaussians
+from gsencoder.types import GaussianFeatures, Gaussians, Scene
 
+OPTIONS = ("classes", "label_map", "scenes")
 BACKGROUND = ("wall", "floor", "ceiling")
 """Names that SceneSplat excludes from the foreground. ScanNet's 20 classes have no ceiling."""
+NO_CLASS, NO_CLASS_BESIDE_ZERO = 0, -100
+"""Ids of points of no class, in labels and predictions; the second where 0 is the id of a class, as in ScanNet++."""
+RAW_IDS = range(1100, 1358)
+"""Ids from here to the end of ScanNet's raw ones are no instances: no scene has a hundred of class 1."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SemanticsProtocol(Protocol):
+    """How vertices get the class of Gaussians."""
+
+    name: Literal["semantics"] = "semantics"
+    voters: int = field(
+        default=VOTERS,
+        metadata={
+            "help": "on meshes: nearest Gaussians with a feature whose most frequent class a vertex has; 1 = the "
+            "nearest one"
+        },
+    )
+
+    def __post_init__(self) -> None:
+        if self.voters < 1:
+            raise InputError(f"voters: expected 1 or more, got {self.voters}")
+
+    def start(self, given: Evaluation) -> "SemanticsBenchmark":
+        return SemanticsBenchmark(self, given)
+
+
+class SemanticsBenchmark(Benchmark[None]):
+    """Each scene has its own two files, which are written as it is predicted."""
+
+    def __init__(self, protocol: SemanticsProtocol, given: Evaluation) -> None:
+        self.protocol, self.given, self.classes = protocol, given, predicted_classes(given)
+
+    def predict(self, scene: Scene, features: GaussianFeatures) -> None:
+        assert scene.gaussians is not None
+        points, classes = self.classes.points(scene), self.classes.table
+        predicted = predict_semantics(points, scene.gaussians, features, classes, self.given.words, self.protocol)
+        for name, values in ((LABELS, class_ids(points, classes)), (PREDICTIONS, predicted)):
+            self.given.file(name).mkdir(exist_ok=True)
+            write_whole_numbers(self.given.file(name) / f"{scene.name}.txt", values)
+
+    def report(self, results: Sequence[SceneResult[None]]) -> ScoreReport:  # noqa: ARG002 - files hold all
+        write_classes(self.given.file(CLASS_IDS), self.classes.table)
+        return score_semantics(
+            self.given.file(PREDICTIONS), self.given.file(LABELS), self.classes.table, method=self.given.method
+        )
+
+
+def class_ids(points: LabeledPoints, classes: ClassTable) -> Int32[np.ndarray, " P"]:
+    """The class id of each point's object; `id_of_none` for points without a named object."""
+    return vertex_classes(points.objects, points.names, classes.id_of, none=id_of_none(classes))
+
+
+def id_of_none(classes: ClassTable) -> int:
+    """The id of points of no class."""
+    return NO_CLASS_BESIDE_ZERO if 0 in classes.ids else NO_CLASS
+
+
+def predict_semantics(
+    points: LabeledPoints,
+    gaussians: Gaussians,
+    features: GaussianFeatures,
+    classes: ClassTable,
+    text: TextEncoder,
+    protocol: SemanticsProtocol = SemanticsProtocol(),
+) -> Int32[np.ndarray, " P"]:
+    """The predicted class id of each point; `id_of_none` where no Gaussian has a feature.
+
+    Args:
+        points: of a scene.
+        gaussians: of the scene.
+        features: of the Gaussians.
+        classes: that can be predicted.
+        text: turns their names into vectors.
+        protocol: how many Gaussians vote for a vertex.
+    """
+    nearest = nearest_class(features, classes.names, text)
+    none = id_of_none(classes)
+    labels = np.array([*classes.ids, none], np.int32)[nearest]
+    if points.positions is None:
+        return labels
+    return labels_of_vertices(
+        points.positions, gaussians.means, labels, k=protocol.voters, none=none, voters=nearest >= 0
+    )
+
+
+def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport:
+    """IoU and accuracy of the labels of vertices in a folder of SCENE.txt."""
+    return score_semantics(
+        predictions,
+        labels,
+        load_classes(options.given_classes()),
+        method=options.method,
+        scenes=options.split(),
+        raw_ids=options.raw_ids(),
+    )
+
+
+def score_semantics(
+    predictions: Path,
+    labels: Path,
+    classes: ClassTable,
+    *,
+    method: str = "predictions",
+    scenes: Collection[str] | None = None,
+    raw_ids: Mapping[str, int] | None = None,
+) -> ScoreReport:
+    """`score` with other classes.
+
+    Args:
+        predictions: folder of SCENE.txt.
+        labels: folder of SCENE.txt, or of scans.
+        classes: that are scored.
+        method: name of the predictions' row in the table.
+        scenes: names of those to score; None = all that are labeled.
+        raw_ids: class id of each raw name where the labels are those of scans.
+    """
+    counts = list(count_label_files(predictions, labels, classes, scenes=scenes, raw_ids=raw_ids))
+    scores = semantic_scores(counts, classes)
+    if not scores.vertices:
+        raise InputError(
+            f"{labels}: nothing to score: no vertex of {counted(len(counts), 'scene')} has one of the "
+            f"{len(classes.names)} classes; compare its ids with those of classes="
+        )
+    overall = _figures(scores)
+    by_scene = [
+        {"scene": each.scene, **_figures(alone), "vertices": alone.vertices}
+        for each in counts
+        for alone in (semantic_scores([each], classes),)
+    ]
+    excluded = [name for name in classes.names if name in BACKGROUND]
+    notes = [f"Columns f_ leave out {', '.join(excluded)}."] if excluded else []
+    if scores.unlabeled:
+        notes.append(
+            f"{scores.unlabeled:,} of {scores.vertices:,} vertices that count are predicted as none of the classes."
+        )
+    return ScoreReport(
+        results={
+            "protocol": "semantics",
+            "vertices": scores.vertices,
+            "ignored": scores.ignored,
+            "unlabeled": scores.unlabeled,
+            "excluded": excluded,
+            **overall,
+            "spread": spread(by_scene, list(overall)),
+        },
+        table=table_of("Semantic labels", {method: overall}, notes=notes),
+        rows={
+            "scenes": by_scene,
+            "classes": [{"class": name, **asdict(values)} for name, values in scores.classes.items()],
+        },
+        line=f"{counted(scores.vertices, 'label')} in {counted(scores.scenes, 'scene')}: mIoU {overall['miou']:.3f}, "
+        f"mAcc {overall['macc']:.3f}, f-mIoU {overall['f_miou']:.3f}; {scores.unlabeled:,} without a prediction",
+    )
+
+
+def _figures(scores: "SemanticScores") -> dict[str, float]:
+    return asdict(scores.overall) | {f"f_{name}": value for name, value in asdict(scores.foreground).items()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,8 +240,8 @@ class ClassScores:
     """Scores of one class.
 
     Attributes:
-        iou: NaN if it is neither in truth nor predicted.
-        accuracy: NaN if it is not in truth.
+        iou: NaN if it is neither labeled nor predicted.
+        accuracy: NaN if it is not labeled.
         predictions: vertices predicted as the class, of those that are not ignored.
     """
 
@@ -87,8 +256,9 @@ class SemanticAverages:
     """Means over classes; NaN where no class counts.
 
     Attributes:
-        miou: mean IoU of the classes in truth or predictions.
-        macc: mean accuracy of the classes in truth.
+        miou: mean IoU of the classes that are labeled or predicted.
+        miou_present: of those that are labeled.
+        macc: mean accuracy of the classes that are labeled.
         accuracy: share of the vertices of these classes that are right.
     """
 
@@ -103,8 +273,11 @@ class SemanticScores:
     """The scores of scenes.
 
     Attributes:
-        foreground: over those that are not excluded.
-        excluded: names of the classes that are.
+        scenes: their number.
+        overall: over all classes.
+        foreground: over those that are not `BACKGROUND`.
+        classes: by name.
+        vertices: that count.
         ignored: vertices whose true label is no class.
         unlabeled: vertices that count, and are predicted as no class.
     """
@@ -112,7 +285,6 @@ class SemanticScores:
     scenes: int
     overall: SemanticAverages
     foreground: SemanticAverages
-    excluded: tuple[str, ...]
     classes: dict[str, ClassScores]
     vertices: int
     ignored: int
@@ -122,12 +294,7 @@ class SemanticScores:
 def count_labels(
     scene: str, truth: Int64[np.ndarray, " V"], predicted: Int64[np.ndarray, " _V"], classes: ClassTable
 ) -> LabelCounts:
-    """Counts the vertices of a scene by true and predicted class.
-
-    Args:
-        truth: class id of each vertex; others are ignored.
-        predicted: class id of each vertex; others are no class.
-    """
+    """Counts the vertices of a scene by true and predicted class id; other ids are ignored, or no class."""
     if len(truth) != len(predicted):
         raise InputError(
             f"{scene}: the prediction has {len(predicted):,} labels, and the truth {len(truth):,}; expected one for "
@@ -143,36 +310,9 @@ def count_labels(
     )
 
 
-def check_excluded(excluded: Collection[str], classes: ClassTable) -> None:
-    """Checks that what is to be left out of the foreground are classes. Names of `BACKGROUND` may be none."""
-    unknown = [name for name in excluded if name not in classes.names and name not in BACKGROUND]
-    if unknown:
-        near = get_close_matches(unknown[0], classes.names, n=1)
-        raise InputError(
-            f"excluded: {unknown[0][:60]!r} is none of the {len(classes.names)} classes"
-            + (f"; did you mean {near[0]}?" if near else f" ({listed(classes.names)})")
-        )
-
-
-def semantic_scores(
-    counts: Sequence[LabelCounts], classes: ClassTable, *, excluded: Collection[str] = BACKGROUND
-) -> SemanticScores:
-    """The scores of scenes together; of one scene, its own.
-
-    Args:
-        counts: of the scenes, in any order.
-        classes: with which they were counted.
-        excluded: names of the classes that are not of the foreground. Of `BACKGROUND`, those that are no class are
-            passed over.
-    """
-    if not counts:
-        raise InputError("semantics: no scene to score")
-    if repeated := first_repeated(scene.scene for scene in counts):
-        raise InputError(f"semantics: the scene {repeated[0]} is there twice; each is scored once")
+def semantic_scores(counts: Sequence[LabelCounts], classes: ClassTable) -> SemanticScores:
+    """The scores of one scene or more together, counted with these classes."""
     number = len(classes.names)
-    if any(scene.confusion.shape != (number, number + 1) for scene in counts):
-        raise InputError("semantics: the scenes were counted with different classes")
-    check_excluded(excluded, classes)
     confusion = np.sum([scene.confusion for scene in counts], axis=0)
     right = np.diagonal(confusion)
     truths, predictions = confusion.sum(axis=1), confusion[:, :number].sum(axis=0)
@@ -192,8 +332,7 @@ def semantic_scores(
     return SemanticScores(
         scenes=len(counts),
         overall=averages(list(range(number))),
-        foreground=averages([row for row, name in enumerate(classes.names) if name not in excluded]),
-        excluded=tuple(name for name in classes.names if name in excluded),
+        foreground=averages([row for row, name in enumerate(classes.names) if name not in BACKGROUND]),
         classes={
             name: ClassScores(
                 iou=float(iou[row]),
@@ -209,34 +348,36 @@ def semantic_scores(
     )
 
 
-RAW_IDS = range(1100, 1358)
-"""Ids from here to the end of ScanNet's raw ones are no instances: no scene has a hundred of class 1."""
-
-
 def count_label_files(
     predictions: Path,
-    truth: Path,
+    labels: Path,
     classes: ClassTable,
     *,
     scenes: Collection[str] | None = None,
     raw_ids: Mapping[str, int] | None = None,
 ) -> Iterator[LabelCounts]:
-    """Counts the labels of the predictions of a folder by the truth of another, one scene in memory at a time.
-
-    Args:
-        truth: folder of SCENE.txt, or of ScanNet's scans.
-        scenes: to score; None = all of the truth.
-        raw_ids: class id of each raw name, of `read_label_map`, where the truth is the labels of scans.
-    """
-    for files in scene_files(predictions, truth, scenes=scenes, scans=raw_ids is not None):
-        labels = _labels(files.truth, classes) if raw_ids is None else classes_of_scan(files.truth, raw_ids, classes)
-        predicted = _labels(files.prediction, classes)
+    """Counts the labels in two folders, one scene in memory at a time; arguments as of `score_semantics`."""
+    for files in scene_files(predictions, labels, scenes=scenes, scans=raw_ids is not None):
+        if raw_ids is None:
+            true_ids = _class_ids(files.labels, classes)
+        else:
+            true_ids = class_ids_of_scan(files.labels, raw_ids, classes)
+        predicted = _class_ids(files.prediction, classes)
         with about(files.prediction):
-            counts = count_labels(files.scene, labels, predicted, classes)
-        yield counts
+            yield count_labels(files.scene, true_ids, predicted, classes)
 
 
-def _labels(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
+def class_ids_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTable) -> Int64[np.ndarray, " V"]:
+    """The class id of each vertex of a scan's mesh, −1 = none."""
+    labels = labels_of_scan(folder, raw_ids)
+    names = dict(labels.objects)
+    ids = ids_of_names(names.values(), raw_ids, classes)
+    # 0 stands for none there, unless a raw name leads to it.
+    class_of = {name: number for name, number in ids.items() if number or (raw_ids.get(name) == 0 and 0 in classes.ids)}
+    return vertex_classes(labels.instances, names, class_of, none=-1).astype(np.int64)
+
+
+def _class_ids(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
     labels = read_whole_numbers(path)
     if not len(labels):
         raise InputError(f"{path}: no vertices; expected one class id for each")
@@ -248,67 +389,3 @@ def _labels(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
             "class ids"
         )
     return labels
-
-
-NO_CLASS, NO_CLASS_BESIDE_ZERO = 0, -100
-"""Ids of points of no class, in truth and predictions; the second where 0 is the id of a class, as in ScanNet++."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SemanticsProtocol:
-    """How vertices get the class of Gaussians, and which classes are of the foreground."""
-
-    name: Literal["semantics"] = "semantics"
-    voters: int = field(
-        default=VOTERS,
-        metadata={
-            "help": "on meshes: nearest Gaussians with a feature whose most frequent class a vertex has; 1 = the "
-            "nearest one"
-        },
-    )
-    excluded: tuple[str, ...] = field(
-        default=tuple(sorted(BACKGROUND)), metadata={"names": True, "help": "classes that f-mIoU leaves out"}
-    )
-
-    def __post_init__(self) -> None:
-        if self.voters < 1:
-            raise InputError(f"voters: expected 1 or more, got {self.voters}")
-
-
-def semantic_truth(points: LabeledPoints, classes: ClassTable) -> Int32[np.ndarray, " P"]:
-    """The class id of each point's object; `id_of_none` for points without a named object."""
-    return vertex_classes(points.objects, points.names, classes.id_of, none=id_of_none(classes))
-
-
-def id_of_none(classes: ClassTable) -> int:
-    """The id of points of no class."""
-    return NO_CLASS_BESIDE_ZERO if 0 in classes.ids else NO_CLASS
-
-
-def predict_semantics(
-    points: LabeledPoints,
-    gaussians: Gaussians,
-    features: GaussianFeatures,
-    classes: ClassTable,
-    text: TextEncoder,
-    protocol: SemanticsProtocol = SemanticsProtocol(),
-) -> Int32[np.ndarray, " P"]:
-    """The predicted class id of each point; `id_of_none` where no Gaussian has a feature.
-
-    Args:
-        text: turns their names into vectors.
-        protocol: how many Gaussians vote for a vertex.
-    """
-    nearest = nearest_class(features, classes.names, text)
-    none = id_of_none(classes)
-    labels = np.array([*classes.ids, none], np.int32)[nearest]
-    if points.positions is None:
-        return labels
-    return labels_of_vertices(
-        points.positions, gaussians.means, labels, k=protocol.voters, none=none, voters=nearest >= 0
-    )
-
-
-def classes_of(names: Sequence[str]) -> ClassTable:
-    """A table of classes without a benchmark: ids from 1 in the order of the names."""
-    return ClassTable(names=tuple(names), ids=tuple(range(1, len(names) + 1)))

@@ -14,19 +14,18 @@ corpus of samples, each with one hypothesis and one or more references:
   difference of the numbers of bigrams, and the document frequencies over the references of the corpus, so that a score
   depends on all samples, and is 0 where there is only one.
 
-The PTB tokenizer and METEOR, which exist in Java only: run where Java and the package pycocoevalcap are installed.
-
-The package brings Stanford's tokenizer (CoreNLP 3.4.1) and METEOR 1.5 as archives, which are run with the options that
-its own code gives them; none of its Python code is imported. METEOR (Denkowski and Lavie 2014) of a corpus comes from
-the counts of all samples, and is no mean of theirs.
+The PTB tokenizer and METEOR exist in Java only, and run where Java and the package pycocoevalcap are installed. The
+package brings Stanford's tokenizer (CoreNLP 3.4.1) and METEOR 1.5 as archives, which are run with the options that its
+own code gives them; none of its Python code is imported. METEOR (Denkowski and Lavie 2014) of a corpus comes from the
+counts of all samples, and is no mean of theirs.
 """
 
+import math
 import os
 import re
 import shutil
 import subprocess
 import tempfile
-import threading
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -312,9 +311,11 @@ def meteor(
     ]
     command = [tools.java, *ENCODING, "-Xmx2G", "-jar", str(tools.folder / METEOR)]
     command += ["-", "-", "-stdio", "-l", "en", "-norm"]
-    with _Conversation(command, "METEOR") as java:
-        counts = [java.answers(line)[0] for line in lines]
-        scores = java.answers(" ||| ".join(["EVAL", *counts]), len(lines) + 1)
+    # The counts of all samples make the score of the corpus, so METEOR runs once for each.
+    counts = _run(command, "METEOR", lines).splitlines()
+    scores = _run(command, "METEOR", [" ||| ".join(["EVAL", *map(str.strip, counts)])]).splitlines()
+    if not len(counts) == len(scores) - 1 == len(lines):
+        raise InputError(f"METEOR gave {len(counts):,} counts and {len(scores):,} scores for {len(lines):,} samples")
     try:
         values = np.array(scores, np.float64)
     except ValueError as error:
@@ -327,58 +328,12 @@ def _field(sentence: str) -> str:
     return _BREAKS.sub(" ", sentence).replace("|||", "")
 
 
-class _Conversation:
-    """A program that answers lines with lines; it is ended with the block, or after `SECONDS`."""
-
-    def __init__(self, command: Sequence[str], subject: str) -> None:
-        self.subject = subject
-        self.errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the block
-        pipe = subprocess.PIPE
-        try:
-            self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=self.errors, env=_environment())
-        except OSError as error:
-            self.errors.close()
-            raise InputError(f"{subject}: Java cannot be started: {error.strerror or error}") from error
-        self.timer = threading.Timer(SECONDS, self.process.kill)
-        self.timer.daemon = True
-        self.timer.start()
-
-    def __enter__(self) -> "_Conversation":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.timer.cancel()
-        self.process.kill()
-        self.process.communicate()
-        self.errors.close()
-
-    def answers(self, line: str, count: int = 1) -> list[str]:
-        """The next lines that the program writes after it got one."""
-        stdin, stdout = self.process.stdin, self.process.stdout
-        assert stdin is not None
-        assert stdout is not None
-        try:
-            stdin.write(line.encode("utf-8", "replace") + b"\n")
-            stdin.flush()
-        except OSError:
-            raise self._failure() from None
-        lines = [stdout.readline() for _ in range(count)]
-        if not lines[-1].endswith(b"\n"):
-            raise self._failure()
-        return [each.decode("utf-8", "replace").strip() for each in lines]
-
-    def _failure(self) -> InputError:
-        self.errors.seek(0)
-        return InputError(
-            f"{self.subject}: Java ended early, or took more than {SECONDS:,} s: {_end(self.errors.read())}"
-        )
-
-
-def _run(command: Sequence[str], subject: str) -> str:
-    """What a program writes."""
+def _run(command: Sequence[str], subject: str, lines: Sequence[str] = ()) -> str:
+    """What a program writes, given lines of input."""
+    data = "".join(f"{line}\n" for line in lines).encode("utf-8", "replace")
     try:
         process = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, timeout=SECONDS, env=_environment(), check=False
+            command, input=data, capture_output=True, timeout=SECONDS, env=_environment(), check=False
         )
     except subprocess.TimeoutExpired:
         raise InputError(
@@ -387,7 +342,8 @@ def _run(command: Sequence[str], subject: str) -> str:
     except OSError as error:
         raise InputError(f"{subject}: Java cannot be started: {error.strerror or error}") from error
     if process.returncode:
-        raise InputError(f"{subject}: Java ended with code {process.returncode}: {_end(process.stderr)}")
+        end = " ".join(process.stderr.decode("utf-8", "replace").split())[-200:]
+        raise InputError(f"{subject}: Java ended with code {process.returncode}: {end or 'it said nothing'}")
     return process.stdout.decode("utf-8", "replace")
 
 
@@ -396,13 +352,9 @@ def _environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if name not in ("JAVA_TOOL_OPTIONS", "_JAVA_OPTIONS")}
 
 
-def _end(message: bytes) -> str:
-    return " ".join(message.decode("utf-8", "replace").split())[-200:] or "it said nothing"
-
-
-Tokens = Literal["auto", "ptb", "python", "given"]
-"""How texts become tokens: "ptb" through Java, "python" without, "auto" = "ptb" where Java is there, else "python";
-"given" = they are tokens with blanks between them already."""
+Tokens = Literal["auto", "python", "given"]
+"""How texts become tokens: "auto" = PTB tokens where Java is there, else as "python"; "given" = they are tokens with
+blanks between them already."""
 GIVEN_TOKENS = "tokens as given"
 
 
@@ -412,12 +364,11 @@ class SentenceScores:
 
     Attributes:
         tokens: name of the tokens that all scores rest on.
-        official: whether they are those of the official script. If not, `columns` names them in every head.
+        official: whether they are those of the official script. If not, columns name them.
         bleu: BLEU-1 to 4 of the corpus.
-        meteor: of the corpus; None where Java is missing.
+        meteor: of the corpus; NaN where Java is missing.
         cider: mean of the samples, in [0, 10].
         bleu_each: BLEU-1 to 4 of each sample alone.
-        meteor_each: of each sample; None where Java is missing.
         cider_each: of each sample, with the document frequencies of all.
         absent: why a column has no value.
     """
@@ -425,20 +376,20 @@ class SentenceScores:
     tokens: str
     official: bool
     bleu: tuple[float, float, float, float]
-    meteor: float | None
+    meteor: float
     rouge_l: float
     cider: float
     bleu_each: Float64[np.ndarray, "N 4"]
-    meteor_each: Float64[np.ndarray, "N"] | None
     rouge_l_each: Float64[np.ndarray, "N"]
     cider_each: Float64[np.ndarray, "N"]
     absent: dict[str, str]
 
-    def columns(self) -> dict[str, float | None]:
-        """Head and value of each column; None where it is absent."""
-        values: dict[str, float | None] = {f"BLEU-{n + 1}": self.bleu[n] for n in range(ORDER)}
-        values |= {"METEOR": self.meteor, "ROUGE-L": self.rouge_l, "CIDEr": self.cider}
-        return {name if self.official else f"{name} ({self.tokens})": value for name, value in values.items()}
+
+def sentence_figures(scores: SentenceScores) -> dict[str, float]:
+    """The figures by column; columns name their tokens where these are not those of the official script."""
+    figures = {f"bleu_{n}": value for n, value in enumerate(scores.bleu, start=1)}
+    figures |= {"meteor": scores.meteor, "rouge_l": scores.rouge_l, "cider": scores.cider}
+    return figures if scores.official else {f"{name} ({scores.tokens})": value for name, value in figures.items()}
 
 
 def score_sentences(
@@ -456,16 +407,14 @@ def score_sentences(
         tools: of `find_java_tools`, a reason for going without, or None = look for them.
     """
     tools = find_java_tools() if tools is None else tools
-    if tokens == "ptb" and isinstance(tools, str):
-        raise InputError(f"PTB tokens need Java and its archives: {tools}; or take tokens=python")
-    ptb = tokens in ("auto", "ptb") and not isinstance(tools, str)
+    ptb = tokens == "auto" and not isinstance(tools, str)
     if tokens == "given":
-        candidates, truths = list(hypotheses), [list(sentences) for sentences in references]
+        candidates, right = list(hypotheses), [list(sentences) for sentences in references]
     else:
-        candidates, truths = _tokenized(hypotheses, references, tools if ptb else None)
-    each_bleu = bleu(candidates, truths)
-    each_rouge, each_cider = rouge_l(candidates, truths), cider(candidates, truths)
-    corpus_meteor, candidate_meteors = (None, None) if isinstance(tools, str) else meteor(candidates, truths, tools)
+        candidates, right = _tokenized(hypotheses, references, tools if ptb else None)
+    each_bleu = bleu(candidates, right)
+    each_rouge, each_cider = rouge_l(candidates, right), cider(candidates, right)
+    corpus_meteor = math.nan if isinstance(tools, str) else meteor(candidates, right, tools)[0]
     b1, b2, b3, b4 = each_bleu[0].tolist()
     return SentenceScores(
         tokens=GIVEN_TOKENS if tokens == "given" else PTB_TOKENS if ptb else PYTHON_TOKENS,
@@ -475,7 +424,6 @@ def score_sentences(
         rouge_l=mean_of(each_rouge),
         cider=mean_of(each_cider),
         bleu_each=each_bleu[1],
-        meteor_each=candidate_meteors,
         rouge_l_each=each_rouge,
         cider_each=each_cider,
         absent={"METEOR": tools} if isinstance(tools, str) else {},

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 from gsencoder.core.settings import Knob
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.protocols.localization import LocalizationProtocol
+from gsencoder.evaluate.benchmarks.localization import LocalizationProtocol
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.localize import LocalizeConfig

@@ -23,9 +23,8 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.evaluate.boxes import Hit, queryable_objects
-from gsencoder.evaluate.protocols.localization import score_queries
-from gsencoder.evaluate.protocols.naming import compare_names
+from gsencoder.evaluate.benchmarks.localization import Hit, queryable_objects, score_queries
+from gsencoder.evaluate.benchmarks.naming import compare_names
 from gsencoder.evaluate.tradeoff.stage import Inputs, Judged, Score, Stage
 from gsencoder.fusion.checkpoint import CachedTeacher
 from gsencoder.fusion.errors import field_error
@@ -281,7 +280,7 @@ class EncoderScene:
             exact = exact_settings(replace(self._base, weights=settings.weights), ENCODER_KNOBS)
             self._references[settings.weights] = self.run(exact)
         _, words, teacher, truth = self._truth(settings.weights)
-        counts = compare_names(self._scene.name, truth, product, teacher, {})
+        counts = compare_names(truth, product, teacher)
         accuracies = [counts.correct[name] / total for name, total in counts.total.items()]
         hits, _ = score_queries(self._scene, product, words, self._inputs.protocol, self._inputs.localize)
         scores = {

@@ -16,7 +16,7 @@ from jaxtyping import Float16
 from gsencoder.core.errors import InputError, SceneWarning, WriteError, about
 from gsencoder.core.files import plain, sealed, unsealed, write_bytes, write_json
 from gsencoder.core.process import Clock, Track, untracked
-from gsencoder.data.labels.captions import wrapped_caption
+from gsencoder.data.labels.expressions import wrapped_caption
 from gsencoder.data.labels.files import box_corners
 from gsencoder.data.prompts import PromptStore, StoredPrompt
 from gsencoder.data.splats.files import fingerprint

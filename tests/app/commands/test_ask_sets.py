@@ -25,7 +25,7 @@ from gsencoder.data.labels.questions import read_questions
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.benchmarks.answers import read_answer_predictions
-from gsencoder.evaluate.boxes import aabb_iou
+from gsencoder.evaluate.benchmarks.localization import aabb_iou
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.ask.questions import read_answers
 from gsencoder.infer.views.photographs import with_photographs

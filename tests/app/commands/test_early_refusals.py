@@ -6,7 +6,7 @@ import pytest
 from command_runs import refusal
 from named_rooms import write_words
 
-from gsencoder.app import evaluate_settings as evaluate_sources
+from gsencoder.app.commands import evaluate as evaluate_sources
 from gsencoder.data.synthetic import make_room, write_room
 
 
@@ -27,12 +27,6 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def refused(capsys: pytest.CaptureFixture[str], room: Path, *options: str) -> str:
     words = f"teacher.words={room / 'words.safetensors'}"
     return refusal(capsys, "evaluate", str(room / "room"), words, f"out={room / 'out'}", *options)
-
-
-def test_a_class_that_is_left_out_and_is_none(room: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    line = refused(capsys, room, "protocol=semantics", "protocol.excluded=[wall,bal]")
-    assert "protocol: excluded: 'bal' is none of the " in line
-    assert "did you mean ball?" in line
 
 
 def test_a_class_that_the_words_do_not_know(room: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ import pytest
 from command_runs import refusal, results_of
 
 from gsencoder.app import main as cli
-from gsencoder.evaluate.benchmarks.files import load_classes
+from gsencoder.data.labels.classes import load_classes
 
 CLASSES = "id,name\n1,mug\n2,box\n"
 

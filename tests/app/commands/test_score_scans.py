@@ -9,8 +9,7 @@ from command_runs import refusal, results_of
 from labeled_scans import ROOM_NAMES, group, names_of_room, write_scannet_labels, write_scannet_scan
 
 from gsencoder.app import main as cli
-from gsencoder.data.labels.classes import ids_of_names, read_label_map
-from gsencoder.data.labels.expressions import write_instance_truth, write_semantic_truth
+from gsencoder.data.labels.classes import ids_of_names, instance_ids, read_label_map, vertex_classes
 from gsencoder.data.labels.files import read_whole_numbers, write_whole_numbers
 from gsencoder.data.labels.scans import read_scannet_labels
 from gsencoder.data.synthetic import make_room
@@ -54,20 +53,21 @@ def write_masks(scans: Path, *, vertices: int = sum(SIZES)) -> Path:
     return folder
 
 
-def write_truth_files(scans: Path, column: str, write: object) -> Path:
-    """What `write` writes of the scans."""
+def write_truth_files(scans: Path, column: str, ids_of: object) -> Path:
+    """What `ids_of` says of the vertices of the scans."""
     folder = scans.parent / "truth"
     folder.mkdir()
     for scan in scans.iterdir():
         labels = read_scannet_labels(scan)
         ids = ids_of_names((name for _, name in labels.objects), read_label_map(scans.parent / "map.tsv", column))
-        write(folder / f"{scan.name}.txt", labels, ids)  # type: ignore[operator]
+        values = ids_of(labels.instances, dict(labels.objects), ids)  # type: ignore[operator]
+        write_whole_numbers(folder / f"{scan.name}.txt", values)
     return folder
 
 
 def test_instances_of_scans_have_the_scores_of_the_truth_that_is_written_of_them(scans: Path, tmp_path: Path) -> None:
     write_masks(scans)
-    truth = write_truth_files(scans, "nyu40id", write_instance_truth)
+    truth = write_truth_files(scans, "nyu40id", instance_ids)
     assert read_whole_numbers(truth / "scene0000_00.txt")[[0, 150, 270, 380]].tolist() == [5001, 6002, 1003, 40004]
     outs = tmp_path / "scans_out", tmp_path / "files_out"
     assert cli.main([*words_of("instances", scans), f"out={outs[0]}", "quiet=true"]) == 0
@@ -85,7 +85,7 @@ def test_labels_of_scans_have_the_scores_of_the_truth_that_is_written_of_them(sc
     predictions.mkdir()
     for scene in ("scene0000_00", "scene0001_00"):
         write_whole_numbers(predictions / f"{scene}.txt", np.repeat([5, 6, 5, 1], SIZES))
-    truth = write_truth_files(scans, "nyu40id", write_semantic_truth)
+    truth = write_truth_files(scans, "nyu40id", vertex_classes)
     outs = tmp_path / "scans_out", tmp_path / "files_out"
     assert cli.main([*words_of("semantics", scans), f"out={outs[0]}", "quiet=true"]) == 0
     words = ["score", "semantics", f"predictions={predictions}", f"truth={truth}", "classes=scannet20"]
@@ -113,7 +113,7 @@ def test_folders_that_do_not_fit_are_refused(scans: Path, tmp_path: Path, capsys
     predictions = write_masks(scans)
     without_map = [word for word in words_of("instances", scans) if not word.startswith("label_map")]
     assert "no truth; expected SCENE.txt for each scene; the labels of 2 scans" in refusal(capsys, *without_map)
-    truth = write_truth_files(scans, "nyu40id", write_instance_truth)
+    truth = write_truth_files(scans, "nyu40id", instance_ids)
     words = [word for word in words_of("instances", scans) if not word.startswith("truth")]
     message = refusal(capsys, *words, f"truth={truth}")
     assert "no scans; expected SCENE/SCENE.aggregation.json" in message

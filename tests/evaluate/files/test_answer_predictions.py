@@ -10,7 +10,7 @@ import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.questions import Question
-from gsencoder.evaluate.benchmarks.answers import read_answer_predictions, write_answer_predictions
+from gsencoder.evaluate.benchmarks.answers import read_answer_predictions
 
 SCANQA = (
     Question(dataset="scanqa", id="q0", scene="s0", text="What?", answers=("chair",)),
@@ -57,31 +57,6 @@ def test_sqa3ds_answers_are_found_by_situation_and_place(tmp_path: Path) -> None
     with pytest.raises(InputError, match="those of no question of the truth: 'Which\\?'"):
         read_answer_predictions(written(tmp_path, [row | pose | {"situation": "I sit."}]), SQA3D)
     assert read_answer_predictions(written(tmp_path, [{"question_id": 1, "answer": ""}]), SQA3D) == {"1": ("",)}
-
-
-@pytest.mark.parametrize("questions", [SCANQA, SQA3D])
-def test_what_is_written_is_read_again(tmp_path: Path, questions: tuple[Question, ...]) -> None:
-    predictions = {questions[1].id: ("é",)}
-    write_answer_predictions(tmp_path / "p.json", questions, predictions)
-    assert read_answer_predictions(tmp_path / "p.json", questions) == predictions
-    rows = json.loads((tmp_path / "p.json").read_text())
-    for row in rows:
-        row.pop("question_id")
-    if questions is SQA3D:
-        # The official script finds them without an id.
-        assert read_answer_predictions(written(tmp_path, rows), questions) == predictions
-
-
-def test_scanqas_boxes_are_written_as_corners(tmp_path: Path) -> None:
-    box = ((0.0, 1.0, 2.0), (3.0, 4.0, 5.0))
-    write_answer_predictions(tmp_path / "p.json", SCANQA, {"q0": ["a", "b"]}, boxes={"q0": box})
-    (row,) = json.loads((tmp_path / "p.json").read_text())
-    assert row["answer_top10"] == ["a", "b"]
-    assert row["bbox"][0] == [3.0, 4.0, 5.0]
-    with pytest.raises(InputError, match="question x is predicted and is none"):
-        write_answer_predictions(tmp_path / "p.json", SCANQA, {"x": ["a"]})
-    with pytest.raises(InputError, match="has 0 answers"):
-        write_answer_predictions(tmp_path / "p.json", SCANQA, {"q0": []})
 
 
 @pytest.mark.parametrize(
@@ -131,11 +106,6 @@ def test_situations_at_one_place_are_told_apart_by_where_one_faces(tmp_path: Pat
         assert predictions == {question.id: ("right",)}
     with pytest.raises(InputError, match="are those of 2 questions; give its question_id"):
         read_answer_predictions(written(tmp_path, [row | pose]), (SQA3D[0], turned))
-    write_answer_predictions(tmp_path / "p.json", (turned,), {"7": ("right", "left")})
-    (entry,) = json.loads((tmp_path / "p.json").read_text())
-    assert entry["agent_rot"] == {"_x": 0.0, "_y": 0.0, "_z": 0.8, "_w": 0.6}
-    assert entry["agent_pos"] == {"x": 0.0, "y": 0.5, "z": 0.0}
-    assert (entry["answer"], entry["situation"], entry["question"]) == ("right", "I stand.", "Which?")
 
 
 def test_equal_questions_are_answered_in_the_order_of_the_file(tmp_path: Path) -> None:

@@ -13,8 +13,6 @@ from gsencoder.evaluate.benchmarks.captions import (
     CaptionedObject,
     NamedCaption,
     read_caption_predictions,
-    write_box_captions,
-    write_named_captions,
 )
 
 OBJECTS = tuple(
@@ -38,15 +36,8 @@ def test_captions_of_boxes_are_read_as_the_benchmark_takes_them(tmp_path: Path) 
     first, second = read_caption_predictions(
         written(tmp_path, {"s0": [row(), {"caption": "", "box": CORNERS[::-1]}], "s1": []}), OBJECTS
     )
-    assert first == CaptionedBox(
-        scene="s0",
-        caption="sos a chair eos",
-        aabb=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)),
-        objectness=0.75,
-        class_probabilities=(0.5, 0.5),
-    )
-    assert isinstance(second, CaptionedBox)
-    assert (second.aabb, second.objectness, second.class_probabilities) == (first.aabb, 1.0, ())
+    assert first == CaptionedBox(scene="s0", caption="sos a chair eos", aabb=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)))
+    assert second == CaptionedBox(scene="s0", caption="", aabb=first.aabb)
 
 
 def test_captions_of_given_objects_are_read_as_scan2cap_writes_them(tmp_path: Path) -> None:
@@ -56,21 +47,6 @@ def test_captions_of_given_objects_are_read_as_scan2cap_writes_them(tmp_path: Pa
         NamedCaption(scene="s1", object_id=3, caption="b"),
     )
     assert read_caption_predictions(written(tmp_path, {}), OBJECTS) == ()
-
-
-def test_what_is_written_is_read_again_with_its_wrapping(tmp_path: Path) -> None:
-    box = CaptionedBox(scene="s1", caption="a chair.", aabb=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)), objectness=0.75)
-    write_box_captions(tmp_path / "a.json", [box])
-    (again,) = read_caption_predictions(tmp_path / "a.json", OBJECTS)
-    assert isinstance(again, CaptionedBox)
-    assert (again.caption, again.aabb, again.objectness) == ("sos a chair . eos", box.aabb, 0.75)
-    caption = NamedCaption(scene="s0", object_id=4, caption="b")
-    write_named_captions(tmp_path / "b.json", OBJECTS, [caption])
-    assert json.loads((tmp_path / "b.json").read_text()) == {"s0|4|office_chair": ["sos b eos"]}
-    with pytest.raises(InputError, match="has two captions"):
-        write_named_captions(tmp_path / "b.json", OBJECTS, [caption, caption])
-    with pytest.raises(InputError, match="object 9 of s0 is captioned"):
-        write_named_captions(tmp_path / "b.json", OBJECTS, [NamedCaption(scene="s0", object_id=9, caption="b")])
 
 
 @pytest.mark.parametrize(
@@ -85,8 +61,6 @@ def test_what_is_written_is_read_again_with_its_wrapping(tmp_path: Path) -> None
         ({"s0": [row(box=[[float("inf"), 0, 0]] * 8)]}, r"box\[0\] must be a finite number"),
         ({"s0": [row(caption=3)]}, r"s0\[0\]: caption must be a text, got 3"),
         ({"s0": [row(caption="x" * 10_000_000)]}, r"s0\[0\]: caption has 10,000,000 characters"),
-        ({"s0": [row(obj_prob="high")]}, r"s0\[0\]: obj_prob must be a list of numbers"),
-        ({"s0": [row(obj_prob=[0.5, float("nan")])]}, r"obj_prob\[1\] must be a finite number"),
         ({"s9|3": ["a"]}, "'s9|3': is no scene of the truth"),
         ({"s0|9": ["a"]}, r"'s0\|9': is no object of the truth"),
         ({"s0|x": ["a"]}, "object_id must be a whole number"),
@@ -110,32 +84,3 @@ def test_a_scene_that_is_there_twice_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "pred.json").write_text('{"s0": [], "s0": []}')
     with pytest.raises(InputError, match="'s0' is there twice"):
         read_caption_predictions(tmp_path / "pred.json", OBJECTS)
-
-
-def test_boxes_are_written_by_scene_with_the_probability_of_nothing_before_that_of_an_object(tmp_path: Path) -> None:
-    aabb = ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
-    boxes = [
-        CaptionedBox(scene="s1", caption="one", aabb=aabb, objectness=0.75, class_probabilities=(0.25, 0.5)),
-        CaptionedBox(scene="s0", caption="sos two eos", aabb=aabb),
-        CaptionedBox(scene="s1", caption="three", aabb=aabb, objectness=0.0),
-    ]
-    write_box_captions(tmp_path / "p.json", boxes)
-    content = json.loads((tmp_path / "p.json").read_text())
-    assert {scene: [row["caption"] for row in rows] for scene, rows in content.items()} == {
-        "s1": ["sos one eos", "sos three eos"],
-        "s0": ["sos two eos"],
-    }
-    assert [row["obj_prob"] for row in content["s1"]] == [[0.25, 0.75], [1.0, 0.0]]
-    assert content["s1"][0]["sem_prob"] == [0.25, 0.5]
-    assert content["s0"][0] == {"caption": "sos two eos", "box": CORNERS, "sem_prob": [], "obj_prob": [0.0, 1.0]}
-
-
-def test_captions_of_objects_are_written_under_their_names_and_once_each(tmp_path: Path) -> None:
-    captions = [NamedCaption(scene="s1", object_id=3, caption="a"), NamedCaption(scene="s0", object_id=3, caption="b.")]
-    write_named_captions(tmp_path / "p.json", OBJECTS, captions)
-    content = json.loads((tmp_path / "p.json").read_text())
-    assert content == {"s1|3|office_chair": ["sos a eos"], "s0|3|office_chair": ["sos b . eos"]}
-    with pytest.raises(InputError, match="has two captions; expected one"):
-        write_named_captions(tmp_path / "p.json", OBJECTS, [captions[0], captions[0]])
-    with pytest.raises(InputError, match="object 4 of s1 is captioned and is not in the truth"):
-        write_named_captions(tmp_path / "p.json", OBJECTS, [NamedCaption(scene="s1", object_id=4, caption="a")])

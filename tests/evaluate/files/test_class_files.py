@@ -7,11 +7,11 @@ import pytest
 from labeled_scans import group, write_scannet_labels
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.classes import ClassTable, load_classes, write_classes
 from gsencoder.data.labels.files import write_whole_numbers
-from gsencoder.evaluate.benchmarks.files import load_classes, scene_files, write_classes
-from gsencoder.evaluate.benchmarks.instances import classes_of_scan, instances_of_scan
-from gsencoder.evaluate.benchmarks.semantics import count_label_files
+from gsencoder.evaluate.benchmarks.files import scene_files
+from gsencoder.evaluate.benchmarks.instances import instance_ids_of_scan
+from gsencoder.evaluate.benchmarks.semantics import class_ids_of_scan, count_label_files
 
 TABLE = ClassTable(
     names=("office chair", "bed", "lamp"), ids=(12, 4, 999_999_999), groups={"tail": ("lamp",), "head": ("bed",)}
@@ -100,20 +100,19 @@ def scan(tmp_path: Path) -> Path:
 
 def test_vertices_of_a_scan_have_class_and_objectId_plus_one(scan: Path) -> None:
     with pytest.warns(SceneWarning, match="1 of 4 names are not in the label map"):
-        truth = instances_of_scan(scan, RAW, CLASSES)
-    assert truth.scene == "s0"
+        ids = instance_ids_of_scan(scan, RAW, CLASSES)
     # A wall has an id of the map that is not scored: it is no class, as the beanbag is.
-    assert truth.ids.tolist() == [5, 5001, 5001, 6010, 8, 0, 5]
+    assert ids.tolist() == [5, 5001, 5001, 6010, 8, 0, 5]
     with pytest.warns(SceneWarning):
-        assert classes_of_scan(scan, RAW, CLASSES).tolist() == [-1, 5, 5, 6, -1, -1, -1]
+        assert class_ids_of_scan(scan, RAW, CLASSES).tolist() == [-1, 5, 5, 6, -1, -1, -1]
 
 
 def test_a_class_may_have_the_id_0_among_labels_and_not_among_instances(scan: Path) -> None:
     zero, raw = ClassTable(names=("chair", "wall"), ids=(5, 0)), {**RAW, "wall": 0}
     with pytest.raises(InputError, match="classes: 'wall' has the id 0, which files of instances cannot hold"):
-        instances_of_scan(scan, raw, zero)
+        zero.check_instance_ids()
     with pytest.warns(SceneWarning):
-        assert classes_of_scan(scan, raw, zero).tolist() == [0, 5, 5, -1, -1, -1, 0]
+        assert class_ids_of_scan(scan, raw, zero).tolist() == [0, 5, 5, -1, -1, -1, 0]
 
 
 # Folders
@@ -167,7 +166,7 @@ def test_truth_and_prediction_of_a_scene_are_not_taken_for_each_other(tmp_path: 
     # Rows are true classes.
     assert counts.confusion.tolist() == [[1, 0, 0], [1, 1, 0]]
     (files,) = scene_files(*folders)
-    assert (files.prediction, files.truth) == (folders[0] / "s.txt", folders[1] / "s.txt")
+    assert (files.prediction, files.labels) == (folders[0] / "s.txt", folders[1] / "s.txt")
 
 
 def test_of_many_scenes_those_asked_for_are_taken_by_name_and_three_are_named_where_one_is_foreign(

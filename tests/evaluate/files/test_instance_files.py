@@ -15,8 +15,8 @@ from gsencoder.evaluate.benchmarks.instances import (
     instance_scores,
     match_instance_files,
     prediction_of_masks,
+    read_instance_ids,
     read_instance_prediction,
-    read_instance_truth,
     write_instance_prediction,
 )
 from gsencoder.evaluate.benchmarks.semantics import count_label_files, semantic_scores
@@ -46,8 +46,9 @@ def test_what_is_written_is_read_back(tmp_path: Path, form: str) -> None:
     path = write_instance_prediction(tmp_path, prediction(), form=form)  # type: ignore[arg-type]
     again = read_instance_prediction(path, num_vertices=SIZE)
     assert again.scene == "scene0011_00"
-    for name in ("vertices", "offsets", "labels", "scores"):
+    for name in ("labels", "scores"):
         assert np.array_equal(getattr(again, name), getattr(prediction(), name))
+    assert all(map(np.array_equal, again.masks, prediction().masks))
 
 
 @pytest.mark.parametrize("form", ["text", "npz"])
@@ -80,7 +81,7 @@ def test_files_of_other_tools_are_read(folders: tuple[Path, Path]) -> None:
     (folders[0] / "scene0011_00.txt").write_bytes(b"./masks/m.txt 4.0 1e-1\r\n")
     assert [files.scene for files in scene_files(*folders)] == ["scene0011_00"]
     prediction = read_instance_prediction(folders[0] / "scene0011_00.txt", num_vertices=SIZE)
-    assert np.array_equal(prediction.mask(0), np.flatnonzero(IDS == 4001))
+    assert np.array_equal(prediction.masks[0], np.flatnonzero(IDS == 4001))
     assert (prediction.labels[0], prediction.scores[0]) == (4, 0.1)
 
 
@@ -152,7 +153,7 @@ def test_swapped_folders_are_told(folders: tuple[Path, Path]) -> None:
 def test_truth_without_vertices_is_refused(folders: tuple[Path, Path]) -> None:
     (folders[1] / "scene0011_00.txt").write_text("")
     with pytest.raises(InputError, match="no vertices"):
-        read_instance_truth(folders[1] / "scene0011_00.txt")
+        read_instance_ids(folders[1] / "scene0011_00.txt")
 
 
 def save_npz(path: Path, **changes: object) -> Path:

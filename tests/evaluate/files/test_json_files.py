@@ -11,21 +11,22 @@ from labeled_scans import group, write_scannet_labels
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.expressions import read_scanrefer, write_scanrefer
+from gsencoder.evaluate.benchmarks import recognition, referring
+from gsencoder.evaluate.benchmarks.files import ScoreOptions
 from gsencoder.evaluate.benchmarks.recognition import (
     NamedInstance,
     RankedNames,
+    read_recognition_labels,
     read_recognition_predictions,
-    read_recognition_truth,
-    recognize_files,
+    recognize,
+    write_recognition_labels,
     write_recognition_predictions,
-    write_recognition_truth,
 )
 from gsencoder.evaluate.benchmarks.referring import (
-    NO_TRUE_BOX,
     PredictedBoxes,
-    compare_box_files,
+    compare_boxes,
+    read_referring_labels,
     read_referring_predictions,
-    read_referring_truth,
     referring_scores,
     write_referring_predictions,
 )
@@ -47,8 +48,8 @@ def written(path: Path, rows: Any) -> Path:
 def test_boxes_are_read_back(tmp_path: Path) -> None:
     boxes = np.stack([BOX, BOX + 1, BOX / 3])
     predictions = [
-        PredictedBoxes(scene="a", object="1", annotation="2", boxes=boxes, multiple=True, others=False),
-        PredictedBoxes(scene="a", object="1", annotation="3", boxes=np.zeros((0, 2, 3))),
+        PredictedBoxes(scene="a", object_id=1, annotation="2", boxes=boxes, multiple=True, others=False),
+        PredictedBoxes(scene="a", object_id=1, annotation="3", boxes=np.zeros((0, 2, 3))),
     ]
     write_referring_predictions(tmp_path / "p.json", predictions)
     for before, after in zip(predictions, read_referring_predictions(tmp_path / "p.json"), strict=True):
@@ -61,19 +62,19 @@ def test_what_is_known_of_the_truth_is_read_back(tmp_path: Path) -> None:
     path = written(tmp_path / "t.json", [TRUTH, TRUTH | {"ann_id": "1", "others": None}])
     write_scanrefer(tmp_path / "again.json", read_scanrefer(path))
     for file in (path, tmp_path / "again.json"):
-        first, second = read_referring_truth(file)
-        assert first.key == ("scene0011_00", "3", "0")
-        assert np.array_equal(first.box, BOX)  # type: ignore[arg-type]
+        first, second = read_referring_labels(file)
+        assert first.key == ("scene0011_00", 3, "0")
+        assert np.array_equal(np.array(first.aabb), BOX)
         assert (first.multiple, first.others, second.multiple, second.others) == (True, False, True, None)
 
 
 def test_sentences_whose_object_has_no_box_are_counted_and_not_scored(tmp_path: Path) -> None:
     bare = TRUTH | {"object_id": "4", "bbox": None}
     truth = written(tmp_path / "t.json", [TRUTH, bare])
-    results, skipped = compare_box_files(written(tmp_path / "p.json", [PREDICTED]), truth)
-    assert (len(results), skipped) == (1, {NO_TRUE_BOX: 1})
+    results = referring.score(written(tmp_path / "p.json", [PREDICTED]), truth, ScoreOptions()).results
+    assert (results["sentences"], results["not_scored"]) == (1, {"the object has no box in the truth": 1})
     with pytest.raises(InputError, match=r"t.json: no sentence has a box \(bbox\).*scans="):
-        read_referring_truth(written(tmp_path / "t.json", [bare]))
+        read_referring_labels(written(tmp_path / "t.json", [bare]))
 
 
 @pytest.mark.parametrize(
@@ -97,7 +98,10 @@ def test_boxes_are_read_as_corners_or_as_two_of_them(tmp_path: Path, boxes: dict
 
 def test_ids_are_the_same_as_numbers_and_as_text(tmp_path: Path) -> None:
     truth = written(tmp_path / "t.json", [TRUTH])
-    results, _ = compare_box_files(written(tmp_path / "p.json", [PREDICTED | {"object_id": 3, "ann_id": "00"}]), truth)
+    predictions = read_referring_predictions(
+        written(tmp_path / "p.json", [PREDICTED | {"object_id": 3, "ann_id": "00"}])
+    )
+    results = compare_boxes(predictions, read_referring_labels(truth))
     assert referring_scores(results).top1["multiple"]["not_in_others"].acc50 == 1
 
 
@@ -132,7 +136,7 @@ def test_ids_are_the_same_as_numbers_and_as_text(tmp_path: Path) -> None:
     ],
 )
 def test_a_bad_entry_of_sentences_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    for read, row in ((read_referring_truth, TRUTH), (read_referring_predictions, PREDICTED)):
+    for read, row in ((read_referring_labels, TRUTH), (read_referring_predictions, PREDICTED)):
         path = written(tmp_path / "boxes.json", [row | changes])
         with pytest.raises(InputError, match=message) as error:
             read(path)
@@ -143,13 +147,13 @@ def test_a_bad_entry_of_sentences_is_named(tmp_path: Path, changes: dict[str, An
 @pytest.mark.parametrize("rows", [{"a": 1}, [3], None])
 def test_what_is_no_list_of_entries_is_refused(tmp_path: Path, rows: Any) -> None:
     path = written(tmp_path / "boxes.json", rows)
-    for read in (read_referring_truth, read_referring_predictions):
+    for read in (read_referring_labels, read_referring_predictions):
         with pytest.raises(InputError, match=r"boxes.json: (entry 0: )?expected an? (list|object)"):
             read(path)
 
 
 def test_a_sentence_that_is_there_twice_or_has_no_box_is_named(tmp_path: Path) -> None:
-    for read, row in ((read_referring_truth, TRUTH), (read_referring_predictions, PREDICTED)):
+    for read, row in ((read_referring_labels, TRUTH), (read_referring_predictions, PREDICTED)):
         path = written(tmp_path / "boxes.json", [row, row | {"ann_id": "1"}, row | {"ann_id": "00"}])
         with pytest.raises(
             InputError, match="entries 0 and 2 have one id: sentence 0 about object 3 of scene0011_00; expected each"
@@ -183,16 +187,17 @@ def test_swapped_files_of_sentences_are_told(tmp_path: Path) -> None:
             InputError,
             match=f"p.json: entry 0: expected an expression with a description{problem}; predictions and truth",
         ):
-            read_referring_truth(written(tmp_path / "p.json", [KEY | boxes]))
+            read_referring_labels(written(tmp_path / "p.json", [KEY | boxes]))
 
 
 def test_what_predictions_and_truth_do_not_share_is_told_with_the_file(tmp_path: Path) -> None:
     truth, other = written(tmp_path / "t.json", [TRUTH]), written(tmp_path / "p.json", [PREDICTED | {"ann_id": 4}])
     with pytest.raises(InputError, match="p.json: sentence 4 about object 3 of scene0011_00 is predicted, and not in"):
-        compare_box_files(other, truth)
+        referring.score(other, truth, ScoreOptions())
     with pytest.raises(InputError, match="p.json: sentence 0 about object 3 of scene0011_00 has no prediction"):
-        compare_box_files(written(tmp_path / "p.json", []), truth)
-    assert len(compare_box_files(written(tmp_path / "p.json", []), truth, allow_missing=True)[0]) == 1
+        referring.score(written(tmp_path / "p.json", []), truth, ScoreOptions())
+    missing = referring.score(written(tmp_path / "p.json", []), truth, ScoreOptions(allow_missing=True))
+    assert missing.results["without_box"] == 1
 
 
 # ScanRefer's own files, which have neither boxes nor kinds
@@ -217,23 +222,23 @@ def scan_refer(folder: Path) -> tuple[Path, Path, Path]:
 def test_scanrefers_own_file_has_boxes_from_the_scans_and_kinds_from_the_label_map(tmp_path: Path) -> None:
     path, scans, label_map = scan_refer(tmp_path)
     with pytest.raises(InputError, match="no sentence has a box"):
-        read_referring_truth(path, label_map=label_map)
-    truth = read_referring_truth(path, label_map=label_map, scans=scans)
+        read_referring_labels(path, label_map=label_map)
+    truth = read_referring_labels(path, label_map=label_map, scans=scans)
     # The first chair's vertices (0, 0, 0) and (1, 2, 3) are (0, 0, 0) and (-2, 1, 3) in the aligned frame.
-    assert np.allclose(truth[0].box, [[-2, 0, 0], [0, 1, 3]])  # type: ignore[arg-type]
+    assert np.allclose(np.array(truth[0].aabb), [[-2, 0, 0], [0, 1, 3]])
     # Of the monitor all vertices belong to the bed, which was annotated later.
-    assert [each.box is None for each in truth] == [False, False, True, False]
+    assert [each.aabb is None for each in truth] == [False, False, True, False]
     assert [each.multiple for each in truth] == [True, True, False, False]
     assert [each.others for each in truth] == [False, False, True, False]
     # Without the map nothing says what the objects are.
-    assert {(each.multiple, each.others) for each in read_referring_truth(path, scans=scans)} == {(None, None)}
+    assert {(each.multiple, each.others) for each in read_referring_labels(path, scans=scans)} == {(None, None)}
 
 
 def test_names_that_the_label_map_lacks_are_counted_and_are_others(tmp_path: Path) -> None:
     path, scans, label_map = scan_refer(tmp_path)
     label_map.write_text("raw_category\tnyu40id\narmchair\t5\nmonitor\t40\nbed\t4\n")
     with pytest.warns(SceneWarning, match="1 of 4 names are not in the label map"):
-        truth = read_referring_truth(path, label_map=label_map, scans=scans)
+        truth = read_referring_labels(path, label_map=label_map, scans=scans)
     assert [each.others for each in truth] == [True, False, True, False]
     assert [each.multiple for each in truth] == [True, False, True, False]
 
@@ -242,9 +247,9 @@ def test_scans_that_do_not_belong_to_the_sentences_are_refused(tmp_path: Path) -
     path, scans, _ = scan_refer(tmp_path)
     rows = json.loads(path.read_text())
     with pytest.raises(InputError, match="scene0022_00: no annotation of ScanNet"):
-        read_referring_truth(written(path, [rows[0] | {"scene_id": "scene0022_00"}]), scans=scans)
+        read_referring_labels(written(path, [rows[0] | {"scene_id": "scene0022_00"}]), scans=scans)
     with pytest.raises(InputError, match="scene0011_00: its labels have no object with the objectId 4"):
-        read_referring_truth(written(path, [rows[0] | {"object_id": "4"}]), scans=scans)
+        read_referring_labels(written(path, [rows[0] | {"object_id": "4"}]), scans=scans)
 
 
 @pytest.mark.parametrize(
@@ -259,7 +264,7 @@ def test_scans_that_do_not_belong_to_the_sentences_are_refused(tmp_path: Path) -
 )
 def test_a_file_that_is_no_list_is_named(tmp_path: Path, content: bytes, message: str) -> None:
     (tmp_path / "a.json").write_bytes(content)
-    for read in (read_referring_truth, read_recognition_truth):
+    for read in (read_referring_labels, read_recognition_labels):
         with pytest.raises(InputError, match=f"a.json: {message}"):
             read(tmp_path / "a.json")
 
@@ -270,11 +275,11 @@ def test_a_file_that_is_no_list_is_named(tmp_path: Path, content: bytes, message
 def test_names_are_read_back_and_scored(tmp_path: Path) -> None:
     truth = [NamedInstance(scene="a", object="1", name="chair"), NamedInstance(scene="a", object="2", name="dog")]
     answers = [RankedNames(scene="a", object="1", names=("bed", "chair")), RankedNames(scene="a", object="2", names=())]
-    write_recognition_truth(tmp_path / "t.json", truth)
+    write_recognition_labels(tmp_path / "t.json", truth)
     write_recognition_predictions(tmp_path / "p.json", answers)
-    assert read_recognition_truth(tmp_path / "t.json") == tuple(truth)
+    assert read_recognition_labels(tmp_path / "t.json") == tuple(truth)
     assert read_recognition_predictions(tmp_path / "p.json") == tuple(answers)
-    results, others = recognize_files(tmp_path / "p.json", tmp_path / "t.json", ("bed", "chair"))
+    results, others = recognize(answers, truth, ("bed", "chair"))
     assert ([item.rank for item in results], others) == ([2], 1)
 
 
@@ -311,23 +316,6 @@ def test_entries_that_are_there_twice_swapped_or_of_no_class_are_named(tmp_path:
     with pytest.raises(
         InputError, match="p.json: entry 0: unexpected key 'labels'; predictions and truth may be swapped"
     ):
-        recognize_files(truth, written(tmp_path / "p.json", [NAMES]), ("chair",))
+        recognition.score(truth, written(tmp_path / "p.json", [NAMES]), ScoreOptions())
     with pytest.raises(InputError, match="p.json: object 3 of scene0011_00 is predicted as 'bed', which is no class"):
-        recognize_files(tmp_path / "p.json", truth, ("chair",))
-
-
-def test_an_object_without_a_prediction_is_refused_unless_it_may_be_missing(tmp_path: Path) -> None:
-    write_recognition_truth(tmp_path / "t.json", [NamedInstance(scene="s", object="1", name="bed")])
-    write_recognition_predictions(tmp_path / "p.json", [])
-    with pytest.raises(InputError, match=r"p\.json: object 1 of s has no prediction"):
-        recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"])
-    results, others = recognize_files(tmp_path / "p.json", tmp_path / "t.json", ["bed"], allow_missing=True)
-    assert ([(each.rank, each.first) for each in results], others) == ([(0, None)], 0)
-
-
-def test_bbox_is_the_first_of_bboxes_and_no_other_of_them(tmp_path: Path) -> None:
-    other = [[5.0, 0.0, 0.0], [6.0, 1.0, 1.0]]
-    (read,) = read_referring_predictions(written(tmp_path / "p.json", [PREDICTED | {"bboxes": [CORNERS, other]}]))
-    assert read.boxes.tolist() == [BOX.tolist(), other]
-    with pytest.raises(InputError, match="bbox is not the first of bboxes"):
-        read_referring_predictions(written(tmp_path / "p.json", [PREDICTED | {"bboxes": [other, CORNERS]}]))
+        recognition.score(tmp_path / "p.json", truth, ScoreOptions())

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.captions import wrapped_caption
-from gsencoder.data.labels.expressions import Expression
+from gsencoder.data.labels.expressions import Expression, wrapped_caption
 from gsencoder.evaluate.benchmarks.captions import (
     CaptionedBox,
     CaptionedObject,
@@ -40,7 +39,7 @@ def test_the_caption_of_the_best_box_counts_where_it_overlaps_enough() -> None:
     boxes = [box(0.2, "wrong"), box(0.1, "a red chair"), box(10.5, "a table")]
     scores = score_box_captions(objects, boxes, min_iou=0.5, tools=NO_JAVA)
     assert scores.ious == pytest.approx([0.9 / 1.1, 0.5 / 1.5])
-    assert (scores.missing, scores.predictions) == (1, 3)
+    assert scores.missing == 1
     # Object 2 says "sos eos" against four words: c = 5 + 2, r = 5 + 4, all unigrams right: exp(1 - 9/7).
     assert scores.sentences.bleu[0] == pytest.approx(np.exp(1 - 9 / 7))
     assert scores.sentences.bleu_each[0] == pytest.approx([1.0] * 4)
@@ -48,7 +47,7 @@ def test_the_caption_of_the_best_box_counts_where_it_overlaps_enough() -> None:
     assert scores.sentences.rouge_l_each == pytest.approx([1.0, 2.44 * 0.5 / (0.5 + 1.44)])
     lower = score_box_captions(objects, boxes, min_iou=0.25, tools=NO_JAVA)
     assert lower.missing == 0
-    assert lower.columns()["BLEU-4@0.25IoU"] == pytest.approx(1.0)
+    assert lower.sentences.bleu[3] == pytest.approx(1.0)
     assert lower.sentences.absent == {"METEOR": NO_JAVA}
 
 
@@ -89,7 +88,6 @@ def test_expressions_of_one_object_become_its_references() -> None:
     objects = captioned_objects(expressions)
     assert [each.object_id for each in objects] == [3, 1]
     assert objects[0].captions == ("sos a chair . eos", f"sos {' '.join('w' * 30)} eos")
-    assert len(captioned_objects(expressions, max_tokens=None)[0].captions[1].split()) == 42
 
 
 @pytest.mark.parametrize(
@@ -111,26 +109,10 @@ def test_captions_of_given_objects_need_no_boxes() -> None:
         true_object(5, 0.0),
     ]
     scores = score_named_captions(objects, [NamedCaption(scene="s0", object_id=4, caption="a b")], tools=NO_JAVA)
-    assert (scores.min_iou, scores.missing, scores.ious) == (None, 1, None)
+    assert (scores.missing, scores.ious) == (1, None)
     assert scores.sentences.bleu_each[0] == pytest.approx([1.0] * 4)
-    assert "CIDEr" in scores.columns()
     with pytest.raises(InputError, match="object 4 of s0 has no box"):
         score_box_captions(objects, [], tools=NO_JAVA)
-
-
-def test_what_does_not_belong_together_is_an_error() -> None:
-    objects = [true_object(1, 0.0)]
-    caption = NamedCaption(scene="s0", object_id=1, caption="a")
-    with pytest.raises(InputError, match="object 1 of s0 has two captions"):
-        score_named_captions(objects, [caption, caption], tools=NO_JAVA)
-    with pytest.raises(InputError, match="object 9 of s0 is no object"):
-        score_named_captions(objects, [NamedCaption(scene="s0", object_id=9, caption="a")], tools=NO_JAVA)
-    with pytest.raises(InputError, match="s7, which is no scene"):
-        score_box_captions(objects, [box(0.0, "a", scene="s7")], tools=NO_JAVA)
-    with pytest.raises(InputError, match="object 1 of s0 is there twice"):
-        score_box_captions(objects * 2, [], tools=NO_JAVA)
-    with pytest.raises(InputError, match=r"in \[0, 1\], got nan"):
-        score_box_captions(objects, [], min_iou=float("nan"), tools=NO_JAVA)
 
 
 @given(st.permutations(range(6)))

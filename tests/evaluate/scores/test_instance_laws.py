@@ -9,8 +9,6 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.benchmarks.instances import (
     MAX_TABLE,
-    InstancePrediction,
-    InstanceTruth,
     average_precision,
     instance_scores,
     match_instances,
@@ -33,7 +31,7 @@ def matched(ids: list[tuple[int, int]], masks: list[tuple[int, int, int, float]]
         [score for _, _, _, score in masks],
         num_vertices=len(truth),
     )
-    return match_instances(InstanceTruth(scene="s", ids=truth), made, CLASSES, **options)
+    return match_instances(truth, made, CLASSES, **options)
 
 
 def test_a_truth_of_a_smaller_id_chooses_first_whatever_the_scores_are() -> None:
@@ -53,7 +51,7 @@ def test_groups_that_are_small_and_of_no_class_are_counted_twice_as_in_scannets_
     classes = ClassTable(names=("wall", "bed"), ids=(0, 4))
     truth = np.concatenate([np.full(60, 7), np.full(140, 4001), np.full(300, 4002)])
     made = prediction_of_masks("s", [np.arange(500) < 200], [0], [0.9], num_vertices=500)
-    matches = match_instances(InstanceTruth(scene="s", ids=truth), made, classes)
+    matches = match_instances(truth, made, classes)
     # False from 0.6 on, the third of nine thresholds: 0.5 and 0.55 ignore it, and so does 0.25.
     assert matches.thresholds[~matches.hits].tolist() == [2, 3, 4, 5, 6, 7, 8]
 
@@ -61,7 +59,7 @@ def test_groups_that_are_small_and_of_no_class_are_counted_twice_as_in_scannets_
 def test_ids_far_apart_are_counted_as_those_that_are_near() -> None:
     near = matched([(4001, 150), (5001, 150), (0, 20)], [(0, 140, 4, 0.5), (150, 290, 5, 0.6)])
     far = matched([(4001, 150), (5001, 150), (MAX_TABLE + 7, 20)], [(0, 140, 4, 0.5), (150, 290, 5, 0.6)])
-    for name in ("truths", "hits", "outcome_scores", "rows", "thresholds"):
+    for name in ("instances", "hits", "outcome_scores", "rows", "thresholds"):
         assert np.array_equal(getattr(near, name), getattr(far, name))
 
 
@@ -73,15 +71,12 @@ def test_two_scenes_are_ranked_together_and_groups_take_their_own_classes() -> N
         # The bed of each scene is right; the chair's mask of b is on the bed, and wrong.
         masks = [rows < 200, (rows < 190) if scene == "b" else (rows >= 200)]
         made = prediction_of_masks(scene, masks, [4, 5], [score, 0.5], num_vertices=400)
-        scenes.append(match_instances(InstanceTruth(scene=scene, ids=ids), made, CLASSES))
+        scenes.append(match_instances(ids, made, CLASSES))
     scores = instance_scores(scenes, CLASSES)
     # Chairs: one right and one wrong of one score, of two: precision 1/2, 1, recall 1/2, 0, steps 1/4: 3/8.
     assert (scores.groups["tail"].ap50, scores.groups["head"].ap50) == (1, pytest.approx(3 / 8))
     assert (scores.classes["bed"].ap25, scores.overall.ap) == (1, pytest.approx((1 + 3 / 8) / 2))
-    assert (scores.truths.tolist(), scores.predictions.tolist(), scores.equal_scores) == ([2, 2], [2, 2], False)
-    other = ClassTable(names=("bed",), ids=(4,))
-    with pytest.raises(InputError, match="matched with different classes"):
-        instance_scores(scenes, other)
+    assert (scores.instances.tolist(), scores.predictions.tolist(), scores.equal_scores) == ([2, 2], [2, 2], False)
 
 
 def test_precision_is_taken_at_each_score_from_the_lowest() -> None:
@@ -93,29 +88,23 @@ def test_precision_is_taken_at_each_score_from_the_lowest() -> None:
     assert ap == pytest.approx((3 / 5 + 2 / 4 + 2 / 3 + 1 / 2 + 1 + 1) / 8)
 
 
-@pytest.mark.parametrize(
-    ("changes", "problem"),
-    [
-        ({"offsets": [1, 2]}, "do not divide their 2 vertices"),
-        ({"offsets": [0, 1]}, "do not divide"),
-        ({"offsets": [0, 2, 1, 2], "labels": [4] * 3, "scores": [0.1] * 3}, "do not divide"),
-        ({"vertices": [1, 1]}, "not ascending, each once"),
-        ({"vertices": [0, 3]}, "a vertex outside of the scene's 3"),
-        ({"vertices": [-1, 2]}, "a vertex outside"),
-        ({"scores": [-math.inf]}, "prediction 0 has the score -inf"),
-    ],
-)
-def test_masks_that_contradict_themselves_are_refused(changes: dict[str, list[float]], problem: str) -> None:
-    parts = {"vertices": [0, 2], "offsets": [0, 2], "labels": [4], "scores": [0.5]} | changes
-    arrays = {name: np.array(part, np.float64 if name == "scores" else np.int64) for name, part in parts.items()}
-    with pytest.raises(InputError, match=problem):
-        InstancePrediction(scene="s", num_vertices=3, **arrays)
+def test_precision_and_recall_of_no_predictions_are_0() -> None:
+    assert average_precision(np.zeros(0), np.zeros(0, bool), 3) == (0, 0)
+
+
+def test_sizes_that_differ_and_scores_that_are_not_finite_are_refused() -> None:
+    made = prediction_of_masks("a", [], [], [], num_vertices=4)
+    with pytest.raises(InputError, match="a: the masks have 4 vertices, and the truth 3"):
+        match_instances(np.zeros(3, np.int64), made, CLASSES)
+    for score in (math.nan, -math.inf):
+        with pytest.raises(InputError, match="prediction 1 has the score"):
+            prediction_of_masks("a", np.ones((2, 3), bool), [4, 4], [0.5, score], num_vertices=3)
 
 
 def test_masks_begin_anew_and_may_be_empty() -> None:
     rows = np.array([[True, False, True], [False] * 3, [True, True, False]])
     made = prediction_of_masks("s", rows, [4, 5, 4], [0.1, 0.2, 0.3], num_vertices=3)
-    assert [made.mask(row).tolist() for row in range(3)] == [[0, 2], [], [0, 1]]
+    assert [made.masks[row].tolist() for row in range(3)] == [[0, 2], [], [0, 1]]
     with pytest.raises(InputError, match="mask 0 has 3 vertices, and the scene 4"):
         prediction_of_masks("s", rows, [4, 5, 4], [0.1, 0.2, 0.3], num_vertices=4)
 
@@ -128,7 +117,7 @@ def test_places_count_from_one_and_other_classes_are_counted_beside() -> None:
     ranked_names = [("b", "a"), (), ("a",)]
     ranked = [RankedNames(scene="s", object=str(k), names=names) for k, names in enumerate(ranked_names)]
     results, others = recognize(ranked, truth, ["a", "b"])
-    assert [(each.rank, each.first) for each in results] == [(2, "b"), (0, None), (1, "a")]
+    assert [(each.rank, each.answered) for each in results] == [(2, True), (0, False), (1, True)]
     assert others == 1
     scores = recognition_scores(results, ["b", "a"], ks=(1, 2))
     assert scores.overall == {1: pytest.approx(1 / 3), 2: pytest.approx(2 / 3)}
@@ -142,9 +131,8 @@ def test_the_ceiling_is_of_the_background_and_no_class_is_of_none() -> None:
     classes = ClassTable(names=("ceiling", "bed", "floor", "lamp"), ids=(22, 4, 2, 9))
     truth, labels = np.array([22, 4, 4, 2, 9]), np.array([22, 4, 22, 2, 77])
     scores = semantic_scores([count_labels("s", truth, labels, classes)], classes)
-    assert scores.excluded == ("ceiling", "floor")
     assert scores.foreground.miou == pytest.approx((1 / 2 + 0) / 2)
-    assert {name: (each.truths, each.predictions) for name, each in scores.classes.items()} == {
+    assert {name: (each.instances, each.predictions) for name, each in scores.classes.items()} == {
         "ceiling": (1, 2),
         "bed": (2, 1),
         "floor": (1, 1),

@@ -15,7 +15,6 @@ from gsencoder.data.labels.classes import ClassTable
 from gsencoder.evaluate.benchmarks.instances import (
     OVERLAPS,
     InstanceScores,
-    InstanceTruth,
     instance_scores,
     match_instances,
     prediction_of_masks,
@@ -23,7 +22,7 @@ from gsencoder.evaluate.benchmarks.instances import (
 
 
 @st.composite
-def scenes(draw: st.DrawFn) -> tuple[InstanceTruth, list[Mask]]:
+def scenes(draw: st.DrawFn) -> tuple[np.ndarray, list[Mask]]:
     borders = sorted(draw(st.lists(st.integers(0, VERTICES), min_size=2, max_size=9, unique=True)))
     labels = st.sampled_from([0, 4, 4, 5, 9])
     parts = [(a, b, draw(labels) * 1000 + k) for k, (a, b) in enumerate(itertools.pairwise(borders), 1)]
@@ -40,11 +39,11 @@ def same(first: InstanceScores, second: InstanceScores) -> None:
     assert aps(first) == pytest.approx(aps(second), nan_ok=True)
 
 
-def by_definition(truth: InstanceTruth, masks: Sequence[Mask], label: int, overlap: float) -> float:
+def by_definition(truth: np.ndarray, masks: Sequence[Mask], label: int, overlap: float) -> float:
     """AP of a class of one scene at one threshold from 0.5 on, where no mask lies on two truths, by sets and loops."""
-    ids = sorted({number for number in truth.ids.tolist() if number // 1000 == label})
-    instances = {number: set(np.flatnonzero(truth.ids == number).tolist()) for number in ids}
-    void = {v for v, number in enumerate(truth.ids.tolist()) if number // 1000 not in CLASSES.ids}
+    ids = sorted({number for number in truth.tolist() if number // 1000 == label})
+    instances = {number: set(np.flatnonzero(truth == number).tolist()) for number in ids}
+    void = {v for v, number in enumerate(truth.tolist()) if number // 1000 not in CLASSES.ids}
     candidates = [(set(range(a, b)), score) for a, b, own, score in masks if own == label and b - a >= 100]
     big = {number for number in ids if len(instances[number]) >= 100}
     if not big:
@@ -71,7 +70,7 @@ def by_definition(truth: InstanceTruth, masks: Sequence[Mask], label: int, overl
 
 
 @given(scenes())
-def test_every_threshold_from_a_half_follows_the_definition(scene: tuple[InstanceTruth, list[Mask]]) -> None:
+def test_every_threshold_from_a_half_follows_the_definition(scene: tuple[np.ndarray, list[Mask]]) -> None:
     truth, masks = scene
     scores = scored(truth, *masks)
     for name, label in (("bed", BED), ("chair", CHAIR)):
@@ -82,7 +81,7 @@ def test_every_threshold_from_a_half_follows_the_definition(scene: tuple[Instanc
 
 @given(scenes(), st.randoms())
 def test_the_order_of_masks_means_nothing_where_none_lies_on_two_truths(
-    scene: tuple[InstanceTruth, list[Mask]], random: Random
+    scene: tuple[np.ndarray, list[Mask]], random: Random
 ) -> None:
     truth, masks = scene
     shuffled = list(masks)
@@ -98,31 +97,30 @@ def test_the_order_of_masks_means_nothing_where_none_lies_on_two_truths(
 
 
 @given(scenes(), st.integers(0, 2**32 - 1))
-def test_the_order_of_vertices_means_nothing(scene: tuple[InstanceTruth, list[Mask]], seed: int) -> None:
+def test_the_order_of_vertices_means_nothing(scene: tuple[np.ndarray, list[Mask]], seed: int) -> None:
     truth, masks = scene
     order = np.random.default_rng(seed).permutation(VERTICES)
     made = masks_of(*masks)
-    in_masks = [np.isin(order, made.mask(index)) for index in range(len(masks))]
+    in_masks = [np.isin(order, made.masks[index]) for index in range(len(masks))]
     moved = prediction_of_masks("a", in_masks, made.labels.tolist(), made.scores.tolist(), num_vertices=VERTICES)
-    matches = match_instances(InstanceTruth(scene="a", ids=truth.ids[order]), moved, CLASSES)
+    matches = match_instances(truth[order], moved, CLASSES)
     same(scored(truth, *masks), instance_scores([matches], CLASSES))
 
 
 @given(scenes())
-def test_only_the_ranking_by_scores_counts(scene: tuple[InstanceTruth, list[Mask]]) -> None:
+def test_only_the_ranking_by_scores_counts(scene: tuple[np.ndarray, list[Mask]]) -> None:
     truth, masks = scene
     same(scored(truth, *masks), scored(truth, *[(a, b, label, 5 * score - 9) for a, b, label, score in masks]))
 
 
 @given(st.lists(scenes(), min_size=2, max_size=4))
 def test_the_order_of_scenes_means_nothing_and_a_scene_without_anything_changes_nothing(
-    parts: list[tuple[InstanceTruth, list[Mask]]],
+    parts: list[tuple[np.ndarray, list[Mask]]],
 ) -> None:
     matches = [
-        match_instances(InstanceTruth(scene=str(k), ids=truth.ids), masks_of(*masks, scene=str(k)), CLASSES)
-        for k, (truth, masks) in enumerate(parts)
+        match_instances(truth, masks_of(*masks, scene=str(k)), CLASSES) for k, (truth, masks) in enumerate(parts)
     ]
-    empty = match_instances(truth_of(scene="empty"), masks_of(scene="empty"), CLASSES)
+    empty = match_instances(truth_of(), masks_of(scene="empty"), CLASSES)
     same(instance_scores(matches, CLASSES), instance_scores([empty, *matches[::-1]], CLASSES))
 
 

@@ -180,5 +180,5 @@ def test_class_0_has_instances_from_id_1000_never_and_its_ids_below_are_ignored(
     # With a class of id 0, ids from 1 to 999 are its "groups", which the official script ignores.
     classes = ClassTable(names=("wall", "bed"), ids=(0, 4))
     matches = match_instances(truth_of((0, 200, 5), (200, 400, 4001)), masks_of((0, 200, 0, 1.0)), classes)
-    assert matches.truths.tolist() == [0, 1]
+    assert matches.instances.tolist() == [0, 1]
     assert matches.hits.sum() == 0

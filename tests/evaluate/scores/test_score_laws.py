@@ -5,20 +5,17 @@ import math
 import numpy as np
 import pytest
 
-from gsencoder.core.errors import InputError
-from gsencoder.data.labels.expressions import Expression
+from gsencoder.data.labels.files import box_ious
 from gsencoder.data.labels.questions import Question
 from gsencoder.evaluate.benchmarks.answers import clean_answer, match_cleaned, score_answers
 from gsencoder.evaluate.benchmarks.captions import (
     CaptionedBox,
     CaptionedObject,
     NamedCaption,
-    captioned_objects,
     score_box_captions,
     score_named_captions,
     wrapped_caption,
 )
-from gsencoder.evaluate.benchmarks.referring import box_ious
 from gsencoder.evaluate.benchmarks.text_metrics import bleu, cider, f_value, python_tokens, score_sentences
 
 NO_JAVA = "no Java here"
@@ -52,23 +49,12 @@ def test_rows_of_boxes_are_those_of_the_whole_list_in_every_scene() -> None:
     scores = score_box_captions(objects, boxes, tools=NO_JAVA)
     assert scores.ious == pytest.approx([1, 0.9 / 1.1, 0.9 / 1.1])
     assert scores.sentences.rouge_l_each == pytest.approx([1, 1, 1])
-    assert (scores.missing, scores.min_iou) == (0, 0.5)
+    assert scores.missing == 0
     # Half of the box: between a quarter and the half that is asked for unless something else is said.
     third = [CaptionedBox(scene="s", caption="x", aabb=((0.5, 0.0, 0.0), (1.5, 1.0, 1.0)))]
     assert score_box_captions(objects[:1], third, tools=NO_JAVA).missing == 1
-    for k in (-0.01, 1.01):
-        with pytest.raises(InputError, match=r"smallest IoU must lie in \[0, 1\]"):
-            score_box_captions(objects, boxes, min_iou=k, tools=NO_JAVA)
     assert score_box_captions(objects[:1], boxes[:1], min_iou=1.0, tools=NO_JAVA).missing == 1
     assert score_box_captions(objects[:1], boxes[:1], min_iou=0.0, tools=NO_JAVA).missing == 0
-
-
-def test_thirty_tokens_of_a_reference_are_taken_unless_all_are() -> None:
-    words = tuple(f"w{number}" for number in range(31))
-    long = Expression(scene="s", object_id=1, object_name="x", annotation="0", text="t", tokens=words)
-    (cut,), (whole,) = captioned_objects([long]), captioned_objects([long], max_tokens=None)
-    assert cut.captions == (f"sos {' '.join(words[:30])} eos",)
-    assert whole.captions == (f"sos {' '.join(words)} eos",)
 
 
 def test_a_caption_belongs_to_its_object_and_scene() -> None:
@@ -79,9 +65,7 @@ def test_a_caption_belongs_to_its_object_and_scene() -> None:
     ]
     scores = score_named_captions(objects, captions, tools=NO_JAVA)
     assert scores.sentences.rouge_l_each[2] == pytest.approx(1)
-    assert (scores.missing, scores.predictions, scores.ious) == (1, 2, None)
-    with pytest.raises(InputError, match="object 1 of s has two captions"):
-        score_named_captions(objects, [captions[1], captions[1]], tools=NO_JAVA)
+    assert (scores.missing, scores.ious) == (1, None)
     assert wrapped_caption("sos a. b") == "sos sos a . b eos"
 
 
@@ -97,13 +81,13 @@ def test_answers_are_cleaned_before_blanks_are_counted_and_the_first_match_decid
         Question(dataset="scanqa", id=str(number), scene="s", text="What is it?", answers=("no", "yes"))
         for number in range(3)
     ]
-    scores = score_answers(
-        arguments, {"0": ["?!"], "1": ["yes"], "2": ["."]}, sentences=False, lemmatize="no WordNet", tools=NO_JAVA
-    )
-    assert (scores.blank, scores.overall.em1, scores.overall.f_value) == (2, 1 / 3, None)
+    predictions = {"0": ["?!"], "1": ["yes"], "2": ["."]}
+    scores = score_answers(arguments, predictions, lemmatize="no WordNet", tools=NO_JAVA)
+    assert (scores.blank, scores.overall.em1) == (2, 1 / 3)
     assert scores.absent == {
         "F-value": "no WordNet",
         "EM@10": "no question has more than one predicted answer",
+        "METEOR": NO_JAVA,
     }
 
 
@@ -155,11 +139,7 @@ def test_sentences_and_references_stay_with_their_samples() -> None:
         tools=NO_JAVA,
     )
     assert scores.rouge_l_each.tolist() == pytest.approx([1, 1, 1])
-    assert (scores.official, scores.meteor, scores.meteor_each) == (False, None, None)
-    assert set(scores.columns()) == {
-        f"{name} (Python tokens)" for name in ("BLEU-1", "BLEU-2", "BLEU-3", "BLEU-4", "METEOR", "ROUGE-L", "CIDEr")
-    }
+    assert not scores.official
+    assert math.isnan(scores.meteor)
     as_given = score_sentences(["A chair."], [["a chair"]], tokens="given", tools=NO_JAVA)
     assert (as_given.official, as_given.tokens, as_given.rouge_l) == (True, "tokens as given", 0)
-    with pytest.raises(InputError, match="PTB tokens need Java and its archives: no Java here"):
-        score_sentences(["a"], [["a"]], tokens="ptb", tools=NO_JAVA)

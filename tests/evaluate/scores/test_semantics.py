@@ -37,7 +37,6 @@ def test_scores_are_those_worked_out_by_hand() -> None:
     assert scores.overall.macc == pytest.approx((2 / 3 + 1 / 2) / 3)
     assert scores.overall.accuracy == 3 / 6
     # Without the wall; its vertex that is called bed still counts as wrong there.
-    assert scores.excluded == ("wall",)
     assert scores.foreground.miou == pytest.approx((2 / 5 + 1 / 2) / 2)
     assert scores.foreground.macc == pytest.approx((2 / 3 + 1 / 2) / 2)
     assert scores.foreground.accuracy == 3 / 5
@@ -65,12 +64,6 @@ def test_without_vertices_that_count_there_are_no_scores() -> None:
         values = (scores.overall.miou, scores.overall.miou_present, scores.overall.macc, scores.overall.accuracy)
         assert all(math.isnan(value) for value in values)
         assert scores.ignored == len(truth)
-
-
-def test_excluding_every_class_leaves_no_foreground() -> None:
-    scores = semantic_scores([counts([BED], [BED])], CLASSES, excluded=CLASSES.names)
-    assert math.isnan(scores.foreground.miou)
-    assert scores.overall.miou == 1
 
 
 LABELS = st.lists(st.tuples(st.sampled_from([1, 4, 5, 6, 0]), st.sampled_from([1, 4, 5, 6, 0])), min_size=1)
@@ -108,15 +101,3 @@ def test_scenes_scored_together_are_one_long_scene_in_any_order(pairs: list[tupl
 def test_numbers_of_vertices_that_differ_are_refused() -> None:
     with pytest.raises(InputError, match="a: the prediction has 1 labels, and the truth 2"):
         counts([BED, BED], [BED])
-
-
-def test_a_scene_twice_other_classes_and_unknown_names_are_refused() -> None:
-    one = counts([BED], [BED])
-    with pytest.raises(InputError, match="the scene a is there twice"):
-        semantic_scores([one, one], CLASSES)
-    with pytest.raises(InputError, match="no scene"):
-        semantic_scores([], CLASSES)
-    with pytest.raises(InputError, match="different classes"):
-        semantic_scores([one], CLASSES.without(("sofa",)))
-    with pytest.raises(InputError, match="excluded: 'walls' is none of the 4 classes; did you mean wall"):
-        semantic_scores([one], CLASSES, excluded=("walls",))

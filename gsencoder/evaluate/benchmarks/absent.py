@@ -1,4 +1,4 @@
-"""The absent protocol: how well the probabilities of words tell those that are in a room from those that are not.
+"""Absent words: how well the probabilities of words tell those that are in a room from those that are not.
 
 In each scene two groups of words are asked: the names of objects that are seen well enough (small ones and furniture),
 which are present, and the names of the other scenes' objects that this one does not have, which are absent. A name of
@@ -7,7 +7,6 @@ which the scene has only objects that are hardly seen is in neither group. The p
 """
 
 import math
-import time
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,14 +15,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError, SceneWarning, about, counted
 from gsencoder.data.labels.scans import with_counted_views
-from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.boxes import is_seen
-from gsencoder.evaluate.sources import FeatureSource, with_features
-from gsencoder.evaluate.tables import mean_of
-from gsencoder.infer.localize import LocalizeConfig, localize
-from gsencoder.text.table import TextEncoder
+from gsencoder.evaluate.benchmarks.localization import is_seen
+from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult, names_of
+from gsencoder.evaluate.tables import ScoreReport, mean_of, table_of
+from gsencoder.infer.localize import localize
+from gsencoder.text.vocabulary import check_known
 from gsencoder.types import GaussianFeatures, Scene, SceneObject
 
 BINS = 10
@@ -31,7 +29,7 @@ BINS = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AbsentProtocol:
+class AbsentProtocol(Protocol):
     """Selection of the words that are asked."""
 
     name: Literal["absent"] = "absent"
@@ -51,6 +49,9 @@ class AbsentProtocol:
             if getattr(self, name) < 0:
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
 
+    def start(self, given: Evaluation) -> "AbsentBenchmark":
+        return AbsentBenchmark(self, given)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AskedWord:
@@ -62,20 +63,69 @@ class AskedWord:
         boxed: whether it was given a box.
     """
 
-    scene: str
     word: str
     present: bool
     probability: float
     boxed: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SceneWords:
-    """The words asked in one scene, and the seconds of each step."""
+Asked = tuple[AskedWord, ...]
+"""The words asked in one scene."""
 
-    scene: str
-    words: tuple[AskedWord, ...]
-    seconds: dict[str, float]
+
+class AbsentBenchmark(Benchmark[Asked]):
+    def __init__(self, protocol: AbsentProtocol, given: Evaluation) -> None:
+        self.protocol, self.given = protocol, given
+        with about("protocol.vocabulary"):
+            check_known(given.words, protocol.vocabulary)
+        self.vocabulary = protocol.vocabulary or names_of(given.scenes())
+
+    def check(self, scene: Scene) -> Scene:
+        return with_counted_views(scene)
+
+    def predict(self, scene: Scene, features: GaussianFeatures) -> Asked:
+        present, absent = words_to_ask(
+            scene.objects, self.vocabulary, min_views=self.protocol.min_views, min_pixels=self.protocol.min_pixels
+        )
+        if not (names := [*present, *absent]):
+            return ()
+        asked_scene = replace(scene, features={features.space.name: features})
+        with warnings.catch_warnings():
+            # That words have no box is the result here, not a fault.
+            warnings.filterwarnings("ignore", ".*words have no box", SceneWarning)
+            result = localize(asked_scene, names, self.given.words, self.given.localization)
+        boxless = result.absent
+        return tuple(
+            AskedWord(word=name, present=row < len(present), probability=float(probability), boxed=name not in boxless)
+            for row, (name, probability) in enumerate(zip(names, result.probabilities, strict=True))
+        )
+
+    def report(self, results: Sequence[SceneResult[Asked]]) -> ScoreReport:
+        scenes = [result.value for result in results]
+        scores, names = absent_scores(scenes), probabilities_by_word(scenes)
+        shares = ("auroc", "calibration_error", "brier", "boxed_present", "boxed_absent")
+        return ScoreReport(
+            results={"protocol": "absent", **scores, "names": names, "scenes": [result.scene for result in results]},
+            table=table_of("Absent words", {self.given.method: {name: scores[name] for name in shares}}),
+            rows={
+                "names": [{"name": name, **row} for name, row in names.items()],
+                "words": [
+                    {
+                        "scene": result.scene,
+                        "word": word.word,
+                        "present": word.present,
+                        "probability": word.probability,
+                        "boxed": word.boxed,
+                    }
+                    for result in results
+                    for word in result.value
+                ],
+            },
+            line=f"{scores['present']} present and {counted(scores['absent'], 'absent word')} in "
+            f"{counted(len(results), 'scene')}: AUROC {scores['auroc']:.3f} ± {scores['auroc_se']:.3f}, calibration "
+            f"error {scores['calibration_error']:.3f}, Brier {scores['brier']:.3f}; given a box: "
+            f"{scores['boxed_present']:.3f} of the present, {scores['boxed_absent']:.3f} of the absent",
+        )
 
 
 def words_to_ask(
@@ -84,84 +134,14 @@ def words_to_ask(
     """The present and the absent words of a scene, each in alphabetical order.
 
     Args:
-        objects: all objects of the scene.
+        objects: of the scene.
         vocabulary: names that may be absent.
-        min_views: smallest number of views in which an object is seen.
-        min_pixels: smallest number of pixels that an object has in the view that shows it best.
+        min_views: see `is_seen`.
+        min_pixels: see there.
     """
     with_names = [each for each in objects if each.name]
     present = {each.name for each in with_names if is_seen(each, min_views=min_views, min_pixels=min_pixels)}
     return sorted(name for name in present if name), sorted(set(vocabulary) - {each.name for each in with_names})
-
-
-def evaluate_absent(
-    scenes: Iterable[tuple[Scene, float]],
-    source: FeatureSource,
-    words: TextEncoder,
-    vocabulary: Sequence[str],
-    *,
-    protocol: AbsentProtocol = AbsentProtocol(),
-    seeds: SeedConfig = SeedConfig(),
-    localization: LocalizeConfig = LocalizeConfig(),
-) -> list[SceneWords]:
-    """Runs the protocol scene by scene; one scene is in memory at a time.
-
-    Args:
-        scenes: scenes with labeled objects and the seconds of loading, as `load_scenes` yields them.
-        source: computes the features of a scene.
-        words: turns words into the features' space.
-        vocabulary: names that may be absent, such as those of `names_of`.
-        protocol: which objects count as present.
-        seeds: how Gaussians are made for scenes without.
-
-    Returns:
-        The words of each scene, in order.
-    """
-    results = []
-    for loaded_scene, load_seconds in scenes:
-        scene, features, seconds = with_features(with_counted_views(loaded_scene), source, seeds)
-        start = time.perf_counter()
-        outcomes = ask_words(scene, features, words, vocabulary, protocol, localization)
-        seconds = {"load": load_seconds, **seconds, "localize": time.perf_counter() - start}
-        results.append(SceneWords(scene=scene.name, words=tuple(outcomes), seconds=seconds))
-    return results
-
-
-def ask_words(
-    scene: Scene,
-    features: GaussianFeatures,
-    words: TextEncoder,
-    vocabulary: Sequence[str],
-    protocol: AbsentProtocol,
-    localization: LocalizeConfig,
-) -> list[AskedWord]:
-    """Localizes the present and the absent words of a scene in features of its Gaussians."""
-    present, absent = words_to_ask(
-        scene.objects, vocabulary, min_views=protocol.min_views, min_pixels=protocol.min_pixels
-    )
-    names = [*present, *absent]
-    if not names:
-        return []
-    with warnings.catch_warnings():
-        # That words have no box is the result here, not a fault.
-        warnings.filterwarnings("ignore", ".*words have no box", SceneWarning)
-        result = localize(replace(scene, features={features.space.name: features}), names, words, localization)
-    absent_names = result.absent
-    return [
-        AskedWord(
-            scene=scene.name,
-            word=name,
-            present=number < len(present),
-            probability=float(result.probabilities[number]),
-            boxed=name not in absent_names,
-        )
-        for number, name in enumerate(names)
-    ]
-
-
-def names_of(scenes: Iterable[Scene]) -> list[str]:
-    """All names of the objects of scenes, in alphabetical order."""
-    return sorted({each.name for scene in scenes for each in scene.objects if each.name})
 
 
 def auroc(present: Bool[np.ndarray, " n"], probability: Float64[np.ndarray, " n"]) -> float:
@@ -219,7 +199,7 @@ def calibration_error(
     return sum(row["words"] * abs(row["probability"] - row["present"]) for row in rows) / len(present)
 
 
-def absent_scores(scenes: Sequence[SceneWords]) -> dict[str, Any]:
+def absent_scores(scenes: Sequence[Asked]) -> dict[str, Any]:
     """The metrics of the protocol over all words of all scenes.
 
     Returns:
@@ -227,11 +207,11 @@ def absent_scores(scenes: Sequence[SceneWords]) -> dict[str, Any]:
         probability and presence), boxed_present and boxed_absent (shares of the words that were given a box), and
         reliability.
     """
-    words = [word for scene in scenes for word in scene.words]
+    words = [word for scene in scenes for word in scene]
     present = np.array([word.present for word in words], bool)
     probability = np.array([word.probability for word in words], np.float64)
     boxed = np.array([word.boxed for word in words], bool)
-    scene = np.array([number for number, each in enumerate(scenes) for _ in each.words], np.int64)
+    scene = np.array([number for number, each in enumerate(scenes) for _ in each], np.int64)
     if present.all() or not present.any():
         raise InputError(
             f"absent: expected words that are present and words that are absent, got {int(present.sum())} and "
@@ -250,12 +230,12 @@ def absent_scores(scenes: Sequence[SceneWords]) -> dict[str, Any]:
     }
 
 
-def probabilities_by_word(scenes: Sequence[SceneWords]) -> dict[str, dict[str, Any]]:
+def probabilities_by_word(scenes: Sequence[Asked]) -> dict[str, dict[str, Any]]:
     """For each word the numbers of scenes in which it is present and absent, and its mean probability in both; the
     words that these tell least apart come first. Means without scenes are NaN."""
     words: dict[str, tuple[list[float], list[float]]] = {}
-    for outcome in (word for scene in scenes for word in scene.words):
-        words.setdefault(outcome.word, ([], []))[0 if outcome.present else 1].append(outcome.probability)
+    for asked in (word for scene in scenes for word in scene):
+        words.setdefault(asked.word, ([], []))[0 if asked.present else 1].append(asked.probability)
     table = {
         word: {
             "present": len(present),

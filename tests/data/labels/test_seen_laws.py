@@ -18,7 +18,7 @@ from gsencoder.data.labels.made_questions import (
     side_of,
 )
 from gsencoder.data.labels.names import RANGES, color_counts, color_word, hsv
-from gsencoder.data.labels.questions import Question, read_questions, read_sqa3d, write_sqa3d
+from gsencoder.data.labels.questions import Question, read_questions, write_sqa3d
 from gsencoder.data.labels.seen_objects import COLOR_VIEWS, SeenObject, SeenScene, see_objects
 from gsencoder.types import Scene, SceneObject, Views
 
@@ -259,14 +259,6 @@ def test_situated_questions_are_written_in_sqa3ds_two_files(tmp_path: Path) -> N
     for lacking in ("situation", "position", "rotation"):
         with pytest.raises(InputError, match="question 7 has no situation"):
             write_sqa3d(tmp_path / "questions.json", [replace(SITUATED, **{lacking: None})])
-
-
-def test_a_file_without_questions_is_no_file_of_sqa3d(tmp_path: Path) -> None:
-    path = tmp_path / "questions.json"
-    for content, got in (({"annotations": []}, "an object"), ([], "a list"), (["questions"], "a list")):
-        path.write_text(json.dumps(content))
-        with pytest.raises(InputError, match=f"expected SQA3D's object with questions, got {got}"):
-            read_sqa3d(path)
 
 
 def test_two_hundred_pixels_are_enough_to_be_asked_about_where_nothing_else_is_said() -> None:

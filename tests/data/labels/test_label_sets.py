@@ -11,12 +11,12 @@ from gsencoder.data.labels.classes import (
     COLUMNS,
     ClassTable,
     ids_of_names,
+    instance_ids,
     read_class_list,
     read_label_map,
     scannet_classes,
     vertex_classes,
 )
-from gsencoder.data.labels.expressions import instance_truth, write_instance_truth, write_semantic_truth
 from gsencoder.data.labels.files import read_split
 from gsencoder.types import MeshLabels
 
@@ -162,32 +162,11 @@ def test_a_vertex_has_the_class_of_its_objects_name() -> None:
     assert vertex_classes(np.array([7], np.int32), {}, {"wall": 1}).tolist() == [0]
 
 
-def test_truth_files_hold_one_number_a_vertex(tmp_path: Path) -> None:
+def test_an_instance_is_its_class_times_a_thousand_and_its_number() -> None:
     classes = {"couch": 6, "wall": 1}
     # The bean bag has no class: 0 · 1000 + 5.
-    truth = instance_truth(LABELS.instances, NAMES, classes)
+    truth = instance_ids(LABELS.instances, NAMES, classes)
     assert truth.tolist() == [1003, 0, 6012, 1003, 5, 5]
-    write_instance_truth(tmp_path / "a.txt", LABELS, classes)
-    write_semantic_truth(tmp_path / "b.txt", LABELS, classes)
-    assert (tmp_path / "a.txt").read_text() == "1003\n0\n6012\n1003\n5\n5\n"
-    assert (tmp_path / "b.txt").read_text() == "1\n0\n6\n1\n0\n0\n"
-    assert np.loadtxt(tmp_path / "a.txt", np.int64).tolist() == truth.tolist()
-
-
-def test_instances_whose_ids_would_read_as_another_class_are_numbered_within_their_class() -> None:
-    instances = np.array([1000, 7, 0, 2500, 999, 1000], np.int32)
-    names = {7: "couch", 999: "lamp", 1000: "couch", 2500: "wall"}
-    # Of the couches 7 is the first and 1000 the second; the lamp has no class.
-    assert instance_truth(instances, names, {"couch": 6, "wall": 1}).tolist() == [6002, 6001, 0, 1001, 0, 6002]
-
-
-def test_more_instances_of_a_class_than_the_format_can_hold_are_refused() -> None:
-    many = np.arange(1, 1001, dtype=np.int32)
-    with pytest.raises(InputError, match="'couch': 1,000 objects are of its class; up to 999 fit"):
-        instance_truth(many, dict.fromkeys(many.tolist(), "couch"), {"couch": 6})
-    assert instance_truth(many[:999], dict.fromkeys(many.tolist(), "couch"), {"couch": 6}).max() == 6999
-    # Objects without a class are not counted.
-    assert instance_truth(many, {}, {"couch": 6}).tolist() == [0] * 1000
 
 
 def test_the_classes_are_those_of_scannets_own_lists() -> None:
@@ -218,26 +197,26 @@ def test_the_classes_are_those_of_scannets_own_lists() -> None:
 )
 def test_ids_below_a_thousand_are_the_numbers_of_instances(ids: list[int], expected: list[int]) -> None:
     instances = np.array([*ids, 0], np.int32)
-    assert instance_truth(instances, dict.fromkeys(ids, "chair"), {"chair": 5}).tolist() == expected
+    assert instance_ids(instances, dict.fromkeys(ids, "chair"), {"chair": 5}).tolist() == expected
 
 
 def test_objects_are_numbered_within_their_class_in_the_order_of_their_ids() -> None:
     instances = np.array([2000, 3, 0, 1200, 77, 2000], np.int32)
     names = {3: "bed", 77: "chair", 1200: "chair", 2000: "bed"}
-    assert instance_truth(instances, names, {"bed": 4, "chair": 5}).tolist() == [4002, 4001, 0, 5002, 5001, 4002]
+    assert instance_ids(instances, names, {"bed": 4, "chair": 5}).tolist() == [4002, 4001, 0, 5002, 5001, 4002]
     # Without a class the number means nothing, and may be none.
-    assert instance_truth(instances, names, {"bed": 4}).tolist() == [4002, 4001, 0, 0, 0, 4002]
-    assert instance_truth(np.zeros(0, np.int32), {}, {}).tolist() == []
+    assert instance_ids(instances, names, {"bed": 4}).tolist() == [4002, 4001, 0, 0, 0, 4002]
+    assert instance_ids(np.zeros(0, np.int32), {}, {}).tolist() == []
 
 
 def test_no_more_than_999_objects_of_a_class_fit(tmp_path: Path) -> None:
     instances = np.arange(1001, 2001, dtype=np.int32)
     names = dict.fromkeys(range(1001, 2001), "bed")
-    assert instance_truth(instances[:999], names, {"bed": 4}).tolist() == list(range(4001, 5000))
+    assert instance_ids(instances[:999], names, {"bed": 4}).tolist() == list(range(4001, 5000))
     with pytest.raises(InputError, match="'bed': 1,000 objects are of its class; up to 999 fit"):
-        instance_truth(instances, names, {"bed": 4})
+        instance_ids(instances, names, {"bed": 4})
     # Objects of no class may be any number.
-    assert not instance_truth(instances, names, {}).any()
+    assert not instance_ids(instances, names, {}).any()
 
 
 def test_names_of_scenes_are_as_long_as_folders_names(tmp_path: Path) -> None:

@@ -1,29 +1,22 @@
-"""The grounding protocol: how well rendered features show where in a picture the objects of a name are.
+"""Grounding in pictures, as M3 measures it (sec. 4.1, table 2): Otsu's threshold on a name's map, IoU with a mask.
 
-In each view of a labeled scene the names of the objects that it shows are looked for in the features, which are
-rendered at its pixels. The ground truth is the union of all instances of a name; scores are M3's
-(`gsencoder.evaluate.protocols.grounding`).
-
-Grounding in pictures, as M3 measures it (sec. 4.1, table 2): Otsu's threshold on a phrase's map, IoU with a mask.
-
-M3 prints the share of pairs whose IoU reaches 0.5 or 0.6 as AP50 and AP60. It is no average precision, and is called a
-precision here.
+In each view of a labeled scene the names of the objects that it shows are looked for in the features, rendered at its
+pixels. The ground truth is the union of all instances of a name. M3 prints the share of pairs whose IoU reaches 0.5 or
+0.6 as AP50 and AP60. It is no average precision, and is called a precision here.
 """
 
 import math
-import time
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
-from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.seeding.seed import SeedConfig
-from gsencoder.evaluate.sources import FeatureSource, with_features
-from gsencoder.evaluate.tables import mean_of
+from gsencoder.core.errors import InputError, SceneWarning, counted
+from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult
+from gsencoder.evaluate.tables import ScoreReport, mean_of, table_of
 from gsencoder.infer.pictures import pixel_features
 from gsencoder.infer.relevancy import GaussianProducts, word_directions
 from gsencoder.render import blend
@@ -35,6 +28,31 @@ BINS = 256
 """Bins of the histogram, as in scikit-image, which M3's released code calls."""
 PRECISION_IOUS = (0.5, 0.6)
 """IoUs from which on a pair counts in the precision."""
+SHARES = ("miou", "ciou", "p50", "p60")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundingProtocol(Protocol):
+    """Selection of the pairs of a view and a name, and of the pixels that are compared."""
+
+    name: Literal["grounding"] = "grounding"
+    stride: int = field(
+        default=1, metadata={"help": "pixels from one rendered pixel to the next, along both sides of a view"}
+    )
+    min_pixels: int = field(
+        default=60, metadata={"help": "smallest area that the objects of a name must have in a view to be looked for"}
+    )
+    furniture: bool = field(
+        default=True, metadata={"help": "whether furniture is looked for, and not the small objects alone"}
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("stride", "min_pixels"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
+
+    def start(self, given: Evaluation) -> "GroundingBenchmark":
+        return GroundingBenchmark(self, given)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +81,7 @@ class GroundingScores:
     """Scores of pairs of a view and a phrase; NaN without pairs.
 
     Attributes:
+        pairs: that were scored.
         not_finite: of them, those whose map was not finite. Their IoU is 0, so that no method gains by failing.
         miou: mean IoU of the pairs.
         ciou: sum of the intersections by the sum of the unions: each pixel counts the same, and large masks most.
@@ -78,12 +97,101 @@ class GroundingScores:
     p60: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundedScene:
+    """The pairs of a scene, the number that were left out as too small, and that of its views."""
+
+    pairs: tuple[GroundedPair, ...]
+    small: int
+    views: int
+
+
+class GroundingBenchmark(Benchmark[GroundedScene]):
+    def __init__(self, protocol: GroundingProtocol, given: Evaluation) -> None:
+        self.protocol, self.given = protocol, given
+
+    def check(self, scene: Scene) -> Scene:
+        if scene.views is None or scene.views.instances is None or not scene.objects:
+            raise InputError(
+                f"grounding: scene {scene.name} needs views with instance maps (instance_file_path in "
+                "transforms.json) and an objects.json that names them, or the label files of ScanNet or ScanNet++"
+            )
+        return scene
+
+    def predict(self, scene: Scene, features: GaussianFeatures) -> GroundedScene:
+        assert scene.views is not None
+        memory = self.given.memory_of(scene)
+        pairs, small = ground_scene(scene, features, self.given.words, self.protocol, memory=memory)
+        return GroundedScene(pairs=tuple(pairs), small=small, views=len(scene.views))
+
+    def report(self, results: Sequence[SceneResult[GroundedScene]]) -> ScoreReport:
+        small = sum(result.value.small for result in results)
+        self._warn_about_gaps(results, small)
+        pairs = [pair for result in results for pair in result.value.pairs]
+        scores, names = grounding_scores(pairs), scores_by_phrase(pairs)
+        by_scene = [
+            {
+                "scene": result.scene,
+                "views": result.value.views,
+                "gaussians": result.gaussians,
+                "small": result.value.small,
+                **asdict(grounding_scores(result.value.pairs)),
+            }
+            for result in results
+        ]
+        shares = {name: getattr(scores, name) for name in SHARES}
+        faults = f", {counted(scores.not_finite, 'map')} not finite" if scores.not_finite else ""
+        return ScoreReport(
+            results={
+                "protocol": "grounding",
+                **asdict(scores),
+                "miou_names": phrase_mean(names),
+                "small": small,
+                "names": names,
+                "scenes": by_scene,
+            },
+            table=table_of(
+                "Grounding", {self.given.method: shares}, published="m3_2_grounding_and_retrieval", columns=SHARES
+            ),
+            rows={
+                "names": [{"name": name, **row} for name, row in names.items()],
+                "pairs": [
+                    {"scene": each.scene, "view": p.view, "name": p.phrase, "iou": p.iou, "finite": p.finite}
+                    for each in results
+                    for p in each.value.pairs
+                ],
+                "scenes": by_scene,
+            },
+            line=f"{counted(len(pairs), 'pair')} of a view and a name in {counted(len(results), 'scene')}: mIoU "
+            f"{scores.miou:.3f} (averaged over names {phrase_mean(names):.3f}), cIoU {scores.ciou:.3f}, P@0.5 "
+            f"{scores.p50:.3f}, P@0.6 {scores.p60:.3f}; {counted(small, 'pair')} too small{faults}",
+        )
+
+    def _warn_about_gaps(self, results: Sequence[SceneResult[GroundedScene]], small: int) -> None:
+        empty = [result.scene for result in results if not result.value.pairs]
+        least = self.protocol.min_pixels
+        if len(empty) == len(results):
+            raise InputError(
+                f"grounding: no view of {len(results)} scenes shows a named object with {least} pixels ({small} have "
+                "fewer); lower protocol.min_pixels, or name objects"
+            )
+        if empty:
+            warnings.warn(
+                f"{len(empty)} of {len(results)} scenes show no named object with {least} pixels (first: {empty[0]!r})",
+                SceneWarning,
+                stacklevel=3,
+            )
+
+
 def otsu_threshold(values: Float32[np.ndarray, "*shape"]) -> float:
     """The threshold that separates two classes of values with the largest variance between them (Otsu 1979).
 
     Of the histogram of the values in 256 bins between their extremes, a split after bin k has the variance
     n₁(k) · n₂(k) · (m₁(k) − m₂(k))², with the numbers and mean values of both classes, where a bin stands for its
     center. The threshold is the center of bin k; of equal splits the first is taken.
+
+    Args:
+        values: finite, one or more.
 
     Returns:
         The threshold; values above it are the upper class. The value itself where all are equal, so that none is above.
@@ -112,6 +220,7 @@ def ground(
     Args:
         relevancy: of the phrase. With a value that is not finite, nothing is found, and the pair says so.
         truth: pixels of what the phrase means, one or more.
+        view: its name.
         phrase: that the map is of.
     """
     if relevancy.shape != truth.shape or not truth.any():
@@ -121,13 +230,8 @@ def ground(
         )
     finite = bool(np.isfinite(relevancy).all())
     above = relevancy > otsu_threshold(relevancy) if finite else np.zeros_like(truth)
-    return GroundedPair(
-        view=view,
-        phrase=phrase,
-        intersection=int((above & truth).sum()),
-        union=int((above | truth).sum()),
-        finite=finite,
-    )
+    intersection, union = int((above & truth).sum()), int((above | truth).sum())
+    return GroundedPair(view=view, phrase=phrase, intersection=intersection, union=union, finite=finite)
 
 
 def grounding_scores(pairs: Sequence[GroundedPair]) -> GroundingScores:
@@ -145,108 +249,6 @@ def grounding_scores(pairs: Sequence[GroundedPair]) -> GroundingScores:
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GroundingProtocol:
-    """Selection of the pairs of a view and a name, and of the pixels that are compared."""
-
-    name: Literal["grounding"] = "grounding"
-    stride: int = field(
-        default=1, metadata={"help": "pixels from one rendered pixel to the next, along both sides of a view"}
-    )
-    min_pixels: int = field(
-        default=60, metadata={"help": "smallest area that the objects of a name must have in a view to be looked for"}
-    )
-    furniture: bool = field(
-        default=True, metadata={"help": "whether furniture is looked for, and not the small objects alone"}
-    )
-
-    def __post_init__(self) -> None:
-        for name in ("stride", "min_pixels"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SceneGrounding:
-    """The result of the protocol on one scene.
-
-    Attributes:
-        pairs: of its views and the names of what they show.
-        small: pairs that were left out because the objects of the name have too few pixels in the view.
-    """
-
-    scene: str
-    pairs: tuple[GroundedPair, ...]
-    small: int
-    views: int
-    gaussians: int
-    seconds: dict[str, float]
-
-
-def evaluate_grounding(
-    scenes: Iterable[tuple[Scene, float]],
-    source: FeatureSource,
-    words: TextEncoder,
-    *,
-    protocol: GroundingProtocol = GroundingProtocol(),
-    seeds: SeedConfig = SeedConfig(),
-    memory_of: Callable[[Scene], QueryMemory | None] = lambda _: None,
-) -> list[SceneGrounding]:
-    """Runs the protocol scene by scene; one scene is in memory at a time.
-
-    Args:
-        scenes: scenes with labeled objects and instance maps, and the seconds of loading, as `load_scenes` yields them.
-        source: computes the features of a scene.
-        words: turns names into the features' space.
-        protocol: which names are looked for.
-        seeds: how Gaussians are made for scenes without.
-        memory_of: the memory that the features of a scene come from, or None where there is none. Its queries are
-            rendered, and attend to its bank at each pixel.
-
-    Returns:
-        One result per scene, in order.
-
-    Warns:
-        SceneWarning: scenes have no pair.
-    """
-    results = []
-    for loaded_scene, load_seconds in scenes:
-        views = loaded_scene.views
-        if views is None or views.instances is None or not loaded_scene.objects:
-            raise InputError(
-                f"grounding: scene {loaded_scene.name} needs views with instance maps (instance_file_path in "
-                "transforms.json) and an objects.json that names them, or the label files of ScanNet or ScanNet++"
-            )
-        scene, features, seconds = with_features(loaded_scene, source, seeds)
-        start = time.perf_counter()
-        pairs, small = ground_scene(scene, features, words, protocol, memory=memory_of(scene))
-        seconds = {"load": load_seconds, **seconds, "ground": time.perf_counter() - start}
-        results.append(
-            SceneGrounding(
-                scene=scene.name,
-                pairs=tuple(pairs),
-                small=small,
-                views=len(views),
-                gaussians=len(features),
-                seconds=seconds,
-            )
-        )
-    empty = [result.scene for result in results if not result.pairs]
-    if len(empty) == len(results):
-        raise InputError(
-            f"grounding: no view of {len(results)} scenes shows a named object with {protocol.min_pixels} pixels "
-            f"({sum(result.small for result in results)} have fewer); lower protocol.min_pixels, or name objects"
-        )
-    if empty:
-        warnings.warn(
-            f"{len(empty)} of {len(results)} scenes show no named object with {protocol.min_pixels} pixels (first: "
-            f"{empty[0]!r})",
-            SceneWarning,
-            stacklevel=2,
-        )
-    return results
-
-
 def ground_scene(
     scene: Scene,
     features: GaussianFeatures,
@@ -261,9 +263,10 @@ def ground_scene(
 
     Args:
         scene: Gaussians, views with instance maps, and objects.
+        features: of the Gaussians.
         words: turns names into the features' space.
         protocol: which names are looked for.
-        memory: that the features come from; see `evaluate_grounding`.
+        memory: that the features come from; see `Evaluation`.
 
     Returns:
         The pairs, view by view, and the number of pairs that were left out because they have too few pixels.

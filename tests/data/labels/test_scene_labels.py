@@ -20,7 +20,7 @@ from gsencoder.data.labels.mesh import MeshInstances, draw_instances
 from gsencoder.data.labels.scans import find_labels, is_placed, with_counted_views
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.synthetic import make_room
-from gsencoder.evaluate.boxes import queryable_objects
+from gsencoder.evaluate.benchmarks.localization import queryable_objects
 from gsencoder.types import MeshLabels, Scene
 
 VIEWS = 8

@@ -7,9 +7,15 @@ import pytest
 from labeled_scans import group, write_scannetpp_labels
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.classes import ClassTable, ids_of_benchmark, read_benchmark_map, read_instance_classes
-from gsencoder.evaluate.benchmarks.files import load_classes
-from gsencoder.evaluate.benchmarks.instances import classes_of_scan, instances_of_scan
+from gsencoder.data.labels.classes import (
+    ClassTable,
+    ids_of_benchmark,
+    load_classes,
+    read_benchmark_map,
+    read_instance_classes,
+)
+from gsencoder.evaluate.benchmarks.instances import instance_ids_of_scan
+from gsencoder.evaluate.benchmarks.semantics import class_ids_of_scan
 
 MAP = """class,count,instance_map_to,semantic_map_to
 wall,90,None,
@@ -57,9 +63,9 @@ def test_the_truth_of_a_scan_is_that_of_the_objects_with_a_class(lists: Path) ->
     scan = write_scannetpp_labels(lists / "abc", np.eye(5, 3, dtype=np.float32), segments, groups)
     every = load_classes(str(lists / "top100.txt"))
     ids = ids_of_benchmark(lists / "map_benchmark.csv", every)
-    assert classes_of_scan(scan, ids, every).tolist() == [0, 0, 2, 2, -1]
-    truth = instances_of_scan(scan, ids, load_classes(str(lists / "top100.txt"), instances=True))
-    assert truth.ids.tolist() == [1, 1, 2002, 2002, 0]
+    assert class_ids_of_scan(scan, ids, every).tolist() == [0, 0, 2, 2, -1]
+    ids_of_instances = instance_ids_of_scan(scan, ids, load_classes(str(lists / "top100.txt"), instances=True))
+    assert ids_of_instances.tolist() == [1, 1, 2002, 2002, 0]
 
 
 @pytest.mark.parametrize(

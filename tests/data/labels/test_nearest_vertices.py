@@ -6,30 +6,11 @@ from sklearn.neighbors import KNeighborsClassifier
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels import mesh as nearest_vertices
-from gsencoder.data.labels.mesh import labels_of_gaussians, labels_of_vertices, nearest_rows
+from gsencoder.data.labels.mesh import labels_of_vertices, nearest_rows
 
 
 def points(rng: np.random.Generator, count: int) -> np.ndarray:
     return rng.uniform(0, 1, (count, 3)).astype(np.float32)
-
-
-def test_a_gaussian_has_the_label_of_the_nearest_vertex_within_the_distance(rng: np.random.Generator) -> None:
-    means, vertices = points(rng, 300), points(rng, 200)
-    labels = rng.integers(0, 9, 200).astype(np.int32)
-    nearest_labels = labels_of_gaussians(means, vertices, labels, max_distance=0.1, none=-7)
-    distances = np.linalg.norm(means[:, None].astype(float) - vertices[None], axis=2)
-    near = distances.min(axis=1) <= 0.1
-    assert 0 < near.sum() < 300
-    assert np.array_equal(nearest_labels.vertices, np.where(near, distances.argmin(axis=1), -1))
-    assert np.array_equal(nearest_labels.labels, np.where(near, labels[distances.argmin(axis=1)], -7))
-    assert nearest_labels.far == (~near).sum()
-
-
-def test_the_distance_itself_is_near_enough() -> None:
-    vertices = np.array([[0, 0, 0]], np.float32)
-    means = np.array([[0.25, 0, 0], [0.2500001, 0, 0]], np.float32)
-    labels = labels_of_gaussians(means, vertices, np.array([4]), max_distance=0.25)
-    assert labels.labels.tolist() == [4, 0]
 
 
 def test_the_nearest_row_is_that_of_brute_force_and_minus_one_where_none_is_near(rng: np.random.Generator) -> None:
@@ -38,6 +19,8 @@ def test_the_nearest_row_is_that_of_brute_force_and_minus_one_where_none_is_near
     assert np.array_equal(nearest_rows(some, targets), distances.argmin(axis=1))
     near = distances.min(axis=1) <= 0.1
     assert 0 < near.sum() < 300
+    at_it = np.array([[0.25, 0, 0], [0.2500001, 0, 0]])
+    assert nearest_rows(at_it, np.zeros((1, 3)), max_distance=0.25).tolist() == [0, -1]
     assert np.array_equal(nearest_rows(some, targets, max_distance=0.1), np.where(near, distances.argmin(axis=1), -1))
     assert nearest_rows(some, targets[:0]).tolist() == [-1] * 300
     assert nearest_rows(some[:0], targets).tolist() == []
@@ -58,13 +41,10 @@ def test_chunks_change_nothing(rng: np.random.Generator, monkeypatch: pytest.Mon
     means, vertices = points(rng, 300), points(rng, 257)
     labels = rng.integers(0, 40, 300)
     whole = labels_of_vertices(vertices, means, labels)
-    nearest_labels = labels_of_gaussians(means, vertices, np.arange(257), max_distance=0.1)
     rows = nearest_rows(vertices, means)
     monkeypatch.setattr(nearest_vertices, "CHUNK", 16)
     monkeypatch.setattr(nearest_vertices, "MAX_VOTES", 300)
     assert np.array_equal(labels_of_vertices(vertices, means, labels), whole)
-    again = labels_of_gaussians(means, vertices, np.arange(257), max_distance=0.1)
-    assert np.array_equal(again.labels, nearest_labels.labels)
     assert np.array_equal(nearest_rows(vertices, means), rows)
 
 
@@ -93,9 +73,6 @@ def test_nothing_gives_no_labels(rng: np.random.Generator) -> None:
     assert labels_of_vertices(some, none, empty).tolist() == [-1, -1, -1]
     assert labels_of_vertices(none, some, np.arange(3)).shape == (0,)
     assert labels_of_vertices(some, some, np.arange(3), voters=np.zeros(3, bool)).tolist() == [-1, -1, -1]
-    labels = labels_of_gaussians(some, none, empty)
-    assert (labels.labels.tolist(), labels.far) == ([0, 0, 0], 3)
-    assert labels_of_gaussians(none, some, np.arange(3)).far == 0
 
 
 def test_positions_that_are_not_finite_and_senseless_settings_are_refused(rng: np.random.Generator) -> None:
@@ -103,10 +80,8 @@ def test_positions_that_are_not_finite_and_senseless_settings_are_refused(rng: n
     broken[2, 1] = np.nan
     labels = np.arange(4)
     with pytest.raises(InputError, match="Gaussians: row 2 is not finite"):
-        labels_of_gaussians(broken, some, labels)
+        labels_of_vertices(some, broken, labels)
     with pytest.raises(InputError, match="vertices: row 2 is not finite"):
         labels_of_vertices(broken, some, labels)
     with pytest.raises(InputError, match="k: expected at least 1"):
         labels_of_vertices(some, some, labels, k=0)
-    with pytest.raises(InputError, match="max_distance: expected a positive length"):
-        labels_of_gaussians(some, some, labels, max_distance=0.0)

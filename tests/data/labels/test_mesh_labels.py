@@ -10,7 +10,7 @@ from labeled_scans import group, write_ply, write_scannet_labels, write_scannetp
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels import scans as segment_files
-from gsencoder.data.labels.mesh import read_mesh, read_vertex_labels
+from gsencoder.data.labels.mesh import read_mesh
 from gsencoder.data.labels.scans import (
     find_scannet_files,
     find_scannetpp_files,
@@ -112,7 +112,6 @@ def test_meshes_of_every_encoding_keep_the_order_of_vertices(tmp_path: Path, tex
     assert np.array_equal(read, vertices)
     assert triangles is not None
     assert np.array_equal(triangles, faces)
-    assert np.array_equal(read_vertex_labels(path), nyu40)
 
 
 def test_a_cloud_has_no_triangles(tmp_path: Path) -> None:
@@ -234,8 +233,6 @@ def test_meshes_of_other_polygons_and_other_files_are_refused(tmp_path: Path) ->
     path.write_bytes(b"PK\x03\x04")
     with pytest.raises(InputError, match="not a .ply file"):
         read_mesh(path)
-    with pytest.raises(InputError, match="has no property 'label'"):
-        read_vertex_labels(write_ply(tmp_path / "b.ply", VERTICES, FACES))
     with pytest.raises(InputError, match="cannot be read"):
         read_mesh(tmp_path / "missing.ply")
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.questions import Question, read_questions, read_scanqa, read_sqa3d, write_scanqa
+from gsencoder.data.labels.questions import Question, read_questions, write_scanqa
 
 
 def entry(**changes: Any) -> dict[str, Any]:
@@ -74,13 +74,13 @@ def test_scanqa_is_read_as_it_is_published(tmp_path: Path) -> None:
 def test_a_test_set_has_no_answers_and_is_read_where_none_are_needed(tmp_path: Path) -> None:
     bare = {name: value for name, value in entry().items() if name in ("scene_id", "question_id", "question")}
     path = scanqa(tmp_path, [bare])
-    assert read_scanqa(path, answered=False)[0].answers == ()
+    assert read_questions(path, answered=False)[0].answers == ()
     with pytest.raises(InputError, match="1 of 1 questions have no answers, such as val-scene0300-18"):
-        read_scanqa(path)
+        read_questions(path)
 
 
 def test_what_is_written_is_read_again(tmp_path: Path) -> None:
-    questions = read_scanqa(scanqa(tmp_path, [entry(), entry(question_id="b", answers=["é"])]))
+    questions = read_questions(scanqa(tmp_path, [entry(), entry(question_id="b", answers=["é"])]))
     write_scanqa(tmp_path / "again.json", questions)
     assert read_questions(tmp_path / "again.json") == questions
     with pytest.raises(InputError, match="one question_id: b"):
@@ -94,8 +94,7 @@ def test_sqa3d_finds_the_answers_beside_the_questions(tmp_path: Path) -> None:
     assert (first.situation, first.position) == ("I am standing by the ottoman.", (0.7, -0.03, 0.0))
     # Quaternions are wxyz inside, and the file writes the parts by name.
     assert first.rotation == (0.8, 0, 0, -0.6)
-    assert read_sqa3d(path, tmp_path / "v1_balanced_sqa_annotations_test_scannetv2.json") == (first, second)
-    assert read_sqa3d(path, answered=False)[0].answers == ()
+    assert read_questions(path, answered=False)[0].answers == ()
 
 
 @pytest.mark.parametrize(
@@ -145,11 +144,3 @@ def test_files_of_sqa3d_must_belong_together(
 ) -> None:
     with pytest.raises(InputError, match=message):
         read_questions(sqa3d(tmp_path, questions, annotations))
-
-
-def test_the_other_data_set_is_told_apart(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected SQA3D's object with questions"):
-        read_sqa3d(scanqa(tmp_path, [entry()]))
-    with pytest.raises(InputError, match="expected a list of objects with scene_id, question_id, question and"):
-        read_scanqa(sqa3d(tmp_path, [question()], []))
-    assert read_questions(scanqa(tmp_path, [])) == ()
