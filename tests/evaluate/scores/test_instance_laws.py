@@ -132,7 +132,7 @@ def test_the_ceiling_is_of_the_background_and_no_class_is_of_none() -> None:
     truth, labels = np.array([22, 4, 4, 2, 9]), np.array([22, 4, 22, 2, 77])
     scores = semantic_scores([count_labels("s", truth, labels, classes)], classes)
     assert scores.foreground.miou == pytest.approx((1 / 2 + 0) / 2)
-    assert {name: (each.instances, each.predictions) for name, each in scores.classes.items()} == {
+    assert {name: (each.truths, each.predictions) for name, each in scores.classes.items()} == {
         "ceiling": (1, 2),
         "bed": (2, 1),
         "floor": (1, 1),
