@@ -15,7 +15,6 @@ import splat_samples
 import test_flipped_bits
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.expressions import read_nr3d
 from gsencoder.data.labels.files import read_whole_numbers
 from gsencoder.data.splats.files import RawSplat
 from gsencoder.data.splats.repair import inspect_splat
@@ -145,15 +144,6 @@ def test_a_number_of_thousands_of_digits_is_refused_and_one_of_zeros_is_none(tmp
         read_whole_numbers(tmp_path / "a.txt")
     (tmp_path / "a.txt").write_text("0" * 5000 + "7\n")
     assert read_whole_numbers(tmp_path / "a.txt").tolist() == [7]
-
-
-@pytest.mark.usefixtures("fuzz")
-def test_a_stimulus_of_nr3d_with_thousands_of_digits_is_refused(tmp_path: Path) -> None:
-    from fuzz_samples import NR3D
-
-    (tmp_path / "nr3d.csv").write_text(NR3D.replace("-2-3-4", f"-{'2' * 5000}-3-4"))
-    with pytest.raises(InputError, match="stimulus_id must be"):
-        read_nr3d(tmp_path / "nr3d.csv")
 
 
 def test_a_mask_with_a_null_in_its_name_is_refused(tmp_path: Path) -> None:

@@ -43,11 +43,7 @@ FeatureSource = Callable[[Scene], tuple[GaussianFeatures, dict[str, float]]]
 
 
 def fusion_source(teacher: TeacherConfig, words: Words | None, config: FuseConfig = FuseConfig()) -> FeatureSource:
-    """A source that fuses a teacher's maps.
-
-    Args:
-        words: text table of the teacher; None if it has none.
-    """
+    """A source that fuses a teacher's maps; `words` are those of the teacher, if it has any."""
 
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         with Clock().running() as clock:
@@ -58,11 +54,7 @@ def fusion_source(teacher: TeacherConfig, words: Words | None, config: FuseConfi
 
 
 def encoder_source(encoder: Encoder, config: EncodeConfig = EncodeConfig(), space: str | None = None) -> FeatureSource:
-    """A source that runs an encoder.
-
-    Args:
-        space: of an encoder with several teachers, the one whose features are evaluated; None = the only one.
-    """
+    """A source that runs an encoder; `space` is one of several teachers, None = the only one."""
 
     def source(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         assert scene.gaussians is not None
@@ -100,13 +92,7 @@ def table_beside(encoder: Encoder, space: str | None) -> TextTable | None:
 
 
 def head_source(source: FeatureSource, heads: HeadSet, head: MeasuredHead, text_encoder: str) -> FeatureSource:
-    """A source that applies an adapter head to the features of another one.
-
-    Args:
-        source: features of the backbone that the head takes.
-        heads: of which the head is one.
-        text_encoder: what turns words into the head's space.
-    """
+    """A source that applies one of some adapter heads to backbone features; `text_encoder` leads into its space."""
 
     def outputs(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         features, seconds = source(scene)
@@ -120,11 +106,7 @@ def head_source(source: FeatureSource, heads: HeadSet, head: MeasuredHead, text_
 def fused_head_source(
     teacher: TeacherConfig, head: Head, text_encoder: str, config: FuseConfig = FuseConfig()
 ) -> FeatureSource:
-    """A source that fuses a teacher's maps, measures an adapter head over them, and applies it.
-
-    Args:
-        text_encoder: what turns words into the head's space.
-    """
+    """A source that fuses a teacher's maps, measures an adapter head over them, and applies it."""
 
     def outputs(scene: Scene) -> tuple[GaussianFeatures, dict[str, float]]:
         assert scene.views is not None
@@ -141,15 +123,12 @@ def fused_head_source(
 def load_scenes(
     paths: Sequence[str | Path], data: SceneConfig = SceneConfig(), splat: str = "", track: Track = untracked
 ) -> Iterator[tuple[Scene, float]]:
-    """Loads scenes one by one, so that one is in memory at a time.
+    """Loads scenes one by one, with the seconds that it took.
 
     Args:
         paths: folders or files of the scenes.
         splat: file of the Gaussians of each scene, relative to its folder; empty = those that the scene has.
         track: wraps the loop to show progress.
-
-    Yields:
-        Each scene, and the seconds that loading took.
     """
     for path in track([Path(path) for path in paths], "scenes"):
         start = time.perf_counter()
@@ -160,11 +139,7 @@ def load_scenes(
 def with_features(
     scene: Scene, source: FeatureSource, seeds: SeedConfig
 ) -> tuple[Scene, GaussianFeatures, dict[str, float]]:
-    """Computes the features of a scene, after making seeds if it has no Gaussians.
-
-    Returns:
-        The scene with Gaussians, their features, and the seconds of each step.
-    """
+    """A scene with Gaussians, which are seeded where it has none, their features, and the seconds of each step."""
     start = time.perf_counter()
     scene = with_gaussians(scene, seeds)
     seconds = {"seeds": time.perf_counter() - start}
@@ -219,28 +194,28 @@ class LabeledPoints:
         return inside[self.gaussians]
 
 
-def labeled_points(
-    scene: Scene, mesh: MeshLabels | None = None, *, max_distance: float = MAX_DISTANCE
-) -> LabeledPoints:
-    """The labeled points of a scene with Gaussians.
-
-    Args:
-        scene: with Gaussians; without a mesh, with views that have instance pictures, and objects.
-        mesh: labeled, in the world of the scene, or None.
-        max_distance: from a vertex to the nearest Gaussian, metres; world units where their length is not known.
-    """
-    if scene.gaussians is None:
+def labeled_points(scene: Scene, mesh: MeshLabels | None = None) -> LabeledPoints:
+    """The labeled points of a scene with Gaussians: the vertices of a mesh in the world of the scene, or without one
+    the Gaussians, by views with instance pictures, and objects."""
+    gaussians, views = scene.gaussians, scene.views
+    if gaussians is None:
         raise InputError(f"scene {scene.name} has no Gaussians")
     if mesh is not None:
-        return _vertices(scene, mesh, max_distance / (scene.metres_per_unit or 1.0))
-    views = scene.views
+        positions = mesh.vertices.astype(np.float64) - scene.origin
+        max_distance = MAX_DISTANCE / (scene.metres_per_unit or 1.0)
+        nearest = nearest_rows(positions, gaussians.means.astype(np.float64), max_distance=max_distance)
+        return LabeledPoints(
+            scene=scene.name,
+            objects=mesh.instances,
+            names=dict(mesh.objects),
+            gaussians=nearest,
+            positions=positions,
+        )
     if views is None or views.instances is None or not scene.objects:
         raise InputError(
             f"scene {scene.name} has no true objects: expected a labeled mesh, or views with instance pictures "
             "(instance_file_path in transforms.json) and an objects.json that names them"
         )
-    names = {each.id: each.name for each in scene.objects if each.name}
-    gaussians = scene.gaussians
     ids = np.array(sorted({each.id for each in scene.objects}), np.int32)
     sums = torch.zeros(len(gaussians), len(ids) + 1)
     for view in range(len(views)):
@@ -251,21 +226,12 @@ def labeled_points(
         pixels = np.asarray(views.instances[view]).ravel()
         columns = np.where(np.isin(pixels, ids), np.searchsorted(ids, pixels) + 1, 0)
         b.lift_codes_into(torch.from_numpy(columns.astype(np.int32)), sums)
-    weights = sums.sum(dim=1).numpy()
-    best = sums.argmax(dim=1).numpy()
-    objects = np.where(weights >= MIN_WEIGHT, np.concatenate([[0], ids])[best], 0).astype(np.int32)
-    return LabeledPoints(scene=scene.name, objects=objects, names=names, gaussians=np.arange(len(gaussians)))
-
-
-def _vertices(scene: Scene, mesh: MeshLabels, max_distance: float) -> LabeledPoints:
-    assert scene.gaussians is not None
-    positions = mesh.vertices.astype(np.float64) - scene.origin
+    best = np.concatenate([[0], ids])[sums.argmax(dim=1).numpy()]
     return LabeledPoints(
         scene=scene.name,
-        objects=mesh.instances,
-        names=dict(mesh.objects),
-        gaussians=nearest_rows(positions, scene.gaussians.means.astype(np.float64), max_distance=max_distance),
-        positions=positions,
+        objects=np.where(sums.sum(dim=1).numpy() >= MIN_WEIGHT, best, 0).astype(np.int32),
+        names={each.id: each.name for each in scene.objects if each.name},
+        gaussians=np.arange(len(gaussians)),
     )
 
 
@@ -275,9 +241,6 @@ NAMES_AT_ONCE = 16
 
 def nearest_class(features: GaussianFeatures, names: Sequence[str], text: TextEncoder) -> Int64[np.ndarray, " N"]:
     """The class whose name has the largest centered cosine with each Gaussian's feature, of equal ones the first.
-
-    Args:
-        text: turns them into vectors of the features' space.
 
     Returns:
         Number of the class in `names`; -1 for Gaussians without a feature.
@@ -300,13 +263,7 @@ def class_cosines(
 ) -> Float32[np.ndarray, "M C"]:
     """Centered cosines of the mean feature of some sets of Gaussians with the names of classes.
 
-    The mean of a set is over its Gaussians that were seen, each counting the same.
-
-    Args:
-        text: turns them into vectors of the features' space.
-
-    Returns:
-        Cosines; NaN for sets in which no Gaussian was seen.
+    The mean of a set is over its Gaussians that were seen, each counting the same; NaN where none was.
     """
     check_space(features.space, text.space)
     seen = features.seen

@@ -106,10 +106,7 @@ def test_the_calibration_error_averages_the_bins_by_their_words() -> None:
 
 
 def test_the_scores_of_scenes_are_those_of_all_their_words() -> None:
-    scenes = [
-        scene_of(("mug", True, 0.9), ("lamp", False, 0.1)),
-        scene_of(("lamp", True, 0.4), ("mug", False, 0.6)),
-    ]
+    scenes = [scene_of(("mug", True, 0.9), ("lamp", False, 0.1)), scene_of(("lamp", True, 0.4), ("mug", False, 0.6))]
     scores = absent_scores(scenes)
     assert (scores["present"], scores["absent"]) == (2, 2)
     # Pairs: 0.9 beats both, 0.4 beats 0.1 alone.

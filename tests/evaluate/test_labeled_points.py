@@ -98,7 +98,6 @@ def test_the_distance_to_a_vertex_is_in_metres(unit: float | None, near: bool) -
     )
     scene = Scene(name="s", gaussians=gaussians, metres_per_unit=unit)
     assert labeled_points(scene, mesh).gaussians.tolist() == [0 if near else -1]
-    assert labeled_points(scene, mesh, max_distance=0.01).gaussians.tolist() == [-1]
 
 
 def test_scenes_without_gaussians_or_true_objects_are_refused() -> None:

@@ -237,10 +237,7 @@ def test_boxes_of_sentences_are_reported_by_kind_threshold_and_number(tmp_path: 
     assert (results["acc_25"], results["acc_50"]) == (2 / 4, 1 / 4)
     assert (results["sentences"], results["without_box"], results["not_scored"]) == (4, 1, {})
     assert results["thresholds"] == [0.25, 0.5]
-    assert results["best_of"] == {
-        "5": {"acc_25": 2 / 4, "acc_50": 2 / 4},
-        "all": {"acc_25": 2 / 4, "acc_50": 2 / 4},
-    }
+    assert results["best_of"] == {"5": {"acc_25": 2 / 4, "acc_50": 2 / 4}, "all": {"acc_25": 2 / 4, "acc_50": 2 / 4}}
     mine = {"acc_25": 50, "acc_50": 25, "unique_25": 100, "unique_50": 100, "multiple_25": 50, "multiple_50": 0}
     best = mine | {"acc_50": 50, "multiple_50": 50}
     names = ["mine", "mine, best of 5", "mine, best of all"]

@@ -73,9 +73,7 @@ def test_who_always_says_the_same_is_right_about_one_kind_and_who_says_the_oppos
 
 
 @pytest.mark.slow
-def test_an_encoder_is_drawn_beside_the_truth(
-    walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray],
-) -> None:
+def test_an_encoder_is_drawn_beside_the_truth(walls: tuple[list[TrainingScene], OutputSpaces, np.ndarray]) -> None:
     scenes, outputs, codebook = walls
     config = EncodeConfig(precision="float32")
     accuracy = validate_encoder(scenes, small_encoder(), outputs, {"sides": codebook}, config, pictured=1)["sides"]

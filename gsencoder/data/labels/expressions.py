@@ -47,7 +47,7 @@ from gsencoder.types import MeshLabels
 
 SCANREFER = "scene_id, object_id, object_name, ann_id, description and token"
 NR3D_COLUMNS = ("assignmentid", "utterance", "instance_type", "scan_id", "target_id", "tokens")
-"""Columns that Nr3D must have; `stimulus_id`, `mentions_target_class` and `correct_guess` are read if present."""
+"""Columns that are read of Nr3D."""
 PREDICTED = ("answer_top10", "pred_answers_at10", "caption", "aabb", "boxes", "bboxes")
 """Keys that predictions have and annotations have not."""
 
@@ -63,10 +63,6 @@ class Expression:
         tokens: the words of the text as the data set cuts it, lower case in ScanRefer.
         aabb: lower and upper corner of the object's box, in the axes of the aligned scan and its unit; None where the
             file has none.
-        same_class: objects of the target's class in the scene, the target included (Nr3D's stimulus); None where the
-            file does not say. More than two are hard (ReferIt3D).
-        mentions_class: whether the text names the class of the object; None where the file does not say.
-        understood: whether a listener found the object; None where the file does not say.
         multiple: whether the scene has several objects of its class; None where the file does not say.
         others: whether its class is none of ScanRefer's named ones; None where the file does not say.
     """
@@ -78,9 +74,6 @@ class Expression:
     text: str
     tokens: tuple[str, ...]
     aabb: tuple[Corner, Corner] | None = None
-    same_class: int | None = None
-    mentions_class: bool | None = None
-    understood: bool | None = None
     multiple: bool | None = None
     others: bool | None = None
 
@@ -168,9 +161,6 @@ def _nr3d(row: Mapping[str, str], where: str) -> Expression:
         annotation=id_value(row["assignmentid"], where, "assignmentid"),
         text=text_value(row["utterance"], where, "utterance"),
         tokens=_literal_tokens(row["tokens"], where),
-        same_class=_stimulus_count(row.get("stimulus_id"), where),
-        mentions_class=_truth_value(row.get("mentions_target_class"), where, "mentions_target_class"),
-        understood=_truth_value(row.get("correct_guess"), where, "correct_guess"),
     )
 
 
@@ -205,26 +195,6 @@ def _literal_tokens(text: str, where: str) -> tuple[str, ...]:
     if not isinstance(value, list):
         raise InputError(f"{where}: tokens must be a list of words such as ['the', 'chair'], got {shown(text)}")
     return text_list(value, where, "tokens", empty=True)
-
-
-def _stimulus_count(stimulus: str | None, where: str) -> int | None:
-    """Objects of the class, from scene-class-count-target-distractor-distractor."""
-    if stimulus is None:
-        return None
-    parts = stimulus.split("-")
-    if len(parts) < 4 or not parts[2].isdecimal() or len(parts[2]) > 9 or len(parts) != int(parts[2]) + 3:
-        raise InputError(
-            f"{where}: stimulus_id must be scene-class-count-target and count - 1 other objects, got {shown(stimulus)}"
-        )
-    return int(parts[2])
-
-
-def _truth_value(text: str | None, where: str, column: str) -> bool | None:
-    if text is None:
-        return None
-    if text.strip().lower() not in ("true", "false"):
-        raise InputError(f"{where}: {column} must be True or False, got {shown(text)}")
-    return text.strip().lower() == "true"
 
 
 def _refuse_repeated(path: Path, expressions: Sequence[Expression]) -> None:

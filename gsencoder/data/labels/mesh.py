@@ -1,23 +1,14 @@
-"""Labeled meshes: their files, instances in views, and the labels of the nearest vertices.
+"""Labeled meshes: their files, instances in views, and the labels of the nearest Gaussians.
 
-Vertices, one property of them, and triangles of a .ply mesh, in the order of the file.
+Vertices are in the order of the file, by which benchmarks count their labels; general readers of meshes do not keep it.
 
-Benchmarks count their labels by this order, which general readers of meshes do not promise.
+Instance maps of views are drawn with a depth buffer; a pixel has the object of the vertex that is nearest to its point
+on the triangle. Where sensor depth is known and differs from the mesh's by more than a tolerance, the pixel has no
+object: it shows something that the mesh lacks, such as a person. ScanNet's own instance pictures (instance-filt) are
+made in the same way.
 
-Instance maps of views from a labeled mesh: what a camera sees of it, kept where the depth sensor agrees.
-
-The triangles are drawn with a depth buffer; a pixel has the object of the vertex that is nearest to its point on the
-triangle. Where sensor depth is known and differs from the mesh's by more than a tolerance, the pixel has no object: it
-shows something that the mesh lacks, such as a person, or that was scanned elsewhere. ScanNet's own
-instance pictures (instance-filt) are made in the same way.
-
-Labels of mesh vertices for Gaussians, and back.
-
-As published work does: a Gaussian has the label of the nearest vertex within a distance (SceneSplat takes 0.25 m), and
-a vertex the most frequent label among the k nearest Gaussians that have features (SceneSplat's benchmark takes k = 25).
-Queries run in chunks, so that memory does not grow with their number.
-
-Reference: Li et al., SceneSplat, 2025; SceneSplat's pointcept/utils/misc.py (neighbor_voting).
+A vertex has the most frequent label among the k nearest Gaussians that have features (SceneSplat's benchmark takes
+k = 25: Li et al. 2025; pointcept/utils/misc.py, neighbor_voting).
 """
 
 from collections.abc import Iterator, Sequence
@@ -170,15 +161,7 @@ def draw_instances(
     width: int,
     height: int,
 ) -> tuple[Int32[np.ndarray, "{height} {width}"], Float32[np.ndarray, "{height} {width}"]]:
-    """The object and the depth z of the mesh at each pixel; 0 and infinity where there is none.
-
-    Args:
-        labels: of a mesh with faces.
-        cam_from_world: of the camera, in the world of the mesh.
-        K: intrinsics, pixel centers at .5.
-    """
-    # numba is loaded when something is drawn, and not with every scene.
-
+    """The object and the depth z of the mesh at each pixel; 0 and infinity where there is none."""
     assert labels.faces is not None
     local = np.ascontiguousarray(transform(cam_from_world, labels.vertices.astype(np.float64)))
     instances = np.zeros((height, width), np.int32)
@@ -250,7 +233,6 @@ def labels_of_vertices(
     k: int = VOTERS,
     none: int = -1,
     voters: Bool[np.ndarray, " N"] | None = None,
-    max_distance: float = np.inf,
 ) -> Int32[np.ndarray, " V"]:
     """The most frequent label among the k nearest Gaussians of each vertex; of equally frequent ones the smallest.
 
@@ -261,12 +243,7 @@ def labels_of_vertices(
         k: number of Gaussians that vote; 1 = the nearest one. All vote where there are fewer.
         none: what means no label, in and out.
         voters: which Gaussians are looked at, such as those that were seen; None = all.
-        max_distance: Gaussians farther than this do not vote.
     """
-    _check(means, "Gaussians")
-    _check(vertices, "vertices")
-    if k < 1:
-        raise InputError(f"k: expected at least 1 Gaussian, got {k}")
     if voters is not None:
         means, labels = means[voters], labels[voters]
     result = np.full(len(vertices), none, np.int32)
@@ -278,7 +255,7 @@ def labels_of_vertices(
     codes = np.append(codes, len(names))
     k = min(k, len(means))
     chunk = max(1, min(CHUNK, MAX_VOTES // max(len(names) + 1, k)))
-    for part, rows in _neighbors(vertices, means, k, max_distance, chunk):
+    for part, rows in _neighbors(vertices, means, k, np.inf, chunk):
         votes = codes[rows] + np.arange(len(rows))[:, None] * (len(names) + 1)
         counts = np.bincount(votes.ravel(), minlength=len(rows) * (len(names) + 1))
         counts = counts.reshape(len(rows), len(names) + 1)[:, : len(names)]
@@ -309,8 +286,6 @@ def _neighbors(
     """The rows of the k nearest targets, of one chunk of points after the other; T beyond the distance."""
     from scipy.spatial import cKDTree
 
-    if not max_distance > 0:
-        raise InputError(f"max_distance: expected a positive length, got {max_distance}")
     if not len(targets):
         return
     tree = cKDTree(targets)
@@ -319,11 +294,3 @@ def _neighbors(
         # The bound excludes itself, and makes queries far from the targets short.
         _, rows = tree.query(points[part], k=k, distance_upper_bound=np.nextafter(max_distance, np.inf))
         yield part, rows.reshape(-1, k).astype(np.int64)
-
-
-def _check(points: np.ndarray, subject: str) -> None:
-    good = np.isfinite(points).all(axis=1)
-    if not good.all():
-        raise InputError(
-            f"{subject}: row {int(np.flatnonzero(~good)[0])} is not finite ({int((~good).sum()):,} of {len(points):,})"
-        )

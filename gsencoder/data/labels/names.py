@@ -147,6 +147,4 @@ def hsv(
 def inner_pixels(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """The pixels of a mask whose four neighbors are in it: at its border, colors of two things are mixed."""
     padded = np.pad(mask, 1)
-    return np.asarray(
-        mask & padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:],
-    )
+    return np.asarray(mask & padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:])

@@ -1,31 +1,21 @@
 """Labels of scans from the files of ScanNet and ScanNet++.
 
-Labels of a ScanNet scan from its own files.
+Both write two JSON files: one gives each vertex of the mesh the number of its segment (`segIndices`), the other lists
+objects as groups of segments (`segGroups`: objectId, label, segments).
 
-A scan ID has ID_vh_clean_2.ply (the mesh), ID_vh_clean_2.0.010000.segs.json (a segment for each vertex),
-ID.aggregation.json (objects as groups of segments), and ID.txt, whose line `axisAlignment` turns the world of the poses
-and of the mesh into the frame in which ScanNet's benchmarks of boxes (ScanRefer and its kin) are stated. Ids are
-objectId + 1, as in ScanNet's own scripts, so that 0 can mean no object; ScanRefer's object_id is objectId.
+A ScanNet scan ID has ID_vh_clean_2.ply (the mesh), ID_vh_clean_2.0.010000.segs.json, ID.aggregation.json, and ID.txt,
+whose line `axisAlignment` turns the world of the poses and of the mesh into the frame of ScanNet's benchmarks of boxes
+(ScanRefer and its kin). Ids are objectId + 1, as in ScanNet's own scripts, so that 0 can mean no object; ScanRefer's
+object_id is objectId (Dai et al. 2017; BenchmarkScripts/3d_helpers/export_train_mesh_for_evaluation.py).
 
-Reference: Dai et al., ScanNet, 2017; ScanNet's BenchmarkScripts/3d_helpers/export_train_mesh_for_evaluation.py.
-
-Labels of a ScanNet++ scene from its own files: scans/ with mesh_aligned_0.05.ply, segments.json and
-segments_anno.json.
-
-The world is that of the laser scan, which is also the frame of the poses and of the boxes: there is no alignment to
-apply. Ids are the objectIds of the annotation. Objects overlap: a vertex can belong to several, of which ScanNet++'s
-toolkit (semantic/transforms/mesh.py) keeps the smallest.
-
-Reference: Yeshwanth et al., ScanNet++, 2023.
-
-The two JSON files of an annotated scan, which ScanNet and ScanNet++ write alike.
-
-One gives each vertex of the mesh the number of its segment (`segIndices`), the other lists objects as groups of
-segments (`segGroups`: objectId, label, segments).
+A ScanNet++ scene has scans/ with mesh_aligned_0.05.ply, segments.json and segments_anno.json. The world is that of the
+laser scan, which is also the frame of the poses and of the boxes. Ids are the objectIds of the annotation. Objects
+overlap: a vertex can belong to several, of which ScanNet++'s toolkit (semantic/transforms/mesh.py) keeps the smallest
+(Yeshwanth et al. 2023).
 """
 
 import warnings
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -52,13 +42,7 @@ MAX_ID = 2**31 - 2
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SegmentGroup:
-    """One object of an annotation.
-
-    Attributes:
-        id: its objectId, as the file gives it.
-        label: its raw name, as the file gives it.
-        segments: numbers of its segments, ascending and unique.
-    """
+    """One object of an annotation: objectId, raw name, and the numbers of its segments, ascending and unique."""
 
     id: int
     label: str
@@ -75,11 +59,7 @@ def read_segments(path: Path) -> Int64[np.ndarray, " V"]:
 
 
 def read_groups(path: Path, *, first_id: int) -> tuple[SegmentGroup, ...]:
-    """The objects of an annotation, in the order of the file.
-
-    Args:
-        path: ID.aggregation.json of ScanNet, or segments_anno.json of ScanNet++.
-    """
+    """The objects of an annotation, in the order of the file."""
     groups: list[SegmentGroup] = []
     rows = _read(path, "segGroups", "the objects")
     for row, where in entries_of(rows, path, "objectId, label and segments", key="segGroups"):
@@ -103,43 +83,6 @@ def read_groups(path: Path, *, first_id: int) -> tuple[SegmentGroup, ...]:
         number, first, second = repeated
         raise InputError(f"{path}: segGroups[{second}]: objectId {number} is already that of segGroups[{first}]")
     return tuple(groups)
-
-
-class SegmentVertices:
-    """The vertices of each segment of a mesh."""
-
-    def __init__(self, segments: Int64[np.ndarray, " V"], path: Path) -> None:
-        """Sorts the vertices by segment.
-
-        Args:
-            path: of their file, for messages.
-        """
-        self._order = np.argsort(segments, kind="stable")
-        self._numbers, self._starts = np.unique(segments[self._order], return_index=True)
-        self._ends = np.append(self._starts[1:], len(segments))
-        self._path = path
-
-    def of(self, group: SegmentGroup, path: Path) -> Int64[np.ndarray, " n"]:
-        """The vertices of an object of the annotation at `path`."""
-        rows = np.searchsorted(self._numbers, group.segments)
-        unknown = self._numbers[np.minimum(rows, len(self._numbers) - 1)] != group.segments
-        if unknown.any():
-            raise InputError(
-                f"{path}: objectId {group.id} ({group.label[:40]!r}) names segment {group.segments[unknown][0]}, which "
-                f"no vertex has in {self._path}; expected both of one scan"
-            )
-        return np.concatenate(
-            [self._order[start:end] for start, end in zip(self._starts[rows], self._ends[rows], strict=True)]
-        )
-
-
-def check_counts(segments: Int64[np.ndarray, " V"], vertices: np.ndarray, path: Path, mesh: Path) -> None:
-    """Checks that a file of segments and a mesh have as many vertices."""
-    if len(segments) != len(vertices):
-        raise InputError(
-            f"{path}: segIndices has {len(segments):,} entries, but {mesh} has {len(vertices):,} vertices; expected "
-            "the files of one mesh"
-        )
 
 
 def _read(path: Path, key: str, subject: str) -> list[Any]:
@@ -166,32 +109,31 @@ def _integers(values: list[Any], where: str) -> Int64[np.ndarray, " n"]:
 
 
 AGGREGATION, SEGMENTS, MESH = ".aggregation.json", "_vh_clean_2.0.010000.segs.json", "_vh_clean_2.ply"
+ANNOTATION, SEGMENTS_PP, MESH_PP = "segments_anno.json", "segments.json", "mesh_aligned_0.05.ply"
 MAX_META_BYTES = 1 << 20
+MAX_OBJECTS_OF_A_VERTEX = 3
+"""Objects after the third that claim a vertex of ScanNet++, in the order of the file, are not looked at, as in the
+toolkit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScanNetFiles:
-    """The label files of one scan.
-
-    Attributes:
-        name: of the scan, such as scene0000_00.
-        aggregation: objects as groups of segments.
-        meta: text that may state the alignment of axes, or None.
-    """
+class LabelFiles:
+    """The label files of a scan: objects as groups of segments, the segment of each vertex, the mesh, and for ScanNet
+    a text that may hold the alignment of axes."""
 
     name: str
-    aggregation: Path
+    annotation: Path
     segments: Path
     mesh: Path
     meta: Path | None = None
 
     @property
     def missing(self) -> tuple[Path, ...]:
-        """Those of the files that do not exist."""
-        return tuple(path for path in (self.aggregation, self.segments, self.mesh) if not path.is_file())
+        """Those of the needed files that do not exist."""
+        return tuple(path for path in (self.annotation, self.segments, self.mesh) if not path.is_file())
 
 
-def find_scannet_files(folder: Path) -> ScanNetFiles | None:
+def find_scannet_files(folder: Path) -> LabelFiles | None:
     """The label files of a scan in a folder, or of a scan of the folder's or its parent's name in the parent.
 
     The second is for frames that were exported to a folder inside the scan's. None where there is no annotation.
@@ -203,60 +145,115 @@ def find_scannet_files(folder: Path) -> ScanNetFiles | None:
         for path in folder.glob(f"*{AGGREGATION}")
         if path.is_file() and not path.name.endswith(f"_vh_clean{AGGREGATION}")
     )
-    if folder.name in scans:
-        return _files(folder, folder.name)
-    if len(scans) > 1:
+    if len(scans) > 1 and folder.name not in scans:
         raise InputError(
             f"{folder}: holds annotations of {len(scans)} scans ({', '.join(scans)[:80]}); expected one, or one named "
             f"{folder.name}{AGGREGATION}"
         )
     if scans:
-        return _files(folder, scans[0])
+        return _scannet_files(folder, folder.name if folder.name in scans else scans[0])
     for name in (folder.name, folder.parent.name):
         if name and (folder.parent / f"{name}{AGGREGATION}").is_file():
-            return _files(folder.parent, name)
+            return _scannet_files(folder.parent, name)
     return None
 
 
-def _files(folder: Path, name: str) -> ScanNetFiles:
-    meta = folder / f"{name}.txt"
-    return ScanNetFiles(
-        name=name,
-        aggregation=folder / f"{name}{AGGREGATION}",
-        segments=folder / f"{name}{SEGMENTS}",
-        mesh=folder / f"{name}{MESH}",
-        meta=meta if meta.is_file() else None,
-    )
+def _scannet_files(folder: Path, name: str) -> LabelFiles:
+    annotation, segments, mesh, meta = (folder / f"{name}{end}" for end in (AGGREGATION, SEGMENTS, MESH, ".txt"))
+    meta_file = meta if meta.is_file() else None
+    return LabelFiles(name=name, annotation=annotation, segments=segments, mesh=mesh, meta=meta_file)
 
 
-def read_scannet_labels(source: Path | ScanNetFiles) -> MeshLabels:
-    """The labels of a scan.
+def find_scannetpp_files(folder: Path) -> LabelFiles | None:
+    """The label files of a scene, given itself, its scans/, or its dslr/ or iphone/; None without an annotation."""
+    folder = folder.absolute()
+    homes = [folder / "scans", folder]
+    if folder.name in ("dslr", "iphone"):
+        homes.append(folder.parent / "scans")
+    for home in homes:
+        if (home / ANNOTATION).is_file():
+            files = (home / name for name in (ANNOTATION, SEGMENTS_PP, MESH_PP))
+            return LabelFiles(name="the scene", **dict(zip(("annotation", "segments", "mesh"), files, strict=True)))
+    return None
+
+
+def read_scannet_labels(source: Path | LabelFiles) -> MeshLabels:
+    """The labels of a scan, of its folder or its files.
 
     A segment that several objects list belongs to the last of them, as ScanNet's script writes one after the other.
-
-    Args:
-        source: folder of the scan, or its files.
     """
-    files = source if isinstance(source, ScanNetFiles) else find_scannet_files(source)
+    files = source if isinstance(source, LabelFiles) else find_scannet_files(source)
     if files is None:
         raise InputError(f"{source}: no annotation of ScanNet; expected ID{AGGREGATION}, ID{SEGMENTS} and ID{MESH}")
-    if files.missing:
-        raise InputError(f"{files.missing[0]}: no such file; the labels of {files.name} need it")
-    groups = read_groups(files.aggregation, first_id=0)
-    segments = read_segments(files.segments)
-    vertices, faces = read_mesh(files.mesh)
-    check_counts(segments, vertices, files.segments, files.mesh)
-    rows_of = SegmentVertices(segments, files.segments)
+    groups, vertices, faces = _annotated_mesh(files, first_id=0)
     instances = np.zeros(len(vertices), np.int32)
-    for group in groups:
-        instances[rows_of.of(group, files.aggregation)] = group.id + 1
+    for group, rows in groups:
+        instances[rows] = group.id + 1
     return MeshLabels(
         vertices=vertices,
         instances=instances,
-        objects=tuple((group.id + 1, group.label) for group in groups),
+        objects=tuple((group.id + 1, group.label) for group, _ in groups),
         faces=faces,
         aligned_from_world=None if files.meta is None else read_axis_alignment(files.meta),
     )
+
+
+def read_scannetpp_labels(source: Path | LabelFiles, *, names: Collection[str] | None = None) -> MeshLabels:
+    """The labels of a scene, of its folder or its files.
+
+    A vertex that several objects claim belongs to the one with the fewest vertices, and of equal ones to the first in
+    the file. An object whose vertices all belong to others stays in the list.
+    """
+    files = source if isinstance(source, LabelFiles) else find_scannetpp_files(source)
+    if files is None:
+        raise InputError(
+            f"{source}: no annotation of ScanNet++; expected scans/ with {ANNOTATION}, {SEGMENTS_PP}, {MESH_PP}"
+        )
+    # Objects count from 1: the toolkit takes 0 for the background.
+    groups, vertices, faces = _annotated_mesh(files, first_id=1, names=names)
+    instances = np.zeros(len(vertices), np.int32)
+    claims = np.zeros(len(vertices), np.int8)
+    smallest = np.full(len(vertices), np.iinfo(np.int64).max)
+    for group, claimed in groups:
+        rows = claimed[claims[claimed] < MAX_OBJECTS_OF_A_VERTEX]
+        claims[rows] += 1
+        count = len(rows)
+        rows = rows[count < smallest[rows]]
+        instances[rows], smallest[rows] = group.id, count
+    objects = tuple((group.id, group.label) for group, _ in groups)
+    return MeshLabels(vertices=vertices, instances=instances, objects=objects, faces=faces)
+
+
+def _annotated_mesh(
+    files: LabelFiles, *, first_id: int, names: Collection[str] | None = None
+) -> tuple[list[tuple[SegmentGroup, Int64[np.ndarray, " n"]]], np.ndarray, np.ndarray | None]:
+    """The objects of a scan with their vertices, and all vertices and faces of its mesh."""
+    if files.missing:
+        raise InputError(f"{files.missing[0]}: no such file; the labels of {files.name} need it")
+    groups = [
+        group for group in read_groups(files.annotation, first_id=first_id) if names is None or group.label in names
+    ]
+    segments = read_segments(files.segments)
+    vertices, faces = read_mesh(files.mesh)
+    if len(segments) != len(vertices):
+        raise InputError(
+            f"{files.segments}: segIndices has {len(segments):,} entries, but {files.mesh} has {len(vertices):,} "
+            "vertices; expected the files of one mesh"
+        )
+    order = np.argsort(segments, kind="stable")
+    numbers, starts = np.unique(segments[order], return_index=True)
+    parts = np.split(order, starts[1:])
+    with_vertices = []
+    for group in groups:
+        rows = np.searchsorted(numbers, group.segments)
+        unknown = numbers[np.minimum(rows, len(numbers) - 1)] != group.segments
+        if unknown.any():
+            raise InputError(
+                f"{files.annotation}: objectId {group.id} ({group.label[:40]!r}) names segment "
+                f"{group.segments[unknown][0]}, which no vertex has in {files.segments}; expected both of one scan"
+            )
+        with_vertices.append((group, np.concatenate([parts[row] for row in rows])))
+    return with_vertices, vertices, faces
 
 
 def read_axis_alignment(path: Path) -> Float64[np.ndarray, "4 4"] | None:
@@ -279,79 +276,6 @@ def read_axis_alignment(path: Path) -> Float64[np.ndarray, "4 4"] | None:
     return values.reshape(4, 4)
 
 
-ANNOTATION, SEGMENTS_PP, MESH_PP = "segments_anno.json", "segments.json", "mesh_aligned_0.05.ply"
-MAX_OBJECTS_OF_A_VERTEX = 3
-"""Objects after the third that claim a vertex, in the order of the file, are not looked at, as in the toolkit."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScanNetPPFiles:
-    """The label files of one scene: objects as groups of segments, the segment of each vertex, and the mesh."""
-
-    annotation: Path
-    segments: Path
-    mesh: Path
-
-    @property
-    def missing(self) -> tuple[Path, ...]:
-        """Those of the files that do not exist."""
-        return tuple(path for path in (self.annotation, self.segments, self.mesh) if not path.is_file())
-
-
-def find_scannetpp_files(folder: Path) -> ScanNetPPFiles | None:
-    """The label files of a scene, given itself, its scans/, or its dslr/ or iphone/; None without an annotation."""
-    folder = folder.absolute()
-    homes = [folder / "scans", folder]
-    if folder.name in ("dslr", "iphone"):
-        homes.append(folder.parent / "scans")
-    for home in homes:
-        if (home / ANNOTATION).is_file():
-            return ScanNetPPFiles(annotation=home / ANNOTATION, segments=home / SEGMENTS_PP, mesh=home / MESH_PP)
-    return None
-
-
-def read_scannetpp_labels(source: Path | ScanNetPPFiles, *, names: Collection[str] | None = None) -> MeshLabels:
-    """The labels of a scene.
-
-    A vertex that several objects claim belongs to the one with the fewest vertices, and of equal ones to the first in
-    the file. An object whose vertices all belong to others stays in the list.
-
-    Args:
-        source: folder of the scene, or its files.
-        names: raw names of the objects that are labeled, as benchmarks take those of their classes only, which decides
-            what a vertex with several objects belongs to; None = all. Others are left out.
-    """
-    files = source if isinstance(source, ScanNetPPFiles) else find_scannetpp_files(source)
-    if files is None:
-        raise InputError(
-            f"{source}: no annotation of ScanNet++; expected scans/ with {ANNOTATION}, {SEGMENTS_PP}, {MESH_PP}"
-        )
-    if files.missing:
-        raise InputError(f"{files.missing[0]}: no such file; the labels of the scene need it")
-    # Objects count from 1: the toolkit takes 0 for the background.
-    groups = [group for group in read_groups(files.annotation, first_id=1) if names is None or group.label in names]
-    segments = read_segments(files.segments)
-    vertices, faces = read_mesh(files.mesh)
-    check_counts(segments, vertices, files.segments, files.mesh)
-    rows_of = SegmentVertices(segments, files.segments)
-    instances = np.zeros(len(vertices), np.int32)
-    claims = np.zeros(len(vertices), np.int8)
-    smallest = np.full(len(vertices), np.iinfo(np.int64).max)
-    for group in groups:
-        rows = rows_of.of(group, files.annotation)
-        rows = rows[claims[rows] < MAX_OBJECTS_OF_A_VERTEX]
-        claims[rows] += 1
-        count = len(rows)
-        rows = rows[count < smallest[rows]]
-        instances[rows], smallest[rows] = group.id, count
-    return MeshLabels(
-        vertices=vertices,
-        instances=instances,
-        objects=tuple((group.id, group.label) for group in groups),
-        faces=faces,
-    )
-
-
 STRUCTURE = frozenset(
     """
     wall; floor; ceiling; door; doorframe; door frame; window; window frame; windowsill; window sill; pillar; column;
@@ -372,6 +296,7 @@ def find_labels(folder: Path, *, names: Collection[str] | None = None) -> MeshLa
     """The labels of a scene's mesh in the files of ScanNet or ScanNet++; None where there is no annotation.
 
     Args:
+        folder: of the scene (`Scene.folder`).
         names: of ScanNet++, raw names of the objects that are labeled (`read_scannetpp_labels`); None = all.
     """
     scannet = find_scannet_files(folder)
@@ -382,42 +307,30 @@ def find_labels(folder: Path, *, names: Collection[str] | None = None) -> MeshLa
 
 
 def labels_of_scan(folder: Path, raw_names: Collection[str]) -> MeshLabels:
-    """The labels of a scan; of ScanNet++ those of the objects whose raw name has a class, as its toolkit takes them."""
-    if find_scannet_files(folder) is None and find_scannetpp_files(folder) is not None:
-        return read_scannetpp_labels(folder, names=raw_names)
-    return read_scannet_labels(folder)
+    """The labels of a scan, which must be there; of ScanNet++ those of the objects whose raw name has a class, as its
+    toolkit takes them."""
+    labels = find_labels(folder, names=raw_names)
+    return read_scannet_labels(folder) if labels is None else labels
 
 
 def labels_of_layout(folder: Path, layout: str) -> MeshLabels | None:
     """The labels that lie beside the photographs of a scene, in the world of its poses.
 
-    Args:
-        layout: name of its layout; only ScanNet's and ScanNet++'s have labels.
-
-    Warns:
-        SceneWarning: there is an annotation, but not the files that it needs.
+    Only the layouts ScanNet and ScanNet++ have labels. A warning says where an annotation lacks files that it needs.
     """
-    if layout == "ScanNet":
-        scannet = find_scannet_files(folder)
-        if scannet is None:
-            return None
-        return None if _warn_of_missing(scannet.missing) else read_scannet_labels(scannet)
-    if layout == "ScanNet++":
-        scannetpp = find_scannetpp_files(folder)
-        if scannetpp is None:
-            return None
-        return None if _warn_of_missing(scannetpp.missing) else read_scannetpp_labels(scannetpp)
-    return None
-
-
-def _warn_of_missing(missing: Sequence[Path]) -> bool:
-    if missing:
+    if layout not in ("ScanNet", "ScanNet++"):
+        return None
+    files = find_scannet_files(folder) if layout == "ScanNet" else find_scannetpp_files(folder)
+    if files is None:
+        return None
+    if files.missing:
         warnings.warn(
-            f"{missing[0]}: no such file, so that the scene has no objects; its annotation needs it",
+            f"{files.missing[0]}: no such file, so that the scene has no objects; its annotation needs it",
             SceneWarning,
-            stacklevel=4,
+            stacklevel=3,
         )
-    return bool(missing)
+        return None
+    return read_scannet_labels(files) if layout == "ScanNet" else read_scannetpp_labels(files)
 
 
 def is_placed(name: str) -> bool:
@@ -476,7 +389,7 @@ def with_archived_instances(views: Views, folder: Path) -> Views:
         SceneWarning: the archive is not used, since it lacks frames or its pictures have another size.
     """
     scan = find_scannet_files(folder)
-    archives = () if scan is None else tuple(scan.aggregation.with_name(f"{scan.name}{end}") for end in ARCHIVES)
+    archives = () if scan is None else tuple(scan.annotation.with_name(f"{scan.name}{end}") for end in ARCHIVES)
     archive = next((path for path in archives if path.is_file()), None)
     if archive is None or views.instances is not None or not len(views):
         return views

@@ -131,14 +131,7 @@ class AbsentBenchmark(Benchmark[Asked]):
 def words_to_ask(
     objects: Sequence[SceneObject], vocabulary: Iterable[str], *, min_views: int = 5, min_pixels: int = 60
 ) -> tuple[list[str], list[str]]:
-    """The present and the absent words of a scene, each in alphabetical order.
-
-    Args:
-        objects: of the scene.
-        vocabulary: names that may be absent.
-        min_views: see `is_seen`.
-        min_pixels: see there.
-    """
+    """The present and the absent words of a scene, each in alphabetical order."""
     with_names = [each for each in objects if each.name]
     present = {each.name for each in with_names if is_seen(each, min_views=min_views, min_pixels=min_pixels)}
     return sorted(name for name in present if name), sorted(set(vocabulary) - {each.name for each in with_names})

@@ -334,10 +334,6 @@ EXPECTED = "question_id and answer_top10, or scene_id, situation, question and a
 def read_answer_predictions(path: Path, questions: Sequence[Question]) -> dict[str, tuple[str, ...]]:
     """Reads predicted answers to a question set.
 
-    Args:
-        path: the file; see the module for what may be in it.
-        questions: of the set; they need no right answers.
-
     Returns:
         One to ten answers, best first, by the id of the question. Questions without an entry are not there.
     """

@@ -209,10 +209,7 @@ def score_box_captions(
 
 
 def score_named_captions(
-    objects: Sequence[CaptionedObject],
-    captions: Sequence[NamedCaption],
-    *,
-    tools: JavaTools | str | None = None,
+    objects: Sequence[CaptionedObject], captions: Sequence[NamedCaption], *, tools: JavaTools | str | None = None
 ) -> DenseCaptionScores:
     """The same scores where every caption says which object it is about, at most one an object, and none is dropped for
     its box."""

@@ -261,13 +261,6 @@ def ground_scene(
 
     Pixels that show no Gaussian with a feature have a relevancy of 0.
 
-    Args:
-        scene: Gaussians, views with instance maps, and objects.
-        features: of the Gaussians.
-        words: turns names into the features' space.
-        protocol: which names are looked for.
-        memory: that the features come from; see `Evaluation`.
-
     Returns:
         The pairs, view by view, and the number of pairs that were left out because they have too few pixels.
     """

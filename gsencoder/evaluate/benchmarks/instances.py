@@ -82,8 +82,6 @@ OVERLAPS = np.append(np.arange(0.5, 0.95, 0.05), 0.25)
 """Thresholds of IoU. Their floating-point values decide ties: 0.6 here is 0.6000000000000001."""
 MIN_REGION = 100
 """Smallest number of vertices of an instance and of a mask that count."""
-MAX_TABLE = 1 << 22
-"""Largest range of ids that are counted in a table; ScanNet200's reach 1,191,000."""
 TEMPERATURE = 0.1
 """Of the softmax over classes, as for relevancy (LERF)."""
 
@@ -233,17 +231,7 @@ def score_instances(
     raw_ids: Mapping[str, int] | None = None,
     class_agnostic: bool = False,
 ) -> ScoreReport:
-    """`score`, with classes or without.
-
-    Args:
-        predictions: folder of SCENE.txt or SCENE.npz.
-        labels: folder of SCENE.txt, or of scans.
-        classes: that are scored.
-        method: name of the predictions' row in the table.
-        scenes: names of those to score; None = all that are labeled.
-        raw_ids: class id of each raw name where the labels are those of scans.
-        class_agnostic: leave the classes of masks out of account.
-    """
+    """`score`, with classes or without."""
     files = match_instance_files(
         predictions, labels, classes, scenes=scenes, raw_ids=raw_ids, class_agnostic=class_agnostic
     )
@@ -361,19 +349,14 @@ def match_instances(
 ) -> SceneMatches:
     """Decides at each threshold which predictions of a scene match an instance, are wrong, or are ignored.
 
-    Args:
-        ids_of_vertices: class id · 1000 + number of the instance; other ids, such as 0, are no instance.
-        prediction: of the same vertices. The order of its masks matters where one of them lies on several instances
-            (see the module).
-        classes: that are scored.
-        class_agnostic: leave the classes out of account; labels of predictions are then not looked at.
+    A vertex has class id · 1000 + number of the instance; other ids, such as 0, are no instance.
     """
     if len(ids_of_vertices) != prediction.num_vertices:
         raise InputError(
             f"{prediction.scene}: the masks have {prediction.num_vertices:,} vertices, and the truth "
             f"{len(ids_of_vertices):,}; expected those of the same mesh"
         )
-    ids, codes, sizes = _distinct(ids_of_vertices)
+    ids, codes, sizes = np.unique(ids_of_vertices, return_inverse=True, return_counts=True)
     instance_rows, rows = classes.rows(ids // IDS_PER_CLASS), classes.rows(prediction.labels)
     if class_agnostic:
         instance_rows, rows = np.where(instance_rows < 0, -1, 0), np.zeros_like(rows)
@@ -415,21 +398,6 @@ def match_instances(
         hits=hits,
         outcome_scores=np.concatenate([values for _, _, values in outcomes]),
     )
-
-
-def _distinct(
-    ids: Int64[np.ndarray, " V"],
-) -> tuple[Int64[np.ndarray, " I"], Int64[np.ndarray, " V"], Int64[np.ndarray, " I"]]:
-    """The distinct ids in ascending order, the index of each vertex's id among them, and their numbers of vertices."""
-    lowest = int(ids.min(initial=0))
-    if int(ids.max(initial=0)) - lowest > MAX_TABLE:
-        return np.unique(ids, return_inverse=True, return_counts=True)
-    # Counting takes a tenth of the time of sorting.
-    counts = np.bincount(ids - lowest)
-    present = np.flatnonzero(counts)
-    codes = np.zeros(len(counts), np.int64)
-    codes[present] = np.arange(len(present))
-    return present + lowest, codes[ids - lowest], counts[present]
 
 
 def _outcomes(
@@ -488,7 +456,6 @@ class InstanceScores:
         overall: mean over the classes that have instances.
         classes: by name; the one class of a class-agnostic score is called "any".
         groups: mean over the classes of each group that have instances.
-        recall: share of the instances that are matched, by class and threshold of `OVERLAPS`; NaN without instances.
         equal_scores: whether there are several predictions, all with one score. Their ranking is then undefined, and AP
             is recall · (precision + 1) / 2 at each threshold.
         shared: predictions that are above 0.25 with several instances; AP25 depends on the order of the predictions
@@ -499,23 +466,14 @@ class InstanceScores:
     overall: InstanceAverages
     classes: dict[str, InstanceAverages]
     groups: dict[str, InstanceAverages]
-    recall: Float64[np.ndarray, "C T"]
     instances: Int64[np.ndarray, " C"]
     predictions: Int64[np.ndarray, " C"]
     equal_scores: bool
     shared: int
 
 
-def average_precision(
-    scores: Float64[np.ndarray, " n"], hits: Bool[np.ndarray, " n"], instances: int
-) -> tuple[float, float]:
-    """AP and recall of ranked predictions (the module has the equation); predictions of one score are one step.
-
-    Args:
-        scores: of predictions that are not ignored.
-        hits: which of them match a truth.
-        instances: number of instances, one or more.
-    """
+def average_precision(scores: Float64[np.ndarray, " n"], hits: Bool[np.ndarray, " n"], instances: int) -> float:
+    """AP of ranked predictions (the module has the equation); predictions of one score are one step."""
     order = np.argsort(scores, kind="stable")
     _, starts = np.unique(scores[order], return_index=True)
     hits_before = np.concatenate([[0], np.cumsum(hits[order])])
@@ -523,7 +481,7 @@ def average_precision(
     precision = np.append(right / (len(scores) - starts), 1.0)
     recall = np.append(right / instances, 0.0)
     around = np.concatenate([recall[:1], recall, [0.0]])
-    return float(precision @ ((around[:-2] - around[2:]) / 2)), float(recall[0])
+    return float(precision @ ((around[:-2] - around[2:]) / 2))
 
 
 def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> InstanceScores:
@@ -542,12 +500,12 @@ def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> Ins
     starts = np.searchsorted(keys[order], np.arange(len(labels) * len(OVERLAPS) + 1))
     hits = np.concatenate([m.hits for m in matches])[order]
     scores = np.concatenate([m.outcome_scores for m in matches])[order]
-    table, recall = np.full((2, len(labels), len(OVERLAPS)), math.nan)
+    table = np.full((len(labels), len(OVERLAPS)), math.nan)
     for row in np.flatnonzero(instances):
         for column in range(len(OVERLAPS)):
             cell = row * len(OVERLAPS) + column
             part = slice(starts[cell], starts[cell + 1])
-            table[row, column], recall[row, column] = average_precision(scores[part], hits[part], int(instances[row]))
+            table[row, column] = average_precision(scores[part], hits[part], int(instances[row]))
     ranked = np.concatenate([m.scores for m in matches])
     # A group's names are rows of the table; none of them are scored without classes.
     members = {} if agnostic else {g: [labels.index(name) for name in n] for g, n in classes.groups.items()}
@@ -556,7 +514,6 @@ def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> Ins
         overall=_averages(table),
         classes={name: _averages(table[row : row + 1]) for row, name in enumerate(labels)},
         groups={group: _averages(table[rows]) for group, rows in members.items()},
-        recall=recall,
         instances=instances,
         predictions=predictions,
         equal_scores=len(ranked) > 1 and bool((ranked == ranked[0]).all()),
@@ -598,8 +555,7 @@ def match_instance_files(
     raw_ids: Mapping[str, int] | None = None,
     class_agnostic: bool = False,
 ) -> Iterator[SceneMatches]:
-    """Matches the predictions of a folder with the labels of another, one scene in memory at a time; arguments as of
-    `score_instances`."""
+    """Matches the predictions of a folder with the labels of another, one scene in memory at a time."""
     suffixes = (".txt", ".npz")
     for files in scene_files(predictions, labels, scenes=scenes, suffixes=suffixes, scans=raw_ids is not None):
         if raw_ids is None:
@@ -665,10 +621,6 @@ def write_instance_prediction(
     folder: Path, prediction: InstancePrediction, *, form: Literal["text", "npz"] = "text"
 ) -> Path:
     """Writes the masks of a scene as ScanNet's script takes them, or as one .npz, which is much smaller.
-
-    Args:
-        folder: an existing one, for all scenes.
-        form: "text" writes SCENE.txt and predicted_masks/SCENE_000.txt, …; "npz" writes SCENE.npz.
 
     Returns:
         The file SCENE.txt or SCENE.npz.

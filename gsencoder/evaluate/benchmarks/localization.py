@@ -138,11 +138,7 @@ def _warn_about_gaps(results: Sequence[SceneResult[SceneHits]], queried: int, bo
 
 
 def score_queries(
-    scene: Scene,
-    features: GaussianFeatures,
-    words: Words,
-    protocol: LocalizationProtocol,
-    localization: LocalizeConfig,
+    scene: Scene, features: GaussianFeatures, words: Words, protocol: LocalizationProtocol, localization: LocalizeConfig
 ) -> tuple[list[Hit], int]:
     """Localizes the name of each object to query in features of the scene's Gaussians.
 

@@ -403,11 +403,8 @@ def compare_boxes(
 ) -> tuple[ReferringResult, ...]:
     """The IoUs of every sentence whose object has a box, in order.
 
-    Args:
-        predictions: in any order. What they say of `multiple` and `others` is taken where the sentences do not say it,
-            and must not contradict them.
-        sentences: in any order.
-        allow_missing: count sentences without a prediction as ones without a box; else they are refused.
+    What predictions say of `multiple` and `others` is taken where the sentences do not say it, and must not contradict
+    them. A sentence without a prediction is refused, or with `allow_missing` counts as one without a box.
     """
     prediction_of = {prediction.key: prediction for prediction in predictions}
     keys = {item.key for item in sentences}
@@ -496,10 +493,6 @@ def named_classes(names: Iterable[str], nyu40_ids: Mapping[str, int]) -> dict[st
 
     Its `lib/dataset.py` takes the column nyu40class of scannetv2-labels.combined.tsv, of which nyu40id is the number.
 
-    Args:
-        names: raw names, with underscores or blanks between words.
-        nyu40_ids: `read_label_map` of the column nyu40id.
-
     Warns:
         SceneWarning: names that the map does not have; they are counted, and are others.
     """
@@ -510,12 +503,7 @@ def named_classes(names: Iterable[str], nyu40_ids: Mapping[str, int]) -> dict[st
 
 
 def with_kinds(expressions: Sequence[Expression], class_of: Mapping[str, str]) -> tuple[Expression, ...]:
-    """Expressions that say `multiple` and `others`; those that say it already keep it.
-
-    Args:
-        expressions: all of a benchmark's split, since these are counted.
-        class_of: class of each name of an object.
-    """
+    """Expressions that say `multiple` and `others`; those that say it already keep it."""
     kinds = [class_of[each.object_name] for each in expressions]
     keys = [(each.scene, str(each.object_id), kind) for each, kind in zip(expressions, kinds, strict=True)]
     return tuple(
@@ -531,10 +519,6 @@ def with_kinds(expressions: Sequence[Expression], class_of: Mapping[str, str]) -
 def several_of_their_class(objects: Sequence[tuple[str, str, str]]) -> tuple[bool, ...]:
     """Whether the scene of each sentence has several objects of its class, as ScanRefer counts them.
 
-    Args:
-        objects: scene, id of the object, and its class for each sentence of the benchmark's split; `OTHERS` is one
-            class. An object counts once, with the class of its first sentence; objects without sentences do not count.
-
     Returns:
         For each sentence, whether the objects of its scene that are of its class are not exactly one.
     """
@@ -548,14 +532,7 @@ def several_of_their_class(objects: Sequence[tuple[str, str, str]]) -> tuple[boo
 def read_referring_labels(
     path: Path, *, label_map: Path | None = None, scans: Path | None = None
 ) -> tuple[Expression, ...]:
-    """Reads ScanRefer's sentences with the boxes and kinds of their objects.
-
-    Args:
-        path: ScanRefer's JSON of a whole split, whose sentences say which objects are alone in their class.
-        label_map: scannetv2-labels.combined.tsv, which gives raw names ScanRefer's classes where the file does not say
-            unique_multiple; without it, sentences are neither unique nor multiple.
-        scans: folder of ScanNet's scans, whose labels have the boxes that the file does not have.
-    """
+    """Reads ScanRefer's sentences with the boxes and kinds of their objects."""
     expressions = read_scanrefer(path)
     if scans is not None:
         expressions = boxes_from_scans(expressions, scans)

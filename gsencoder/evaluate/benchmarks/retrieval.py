@@ -439,11 +439,7 @@ def _unit(vectors: Float32[np.ndarray, "n D"]) -> Float64[np.ndarray, "n D"]:
 
 
 def read_scored_pairs(path: Path, *, pooling: Pooling = "max") -> ScoredPairs:
-    """Reads scores, or computes them from features.
-
-    Args:
-        pooling: over the cells of a view, where there are features.
-    """
+    """Reads scores, or computes them from features."""
     if not path.is_file() or path.suffix.lower() in (".json", *PICKLE_SUFFIXES):
         fault = "no such file" if not path.exists() else "is none"
         raise InputError(f"{path}: {fault}; expected {EXPECTED}")

@@ -32,7 +32,6 @@ from jaxtyping import Int32, Int64
 
 from gsencoder.core.errors import InputError, about, counted
 from gsencoder.data.labels.classes import (
-    IDS_PER_CLASS,
     ClassTable,
     ids_of_names,
     load_classes,
@@ -63,8 +62,6 @@ BACKGROUND = ("wall", "floor", "ceiling")
 """Names that SceneSplat excludes from the foreground. ScanNet's 20 classes have no ceiling."""
 NO_CLASS, NO_CLASS_BESIDE_ZERO = 0, -100
 """Ids of points of no class, in labels and predictions; the second where 0 is the id of a class, as in ScanNet++."""
-RAW_IDS = range(1100, 1358)
-"""Ids from here to the end of ScanNet's raw ones are no instances: no scene has a hundred of class 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,16 +124,7 @@ def predict_semantics(
     text: TextEncoder,
     protocol: SemanticsProtocol = SemanticsProtocol(),
 ) -> Int32[np.ndarray, " P"]:
-    """The predicted class id of each point; `id_of_none` where no Gaussian has a feature.
-
-    Args:
-        points: of a scene.
-        gaussians: of the scene.
-        features: of the Gaussians.
-        classes: that can be predicted.
-        text: turns their names into vectors.
-        protocol: how many Gaussians vote for a vertex.
-    """
+    """The predicted class id of each point; `id_of_none` where no Gaussian has a feature."""
     nearest = nearest_class(features, classes.names, text)
     none = id_of_none(classes)
     labels = np.array([*classes.ids, none], np.int32)[nearest]
@@ -168,16 +156,7 @@ def score_semantics(
     scenes: Collection[str] | None = None,
     raw_ids: Mapping[str, int] | None = None,
 ) -> ScoreReport:
-    """`score` with other classes.
-
-    Args:
-        predictions: folder of SCENE.txt.
-        labels: folder of SCENE.txt, or of scans.
-        classes: that are scored.
-        method: name of the predictions' row in the table.
-        scenes: names of those to score; None = all that are labeled.
-        raw_ids: class id of each raw name where the labels are those of scans.
-    """
+    """`score` with other classes."""
     counts = list(count_label_files(predictions, labels, classes, scenes=scenes, raw_ids=raw_ids))
     scores = semantic_scores(counts, classes)
     if not scores.vertices:
@@ -359,10 +338,10 @@ def count_label_files(
     """Counts the labels in two folders, one scene in memory at a time; arguments as of `score_semantics`."""
     for files in scene_files(predictions, labels, scenes=scenes, scans=raw_ids is not None):
         if raw_ids is None:
-            true_ids = _class_ids(files.labels, classes)
+            true_ids = _class_ids(files.labels)
         else:
             true_ids = class_ids_of_scan(files.labels, raw_ids, classes)
-        predicted = _class_ids(files.prediction, classes)
+        predicted = _class_ids(files.prediction)
         with about(files.prediction):
             yield count_labels(files.scene, true_ids, predicted, classes)
 
@@ -377,15 +356,8 @@ def class_ids_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTa
     return vertex_classes(labels.instances, names, class_of, none=-1).astype(np.int64)
 
 
-def _class_ids(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
+def _class_ids(path: Path) -> Int64[np.ndarray, " V"]:
     labels = read_whole_numbers(path)
     if not len(labels):
         raise InputError(f"{path}: no vertices; expected one class id for each")
-    large = labels[(labels >= IDS_PER_CLASS) & ((labels < RAW_IDS.start) | (labels >= RAW_IDS.stop))]
-    instances = large // IDS_PER_CLASS
-    if not (classes.rows(labels) >= 0).any() and (classes.rows(instances) >= 0).any():
-        raise InputError(
-            f"{path}: ids such as {labels.max()} are those of instances, class id · {IDS_PER_CLASS} + number; expected "
-            "class ids"
-        )
     return labels

@@ -84,9 +84,6 @@ def python_tokens(text: str) -> str:
     (twenty-three), contractions are cut (do n't, table 's), so is punctuation at the end of a word. It is another
     tokenizer all the same: scores that rest on it say so.
 
-    Args:
-        text: of one sample; line breaks count as blanks.
-
     Returns:
         The tokens with one blank between them; empty where nothing is left.
     """

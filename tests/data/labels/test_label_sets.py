@@ -63,11 +63,7 @@ def test_raw_names_have_the_ids_of_each_benchmark(tmp_path: Path) -> None:
     names = ["paper", "office chair", "door frame", "paper"]
     # Ids that are not among the twenty stay, as in ScanNet's script; those of the 200 become 0, as in theirs.
     assert ids_of_names(names, nyu40) == {"paper": 40, "office chair": 5, "door frame": 8}
-    assert ids_of_names(names, own, scannet_classes("scannet200")) == {
-        "paper": 0,
-        "office chair": 10,
-        "door frame": 0,
-    }
+    assert ids_of_names(names, own, scannet_classes("scannet200")) == {"paper": 0, "office chair": 10, "door frame": 0}
     with pytest.warns(SceneWarning, match=r"2 of 3 names are not in the label map and have no class \(first: 'Wall'\)"):
         assert ids_of_names(["Wall", "wall", "beanbag"], nyu40) == {"Wall": 0, "wall": 1, "beanbag": 0}
 

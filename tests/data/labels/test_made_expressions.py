@@ -67,11 +67,7 @@ def test_each_expression_of_a_room_means_the_one_object_that_its_words_say(rooms
     made = make_expressions(rooms, per_object=10)
     assert {
         re.sub(r"^the (only|\S+)( \S+)? .*?(next to|on|in) the .*$", r"\3", each.expression.text) for each in made
-    } == {
-        "next to",
-        "on",
-        "in",
-    }
+    } == {"next to", "on", "in"}
     scenes = {each.name: each for each in rooms}
     for each in made:
         things = scenes[each.expression.scene].objects

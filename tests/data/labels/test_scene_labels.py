@@ -338,12 +338,6 @@ def test_a_scan_whose_labels_belong_to_another_mesh_is_refused_by_evaluate(
     scan = write_scannet_scan(room, tmp_path / "scene0000_00")
     write_ply(scan / "scene0000_00_vh_clean_2.ply", np.eye(3))
     words = write_words(tmp_path / "words.safetensors", room)
-    line = refusal(
-        capsys,
-        "evaluate",
-        str(scan),
-        f"out={tmp_path / 'out'}",
-        f"teacher.words={words}",
-    )
+    line = refusal(capsys, "evaluate", str(scan), f"out={tmp_path / 'out'}", f"teacher.words={words}")
     assert "segIndices has" in line
     assert "has 3 vertices; expected the files of one mesh" in line

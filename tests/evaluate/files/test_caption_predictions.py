@@ -8,12 +8,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.files import box_corners
-from gsencoder.evaluate.benchmarks.captions import (
-    CaptionedBox,
-    CaptionedObject,
-    NamedCaption,
-    read_caption_predictions,
-)
+from gsencoder.evaluate.benchmarks.captions import CaptionedBox, CaptionedObject, NamedCaption, read_caption_predictions
 
 OBJECTS = tuple(
     CaptionedObject(scene=scene, object_id=number, object_name="office_chair", captions=("sos a chair eos",))

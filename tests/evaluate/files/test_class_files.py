@@ -132,33 +132,6 @@ def test_labels_of_no_class_are_not_taken_for_instances_of_class_0(tmp_path: Pat
     assert counts.confusion.tolist() == [[0, 0, 1], [0, 0, 2]]
 
 
-def test_ids_of_instances_are_told_from_classes_by_the_thousand(tmp_path: Path) -> None:
-    classes = ClassTable(names=("wall", "bed"), ids=(1, 4))
-    folders = label_folders(tmp_path, predictions=[4000, 0, 0], truth=[1, 4, 4])
-    for number in (1000, 4000):
-        write_whole_numbers(folders[0] / "s.txt", np.array([number, 0, 0]))
-        with pytest.raises(
-            InputError, match=rf"ids such as {number} are those of instances, class id · 1000 \+ number"
-        ):
-            list(count_label_files(*folders, classes))
-    # One id of a class is enough to take the others for ids of no class.
-    write_whole_numbers(folders[0] / "s.txt", np.array([4000, 1, 0]))
-    assert [counts.confusion.tolist() for counts in count_label_files(*folders, classes)] == [[[0, 0, 1], [1, 0, 1]]]
-
-
-@pytest.mark.parametrize(("number", "raw"), [(1099, False), (1100, True), (1200, True), (1357, True), (1358, False)])
-def test_scannets_raw_ids_beyond_a_thousand_are_no_instances(tmp_path: Path, number: int, raw: bool) -> None:
-    folders = label_folders(tmp_path, predictions=[number] * 3, truth=[1, 4, number])
-    classes = ClassTable(names=("wall", "bed"), ids=(1, 4))
-    if raw:
-        (counts,) = count_label_files(*folders, classes)
-        # What has no class is not scored, and a prediction of none is wrong.
-        assert counts.confusion.tolist() == [[0, 0, 1], [0, 0, 1]]
-    else:
-        with pytest.raises(InputError, match="are those of instances"):
-            list(count_label_files(*folders, classes))
-
-
 def test_truth_and_prediction_of_a_scene_are_not_taken_for_each_other(tmp_path: Path) -> None:
     folders = label_folders(tmp_path, predictions=[1, 1, 4], truth=[1, 4, 4])
     classes = ClassTable(names=("wall", "bed"), ids=(1, 4))

@@ -11,13 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.data.labels.questions import Question
-from gsencoder.evaluate.benchmarks.answers import (
-    clean_answer,
-    match_cleaned,
-    scanqa_kind,
-    score_answers,
-    sqa3d_kind,
-)
+from gsencoder.evaluate.benchmarks.answers import clean_answer, match_cleaned, scanqa_kind, score_answers, sqa3d_kind
 from gsencoder.evaluate.benchmarks.text_metrics import f_value, score_sentences, sentence_figures, wordnet_lemmatizer
 
 NO_JAVA = "no Java here"
