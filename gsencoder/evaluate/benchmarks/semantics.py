@@ -337,10 +337,7 @@ def count_label_files(
 ) -> Iterator[LabelCounts]:
     """Counts the labels in two folders, one scene in memory at a time; arguments as of `score_semantics`."""
     for files in scene_files(predictions, labels, scenes=scenes, scans=raw_ids is not None):
-        if raw_ids is None:
-            true_ids = _class_ids(files.labels)
-        else:
-            true_ids = class_ids_of_scan(files.labels, raw_ids, classes)
+        true_ids = _class_ids(files.labels) if raw_ids is None else class_ids_of_scan(files.labels, raw_ids, classes)
         predicted = _class_ids(files.prediction)
         with about(files.prediction):
             yield count_labels(files.scene, true_ids, predicted, classes)
