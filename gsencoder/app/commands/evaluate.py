@@ -3,9 +3,10 @@
 Several processes (torchrun, SLURM) share the scenes: each predicts its own, and the first one scores all.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_sc
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
 from gsencoder.evaluate.benchmarks.localization import LocalizationProtocol
-from gsencoder.evaluate.benchmarks.protocol import Evaluation, predict_scenes
+from gsencoder.evaluate.benchmarks.protocol import Evaluation, SceneResult, predict_scenes
 from gsencoder.evaluate.benchmarks.protocols import AnyProtocol
 from gsencoder.evaluate.sources import (
     FeatureSource,
@@ -118,7 +119,7 @@ def run(config: EvaluateConfig, run: Run) -> None:
                 )
             )
             scenes = scenes_of(config, paths[process.rank :: process.world_size], quiet=not process.is_first)
-            predicted = predict_scenes(benchmark, scenes, source, config.seeds)
+            predicted: list[SceneResult[Any]] = predict_scenes(benchmark, scenes, source, config.seeds)
         parts = values_of_all(predicted)
         if folder is None:
             return
@@ -197,7 +198,7 @@ def source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     return head_source(source, heads, head, words.space.text_encoder), words
 
 
-def scenes_of(config: EvaluateConfig, paths: list[Path], *, quiet: bool) -> Iterator[tuple[Scene, float]]:
+def scenes_of(config: EvaluateConfig, paths: Sequence[Path], *, quiet: bool) -> Iterator[tuple[Scene, float]]:
     """Scenes with their features where these are stored, and the seconds of loading."""
     scenes = load_scenes(paths, config.data, config.splat, Progress(quiet=config.quiet or quiet))
     return with_stored_features(scenes, config) if config.features else scenes

@@ -33,7 +33,7 @@ An object that some photograph shows well enough is described in each way in whi
 
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal, get_args
 
@@ -41,6 +41,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.labels.expressions import Expression
 from gsencoder.data.labels.names import NUMBERS, alike, is_plural, plural, with_article
 from gsencoder.data.labels.questions import Question
@@ -78,23 +79,16 @@ Unit = tuple[Question, ...]
 class QuestionsConfig:
     """How questions are made."""
 
-    seed: int = field(default=0, metadata={"help": "of the choice among all questions that can be asked"})
-    per_kind: int = field(default=10, metadata={"help": "most questions of a kind about a scene"})
-    min_pixels: int = field(
-        default=200,
-        metadata={"help": "pixels that some photograph shows of an object before anything is asked about it"},
+    seed: int = option(0, "of the choice among all questions that can be asked", ge=0)
+    per_kind: int = option(10, "most questions of a kind about a scene", ge=2)
+    min_pixels: int = option(
+        200, "pixels that some photograph shows of an object before anything is asked about it", ge=1
     )
-    balance: bool = field(
-        default=True, metadata={"help": "as many questions of each kind, as there are of the rarest; false = all"}
-    )
-    absent: tuple[str, ...] = field(
-        default=ABSENT, metadata={"help": "names that are asked about where a scene does not have them"}
-    )
+    balance: bool = option(True, "as many questions of each kind, as there are of the rarest; false = all")
+    absent: tuple[str, ...] = option(ABSENT, "names that are asked about where a scene does not have them")
 
     def __post_init__(self) -> None:
-        for name, least in (("seed", 0), ("per_kind", 2), ("min_pixels", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+        check_limits(self)
         if any(not name.strip() for name in self.absent):
             raise InputError("absent: expected names, got an empty one")
 

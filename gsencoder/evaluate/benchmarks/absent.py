@@ -9,13 +9,14 @@ which the scene has only objects that are hardly seen is in neither group. The p
 import math
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning, about, counted
+from gsencoder.core.settings import option
 from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.evaluate.benchmarks.localization import is_seen
 from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult, names_of
@@ -33,21 +34,11 @@ class AbsentProtocol(Protocol):
     """Selection of the words that are asked."""
 
     name: Literal["absent"] = "absent"
-    vocabulary: tuple[str, ...] = field(
-        default=(),
-        metadata={"names": True, "help": "names that may be absent; empty = the names of all scenes' objects"},
+    vocabulary: tuple[str, ...] = option(
+        (), "names that may be absent; empty = the names of all scenes' objects", names=True
     )
-    min_views: int = field(
-        default=5, metadata={"help": "smallest number of views in which an object must be seen to be present"}
-    )
-    min_pixels: int = field(
-        default=60, metadata={"help": "smallest area in its best view that an object must have to be present, pixels"}
-    )
-
-    def __post_init__(self) -> None:
-        for name in ("min_views", "min_pixels"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+    min_views: int = option(5, "smallest number of views in which an object must be seen to be present", ge=0)
+    min_pixels: int = option(60, "smallest area in its best view that an object must have to be present, pixels", ge=0)
 
     def start(self, given: Evaluation) -> "AbsentBenchmark":
         return AbsentBenchmark(self, given)

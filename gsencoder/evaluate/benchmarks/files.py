@@ -2,12 +2,13 @@
 
 import os
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from gsencoder.core.errors import InputError, counted, listed, readable
 from gsencoder.core.files import check_foreign
+from gsencoder.core.settings import option
 from gsencoder.data.labels.classes import ids_of_raw_names
 from gsencoder.data.labels.files import PICKLE_SUFFIXES, read_split
 from gsencoder.data.labels.scans import AGGREGATION, ANNOTATION
@@ -19,61 +20,34 @@ Pooling = Literal["max", "mean"]
 class ScoreOptions:
     """Options of scores; `OPTIONS` of a module names those that it takes. Without slots, for a command to inherit."""
 
-    method: str = field(default="predictions", metadata={"help": "name of the predictions in the table"})
-    classes: str = field(
-        default="",
-        metadata={
-            "help": "of instances, semantics and recognition: scannet20, scannet200, a CSV file with the columns id, "
-            "name and, if there are any, group, or ScanNet++'s top100.txt; empty for recognition = all names of the "
-            "truth"
-        },
+    method: str = option("predictions", "name of the predictions in the table")
+    classes: str = option(
+        "",
+        "of instances, semantics and recognition: scannet20, scannet200, a CSV file with the columns id, "
+        "name and, if there are any, group, or ScanNet++'s top100.txt; empty for recognition = all names of the "
+        "truth",
     )
-    label_map: str = field(
-        default="",
-        metadata={
-            "help": "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv: of instances and semantics it "
-            "gives the objects of truth=SCANS a class, of referring it tells unique from multiple where "
-            "the truth does not"
-        },
+    label_map: str = option(
+        "",
+        "scannetv2-labels.combined.tsv, or ScanNet++'s map_benchmark.csv: of instances and semantics it "
+        "gives the objects of truth=SCANS a class, of referring it tells unique from multiple where "
+        "the truth does not",
     )
-    scans: str = field(
-        default="",
-        metadata={"help": "of referring: folder of ScanNet's scans, whose labels have the boxes that truth= has not"},
+    scans: str = option("", "of referring: folder of ScanNet's scans, whose labels have the boxes that truth= has not")
+    scenes: str = option("", "of instances and semantics: a split, one scene a line; empty = all scenes of the truth")
+    allow_missing: bool = option(
+        False,
+        "of recognition, referring, answers and captions: count what has no prediction as wrong, instead "
+        "of refusing the file",
     )
-    scenes: str = field(
-        default="",
-        metadata={"help": "of instances and semantics: a split, one scene a line; empty = all scenes of the truth"},
+    min_iou: float = option(0.5, "of captions: IoU that a box must be above for its caption to count", ge=0, le=1)
+    distractors: int = option(
+        0, "of retrieval: texts or pictures of others in a query's pool, drawn by its name; 0 = all", ge=0
     )
-    allow_missing: bool = field(
-        default=False,
-        metadata={
-            "help": "of recognition, referring, answers and captions: count what has no prediction as wrong, instead "
-            "of refusing the file"
-        },
+    pooling: Pooling = option("max", "of retrieval, where predictions are features: over the cells of a view")
+    java: bool = option(
+        True, "of answers and captions: use Java's tokenizer and METEOR where they are there; without, columns say so"
     )
-    min_iou: float = field(
-        default=0.5, metadata={"help": "of captions: IoU that a box must be above for its caption to count"}
-    )
-    distractors: int = field(
-        default=0,
-        metadata={"help": "of retrieval: texts or pictures of others in a query's pool, drawn by its name; 0 = all"},
-    )
-    pooling: Pooling = field(
-        default="max", metadata={"help": "of retrieval, where predictions are features: over the cells of a view"}
-    )
-    java: bool = field(
-        default=True,
-        metadata={
-            "help": "of answers and captions: use Java's tokenizer and METEOR where they are there; without, columns "
-            "say so"
-        },
-    )
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.min_iou <= 1:
-            raise InputError(f"min_iou: expected a share in [0, 1], got {self.min_iou}")
-        if self.distractors < 0:
-            raise InputError(f"distractors: expected 0 or more, got {self.distractors}")
 
     def given_classes(self) -> str:
         """The classes, which must be given."""

@@ -8,13 +8,14 @@ pixels. The ground truth is the union of all instances of a name. M3 prints the 
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
 from gsencoder.core.errors import InputError, SceneWarning, counted
+from gsencoder.core.settings import option
 from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult
 from gsencoder.evaluate.tables import ScoreReport, mean_of, table_of
 from gsencoder.infer.pictures import pixel_features
@@ -36,20 +37,9 @@ class GroundingProtocol(Protocol):
     """Selection of the pairs of a view and a name, and of the pixels that are compared."""
 
     name: Literal["grounding"] = "grounding"
-    stride: int = field(
-        default=1, metadata={"help": "pixels from one rendered pixel to the next, along both sides of a view"}
-    )
-    min_pixels: int = field(
-        default=60, metadata={"help": "smallest area that the objects of a name must have in a view to be looked for"}
-    )
-    furniture: bool = field(
-        default=True, metadata={"help": "whether furniture is looked for, and not the small objects alone"}
-    )
-
-    def __post_init__(self) -> None:
-        for name in ("stride", "min_pixels"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
+    stride: int = option(1, "pixels from one rendered pixel to the next, along both sides of a view", ge=1)
+    min_pixels: int = option(60, "smallest area that the objects of a name must have in a view to be looked for", ge=1)
+    furniture: bool = option(True, "whether furniture is looked for, and not the small objects alone")
 
     def start(self, given: Evaluation) -> "GroundingBenchmark":
         return GroundingBenchmark(self, given)

@@ -34,7 +34,7 @@ softmax over the cosines of all classes.
 import io
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal, NamedTuple
 
@@ -44,6 +44,7 @@ from jaxtyping import Bool, Float64, Int64
 from gsencoder.core.archive import read_npz
 from gsencoder.core.errors import InputError, about, counted
 from gsencoder.core.files import write_bytes
+from gsencoder.core.settings import option
 from gsencoder.data.labels.classes import (
     IDS_PER_CLASS,
     ClassTable,
@@ -91,13 +92,10 @@ class InstancesProtocol(Protocol):
     """Where masks come from, and whether classes count."""
 
     name: Literal["instances"] = "instances"
-    proposals: Literal["clusters", "truth"] = field(
-        default="clusters",
-        metadata={
-            "help": "masks: clusters = what localize finds for each class; truth = the true objects, to be named"
-        },
+    proposals: Literal["clusters", "truth"] = option(
+        "clusters", "masks: clusters = what localize finds for each class; truth = the true objects, to be named"
     )
-    class_agnostic: bool = field(default=False, metadata={"help": "leave the classes of masks out of account"})
+    class_agnostic: bool = option(False, "leave the classes of masks out of account")
 
     def start(self, given: Evaluation) -> "InstancesBenchmark":
         return InstancesBenchmark(self, given)

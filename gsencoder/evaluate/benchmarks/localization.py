@@ -7,13 +7,14 @@ oracle_, the best of all boxes of a name counts, as in SplatDistill's tables; a 
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning, counted
+from gsencoder.core.settings import option
 from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult
 from gsencoder.evaluate.tables import ScoreReport, mean_of, table_of
@@ -30,17 +31,8 @@ class LocalizationProtocol(Protocol):
     """Selection of the objects whose names are queried."""
 
     name: Literal["localization"] = "localization"
-    min_views: int = field(
-        default=5, metadata={"help": "smallest number of views in which an object must be seen to be queried"}
-    )
-    min_pixels: int = field(
-        default=60, metadata={"help": "smallest area in its best view that an object must have to be queried, pixels"}
-    )
-
-    def __post_init__(self) -> None:
-        for name in ("min_views", "min_pixels"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+    min_views: int = option(5, "smallest number of views in which an object must be seen to be queried", ge=0)
+    min_pixels: int = option(60, "smallest area in its best view that an object must have to be queried, pixels", ge=0)
 
     def start(self, given: Evaluation) -> "LocalizationBenchmark":
         return LocalizationBenchmark(self, given)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from gsencoder.core.errors import InputError, advised
+from gsencoder.core.settings import check_limits
 from gsencoder.data.labels.classes import ClassTable, ids_of_raw_names, is_scannetpp_map, load_classes
 from gsencoder.data.labels.scans import find_labels
 from gsencoder.data.seeding.seed import SeedConfig
@@ -99,6 +100,9 @@ class Benchmark(Generic[Result]):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Protocol:
     """Settings of one protocol. Subclasses have a field `name: Literal["…"]`."""
+
+    def __post_init__(self) -> None:
+        check_limits(self)
 
     def start(self, given: Evaluation) -> Benchmark[Any]:
         raise NotImplementedError

@@ -26,7 +26,7 @@ import math
 import warnings
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,6 +35,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning, about, counted, listed
 from gsencoder.core.files import write_json
+from gsencoder.core.settings import option
 from gsencoder.data.labels.classes import COLUMNS, ids_of_names, read_label_map, scannet_classes
 from gsencoder.data.labels.expressions import (
     Expression,
@@ -92,13 +93,11 @@ class ReferringProtocol(Protocol):
     """Which sentences are asked, and how."""
 
     name: Literal["referring"] = "referring"
-    expressions: str = field(
-        default="",
-        metadata={"help": "sentences: ScanRefer's JSON or Nr3D's CSV; empty = the names of the scenes' small objects"},
+    expressions: str = option(
+        "", "sentences: ScanRefer's JSON or Nr3D's CSV; empty = the names of the scenes' small objects"
     )
-    query: Literal["names", "sentence"] = field(
-        default="names",
-        metadata={"help": "what of a sentence is looked for: the names of the text table in it, or the whole"},
+    query: Literal["names", "sentence"] = option(
+        "names", "what of a sentence is looked for: the names of the text table in it, or the whole"
     )
 
     def start(self, given: Evaluation) -> "ReferringBenchmark":

@@ -28,7 +28,7 @@ import io
 import math
 import warnings
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -39,6 +39,7 @@ from gsencoder.core.archive import read_npz
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, SceneWarning, about, advised, counted, listed
 from gsencoder.core.files import write_bytes, write_json
+from gsencoder.core.settings import option
 from gsencoder.data.labels.files import (
     MAX_TEXT,
     PICKLE_SUFFIXES,
@@ -80,24 +81,14 @@ class RetrievalProtocol(Protocol):
     """Which texts belong to views, and how both are compared."""
 
     name: Literal["retrieval"] = "retrieval"
-    captions: str = field(default="", metadata={"help": "JSON: a list of {scene_id, view, caption}"})
-    distractors: str = field(
-        default="",
-        metadata={"help": "texts of other pictures, one a line; empty = the pool of a view is the other views' texts"},
+    captions: str = option("", "JSON: a list of {scene_id, view, caption}")
+    distractors: str = option(
+        "", "texts of other pictures, one a line; empty = the pool of a view is the other views' texts"
     )
-    count: int = field(default=0, metadata={"help": "of these, texts in a view's pool, drawn by its name; 0 = all"})
-    stride: int = field(
-        default=4, metadata={"help": "pixels from one rendered pixel to the next, along both sides of a view"}
-    )
-    pooling: Pooling = field(default="max", metadata={"help": "of the cosines of a view's pixels: max (M3) or mean"})
-    mode: Mode = field(
-        default="centered", metadata={"help": "cosines less the mean of features and words, or raw as in M3"}
-    )
-
-    def __post_init__(self) -> None:
-        for name, least in (("stride", 1), ("count", 0)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+    count: int = option(0, "of these, texts in a view's pool, drawn by its name; 0 = all", ge=0)
+    stride: int = option(4, "pixels from one rendered pixel to the next, along both sides of a view", ge=1)
+    pooling: Pooling = option("max", "of the cosines of a view's pixels: max (M3) or mean")
+    mode: Mode = option("centered", "cosines less the mean of features and words, or raw as in M3")
 
     def start(self, given: Evaluation) -> "RetrievalBenchmark":
         return RetrievalBenchmark(self, given)

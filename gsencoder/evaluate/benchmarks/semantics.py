@@ -23,7 +23,7 @@ SceneSplat's benchmark counts (pointcept/utils/misc.py, neighbor_voting). Points
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -31,6 +31,7 @@ import numpy as np
 from jaxtyping import Int32, Int64
 
 from gsencoder.core.errors import InputError, about, counted
+from gsencoder.core.settings import option
 from gsencoder.data.labels.classes import (
     ClassTable,
     ids_of_names,
@@ -69,17 +70,11 @@ class SemanticsProtocol(Protocol):
     """How vertices get the class of Gaussians."""
 
     name: Literal["semantics"] = "semantics"
-    voters: int = field(
-        default=VOTERS,
-        metadata={
-            "help": "on meshes: nearest Gaussians with a feature whose most frequent class a vertex has; 1 = the "
-            "nearest one"
-        },
+    voters: int = option(
+        VOTERS,
+        "on meshes: nearest Gaussians with a feature whose most frequent class a vertex has; 1 = the nearest one",
+        ge=1,
     )
-
-    def __post_init__(self) -> None:
-        if self.voters < 1:
-            raise InputError(f"voters: expected 1 or more, got {self.voters}")
 
     def start(self, given: Evaluation) -> "SemanticsBenchmark":
         return SemanticsBenchmark(self, given)

@@ -31,15 +31,15 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(("protocol", "options"), [("semantics", ()), ("instances", ("min_region=20",))])
+@pytest.mark.parametrize("protocol", ["semantics", "instances"])
 def test_scans_and_the_files_that_evaluate_writes_have_one_truth(
-    protocol: str, options: tuple[str, ...], home: Path, tmp_path: Path
+    protocol: str, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("gsencoder.evaluate.benchmarks.instances.MIN_REGION", 20)
     lists = [f"classes={home / 'top100.txt'}", f"label_map={home / 'map_benchmark.csv'}"]
     words = f"teacher.words={home / 'words.safetensors'}"
-    arguments = [f"protocol.{option}" for option in options]
     seeds = ["seeds.source=mesh", f"seeds.mesh={home / 'scans' / 'room' / 'scans' / 'mesh_aligned_0.05.ply'}"]
-    command = ["evaluate", str(home / "scans" / "room"), f"protocol={protocol}", words, *lists, *arguments, *seeds]
+    command = ["evaluate", str(home / "scans" / "room"), f"protocol={protocol}", words, *lists, *seeds]
     assert cli.main([*command, f"out={tmp_path / 'a'}", "quiet=true"]) == 0
     first = results_of(tmp_path / "a")
     del first["gaussians"]
@@ -49,7 +49,7 @@ def test_scans_and_the_files_that_evaluate_writes_have_one_truth(
         ("scans", [f"truth={home / 'scans'}", *lists]),
     ):
         out = f"out={tmp_path / name}"
-        assert cli.main(["score", protocol, predictions, *more, *options, out, "quiet=true"]) == 0
+        assert cli.main(["score", protocol, predictions, *more, out, "quiet=true"]) == 0
         assert results_of(tmp_path / name) == first
     if protocol == "semantics":
         assert first["miou"] > 0.5
