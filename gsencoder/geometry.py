@@ -14,11 +14,9 @@ from torch import Tensor
 
 from gsencoder.types import SH_C0
 
-ALPHA_MIN = 1 / 255
-"""Below this a Gaussian does not mark a pixel (Kerbl et al. 2023; gsplat)."""
+ALPHA_MIN = 1 / 255  # Below this a Gaussian does not mark a pixel (Kerbl et al. 2023; gsplat).
 
-ALPHA_MAX = 0.999
-"""One Gaussian never closes a ray completely, so that log1p(-alpha) stays finite."""
+ALPHA_MAX = 0.999  # One Gaussian never closes a ray completely, so that log1p(-alpha) stays finite
 
 
 class Projected(NamedTuple):
@@ -125,7 +123,7 @@ def project(
     """Perspective EWA splatting (Zwicker et al. 2001) with gsplat's conventions.
 
     The Jacobian is taken at x/z and y/z clamped to 30 % of the half field of view beyond the image: without that, a
-    Gaussian just beside the camera covers the whole image. `eps2d` pixels² are added to both variances.
+    Gaussian just next to the camera covers the whole image. `eps2d` pixels² are added to both variances.
 
     Args:
         means: centers, world units.

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from gsencoder.data.readers.posed import PosedImage
+from gsencoder.data.readers.undistort import CameraModel
 from gsencoder.types import Gaussians
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -145,3 +147,11 @@ def change(folder: Path, data: dict[str, Any], frame: int = 1, **values: Any) ->
     data["frames"][frame] |= values
     data["frames"][frame] = {key: value for key, value in data["frames"][frame].items() if value is not None}
     return rewrite(folder, data)
+
+
+def with_depth(depth: Path | None, scale: float = 1.0) -> PosedImage:
+    """A view of which nothing but the depth file counts."""
+    camera = CameraModel(model="PINHOLE", width=32, height=24, params=(30.0, 31.0, 16.0, 12.0))
+    return PosedImage(
+        name=str(depth), camera=camera, cam_from_world=np.eye(4), image=Path("x"), depth=depth, depth_scale=scale
+    )

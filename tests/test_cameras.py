@@ -54,7 +54,7 @@ def colmap_cameras(cameras: Cameras) -> Iterator[tuple[Any, Any]]:
 
 
 @pytest.mark.parametrize("length", EXTREME)
-def test_unprojecting_what_was_projected_gives_the_points_again_also_behind_the_camera(length: float) -> None:
+def test_unprojecting_what_was_projected_gives_the_points_again_also_behind_the_camera(length):
     cameras = random_cameras(spread=length)
     points = some_points(length=length)
     behind = 0
@@ -67,7 +67,7 @@ def test_unprojecting_what_was_projected_gives_the_points_again_also_behind_the_
 
 
 @given(st.integers(0, 10_000), st.sampled_from(EXTREME), st.sampled_from([np.float32, np.float64]))
-def test_projecting_what_was_unprojected_gives_the_pixels_and_depths_again(seed: int, depth: float, kind: type) -> None:
+def test_projecting_what_was_unprojected_gives_the_pixels_and_depths_again(seed, depth, kind):
     rng = np.random.default_rng(seed)
     K = intrinsic_matrix(*rng.uniform(10, 2000, 2), *rng.uniform(-100, 2000, 2)).astype(kind)
     pixels = rng.uniform(-2000, 4000, (30, 2)).astype(kind)
@@ -81,7 +81,7 @@ def test_projecting_what_was_unprojected_gives_the_pixels_and_depths_again(seed:
 
 
 @pytest.mark.slow
-def test_projection_is_that_of_colmap() -> None:
+def test_projection_is_that_of_colmap():
     """COLMAP's pixel centers lie at .5, too, so that nothing is added or taken off."""
     cameras, points = random_cameras(), some_points(200)
     compared = 0
@@ -101,7 +101,7 @@ def test_projection_is_that_of_colmap() -> None:
     assert compared > 1000
 
 
-def test_poses_and_centers_are_those_of_colmap() -> None:
+def test_poses_and_centers_are_those_of_colmap():
     cameras = random_cameras()
     for view, (_, cam_from_world) in enumerate(colmap_cameras(cameras)):
         expected = np.asarray(cam_from_world.inverse().matrix())
@@ -109,7 +109,7 @@ def test_poses_and_centers_are_those_of_colmap() -> None:
         np.testing.assert_allclose(cameras.centers[view], expected[:, 3], atol=1e-5)
 
 
-def test_moving_cameras_and_points_together_changes_no_pixel() -> None:
+def test_moving_cameras_and_points_together_changes_no_pixel():
     cameras, points = random_cameras(), some_points()
     for moved_from_world in random_poses(5, seed=1):
         poses = cameras.cam_from_world.astype(np.float64) @ invert_rigid(moved_from_world)
@@ -122,7 +122,7 @@ def test_moving_cameras_and_points_together_changes_no_pixel() -> None:
             np.testing.assert_allclose(project_points(local, K)[near], pixels[near], rtol=1e-4, atol=1e-1)
 
 
-def test_all_cameras_at_once_are_each_camera_after_the_other() -> None:
+def test_all_cameras_at_once_are_each_camera_after_the_other():
     cameras, points = random_cameras(), some_points(30).astype(np.float32)
     for min_depth in (None, 0.5):
         pixels, depths = cameras.project(points, min_depth=min_depth)
@@ -136,7 +136,7 @@ def test_all_cameras_at_once_are_each_camera_after_the_other() -> None:
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_projection_keeps_the_float_type_of_the_points(kind: type) -> None:
+def test_projection_keeps_the_float_type_of_the_points(kind):
     cameras, points = random_cameras(3), some_points(5).astype(kind)
     for view in (1, None):
         assert [array.dtype for array in cameras.project(points, view)] == [kind, kind]
@@ -145,7 +145,7 @@ def test_projection_keeps_the_float_type_of_the_points(kind: type) -> None:
     assert cameras.project(points[:0], 0)[0].shape == (0, 2)
 
 
-def test_points_far_from_the_origin_keep_float64() -> None:
+def test_points_far_from_the_origin_keep_float64():
     """A camera that is known exactly, 10⁶ m away from the points' origin, tells millimetres apart."""
     poses = np.eye(4)[None].repeat(1, axis=0)
     poses[0, :3, 3] = -(2.0**20)
@@ -161,7 +161,7 @@ def test_points_far_from_the_origin_keep_float64() -> None:
     np.testing.assert_allclose(cameras.unproject(pixels, np.ones(2), 0), points, rtol=0, atol=1e-9)
 
 
-def test_a_point_in_the_plane_of_the_lens_is_in_no_image_and_warns_of_nothing() -> None:
+def test_a_point_in_the_plane_of_the_lens_is_in_no_image_and_warns_of_nothing():
     K = intrinsic_matrix(50.0, 50.0, 30.0, 20.0)
     cameras = Cameras(
         cam_from_world=np.eye(4, dtype=np.float32)[None],
@@ -178,7 +178,7 @@ def test_a_point_in_the_plane_of_the_lens_is_in_no_image_and_warns_of_nothing() 
     np.testing.assert_array_equal(raised[4], pixels[4])
 
 
-def test_an_image_holds_its_left_and_upper_border_and_not_the_others() -> None:
+def test_an_image_holds_its_left_and_upper_border_and_not_the_others():
     cameras = random_cameras(1)
     width, height = int(cameras.widths[0]), int(cameras.heights[0])
     pixels = np.array([[0.0, 0], [width, 0], [0, height], [np.nextafter(width, 0), np.nextafter(height, 0)], [-1, 0]])
@@ -187,7 +187,7 @@ def test_an_image_holds_its_left_and_upper_border_and_not_the_others() -> None:
     assert cameras.in_image(pixels, np.full(5, 0.51), 0, near=0.5).sum() == 2
 
 
-def test_rays_have_depth_one_and_go_through_the_pixel_centers() -> None:
+def test_rays_have_depth_one_and_go_through_the_pixel_centers():
     cameras = random_cameras(3, seed=5).resized(40)
     for view in range(3):
         width, height = int(cameras.widths[view]), int(cameras.heights[view])
@@ -202,7 +202,7 @@ def test_rays_have_depth_one_and_go_through_the_pixel_centers() -> None:
         np.testing.assert_array_equal(corner, [rays[0, 0], rays[-1, -1]])
 
 
-def test_directions_turn_to_the_world_without_moving() -> None:
+def test_directions_turn_to_the_world_without_moving():
     cameras = random_cameras()
     directions = some_points(10)
     for view in range(len(cameras)):
@@ -211,7 +211,7 @@ def test_directions_turn_to_the_world_without_moving() -> None:
 
 
 @pytest.mark.parametrize("factor", [0.25, 1.0, 3.0])
-def test_pixels_of_resized_cameras_are_scaled(factor: float) -> None:
+def test_pixels_of_resized_cameras_are_scaled(factor):
     cameras, points = random_cameras(), some_points()
     sizes = [np.round(factor * size).astype(np.int32) for size in (cameras.widths, cameras.heights)]
     resized = cameras.resized_to(*sizes)
@@ -226,7 +226,7 @@ def test_pixels_of_resized_cameras_are_scaled(factor: float) -> None:
 
 
 @pytest.mark.parametrize("length", EXTREME)
-def test_the_inverse_of_a_rigid_transform_is_that_of_linear_algebra_and_of_scipy(length: float) -> None:
+def test_the_inverse_of_a_rigid_transform_is_that_of_linear_algebra_and_of_scipy(length):
     poses = random_poses(50, length=length)
     inverse, back = invert_rigid(poses), Rotation.from_matrix(poses[:, :3, :3]).inv()
     room = 1e-14 * max(1, length)
@@ -238,7 +238,7 @@ def test_the_inverse_of_a_rigid_transform_is_that_of_linear_algebra_and_of_scipy
     assert (inverse[:, 3] == [0, 0, 0, 1]).all()
 
 
-def test_transforms_compose_and_their_inverses_compose_backwards() -> None:
+def test_transforms_compose_and_their_inverses_compose_backwards():
     first, second = random_poses(20), random_poses(20, seed=1)
     points = some_points()
     for a, b in zip(first, second, strict=True):
@@ -250,7 +250,7 @@ def test_transforms_compose_and_their_inverses_compose_backwards() -> None:
 
 
 @pytest.mark.parametrize("length", EXTREME)
-def test_a_moved_origin_changes_coordinates_and_no_camera(length: float) -> None:
+def test_a_moved_origin_changes_coordinates_and_no_camera(length):
     poses, origin = random_poses(20), length * np.array([1.0, -2.0, 0.5])
     moved = move_origin(poses, origin)
     centers = invert_rigid(poses)[:, :3, 3]
@@ -264,7 +264,7 @@ def test_a_moved_origin_changes_coordinates_and_no_camera(length: float) -> None
     np.testing.assert_allclose(seen, transform(poses[0], points), rtol=0, atol=2 * room + 1e-12)
 
 
-def test_cameras_look_at_what_is_before_them_and_stand_upright() -> None:
+def test_cameras_look_at_what_is_before_them_and_stand_upright():
     rng = np.random.default_rng(0)
     forward = rng.normal(size=(50, 3))
     forward /= np.linalg.norm(forward, axis=1, keepdims=True)
@@ -284,7 +284,7 @@ def test_cameras_look_at_what_is_before_them_and_stand_upright() -> None:
 
 
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3), st.sampled_from((1e-150, 1.0, 1e150)))
-def test_a_perpendicular_vector_is_perpendicular_and_of_unit_length(direction: list[float], length: float) -> None:
+def test_a_perpendicular_vector_is_perpendicular_and_of_unit_length(direction, length):
     norm = float(np.linalg.norm(direction))
     assume(norm > 1e-6)
     unit = np.array(direction) / norm
@@ -293,10 +293,10 @@ def test_a_perpendicular_vector_is_perpendicular_and_of_unit_length(direction: l
     assert abs(np.linalg.norm(normal) - 1) < 1e-15
 
 
-def test_the_perpendicular_vector_of_z_is_y() -> None:
+def test_the_perpendicular_vector_of_z_is_y():
     assert perpendicular(np.array([0.0, 0.0, 1.0])).tolist() == [0, 1, 0]
 
 
-def test_opengl_axes_are_a_half_turn_about_x() -> None:
+def test_opengl_axes_are_a_half_turn_about_x():
     np.testing.assert_allclose(OPENCV_FROM_OPENGL[:3, :3], Rotation.from_euler("x", np.pi).as_matrix(), atol=1e-15)
     np.testing.assert_array_equal(OPENCV_FROM_OPENGL @ OPENCV_FROM_OPENGL, np.eye(4))

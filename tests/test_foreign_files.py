@@ -1,7 +1,7 @@
 """What a scene or an option names is a regular file: pipes and devices end with an error, within a second."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,18 +10,11 @@ from no_files import ends_within, make_no_file
 
 from gsencoder.core.archive import read_npz
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import (
-    TEXT_BYTES,
-    check_foreign,
-    check_written,
-    open_foreign,
-    read_foreign,
-    read_foreign_text,
-)
+from gsencoder.core.files import TEXT_BYTES, check_foreign, check_written, open_foreign, read_foreign, read_foreign_text
 from gsencoder.core.pretrained import load_companion, open_session, read_config
 from gsencoder.data.labels.files import read_checked
 from gsencoder.data.labels.mesh import read_mesh
-from gsencoder.data.readers.colmap import check_binary_model
+from gsencoder.data.readers.colmap import read_colmap
 from gsencoder.data.readers.images import load_npy, open_picture
 from gsencoder.data.readers.label_images import table_lines
 from gsencoder.data.readers.transforms_json import read_json
@@ -53,14 +46,14 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.fixture(autouse=True)
-def _ends() -> Iterator[None]:
+def _ends():
     with ends_within(1.0):
         yield
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 @pytest.mark.parametrize("name", READERS)
-def test_a_pipe_and_a_device_are_refused_by_every_reader(tmp_path: Path, name: str, kind: str) -> None:
+def test_a_pipe_and_a_device_are_refused_by_every_reader(tmp_path, name, kind):
     path = make_no_file(tmp_path / name, kind)
     with pytest.raises(InputError, match="not a regular file") as caught:
         READERS[name](path)
@@ -68,7 +61,7 @@ def test_a_pipe_and_a_device_are_refused_by_every_reader(tmp_path: Path, name: s
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_a_summary_that_is_no_file_is_no_summary(tmp_path: Path, kind: str) -> None:
+def test_a_summary_that_is_no_file_is_no_summary(tmp_path, kind):
     (tmp_path / "views.json").write_text("{}")
     make_no_file(tmp_path / "summary.json", kind)
     check_written(tmp_path / "views.json")
@@ -76,19 +69,19 @@ def test_a_summary_that_is_no_file_is_no_summary(tmp_path: Path, kind: str) -> N
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_questions_that_are_no_file_are_no_set(tmp_path: Path, kind: str) -> None:
+def test_questions_that_are_no_file_are_no_set(tmp_path, kind):
     assert not is_question_set(make_no_file(tmp_path / "questions.json", kind))
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_a_binary_model_that_is_no_file_is_refused(tmp_path: Path, kind: str) -> None:
+def test_a_binary_model_that_is_no_file_is_refused(tmp_path, kind):
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         make_no_file(tmp_path / name, kind)
     with pytest.raises(InputError):
-        check_binary_model(tmp_path)
+        read_colmap(tmp_path, tmp_path, tmp_path)
 
 
-def test_links_to_files_are_read_and_large_files_are_not(tmp_path: Path) -> None:
+def test_links_to_files_are_read_and_large_files_are_not(tmp_path):
     (tmp_path / "file").write_bytes(b"\xef\xbb\xbfa\r\nb")
     (tmp_path / "link").symlink_to(tmp_path / "file")
     assert read_foreign_text(tmp_path / "link") == "a\nb"
@@ -103,7 +96,7 @@ def test_links_to_files_are_read_and_large_files_are_not(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("read", [read_foreign, read_foreign_text])
-def test_a_text_of_gigabytes_is_refused_where_no_limit_is_named(tmp_path: Path, read: Callable[[Path], object]) -> None:
+def test_a_text_of_gigabytes_is_refused_where_no_limit_is_named(tmp_path, read):
     with (tmp_path / "file").open("wb") as stream:
         stream.truncate(TEXT_BYTES + 1)
     with pytest.raises(InputError, match="at most 268,435,456 are read"):
@@ -111,12 +104,12 @@ def test_a_text_of_gigabytes_is_refused_where_no_limit_is_named(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_lines_may_end_as_on_any_system(tmp_path: Path, end: str) -> None:
+def test_lines_may_end_as_on_any_system(tmp_path, end):
     (tmp_path / "file").write_bytes(f"a{end}{end}b{end}".encode())
     assert read_foreign_text(tmp_path / "file") == "a\n\nb\n"
 
 
-def test_a_file_that_is_refused_is_closed(tmp_path: Path) -> None:
+def test_a_file_that_is_refused_is_closed(tmp_path):
     (tmp_path / "file").write_bytes(b"1234")
     opened = len(os.listdir("/dev/fd"))
     for path in (tmp_path, tmp_path / "file", make_no_file(tmp_path / "pipe", "pipe")):
@@ -126,7 +119,7 @@ def test_a_file_that_is_refused_is_closed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "dangling"])
-def test_truth_of_a_scene_that_cannot_be_read_is_named_and_not_left_out(tmp_path: Path, kind: str) -> None:
+def test_truth_of_a_scene_that_cannot_be_read_is_named_and_not_left_out(tmp_path, kind):
     for folder in ("predictions", "truth"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "a.txt").write_text("1\n")
@@ -139,7 +132,7 @@ def test_truth_of_a_scene_that_cannot_be_read_is_named_and_not_left_out(tmp_path
         scene_files(tmp_path / "predictions", tmp_path / "truth")
 
 
-def test_masks_are_refused_by_their_declared_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_masks_are_refused_by_their_declared_size(tmp_path, monkeypatch):
     np.savez_compressed(tmp_path / "a.npz", pred_masks=np.zeros((2048, 1024), bool))
     kinds = {"pred_masks": ("b", 2)}
     assert read_npz(tmp_path / "a.npz", kinds)["pred_masks"].shape == (2048, 1024)

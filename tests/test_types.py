@@ -23,7 +23,7 @@ def camera(width: int, height: int) -> Cameras:
 
 
 @pytest.mark.parametrize(("width", "height", "longest"), [(640, 480, 160), (97, 231, 50), (64, 48, 640), (1000, 1, 8)])
-def test_resized_cameras_keep_their_field_of_view(width: int, height: int, longest: int) -> None:
+def test_resized_cameras_keep_their_field_of_view(width, height, longest):
     whole = camera(width, height)
     small = whole.resized(longest)
     assert max(small.widths[0], small.heights[0]) == longest
@@ -35,7 +35,7 @@ def test_resized_cameras_keep_their_field_of_view(width: int, height: int, longe
     assert (small.cam_from_world == whole.cam_from_world).all()
 
 
-def test_a_resized_picture_of_large_gaussians_shows_the_same() -> None:
+def test_a_resized_picture_of_large_gaussians_shows_the_same():
     gaussians = random_gaussians(40, log_scale=-1.0)
     large, small = camera(128, 96), camera(128, 96).resized(32)
     fine = blend(gaussians, large).alpha.reshape(24, 4, 32, 4).mean(dim=(1, 3))
@@ -44,12 +44,12 @@ def test_a_resized_picture_of_large_gaussians_shows_the_same() -> None:
 
 
 @pytest.mark.parametrize("unit", [0.0, -1.0, float("nan"), float("inf"), 10**400, True, "1"])
-def test_a_scene_has_a_positive_unit_or_none(unit: Any, no_jaxtyping: None) -> None:
+def test_a_scene_has_a_positive_unit_or_none(unit, no_jaxtyping):
     with pytest.raises(InputError, match=r"Scene\.metres_per_unit: expected a positive number of metres"):
         Scene(name="room", metres_per_unit=unit)
 
 
-def test_selected_views_read_what_belongs_to_them_when_it_is_asked_for() -> None:
+def test_selected_views_read_what_belongs_to_them_when_it_is_asked_for():
     read = []
 
     class Files(Sequence[np.ndarray]):
@@ -69,7 +69,6 @@ def test_selected_views_read_what_belongs_to_them_when_it_is_asked_for() -> None
     views = Views(cameras=cameras, names=("a", "b", "c"), depths=Files())
     chosen = views.select(np.array([2, 0]))
     assert (chosen.names, chosen.cameras.widths.tolist(), chosen.images) == (("c", "a"), [7, 5], None)
-    assert chosen.depths is not None
     # Runtime checks of types look at an entry of a sequence.
     read.clear()
     assert [float(depth[0, 0]) for depth in chosen.depths] == [2, 0]
@@ -78,7 +77,7 @@ def test_selected_views_read_what_belongs_to_them_when_it_is_asked_for() -> None
     assert [float(depth[0, 0]) for depth in chosen.depths[1:]] == [0]
 
 
-def test_views_need_a_name_and_an_entry_for_each_camera(no_jaxtyping: None) -> None:
+def test_views_need_a_name_and_an_entry_for_each_camera(no_jaxtyping):
     two = camera(8, 6).select([0, 0])
     with pytest.raises(InputError, match=r"Views\.names: expected 2 names, one a camera, got 1"):
         Views(cameras=two, names=("a",))
@@ -90,7 +89,7 @@ def test_views_need_a_name_and_an_entry_for_each_camera(no_jaxtyping: None) -> N
     assert len(Views(cameras=two, names=("a", "b"))) == 2
 
 
-def test_selected_views_have_all_that_belongs_to_them_also_by_slices_and_from_the_end() -> None:
+def test_selected_views_have_all_that_belongs_to_them_also_by_slices_and_from_the_end():
     cameras = camera(8, 6).select([0, 0, 0, 0])
     kinds = {"images": np.uint8, "depths": np.float32, "masks": bool, "instances": np.int32}
     entries = {
@@ -113,12 +112,12 @@ def test_selected_views_have_all_that_belongs_to_them_also_by_slices_and_from_th
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/b", "a\0b"])
-def test_the_name_of_a_scene_can_be_that_of_a_folder(name: str) -> None:
+def test_the_name_of_a_scene_can_be_that_of_a_folder(name):
     with pytest.raises(InputError, match=r"Scene\.name: expected a name that a folder can have"):
         Scene(name=name)
 
 
-def test_up_and_origin_of_a_scene_are_three_float64(no_jaxtyping: None) -> None:
+def test_up_and_origin_of_a_scene_are_three_float64(no_jaxtyping):
     for up in (np.array([0.0, 0, 1.01]), np.array([0.0, 0.98, 0]), np.array([0.0, 1.0]), np.array([0, 1, 0])):
         with pytest.raises(InputError, match=r"Scene\.up"):
             Scene(name="a", up=up)
@@ -128,7 +127,7 @@ def test_up_and_origin_of_a_scene_are_three_float64(no_jaxtyping: None) -> None:
     assert Scene(name="..a", up=np.array([0.0, 0.6, 0.8])).origin.tolist() == [0, 0, 0]
 
 
-def test_features_lie_on_the_gaussians_of_their_scene() -> None:
+def test_features_lie_on_the_gaussians_of_their_scene():
     space = FeatureSpace(name="a", channels=2)
     features = GaussianFeatures(
         features=np.zeros((5, 2), np.float32), weights=np.ones(5, np.float32), mean=np.zeros(2, np.float32), space=space
@@ -139,7 +138,7 @@ def test_features_lie_on_the_gaussians_of_their_scene() -> None:
             Scene(name="a", gaussians=gaussians, features={"a": features})
 
 
-def test_an_object_that_nobody_counted_has_no_views() -> None:
+def test_an_object_that_nobody_counted_has_no_views():
     thing = SceneObject(id=3, name=None, aabb_min=np.zeros(3), aabb_max=np.ones(3))
     assert (thing.placed, thing.views, thing.max_pixels) == (True, 0, 0)
 
@@ -148,7 +147,7 @@ GRID: dict[str, Any] = {"grid_from_image": np.eye(2, 3), "space": FeatureSpace(n
 TABLE = np.eye(3, 2, dtype=np.float32)
 
 
-def test_a_map_is_in_one_form_and_knows_its_size() -> None:
+def test_a_map_is_in_one_form_and_knows_its_size():
     features, codes = np.zeros((3, 4, 2), np.float32), np.array([[-1, 0, 1, 2]] * 3, np.int32)
     shares = np.zeros((3, 4, 3), np.float32)
     shares[0, 0] = (0, 2, 1e30)
@@ -172,14 +171,14 @@ def test_a_map_is_in_one_form_and_knows_its_size() -> None:
 
 
 @pytest.mark.parametrize("value", [-1e-6, float("nan"), float("inf")])
-def test_shares_are_finite_and_not_negative(value: float) -> None:
+def test_shares_are_finite_and_not_negative(value):
     shares = np.ones((3, 4, 3), np.float32)
     shares[1, 2, 0] = value
     with pytest.raises(InputError, match=r"FeatureMap\.shares: expected finite shares from 0"):
         FeatureMap(shares=shares, table=TABLE, **GRID)
 
 
-def test_codes_and_shares_belong_to_rows_of_their_table_and_those_to_the_space(no_jaxtyping: None) -> None:
+def test_codes_and_shares_belong_to_rows_of_their_table_and_those_to_the_space(no_jaxtyping):
     with pytest.raises(InputError, match=r"shares: expected 3 columns, got 4"):
         FeatureMap(shares=np.ones((3, 4, 4), np.float32), table=TABLE, **GRID)
     for wrong in (-2, 3):
@@ -191,7 +190,7 @@ def test_codes_and_shares_belong_to_rows_of_their_table_and_those_to_the_space(n
         FeatureMap(features=np.ones((3, 4, 5), np.float32), **GRID)
 
 
-def test_features_and_their_mean_are_arrays_of_the_space_with_finite_weights(no_jaxtyping: None) -> None:
+def test_features_and_their_mean_are_arrays_of_the_space_with_finite_weights(no_jaxtyping):
     good = {
         "features": np.zeros((3, 2), np.float32),
         "weights": np.zeros(3, np.float32),
@@ -212,7 +211,7 @@ def test_features_and_their_mean_are_arrays_of_the_space_with_finite_weights(no_
             GaussianFeatures(**{**good, name: value}, space=GRID["space"])
 
 
-def test_an_index_numbers_the_rows_of_a_table_where_gaussians_were_seen(no_jaxtyping: None) -> None:
+def test_an_index_numbers_the_rows_of_a_table_where_gaussians_were_seen(no_jaxtyping):
     table = np.arange(6, dtype=np.float32).reshape(3, 2)
     weights = np.array([1, 0, 2, 3], np.float32)
     good = {"features": table, "weights": weights, "mean": np.zeros(2, np.float32), "space": GRID["space"]}
@@ -228,7 +227,7 @@ def test_an_index_numbers_the_rows_of_a_table_where_gaussians_were_seen(no_jaxty
         GaussianFeatures(**good, index=np.array([2, -1, 0, 2], np.int64))
 
 
-def test_a_basis_keeps_between_nothing_and_all_of_the_energy() -> None:
+def test_a_basis_keeps_between_nothing_and_all_of_the_energy():
     def basis(energy: float) -> FeatureBasis:
         rows, mean = np.eye(1, 2, dtype=np.float32), np.zeros(2, np.float32)
         return FeatureBasis(mean=mean, components=rows, energy_kept=energy, space=GRID["space"])

@@ -85,7 +85,7 @@ def with_reported_up(scene: Scene, run: Run) -> Scene:
     """The scene with `up`, which the summary records; an estimate is printed."""
     scene, up = with_up(scene)
     run.results["up"] = None if up is None else up.to_dict()
-    if up is not None and up.source != "stated":
+    if up is not None and up.source != "files":
         run.print(f"up of {scene.name}: {up.describe()} (data.up= states it)")
     return scene
 

@@ -1,7 +1,7 @@
 """Is a bare splat a room or an object? Its free space says: what surrounds it, and what stands in it.
 
 A cupboard, a bust or a box is as closed as a room, so that being enclosed is not enough. Rays in 26 directions through
-a coarse grid tell rooms apart: one free space lies beside most of the surfaces, and something stands in it, so that
+a coarse grid tell rooms apart: one free space borders most of the surfaces, and something stands in it, so that
 rays that leave this space at a surface enter it again behind. They do not where an empty shell ends. A scan without a
 ceiling is flat and open: a ray from its surfaces gets out in half of all directions, as from a floor.
 """
@@ -22,34 +22,22 @@ from gsencoder.types import Gaussians, Views
 from gsencoder.types.checks import invert_rigid, transform
 from gsencoder.types.scene import unproject_points
 
-MAX_SAMPLES = 20_000
-"""So many Gaussians are looked at."""
-FLATTENED = 0.5
-"""Gaussians whose thinnest axis is above this share of the middle one have no normal."""
-PLANE_NEIGHBORS = 32
-"""Means through which a plane is laid."""
+MAX_SAMPLES = 20_000  # Gaussians that are looked at
+FLATTENED = 0.5  # Gaussians whose thinnest axis is above this share of the middle one have no normal
+PLANE_NEIGHBORS = 32  # Means through which a plane is laid
 PLANE_THICKNESS = 0.5
 """Largest thickness of a plane, as a share of its smaller width (standard deviations of the means)."""
-MIN_OPACITY = 0.3
-"""Means of fainter Gaussians are left out of planes."""
-MAX_PLANE_MEANS = 400_000
-"""Means among which neighbors are looked for."""
+MIN_OPACITY = 0.3  # Means of fainter Gaussians are left out of planes
+MAX_PLANE_MEANS = 400_000  # Means among which neighbors are looked for
 
 
 class Surfaces(NamedTuple):
-    """Oriented pieces of surfaces.
+    """Oriented pieces of surfaces."""
 
-    Attributes:
-        means: positions in the world.
-        normals: unit; either side.
-        areas: in any unit.
-        rest: area of what has no normal, in the same unit; it lowers the confidence of an estimate.
-    """
-
-    means: Float64[np.ndarray, "n 3"]
-    normals: Float64[np.ndarray, "n 3"]
-    areas: Float64[np.ndarray, " n"]
-    rest: float = 0.0
+    means: Float64[np.ndarray, "n 3"]  # positions in the world
+    normals: Float64[np.ndarray, "n 3"]  # unit; either side
+    areas: Float64[np.ndarray, " n"]  # in any unit
+    rest: float = 0.0  # area of what has no normal, in the same unit; it lowers the confidence of an estimate
 
 
 def surfaces_of_gaussians(gaussians: Gaussians, *, seed: int = 0) -> Surfaces:
@@ -120,15 +108,12 @@ def surfaces_of_depth(views: Views, *, limit: int = 16, seed: int = 0) -> Surfac
 CELLS = 32
 """Cells along the longest side: a wall of 5 m is 16 cm a cell, less than a chair. Cells are no smaller than most
 Gaussians (`RESOLVED`), else surfaces of few Gaussians have holes, through which rays would enter spaces again."""
-RESOLVED = 0.75
-"""Share of the Gaussians whose standard deviation is at most the side of a cell."""
-EXTENT = (0.03, 0.97)
-"""Quantiles of the coordinates between which the grid lies."""
-OPAQUE = 0.3
-"""Gaussians of less opacity enclose nothing."""
+RESOLVED = 0.75  # Share of the Gaussians whose standard deviation is at most the side of a cell
+EXTENT = (0.03, 0.97)  # Quantiles of the coordinates between which the grid lies
+OPAQUE = 0.3  # Gaussians of less opacity enclose nothing
 MIN_GAUSSIANS, MAX_GAUSSIANS = 4000, 100_000
 """Fewer opaque Gaussians show an object: objects cut from seeds of rooms have up to 1,900, rooms 16,000 and more. Of
-more Gaussians, a random choice of so many fills cells."""
+more Gaussians, a random choice of this size fills cells."""
 TURNS = np.arange(8) * np.pi / 4
 DISC = np.concatenate([np.stack((r * np.cos(TURNS + r / 3), r * np.sin(TURNS + r / 3)), axis=1) for r in (0, 1, 2)])[7:]
 """Points of a disc, in standard deviations, whose cells it fills: surfaces of overlapping discs have no holes."""
@@ -143,48 +128,38 @@ them, as between floor and walls, and a little less where a wall was not photogr
 FLAT, HIGH = 0.35, 0.55
 """Smallest over largest side: scans without a ceiling are at most FLAT (house rooms 0.06 to 0.28), and rooms with walls
 at most HIGH (0.19 to 0.50)."""
-OPEN, OPEN_WITH_CONTENT, OPEN_BESIDE, CONTENT = 0.56, 0.48, 0.6, 0.01
+OPEN, OPEN_WITH_CONTENT, OPEN_ADJACENT, CONTENT = 0.56, 0.48, 0.6, 0.01
 """Of a scan without a ceiling: its surfaces' openness, less where something stands in its space; the share of them that
-lie beside this space; and the content that counts. Rooms: 0.53 and more, 0.69 and more; a deck chair and a window frame
+border this space; and the content that counts. Rooms: 0.53 and more, 0.69 and more; a deck chair and a window frame
 have 0.52 and 0.50, and no content."""
-CLOSED, CLOSED_BESIDE, CLOSED_CONTENT, CLOSED_SPACE = 0.31, 0.83, 0.1, 0.28
+CLOSED, CLOSED_ADJACENT, CLOSED_CONTENT, CLOSED_SPACE = 0.31, 0.83, 0.1, 0.28
 """The same of a room with walls, and its free space: things whose boards lie behind each other are less open (a car
 with seats 0.28, a kitchen 0.34); a teddy's head and body have a content of 0.05, rooms 0.14 and more; a figure on a
 plate of ground has a free space of 0.17, rooms 0.41 and more."""
-BARE_SPACE = 0.43
-"""In a room of which this share is free, as a corridor, `CONTENT` is enough; a hat has 0.41."""
+BARE_SPACE = 0.43  # In a room of which this share is free, as a corridor, `CONTENT` is enough; a hat has 0.41
 DIRECTIONS = tuple(each for each in product((-1, 0, 1), repeat=3) if any(each))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Enclosure:
-    """What surrounds the free space of a splat; shares from 0 to 1.
+    """What surrounds the free space of a splat; shares from 0 to 1."""
 
-    Attributes:
-        flatness: smallest side over largest side.
-        openness: mean share of the directions in which rays from surfaces meet nothing.
-        space: the largest connected enclosed space, as a share of the box around the splat.
-        beside: share of the surfaces that lie beside this space.
-        content: share of the rays from this space that enter it again behind the first surface they meet.
-        enough: whether there are Gaussians enough to tell.
-    """
-
-    flatness: float
-    openness: float
-    space: float
-    beside: float
-    content: float
-    enough: bool = True
+    flatness: float  # smallest side over largest side
+    openness: float  # mean share of the directions in which rays from surfaces meet nothing
+    space: float  # the largest connected enclosed space, as a share of the box around the splat
+    adjacent: float  # share of the surfaces that border this space
+    content: float  # share of the rays from this space that enter it again behind the first surface they meet
+    enough: bool = True  # whether there are Gaussians enough to tell
 
     @property
     def is_room(self) -> bool:
         """Whether photographs of it would be taken from inside."""
-        if not self.enough or self.flatness > HIGH or self.beside < OPEN_BESIDE:
+        if not self.enough or self.flatness > HIGH or self.adjacent < OPEN_ADJACENT:
             return False
         low, filled = self.flatness <= FLAT, self.content >= CONTENT
         if low and (self.openness >= OPEN or (self.openness >= OPEN_WITH_CONTENT and filled)):
             return True
-        if self.beside < CLOSED_BESIDE or self.space < CLOSED_SPACE or self.openness < CLOSED:
+        if self.adjacent < CLOSED_ADJACENT or self.space < CLOSED_SPACE or self.openness < CLOSED:
             return False
         return self.content >= CLOSED_CONTENT or (filled and self.space >= BARE_SPACE)
 
@@ -194,9 +169,9 @@ class Enclosure:
         if not self.enough:
             return f"fewer than {MIN_GAUSSIANS:,} opaque Gaussians show no room"
         if self.is_room:
-            return f"{self.beside:.0%} of its surfaces lie around one free space"
-        if self.beside < OPEN_BESIDE:
-            return f"no free space lies beside most of its surfaces ({self.beside:.0%})"
+            return f"{self.adjacent:.0%} of its surfaces lie around one free space"
+        if self.adjacent < OPEN_ADJACENT:
+            return f"no free space borders most of its surfaces ({self.adjacent:.0%})"
         return f"of the rays from the free space within it {self.content:.1%} meet things that stand there"
 
 
@@ -208,7 +183,7 @@ def enclosure_of(gaussians: Gaussians) -> Enclosure:
     surface = areas >= FILLED
     enough = int((gaussians.opacities >= OPAQUE).sum()) >= MIN_GAUSSIANS
     if not surface.any():
-        return Enclosure(flatness=1.0, openness=1.0, space=0.0, beside=0.0, content=0.0, enough=enough)
+        return Enclosure(flatness=1.0, openness=1.0, space=0.0, adjacent=0.0, content=0.0, enough=enough)
     areas = areas * surface / areas[surface].sum()
     closed = _blocked(surface) / len(DIRECTIONS)
     numbers, count = ndimage.label(~surface & (closed >= ENCLOSED))
@@ -220,7 +195,7 @@ def enclosure_of(gaussians: Gaussians) -> Enclosure:
         flatness=min(surface.shape) / max(surface.shape),
         openness=float((areas * (1 - closed)).sum()),
         space=float(space.mean()),
-        beside=float(areas[ndimage.binary_dilation(space, np.ones((3, 3, 3)))].sum()),
+        adjacent=float(areas[ndimage.binary_dilation(space, np.ones((3, 3, 3)))].sum()),
         content=content,
         enough=enough,
     )

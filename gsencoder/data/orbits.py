@@ -10,14 +10,12 @@ from gsencoder.types import Cameras, Gaussians
 from gsencoder.types.checks import look_at, perpendicular
 from gsencoder.types.scene import intrinsic_matrix
 
-COVERED = 0.95
-"""Opacity-weighted share of the Gaussians that must fit into the picture."""
+COVERED = 0.95  # Opacity-weighted share of the Gaussians that must fit into the picture
 MAX_COVERED = 3.0
 """Largest radius that must fit, in opacity-weighted median distances from the center; farther Gaussians are floaters.
 """
 MARGIN = 1.1
-MIN_DISTANCE = 0.05
-"""Smallest distance of cameras from the center, since renderers clip everything nearer than 0.01."""
+MIN_DISTANCE = 0.05  # Smallest distance of cameras from the center, since renderers clip everything nearer than 0.01
 GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
@@ -50,8 +48,7 @@ def orbit_cameras(
         raise InputError("orbit cameras need at least one Gaussian, got none")
     if count < 1 or width < 1 or height < 1 or not 1 <= fov_degrees <= 170:
         raise InputError(
-            f"orbit cameras: expected count, width, height of at least 1 and fov_degrees in [1, 170], "
-            f"got {count}, {width}, {height}, {fov_degrees}"
+            f"orbit cameras: {count} of {width}×{height}, fov_degrees {fov_degrees}: expected 1 or more, and 1 to 170"
         )
     center, radius = robust_ball(gaussians)
     focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))

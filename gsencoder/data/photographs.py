@@ -17,20 +17,13 @@ from gsencoder.types import Cameras, Views
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScaledPhotograph:
-    """One photograph at one size.
+    """One photograph at one size."""
 
-    Attributes:
-        image: RGB in [0, 1].
-        mask: pixels to look at; None = all.
-        empty: pixels in which nothing is to be seen; None = nothing is known to be empty.
-        depth: z in world units, 0 = unknown; None where there is no sensor.
-        K: intrinsics at this size, in pixels.
-    """
-
-    image: Float[Tensor, "H W 3"]
-    mask: Bool[Tensor, "H W"] | None
-    depth: Float[Tensor, "H W"] | None
-    K: Float[Tensor, "3 3"]
+    image: Float[Tensor, "H W 3"]  # RGB in [0, 1]
+    mask: Bool[Tensor, "H W"] | None  # pixels to look at; None = all
+    depth: Float[Tensor, "H W"] | None  # z in world units, 0 = unknown; None where there is no sensor
+    K: Float[Tensor, "3 3"]  # intrinsics at this size, in pixels
+    # Pixels in which nothing is to be seen; None = nothing is known to be empty.
     empty: Bool[Tensor, "H W"] | None = None
 
     @property

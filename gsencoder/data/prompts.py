@@ -1,6 +1,6 @@
-"""Prompts on disk: what a VLM was or will be told and shown, prepared once and read many times.
+"""Prompts on disk: the words and pictures for a VLM, prepared once and read many times.
 
-A folder has `prompts.jsonl`, one line a prompt, and beside it its pictures, encoded as they are sent, and tokens. These
+A folder has `prompts.jsonl`, one line a prompt, its pictures, encoded as they are sent, and tokens. These
 files are called by the digest of what is in them, so that questions about the same thing share theirs.
 """
 
@@ -26,19 +26,12 @@ PROMPTS_FILE, PICTURES_FOLDER, TOKENS_FOLDER = "prompts.jsonl", "pictures", "tok
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredPrompt:
-    """A prompt in a store.
+    """A prompt in a store."""
 
-    Attributes:
-        text: the words.
-        pictures: names of the files of its pictures, in their order.
-        tokens: name of the file of rendered features, one set of tokens a picture; empty = none.
-        space: of these features, for people and to tell one from another.
-    """
-
-    text: str
-    pictures: tuple[str, ...]
-    tokens: str = ""
-    space: str = ""
+    text: str  # the words
+    pictures: tuple[str, ...]  # names of the files of its pictures, in their order
+    tokens: str = ""  # name of the file of rendered features, one set of tokens a picture; empty = none
+    space: str = ""  # of these features, for people and to tell one from another
 
 
 class PromptStore:
@@ -66,7 +59,7 @@ class PromptStore:
                 self._take(unsealed(json.loads(line)))
             except (ValueError, KeyError, TypeError, RecursionError) as error:
                 raise InputError(
-                    f"{path}: line {number} is no prompt, or not as it was written; remove the folder to make it anew"
+                    f"{path}: line {number} is no prompt, or damaged; remove the folder to make it again"
                 ) from error
 
     def _take(self, row: Mapping[str, Any]) -> None:
@@ -141,10 +134,10 @@ class PromptStore:
         try:
             data = read_foreign(path)
             if sha256(data).hexdigest()[:32] != path.stem:
-                raise InputError(f"{path}: is damaged; remove {self.folder} to prepare it anew")
+                raise InputError(f"{path}: is damaged; remove {self.folder} to prepare it again")
             return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
         except OSError as error:
-            raise InputError(f"{path}: cannot be read; remove {self.folder} to prepare it anew") from error
+            raise InputError(f"{path}: cannot be read; remove {self.folder} to prepare it again") from error
 
     def tokens(self, name: str) -> Float16[np.ndarray, "V P D"]:
         """Rendered features of the pictures of a prompt."""

@@ -77,9 +77,7 @@ def read_bank(file: Archive, components: Float32[np.ndarray, "M D"], space: Feat
     )
 
 
-def scaled_halves(
-    values: Float32[np.ndarray, "n C"],
-) -> tuple[Float16[np.ndarray, "n C"], Float32[np.ndarray, " C"]]:
+def scaled_halves(values: Float32[np.ndarray, "n C"]) -> tuple[Float16[np.ndarray, "n C"], Float32[np.ndarray, " C"]]:
     """Values as float16, and what each channel was divided by: its largest magnitude, or 1."""
     largest = np.abs(values).max(axis=0, initial=0)
     scale = np.where(largest > 0, largest, 1).astype(np.float32)

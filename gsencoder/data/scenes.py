@@ -1,10 +1,4 @@
-"""Loading of scenes in any supported layout, or of a splat alone.
-
-Paths of scenes: which paths are scenes, the scenes in folders and lists of paths, and their names; and what other
-paths are.
-
-Judged by names of files alone; `scenes.py` reads them.
-"""
+"""Loading of scenes in any supported layout, or of a splat alone, and which paths are scenes, by names of files."""
 
 import json
 import math
@@ -12,7 +6,7 @@ import os
 import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -22,13 +16,14 @@ from jaxtyping import Float64, UInt8
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import SUMMARY_NAME, UNFINISHED_FILE, read_foreign_text
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.labels.scans import (
     labels_of_layout,
     objects_of_labels,
     with_archived_instances,
     with_mesh_instances,
 )
-from gsencoder.data.readers.depth_images import DepthFiles, DepthMeasure, DepthSensor
+from gsencoder.data.readers.depth_images import DepthFiles
 from gsencoder.data.readers.images import (
     ImageFiles,
     InstanceFiles,
@@ -41,26 +36,31 @@ from gsencoder.data.readers.images import (
 )
 from gsencoder.data.readers.layouts import (
     SPLAT_SUFFIXES,
-    ReadOptions,
     describe_layouts,
     file_of_scene,
     find_splat,
     layout_of,
     read_bare_splat,
-    read_transforms_file,
     warn_of_unused_splat,
 )
 from gsencoder.data.readers.masks import EmptyFiles, MaskFiles, find_background
-from gsencoder.data.readers.posed import MAX_COORDINATE, PosedImage, PosedImages, choose_origin, rigid_pose
-from gsencoder.data.readers.transforms_json import TRANSFORMS, read_objects
+from gsencoder.data.readers.posed import (
+    MAX_COORDINATE,
+    DepthMeasure,
+    PosedImage,
+    PosedImages,
+    ReadOptions,
+    choose_origin,
+    rigid_pose,
+)
+from gsencoder.data.readers.transforms_json import TRANSFORMS, read_objects, read_transforms
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
 from gsencoder.data.splats.files import load_splat
 from gsencoder.types import Cameras, Scene, Views
 from gsencoder.types.checks import invert_rigid, move_origin
 from gsencoder.types.orientation import EXCHANGED, INVERSE, UNMIRRORED
 
-FEATURES_FILE = "scene.safetensors"
-"""The file by which a folder of features, or of a memory of a scene, is recognized."""
+FEATURES_FILE = "scene.safetensors"  # The file by which a folder of features, or of a memory of a scene, is recognized
 
 
 def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
@@ -68,55 +68,41 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
 
     A folder is a scene if `load_scene` recognizes it; of any other folder the direct subfolders are searched.
     """
-    scenes = DistinctPaths()
+    scenes: list[Path] = []
     for path in listed_paths(paths):
         try:
             if not path.exists():
                 raise InputError(f"{path}: no such file or folder")
-            scenes_of_path = [path] if is_scene(path) else sorted(filter(_is_scene_folder, path.iterdir()))
+            inner = [path] if is_scene(path) else sorted(filter(_is_scene_folder, path.iterdir()))
+        except InputError:
+            raise
         except (OSError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
             raise InputError(f"{str(path)[:200]!r} cannot be read ({type(error).__name__})") from error
-        if not scenes_of_path and (path / FEATURES_FILE).is_file():
-            raise InputError(
-                f"{path}: a folder of features, not a scene; localize, views, ask, pack and evaluate features= take it"
-            )
-        if not scenes_of_path:
-            raise InputError(
-                f"{path}: {kind_of_path(path)}, neither a scene nor a folder of scenes; a scene holds one of: "
-                f"{describe_layouts()}; a splat"
-            )
-        scenes.add(scenes_of_path)
-    return scenes.paths
+        if not inner and (path / FEATURES_FILE).is_file():
+            raise InputError(f"{path}: a folder of features, not a scene; localize, views, ask and pack take it")
+        if not inner:
+            kind = kind_of_path(path)
+            raise InputError(f"{path}: {kind}, neither a scene nor a folder of scenes; {describe_layouts()}")
+        scenes += inner
+    return distinct_paths(scenes)
 
 
-class DistinctPaths:
-    """Paths of scenes, of which none is given twice: whether the second was meant to be another, nobody can tell."""
-
-    def __init__(self) -> None:
-        self._by_target: dict[Path, Path] = {}
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        """In the order in which they were added."""
-        return tuple(self._by_target.values())
-
-    def add(self, paths: Iterable[Path]) -> None:
-        """Adds paths."""
-        for path in paths:
-            target = path.resolve()
-            first = self._by_target.get(target)
+def distinct_paths(paths: Iterable[Path]) -> tuple[Path, ...]:
+    """The paths; InputError where one is given twice, also under another name or by a link."""
+    by_target: dict[Path, Path] = {}
+    for path in paths:
+        target = path.resolve()
+        if (first := by_target.get(target)) is not None:
             if first == path:
                 raise InputError(f"{path}: is given twice; give it once")
-            if first is not None:
-                raise InputError(f"{path}: is the same as {first}, which is given as well; give one of them")
-            self._by_target[target] = path
+            raise InputError(f"{path}: is the same as {first}, which is given as well; give one of them")
+        by_target[target] = path
+    return tuple(by_target.values())
 
 
 def listed_paths(paths: Iterable[str | Path]) -> list[Path]:
     """Paths, with those in list files in place of the files: text files (.txt) with one path a line, relative to the
-    file; blank lines and those that begin with # are left out."""
+    file; blank lines and comments (#) are left out."""
     result: list[Path] = []
     for path in map(Path, paths):
         try:
@@ -153,7 +139,7 @@ def _is_scene_folder(entry: Path) -> bool:
 
 
 def has_views(path: Path) -> bool:
-    """Whether a path is a scene with posed views, as opposed to a splat, judged by names of files alone."""
+    """Whether a path is a scene with posed views, as opposed to a splat, by names of files alone."""
     return is_transforms_file(path) if path.is_file() else layout_of(path) is not None
 
 
@@ -181,14 +167,13 @@ def check_names(paths: Sequence[Path]) -> None:
         name = scene_name(path)
         if name in first:
             raise InputError(
-                f"{path} and {first[name]} are both called {name!r}, so their results would be in one folder; "
-                "rename one, or run them with different out="
+                f"{path} and {first[name]} are both called {name!r}; rename one, or run them with different out="
             )
         first[name] = path
 
 
 def kind_of_path(path: str | Path) -> str:
-    """What a path is, judged by names of files and by the record of the run that wrote it: such as "a folder that
+    """What a path is, by names of files and by the record of the run that wrote it: such as "a folder that
     `gsencoder fuse` wrote", or "an empty folder"."""
     path = Path(path)
     with suppress(OSError, ValueError):
@@ -222,10 +207,8 @@ def _kind_of_folder(folder: Path) -> str:
 
 
 FEW_CAMERAS = 8
-FEWEST_STEPS = 64
-"""Integer depth images whose largest value is smaller have lost most of what was measured."""
-MEASURED = 0.05
-"""Where depth was measured on a larger share of it, what looks like a background is a wall."""
+FEWEST_STEPS = 64  # Integer depth images whose largest value is smaller have lost most of what was measured
+MEASURED = 0.05  # Where depth was measured on a larger share of it, what looks like a background is a wall
 
 
 def make_views(
@@ -272,12 +255,13 @@ def make_views(
         widths=np.array([grid.width for grid in grids], np.int32),
         heights=np.array([grid.height for grid in grids], np.int32),
     )
-    depths = [image.depth for image in images]
     masks = [image.mask for image in images]
     instances = [image.instance for image in images]
     partial = _have_empty_pixels({(grid.pinhole, grid.source, grid.reduction) for grid in grids}, remaps)
     background = None
-    if mask_background and not _any(masks) and not _any(transparent) and not any(map(_is_fisheye, images)):
+    # A fisheye picture may be a disc in a black frame.
+    is_plain = not (_any(masks) or _any(transparent) or any("FISHEYE" in image.camera.model for image in images))
+    if mask_background and is_plain:
         background = find_background([image.image for image in images])
     outlined = transparent if background is None else [image.image for image in images]
     has_outlines = _any(outlined)
@@ -285,9 +269,7 @@ def make_views(
         cameras=cameras,
         names=tuple(image.name for image in images),
         images=ImageFiles([image.image for image in images], grids, remaps),
-        depths=DepthFiles(depths, depth_grids, remaps, [_depth_sensor(image) for image in images])
-        if _any(depths)
-        else None,
+        depths=DepthFiles(images, depth_grids, remaps) if _any([image.depth for image in images]) else None,
         masks=MaskFiles(masks, grids, remaps, outlined, background) if _any(masks) or has_outlines or partial else None,
         empty=EmptyFiles(masks, grids, remaps, outlined, background) if has_outlines else None,
         instances=InstanceFiles(instances, grids, remaps) if _any(instances) else None,
@@ -333,11 +315,6 @@ def _warn_of_odd_files(source: str, images: Sequence[PosedImage]) -> None:
             )
 
 
-def _is_fisheye(image: PosedImage) -> bool:
-    """Whether the picture may be a disc in a black frame."""
-    return "FISHEYE" in image.camera.model
-
-
 def _is_measured(views: Views) -> bool:
     """Whether a sensor saw surfaces where the background is."""
     if views.depths is None or views.empty is None:
@@ -345,16 +322,6 @@ def _is_measured(views: Views) -> bool:
     rows = even_indices(len(views), 4)
     shares = [float((views.depths[int(row)][views.empty[int(row)]] > 0).mean()) for row in rows]
     return float(np.nan_to_num(shares).mean()) > MEASURED
-
-
-def _depth_sensor(image: PosedImage) -> DepthSensor:
-    transform = image.depth_from_color
-    return DepthSensor(
-        scale=image.depth_scale,
-        no_depth=image.no_depth,
-        measure=image.depth_measure,
-        color_from_depth=None if transform is None else invert_rigid(transform),
-    )
 
 
 def _any(paths: Sequence[Path | None]) -> bool:
@@ -368,14 +335,12 @@ def _check_sizes(image: PosedImage, grid: PixelGrid, depth_grid: PixelGrid, size
         raise InputError(f"{where}: {image.image} is listed as photograph and as depth image; list the photograph")
     if (size[::-1] if grid.is_exchanged(*size) else size) != (camera.width, camera.height):
         raise InputError(
-            f"{where}: {image.image} has {size[0]}×{size[1]} pixels but its camera {camera.width}×{camera.height}; "
-            "give the images at the size of the intrinsics (image_scale makes them smaller on load)"
+            f"{where}: {image.image} has {size[0]}×{size[1]} pixels but its camera {camera.width}×{camera.height}"
         )
     for file, expected in ((image.depth, depth_grid), (image.mask, grid), (image.instance, grid)):
         if file is not None and not expected.fits(*(actual := picture_size(file))):
             raise InputError(
-                f"{where}: {file} has {actual[0]}×{actual[1]} pixels but {image.image} has {size[0]}×{size[1]}; "
-                "both must have the same shape"
+                f"{where}: {file} has {actual[0]}×{actual[1]} pixels but {image.image} has {size[0]}×{size[1]}"
             )
 
 
@@ -396,69 +361,41 @@ def _warn(message: str) -> None:
 class SceneConfig:
     """Options of reading a scene."""
 
-    allow_outside: bool = field(default=False, metadata={"help": "allow files outside the folder of the scene"})
-    max_views: int = field(default=0, metadata={"help": "largest number of views, evenly spaced; 0 = all"})
-    depth_scale: float | None = field(
-        default=None, metadata={"help": "world units for one step of a depth file; empty = that of the format"}
+    allow_outside: bool = option(False, "allow files outside the folder of the scene")
+    max_views: int = option(0, "largest number of views, evenly spaced; 0 = all", ge=0)
+    depth_measure: DepthMeasure | None = option(
+        None, "what depth files hold: z, or ray, the distance from the camera; empty = that of the files"
     )
-    depth_measure: DepthMeasure | None = field(
-        default=None,
-        metadata={"help": "what depth files hold: z, or ray, the distance from the camera; empty = that of the files"},
+    image_scale: float = option(
+        1.0, "factor in (0, 1] by which pictures, depth maps, masks and intrinsics are downscaled", gt=0, le=1
     )
-    image_scale: float = field(
-        default=1.0,
-        metadata={"help": "factor in (0, 1] by which pictures, depth maps, masks and intrinsics are downscaled"},
+    metres_per_unit: float | None = option(None, "meters in a world unit; empty = that of the files", gt=0, lt=math.inf)
+    up: tuple[float, float, float] | None = option(
+        None, "the world's up, three numbers of any length; empty = that of the files, else an estimate"
     )
-    metres_per_unit: float | None = field(
-        default=None, metadata={"help": "meters in a world unit; empty = that of the files"}
+    images: str = option("", "folder of the photographs of a COLMAP model; empty = images/ next to the model")
+    background: Literal["auto", "none"] = option(
+        "auto",
+        "auto = a background of one color, around the object in nearly all photographs, is masked and taken for empty "
+        "space; none = photographs are used as they are (transparency is masked in any case)",
     )
-    up: tuple[float, float, float] | None = field(
-        default=None,
-        metadata={"help": "the world's up, three numbers of any length; empty = that of the files, else an estimate"},
+    check_fit: bool = option(True, "refuse a splat that does not fit the photographs, where it fits in another frame")
+    intrinsics: tuple[float, float, float, float] | None = option(
+        None, "fx, fy, cx, cy of the photographs, pixels, no distortion; empty = those of the files"
     )
-    images: str = field(
-        default="", metadata={"help": "folder of the photographs of a COLMAP model; empty = images/ beside the model"}
+    depth_intrinsics: tuple[float, float, float, float] | None = option(
+        None, "fx, fy, cx, cy of the depth images; empty = those of the files"
     )
-    background: Literal["auto", "none"] = field(
-        default="auto",
-        metadata={
-            "help": "auto = a background of one color, around the object in nearly all photographs, is masked and "
-            "taken for empty space; none = photographs are used as they are (transparency is masked in any case)"
-        },
-    )
-    check_fit: bool = field(
-        default=True,
-        metadata={"help": "refuse a splat that does not fit the photographs, where it fits in another frame"},
-    )
-    intrinsics: tuple[float, float, float, float] | None = field(
-        default=None,
-        metadata={"help": "fx, fy, cx, cy of the photographs, pixels, no distortion; empty = those of the files"},
-    )
-    depth_intrinsics: tuple[float, float, float, float] | None = field(
-        default=None, metadata={"help": "fx, fy, cx, cy of the depth images; empty = those of the files"}
-    )
-    depth_from_color: tuple[float, ...] | None = field(
-        default=None,
-        metadata={
-            "help": "where the depth sensor stands: 12 or 16 numbers of the rigid transform from the photograph's "
-            "camera "
-            "axes to its own, row by row, world units; empty = that of the files"
-        },
+    depth_from_color: tuple[float, ...] | None = option(
+        None,
+        "where the depth sensor stands: 12 or 16 numbers of the rigid transform from the photograph's camera axes to "
+        "its own, row by row, world units; empty = that of the files",
     )
 
     def __post_init__(self) -> None:
-        if self.max_views < 0:
-            raise InputError(f"max_views: expected 0 (all) or more, got {self.max_views}")
-        if not 0 < self.image_scale <= 1:
-            raise InputError(f"image_scale: expected a number above 0 and at most 1, got {self.image_scale}")
-        for name in ("depth_scale", "metres_per_unit"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name}: expected a positive number, got {value}")
+        check_limits(self)
         if self.up is not None and not 1e-6 < math.hypot(*self.up) < 1e6:
             raise InputError(f"up: expected three finite numbers that are not all zero, got {list(self.up)}")
-        if self.background not in ("auto", "none"):
-            raise InputError(f"background: expected auto or none, got {self.background!r}")
         if self.depth_from_color is not None and len(self.depth_from_color) not in (12, 16):
             raise InputError(f"depth_from_color: expected 12 or 16 numbers, got {len(self.depth_from_color)}")
 
@@ -475,10 +412,10 @@ def load_scene(path: str | Path, *, splat: str | Path | None = None, options: Sc
     Args:
         splat: the Gaussians of a scene that has views; relative to the scene or else to the current folder, with
             {scene} for the name of the scene's folder. They must be in the world of the cameras. Without it a splat
-            beside the views is not used.
+            next to the views is not used.
 
     Returns:
-        A scene with views, or with Gaussians only, or both. A ScanNet or ScanNet++ scene whose label files lie beside
+        A scene with views, or with Gaussians only, or both. A ScanNet or ScanNet++ scene whose label files lie with
         it has objects, and where there are no pictures of instances, maps that are drawn from the labeled mesh on
         access. `views.masks` exists if there are mask files, transparency, a background of one color, or pinhole
         pixels that the distorted picture does not cover.
@@ -559,28 +496,25 @@ def read_posed(root: Path, options: SceneConfig = SceneConfig()) -> tuple[PosedI
     """The posed images of an existing folder or file as its files describe them, the folder of the scene, and the name
     of the layout; None and "splat" where there are no views."""
     read_options = ReadOptions(
-        allow_outside=options.allow_outside,
-        depth_scale=options.depth_scale,
-        images=options.images,
-        intrinsics=options.intrinsics,
+        allow_outside=options.allow_outside, images=options.images, intrinsics=options.intrinsics
     )
     if root.is_file():
         if not is_transforms_file(root):
             return None, root.parent, "splat"
         name = "transforms.json"
-        posed, folder = read_transforms_file(root, read_options)
+        posed, folder = read_transforms(root, read_options), root.parent
     else:
         layout = layout_of(root)
         if layout is None:
             return None, root, "splat"
         name = layout.name
         posed, folder = layout.read(root, read_options)
-    images = tuple(_with_stated_sensors(image, options) for image in posed.images)
+    images = tuple(_with_given_sensors(image, options) for image in posed.images)
     return replace(posed, images=images), folder, name
 
 
-def _with_stated_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
-    """A view with the intrinsics and the depth sensor that the user states."""
+def _with_given_sensors(image: PosedImage, options: SceneConfig) -> PosedImage:
+    """A view with the intrinsics and the depth sensor that the user gives."""
     if options.intrinsics is not None:
         fx, fy, cx, cy = options.intrinsics
         size = image.camera.width, image.camera.height

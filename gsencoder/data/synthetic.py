@@ -22,19 +22,12 @@ from gsencoder.types.checks import OPENCV_FROM_OPENGL
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Solid:
-    """A convex solid that is turned about the vertical axis.
+    """A convex solid that is turned about the vertical axis."""
 
-    Attributes:
-        shape: box, ellipsoid, or cylinder (upright, elliptic).
-        center: metres.
-        half: half extents along its own axes.
-        yaw: radians about +z.
-    """
-
-    shape: Literal["box", "ellipsoid", "cylinder"]
-    center: Float64[np.ndarray, "3"]
-    half: Float64[np.ndarray, "3"]
-    yaw: float = 0.0
+    shape: Literal["box", "ellipsoid", "cylinder"]  # box, ellipsoid, or cylinder (upright, elliptic)
+    center: Float64[np.ndarray, "3"]  # metres
+    half: Float64[np.ndarray, "3"]  # half extents along its own axes
+    yaw: float = 0.0  # radians about +z
 
     @property
     def world_from_local(self) -> Float64[np.ndarray, "3 3"]:
@@ -170,34 +163,22 @@ COLORS: dict[str, tuple[int, int, int]] = {
 OBJECT_COLORS = ("red", "blue", "yellow", "green", "purple", "pink", "orange", "black")
 HALF_ROOM = (1.7, 1.5)
 WALL_HEIGHT = 1.8
-TABLE = (0.78, 0.52, 0.72)
-"""Half width, half depth, height of the table in the middle."""
-SHELF = (0.65, 0.16, 0.9)
-"""Half width, half depth, height of the shelf at the wall y = +1.5."""
-GAP = 0.03
-"""Least distance between two objects."""
+TABLE = (0.78, 0.52, 0.72)  # Half width, half depth, height of the table in the middle
+SHELF = (0.65, 0.16, 0.9)  # Half width, half depth, height of the shelf at the wall y = +1.5
+GAP = 0.03  # Least distance between two objects
 FLOOR_ID, WALL_ID, TABLE_ID, SHELF_ID, FIRST_ID = 1, 2, 3, 4, 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PlannedObject:
-    """A thing in a room.
+    """A thing in a room."""
 
-    Attributes:
-        id: its value in the instance maps.
-        name: an English noun of the name table; None for floor and walls.
-        color: its word in COLORS.
-        parts: what it is made of, in world coordinates.
-        pattern: how its color varies: plain, bands, or checks.
-        placed: False for the room and its furniture.
-    """
-
-    id: int
-    name: str | None
-    color: str
-    parts: tuple[Solid, ...]
-    pattern: str = "bands"
-    placed: bool = True
+    id: int  # its value in the instance maps
+    name: str | None  # an English noun of the name table; None for floor and walls
+    color: str  # its word in COLORS
+    parts: tuple[Solid, ...]  # what it is made of, in world coordinates
+    pattern: str = "bands"  # how its color varies: plain, bands, or checks
+    placed: bool = True  # False for the room and its furniture
 
     def aabb(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """The exact axis-aligned box of all parts."""
@@ -329,7 +310,7 @@ def _furniture() -> tuple[PlannedObject, ...]:
 
 
 _CATALOGUE: dict[str, tuple[bool, Callable[[], tuple[Solid, ...]]]] = {
-    # name: (stands on the floor, parts around the origin with their feet at z = 0)
+    # Name: (stands on the floor, parts around the origin with their feet at z = 0)
     "mug": (False, lambda: (_cylinder(0.05, 0.11), _box(0.04, 0.02, 0.06, (0.065, 0, 0.025)))),
     "book": (False, lambda: (_box(0.24, 0.17, 0.045, (0, 0, 0)),)),
     "ball": (False, lambda: (_ball(0.09, 0.09, 0.09),)),
@@ -448,25 +429,17 @@ def _write_views(scene: Scene, views: Views, folder: Path) -> None:
 
 __all__ = ["color_words", "make_room", "plan_room", "write_room"]
 
-FOCAL = 0.7
-"""Focal length as a share of the width: 71° from side to side."""
+FOCAL = 0.7  # Focal length as a share of the width: 71° from side to side
 AMBIENT = 0.6
 LIGHT = np.array([0.35, -0.5, 0.79])
 CELLS_ACROSS = 6
-"""A part of an object has at least so many Gaussians across its middle extent, however coarse the spacing is."""
-FINEST = 0.008
-"""… but none closer than this, metres."""
+"""A part of an object has at least this many Gaussians across its middle extent, however coarse the spacing is."""
+FINEST = 0.008  # … but none closer than this, metres
 CONTACT = 1e-4
 
 
 def make_room(
-    seed: int = 0,
-    *,
-    objects: int = 8,
-    views: int = 16,
-    width: int = 160,
-    height: int = 120,
-    spacing: float = 0.04,
+    seed: int = 0, *, objects: int = 8, views: int = 16, width: int = 160, height: int = 120, spacing: float = 0.04
 ) -> Scene:
     """A room of 3.4 × 3 m with a table, a shelf and named objects on them, in metres with z up.
 

@@ -27,24 +27,18 @@ from gsencoder.data.enclosure import (
 from gsencoder.types import Cameras, Scene
 from gsencoder.types.orientation import upright_views
 
-ALIGNED = np.deg2rad(6.0)
-"""Width of the bell by which normals count as parallel or perpendicular."""
-STANDING_WEIGHT = 0.5
-"""A wall says less about up than a floor: it is perpendicular to many directions."""
-MAX_TILT = np.deg2rad(40.0)
-"""Up lies within this angle of what the cameras say."""
-DIRECTIONS = 4000
-"""Candidates on the sphere, about 3° apart."""
+ALIGNED = float(np.deg2rad(6.0))  # Width of the bell by which normals count as parallel or perpendicular; float32 stays
+STANDING_WEIGHT = 0.5  # A wall says less about up than a floor: it is perpendicular to many directions
+MAX_TILT = np.deg2rad(40.0)  # Up lies within this angle of what the cameras say
+DIRECTIONS = 4000  # Candidates on the sphere, about 3° apart
 REFINEMENTS = 10
-MIN_CONFIDENCE = 0.1
-"""Below this, surfaces alone say nothing about up."""
+MIN_CONFIDENCE = 0.1  # Below this, surfaces alone say nothing about up
 MIN_CONFIDENCE_NEAR_USUAL = 0.05
 """The same within `MAX_TILT` of -y, which is up in the worlds of COLMAP and of most splats, and what is assumed where
 surfaces say nothing."""
 ENOUGH_CONFIDENCE = 0.3
 """With this confidence in the normals of Gaussians, planes through their means are not looked at."""
-FLOOR_THICKNESS = 0.01
-"""Thickness of the slices in which floors are sought, as a share of the scene's extent along up."""
+FLOOR_THICKNESS = 0.01  # Thickness of the slices in which floors are sought, as a share of the scene's extent along up
 NEAR_USUAL_WEIGHT = 2.0
 """Factor of the floor of an axis of a bare splat within `MAX_TILT` of -y. In rooms the true floor has more than three
 times the area of the largest wall at an end; where hardly any floor was photographed, this decides."""
@@ -52,26 +46,20 @@ times the area of the largest wall at an end; where hardly any floor was photogr
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Up:
-    """An estimated direction.
+    """An estimated direction."""
 
-    Attributes:
-        direction: unit vector in the world.
-        confidence: from 0 to 1: the share of the surfaces that lie or stand under it, above what a random direction
-            would have; of cameras alone, how level they stand.
-        source: stated, cameras, surfaces, or cameras and surfaces.
-        from_cameras: angle in radians between it and what the cameras say; None without cameras.
-    """
-
-    direction: Float64[np.ndarray, "3"]
+    direction: Float64[np.ndarray, "3"]  # unit vector in the world
+    # From 0 to 1: the share of the surfaces that lie or stand under it, above what a random direction would have; of
+    # cameras alone, how level they stand.
     confidence: float
-    source: str
-    from_cameras: float | None
+    source: str  # files, cameras, surfaces, or cameras and surfaces
+    from_cameras: float | None  # angle in radians between it and what the cameras say; None without cameras
 
     def describe(self) -> str:
         """The direction and how it is known, for people."""
         direction = ", ".join(f"{value + 0.0:.3f}" for value in self.direction)
-        if self.source == "stated":
-            return f"({direction}), stated"
+        if self.source == "files":
+            return f"({direction}), of the files"
         return f"({direction}), estimated from {self.source}, confidence {self.confidence:.2f}"
 
     def to_dict(self) -> dict[str, Any]:
@@ -102,7 +90,7 @@ def up_of_scene(scene: Scene) -> Up | None:
     on nothing either (`MIN_CONFIDENCE`), as on one soft object, level cameras alone say more.
     """
     if scene.up is not None:
-        return Up(direction=scene.up, confidence=1.0, source="stated", from_cameras=None)
+        return Up(direction=scene.up, confidence=1.0, source="files", from_cameras=None)
     cameras = upright_views(scene.views).cameras if scene.views is not None else None
     surfaces = None
     if scene.gaussians is not None:
@@ -156,7 +144,10 @@ def estimate_up(surfaces: Surfaces | None, cameras: Cameras | None) -> Up:
     areas = np.minimum(areas, np.quantile(areas, 0.95))
     areas = areas / (areas.sum() + rest)
     candidates = _sphere(DIRECTIONS)
-    if prior is not None:
+    if prior is None:
+        # An axis and its opposite have the same support.
+        candidates = candidates[: DIRECTIONS // 2]
+    else:
         candidates = np.concatenate((prior[None], candidates[candidates @ prior >= np.cos(MAX_TILT)]))
     scores = _support(candidates, normals, areas)
     best = _refine(candidates[scores.argmax()], normals, areas)

@@ -4,7 +4,7 @@ import json
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,32 +13,25 @@ import numpy as np
 from jaxtyping import Float, Int64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning, listed
-from gsencoder.core.files import atomic_file, check_foreign, read_foreign_text, sha256_of
+from gsencoder.core.files import check_foreign, read_foreign_text, write_json, write_picture
 from gsencoder.core.process import Track, untracked
+from gsencoder.core.settings import check_limits, option
 
-SIZE = 640
-"""Longer side in pixels of the pictures whose sharpness is measured; motion is measured at half of it."""
-BLOCK = 64
-"""Side in pixels of the blocks whose motion is measured."""
+SIZE = 640  # Longer side in pixels of the pictures whose sharpness is measured; motion is measured at half of it
+BLOCK = 64  # Side in pixels of the blocks whose motion is measured
 CONTRAST = 3.0
 """Blocks whose gray levels, of 255, have a smaller standard deviation show nothing that could be seen moving."""
-CLEAR = 0.1
-"""Height of the peak of a phase correlation, of 1, from which on it is no noise."""
-MOVED = 8.0
-"""Motion in pixels after which a picture is compared with a newer one."""
-EDGE = 0.5
-"""What the sharpness of a frame counts midway between two positions, where that of a frame at one counts 1."""
+CLEAR = 0.1  # Height of the peak of a phase correlation, of 1, from which on it is no noise
+MOVED = 8.0  # Motion in pixels after which a picture is compared with a newer one
+EDGE = 0.5  # What the sharpness of a frame counts midway between two positions, where that of a frame at one counts 1
 
 
 class Course(NamedTuple):
-    """What happens in a video.
+    """What happens in a video."""
 
-    Attributes:
-        positions: how far the picture has moved since the first frame, in widths of the picture; never falls.
-        sharpness: variance of the Laplacian of each frame, comparable between frames that show the same.
-    """
-
+    # How far the picture has moved since the first frame, in widths of the picture; never falls.
     positions: Float[np.ndarray, " F"]
+    # Variance of the Laplacian of each frame, comparable between frames that show the same.
     sharpness: Float[np.ndarray, " F"]
 
 
@@ -108,8 +101,8 @@ def choose_frames(course: Course, *, motion: float, most: int, least: int) -> In
 
     Args:
         motion: wanted distance between two frames in widths of the picture.
-        most: so many frames at most; they stand farther apart where that is too few.
-        least: so many at least, closer together where the picture moves little.
+        most: largest number of frames; they stand farther apart where that is too few.
+        least: smallest number, closer together where the picture moves little.
     """
     total = float(course.positions[-1])
     if total < motion:
@@ -142,8 +135,7 @@ def _halved(picture: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "h w"]:
     return halves
 
 
-TIME_BASE = 1_000_000
-"""Parts of a second in which files state how long they are."""
+TIME_BASE = 1_000_000  # Parts of a second in which files state how long they are
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
 
@@ -225,7 +217,7 @@ def grey_picture(frame: Any, size: int) -> UInt8[np.ndarray, "H W"]:
     """Brightness of a frame as stored, not rotated.
 
     Args:
-        size: its longer side becomes so many pixels at most.
+        size: its longer side becomes at most this many pixels.
     """
     width, height = _fitted(frame.width, frame.height, size)
     grey: np.ndarray = frame.reformat(width=width, height=height, format="gray").to_ndarray()
@@ -236,7 +228,7 @@ def color_picture(frame: Any, size: int, pixel_aspect: float = 1.0) -> UInt8[np.
     """RGB of a frame as it is meant to be seen: rotated as the file states, with square pixels.
 
     Args:
-        size: its longer side becomes so many pixels at most.
+        size: its longer side becomes at most this many pixels.
         pixel_aspect: width of a stored pixel by its height.
     """
     width, height = _fitted(round(frame.width * pixel_aspect), frame.height, size)
@@ -254,33 +246,24 @@ def _reason(error: BaseException) -> str:
 
 
 RECORD_FILE = "frames.json"
-FEWEST = 16
-"""So many frames are taken of a video in which the picture moves little."""
-THIN = 0.35
-"""Frames that are farther apart, in widths of the picture, overlap too little to be registered surely."""
-ENOUGH = 0.98
-"""A video of which a smaller share can be decoded, less a second for its last frames, is not whole."""
-QUALITY = 95
-"""Of the JPEG files."""
+FEWEST = 16  # Frames that are taken of a video in which the picture moves little
+THIN = 0.35  # Frames that are farther apart, in widths of the picture, overlap too little to be registered surely
+ENOUGH = 0.98  # A video of which a smaller share can be decoded, less a second for its last frames, is not whole
+QUALITY = 95  # Of the JPEG files
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VideoConfig:
     """Which frames of a video become photographs."""
 
-    frames: int = field(default=100, metadata={"help": "most frames that are taken of a video"})
-    motion: float = field(
-        default=0.08, metadata={"help": "by what share of its width the picture moves from one frame to the next"}
+    frames: int = option(100, "most frames that are taken of a video", ge=3)
+    motion: float = option(
+        0.08, "by what share of its width the picture moves from one frame to the next", ge=0.001, le=1
     )
-    pixels: int = field(default=1600, metadata={"help": "longer side of the frames in pixels, at most"})
+    pixels: int = option(1600, "longer side of the frames in pixels, at most", ge=64, le=16384)
 
     def __post_init__(self) -> None:
-        if self.frames < 3:
-            raise InputError(f"frames: expected at least 3, got {self.frames}")
-        if not 0.001 <= self.motion <= 1:
-            raise InputError(f"motion: expected a share of the width from 0.001 to 1, got {self.motion}")
-        if not 64 <= self.pixels <= 16384:
-            raise InputError(f"pixels: expected 64 to 16384, got {self.pixels}")
+        check_limits(self)
 
 
 def take_frames(
@@ -288,7 +271,7 @@ def take_frames(
 ) -> tuple[str, ...]:
     """Writes the frames of a video that show most: sharp ones, evenly spaced by how far the picture moves.
 
-    The video is decoded twice: small, to measure motion and sharpness of all frames, and large, for those that are
+    The video is decoded twice: small, to measure motion and sharpness of all frames, and large, for the frames that are
     taken. A folder that an earlier call completed for the same file and settings is used again.
 
     Args:
@@ -335,12 +318,12 @@ def take_frames(
     for index, frame in track(enumerate(video.frames()), f"taking {len(numbers)} frames"):
         if index in selected:
             names.append(f"frame_{index:06d}.jpg")
-            _write(folder / names[-1], color_picture(frame, config.pixels, video.pixel_aspect))
+            picture = color_picture(frame, config.pixels, video.pixel_aspect)
+            write_picture(folder / names[-1], picture, quality=QUALITY, subsampling=0)
         if index == numbers[-1]:
             break
-    digests = {name: sha256_of(folder / name) for name in names}
-    with atomic_file(folder / RECORD_FILE) as stream:
-        stream.write(json.dumps({"asked": inputs, "files": digests}).encode())
+    # Written last: with it the folder is whole.
+    write_json(folder / RECORD_FILE, {"asked": inputs, "files": names})
     return tuple(names)
 
 
@@ -353,20 +336,12 @@ def _taken(folder: Path, inputs: dict[str, Any]) -> tuple[str, ...] | None:
     """Names of the frames that an earlier call has written, if they are whole and were asked for as now."""
     try:
         record = json.loads(read_foreign_text(folder / RECORD_FILE))
-        files = record["files"]
-        if record["asked"] != inputs or any(sha256_of(folder / name) != digest for name, digest in files.items()):
-            return None
-        return tuple(files)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        is_whole = record["asked"] == inputs and all((folder / name).is_file() for name in record["files"])
+        return tuple(record["files"]) if is_whole else None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
 
 
 def _inputs(path: Path, config: VideoConfig) -> dict[str, Any]:
     state = path.stat()
     return {"video": [path.name, state.st_size, state.st_mtime_ns], "settings": asdict(config)}
-
-
-def _write(path: Path, picture: UInt8[np.ndarray, "H W 3"]) -> None:
-    from gsencoder.core.files import write_picture
-
-    write_picture(path, picture, quality=QUALITY, subsampling=0)

@@ -17,7 +17,7 @@ from gsencoder.core.process import Clock, Track, untracked
 from gsencoder.data.readers.images import check_picture
 from gsencoder.data.readers.posed import inside
 from gsencoder.data.readers.undistort import load_pycolmap
-from gsencoder.data.scenes import DistinctPaths, SceneConfig, find_scenes, is_scene, listed_paths, load_scene
+from gsencoder.data.scenes import SceneConfig, distinct_paths, find_scenes, is_scene, listed_paths, load_scene
 from gsencoder.data.video import SUFFIXES as VIDEO_SUFFIXES
 from gsencoder.data.video import VideoConfig, is_video, take_frames
 from gsencoder.reconstruct.parameters import CHECKPOINT_FILE
@@ -349,7 +349,7 @@ def find_photographed(paths: Sequence[str]) -> tuple[Path, ...]:
     Raises:
         InputError: a path does not exist, holds nothing of the kind, or is given twice.
     """
-    chosen = DistinctPaths()
+    chosen: list[Path] = []
     for path in listed_paths(paths):
         if not path.exists():
             # Not when its turn comes, after hours of others.
@@ -359,8 +359,8 @@ def find_photographed(paths: Sequence[str]) -> tuple[Path, ...]:
             entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
             scenes = [entry for entry in entries if is_video(entry) or (entry.is_dir() and _is_photographed(entry))]
         # Of a path that holds nothing `find_scenes` says what was expected.
-        chosen.add(scenes or find_scenes([path]))
-    return chosen.paths
+        chosen += scenes or find_scenes([path])
+    return distinct_paths(chosen)
 
 
 def _pictures_of(path: Path) -> Path | None:

@@ -13,8 +13,7 @@ from jaxtyping import Float, Float64
 
 from gsencoder.core.errors import InputError
 
-UNIT_TOLERANCE = 1e-3
-"""How far from 1 the norm of a quaternion, and from 0 an entry of RᵀR − I, may be."""
+UNIT_TOLERANCE = 1e-3  # How far from 1 the norm of a quaternion, and from 0 an entry of RᵀR − I, may be
 
 
 def fail(owner: str, name: str, expected: str, got: str) -> None:

@@ -271,10 +271,8 @@ class Localization:
 Scoring = Literal["centered", "cosine", "dot"]
 """How a query is compared with the components: by the cosine after the mean of the space has been subtracted from both,
 by the cosine (M3's released code), or by the product (M3's Eq. 2)."""
-EPS = 1e-6
-"""Smallest length that a projected query is divided by, as in M3's released code."""
-BLOCK_SCORES = 1 << 24
-"""Scores of queries and components that are held at once, 64 MiB."""
+EPS = 1e-6  # Smallest length that a projected query is divided by, as in M3's released code
+BLOCK_SCORES = 1 << 24  # Scores of queries and components that are held at once, 64 MiB
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

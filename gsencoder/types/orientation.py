@@ -22,8 +22,7 @@ TURNS = {
 INVERSE = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
 UNMIRRORED = {1: 1, 2: 1, 3: 3, 4: 3, 5: 6, 6: 6, 7: 8, 8: 8}
 """The rotation with the same up; of mirrored orientations a reflection (2) is left over."""
-EXCHANGED = (5, 6, 7, 8)
-"""Orientations that exchange width and height."""
+EXCHANGED = (5, 6, 7, 8)  # Orientations that exchange width and height
 
 
 def turned(pixels: np.ndarray, orientation: int) -> np.ndarray:

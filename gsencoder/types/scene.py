@@ -28,8 +28,7 @@ from gsencoder.types.checks import (
 )
 from gsencoder.types.features import GaussianFeatures
 
-SH_C0 = 0.5 / math.sqrt(math.pi)
-"""A color is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction."""
+SH_C0 = 0.5 / math.sqrt(math.pi)  # A color is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction
 
 
 def sh_from_colors(colors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 1 3"]:
@@ -260,8 +259,8 @@ class Cameras:
         )
 
     def resized(self, longest: int, *, enlarge: bool = True) -> "Cameras":
-        """The same fields of view in pictures whose longer side has so many pixels; without `enlarge`, at most so
-        many."""
+        """The same fields of view in pictures whose longer side has `longest` pixels; without `enlarge`, at
+        most."""
         factors = longest / np.maximum(self.widths, self.heights)
         if not enlarge:
             factors = np.minimum(factors, 1)
@@ -276,8 +275,7 @@ class Cameras:
         return Cameras(cam_from_world=self.cam_from_world, Ks=Ks, widths=widths, heights=heights)
 
 
-LAZY = ("images", "depths", "masks", "empty", "instances")
-"""Fields of Views that are sequences with one entry a camera."""
+LAZY = ("images", "depths", "masks", "empty", "instances")  # Fields of Views that are sequences with one entry a camera
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -362,7 +360,7 @@ class SceneObject:
         aabb_max: upper corner.
         placed: one of the small objects, as opposed to furniture; of scanned scenes whatever is no part of the building
             (`gsencoder.data.labels.scans.is_placed`).
-        views: in how many views it shows; None where nobody counted (`with_counted_views` of the same module does).
+        views: in how many views it shows; None where not counted (`with_counted_views` of the same module does).
         max_pixels: its largest visible area in a view; None as above.
     """
 
@@ -388,7 +386,7 @@ class Scene:
         metres_per_unit: None where the unit of length is unknown.
         up: unit vector in the world, or None where unknown.
         objects: labeled objects, where the scene has them.
-        sfm_points: structure-from-motion points relative to `origin`, with uint8 colors beside them.
+        sfm_points: structure-from-motion points relative to `origin`, with uint8 colors.
         folder: that the scene was read from; None for one that was made.
     """
 

@@ -18,13 +18,13 @@ SIZE = 64
 
 
 @pytest.fixture(scope="module")
-def alphas() -> list[np.ndarray]:
+def alphas():
     cameras = hemisphere_cameras(6, SIZE)
     return [look(cameras, view)[1] for view in range(6)]
 
 
 @pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def scenes(tmp_path_factory):
     made = {}
     for name in ("transparent", "white", "black", "jpeg"):
         folder = tmp_path_factory.mktemp(name)
@@ -35,17 +35,11 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def views_of(folder: Path, **options: object) -> Views:
-    views = load_scene(folder, options=SceneConfig(**options)).views  # type: ignore[arg-type]
-    assert views is not None
-    return views
+    return load_scene(folder, options=SceneConfig(**options)).views  # type: ignore[arg-type]
 
 
-def test_transparency_is_empty_where_nothing_shows_and_used_where_half_shows(
-    scenes: dict[str, Path], alphas: list[np.ndarray]
-) -> None:
+def test_transparency_is_empty_where_nothing_shows_and_used_where_half_shows(scenes, alphas):
     views = views_of(scenes["transparent"])
-    assert views.masks is not None
-    assert views.empty is not None
     edges = 0
     for view, alpha in enumerate(alphas):
         rounded = np.round(255 * alpha)
@@ -57,14 +51,10 @@ def test_transparency_is_empty_where_nothing_shows_and_used_where_half_shows(
 
 
 @pytest.mark.parametrize("name", ["white", "black", "jpeg"])
-def test_a_background_of_one_color_is_empty_and_no_part_of_the_object_is(
-    scenes: dict[str, Path], alphas: list[np.ndarray], name: str
-) -> None:
+def test_a_background_of_one_color_is_empty_and_no_part_of_the_object_is(scenes, alphas, name):
     color = "black" if name == "black" else "white"
     with pytest.warns(SceneWarning, match=rf"background of one color \({color}, 79% of the pixels\); it is masked"):
         views = views_of(scenes[name])
-    assert views.masks is not None
-    assert views.empty is not None
     for view, alpha in enumerate(alphas):
         used, empty = views.masks[view], views.empty[view]
         assert not (used & empty).any()
@@ -75,34 +65,30 @@ def test_a_background_of_one_color_is_empty_and_no_part_of_the_object_is(
         assert empty[alpha == 0].mean() > 0.93
 
 
-def test_views_are_selected_with_what_is_empty(scenes: dict[str, Path]) -> None:
+def test_views_are_selected_with_what_is_empty(scenes):
     views = views_of(scenes["transparent"])
-    assert views.empty is not None
     few = views.select([3, 1])
-    assert few.empty is not None
     np.testing.assert_array_equal(few.empty[0], views.empty[3])
 
 
-def test_the_background_can_be_kept(scenes: dict[str, Path]) -> None:
+def test_the_background_can_be_kept(scenes):
     views = views_of(scenes["white"], background="none")
     assert views.masks is None
     assert views.empty is None
 
 
-def test_another_background_is_refused(no_jaxtyping: None) -> None:
+def test_another_background_is_refused(no_jaxtyping):
     with pytest.raises(InputError, match="background: expected auto or none, got 'white'"):
         SceneConfig(background="white")  # type: ignore[arg-type]
 
 
-def test_smaller_pictures_are_empty_where_all_that_they_cover_is(scenes: dict[str, Path]) -> None:
+def test_smaller_pictures_are_empty_where_all_that_they_cover_is(scenes):
     large, small = views_of(scenes["transparent"]), views_of(scenes["transparent"], image_scale=0.5)
-    assert large.empty is not None
-    assert small.empty is not None
     blocks = large.empty[0].reshape(SIZE // 2, 2, SIZE // 2, 2)
     np.testing.assert_array_equal(small.empty[0], blocks.all(axis=(1, 3)))
 
 
-def test_what_has_the_color_and_is_not_connected_to_the_border_stays(tmp_path: Path) -> None:
+def test_what_has_the_color_and_is_not_connected_to_the_border_stays(tmp_path):
     picture = np.full((40, 40, 3), 255, np.uint8)
     picture[10:30, 10:30] = 90
     picture[15:25, 15:25] = 255
@@ -117,13 +103,13 @@ def test_what_has_the_color_and_is_not_connected_to_the_border_stays(tmp_path: P
     assert empty.sum() == 1600 - 22 * 22 + 4
 
 
-def test_photographs_of_rooms_have_no_background(tmp_path: Path) -> None:
+def test_photographs_of_rooms_have_no_background(tmp_path):
     cameras = box_cameras(6, 96, 72, 70.0)
     paths = [save(tmp_path / f"{view}.png", look_at_walls(cameras, view)[0]) for view in range(6)]
     assert find_background(paths) is None
 
 
-def test_bright_walls_windows_and_lens_shades_are_no_background(tmp_path: Path) -> None:
+def test_bright_walls_windows_and_lens_shades_are_no_background(tmp_path):
     """White walls vary by more than rounding, windows end in the picture, and dark corners are the same everywhere."""
     made = np.random.default_rng(0)
     across = np.linspace(0, 6, 64)
@@ -142,7 +128,7 @@ def test_bright_walls_windows_and_lens_shades_are_no_background(tmp_path: Path) 
         assert find_background([tmp_path / f"{kind}_{view}.png" for view in range(6)]) is None, kind
 
 
-def test_few_photographs_that_the_object_fills_do_not_hide_the_background(tmp_path: Path) -> None:
+def test_few_photographs_that_the_object_fills_do_not_hide_the_background(tmp_path):
     cameras = hemisphere_cameras(8, 48)
     paths = [tmp_path / f"{view}.png" for view in range(8)]
     for view, path in enumerate(paths):
@@ -153,12 +139,12 @@ def test_few_photographs_that_the_object_fills_do_not_hide_the_background(tmp_pa
         save(paths[view], photograph(view, 48, 48))
 
 
-def test_pictures_of_one_color_have_no_background(tmp_path: Path) -> None:
+def test_pictures_of_one_color_have_no_background(tmp_path):
     paths = [save(tmp_path / f"{view}.png", np.full((40, 40, 3), 128, np.uint8)) for view in range(4)]
     assert find_background(paths) is None
 
 
-def test_depth_on_it_makes_a_background_a_wall(tmp_path: Path, recwarn: pytest.WarningsRecorder) -> None:
+def test_depth_on_it_makes_a_background_a_wall(tmp_path, recwarn):
     write_transforms(tmp_path, 4, depth=True)
     for view in range(4):
         picture = np.full((24, 32, 3), 255, np.uint8)
@@ -172,7 +158,7 @@ def test_depth_on_it_makes_a_background_a_wall(tmp_path: Path, recwarn: pytest.W
         assert views_of(tmp_path).empty is not None
 
 
-def test_the_white_solid_reaches_the_outline() -> None:
+def test_the_white_solid_reaches_the_outline():
     """Or the tests above would not try what they say."""
     low, high = SOLIDS[WHITE_SOLID].aabb()
     assert high[2] == max(solid.aabb()[1][2] for solid in SOLIDS)

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ def write(path: Path, value: object) -> Path:
     return path
 
 
-def test_a_camera_or_a_list_of_cameras_is_read_as_it_stands(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_camera_or_a_list_of_cameras_is_read_as_it_stands(tmp_path, rng):
     poses = [pose(rng), pose(rng)]
     entries = [{"cam_from_world": matrix.tolist(), **INTRINSICS} for matrix in poses]
     entries[1] |= {"width": 320.0, "cam_from_world": poses[1][:3].tolist()}
@@ -40,7 +39,7 @@ def test_a_camera_or_a_list_of_cameras_is_read_as_it_stands(tmp_path: Path, rng:
     assert np.array_equal(one.cam_from_world, both.cam_from_world[:1])
 
 
-def test_poses_of_nerfstudio_are_the_same_cameras(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_poses_of_nerfstudio_are_the_same_cameras(tmp_path, rng):
     matrix = pose(rng)
     opengl = np.linalg.inv(matrix) @ OPENCV_FROM_OPENGL
     names = {"fx": "fl_x", "fy": "fl_y", "width": "w", "height": "h"}
@@ -52,7 +51,7 @@ def test_poses_of_nerfstudio_are_the_same_cameras(tmp_path: Path, rng: np.random
     assert (other.widths, other.heights) == (ours.widths, ours.heights)
 
 
-def test_a_distant_origin_is_taken_off_before_anything_is_rounded(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_distant_origin_is_taken_off_before_anything_is_rounded(tmp_path, rng):
     near, origin = pose(rng), np.array([1e6, -2e6, 5e5])
     far = near.copy()
     far[:3, 3] -= far[:3, :3] @ origin
@@ -96,9 +95,7 @@ SHEARED = (np.eye(4) + np.eye(4, k=1) * 0.2).tolist()
         ({"width": float("inf")}, "width must be finite"),
     ],
 )
-def test_a_malformed_camera_is_refused_in_one_line_that_names_it(
-    tmp_path: Path, change: dict[str, Any], message: str
-) -> None:
+def test_a_malformed_camera_is_refused_in_one_line_that_names_it(tmp_path, change, message):
     good = {"cam_from_world": np.eye(4).tolist(), **INTRINSICS}
     path = write(tmp_path / "cameras.json", [good, good | change])
     with pytest.raises(InputError, match=message) as error:
@@ -119,21 +116,21 @@ def test_a_malformed_camera_is_refused_in_one_line_that_names_it(
         ("{}", "cam_from_world or transform_matrix is missing"),
     ],
 )
-def test_a_file_without_cameras_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_a_file_without_cameras_is_refused(tmp_path, text, message):
     path = tmp_path / "cameras.json"
     path.write_text(text)
     with pytest.raises(InputError, match=message):
         read_cameras(path, ORIGIN)
 
 
-def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_there_is_refused(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         read_cameras(tmp_path / "gone.json", ORIGIN)
     with pytest.raises(InputError, match="not a readable JSON file"):
         read_cameras(tmp_path, ORIGIN)
 
 
-def test_principal_points_beside_the_picture_and_pictures_of_the_largest_size_are_read(tmp_path: Path) -> None:
+def test_principal_points_beside_the_picture_and_pictures_of_the_largest_size_are_read(tmp_path):
     """A crop may leave the principal point out."""
     entry = {"cam_from_world": np.eye(4).tolist(), **INTRINSICS, "cx": -35.5, "cy": 1e6}
     made = read_cameras(write(tmp_path / "crop.json", entry), ORIGIN)
@@ -144,7 +141,7 @@ def test_principal_points_beside_the_picture_and_pictures_of_the_largest_size_ar
         read_cameras(write(tmp_path / "larger.json", largest | {"width": MAX_PIXELS // 1024 + 1}), ORIGIN)
 
 
-def test_more_cameras_than_are_read_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_cameras_than_are_read_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("gsencoder.data.readers.transforms_json.MAX_CAMERAS", 3)
     entry = {"cam_from_world": np.eye(4).tolist(), **INTRINSICS}
     assert len(read_cameras(write(tmp_path / "three.json", [entry] * 3), ORIGIN)) == 3

@@ -3,7 +3,6 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -13,27 +12,22 @@ from hypothesis import strategies as st
 from scene_files import photograph, save, world_from_cams, write_colmap
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.colmap import CAMERA_PARAMS, check_binary_model, read_colmap
+from gsencoder.data.readers.colmap import CAMERA_PARAMS, read_colmap
 from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.data.scenes import SceneConfig, load_scene
 
-FILES = ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"]
+FILES = ["cameras.bin", "images.bin", "points3D.bin"]
 
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("old", [False, True])
 @pytest.mark.parametrize("where", ["sparse/0", "sparse", "colmap/sparse/0", "."])
-def test_every_kind_and_place_of_a_model_gives_the_same_scene(
-    tmp_path: Path, text: bool, old: bool, where: str
-) -> None:
+def test_every_kind_and_place_of_a_model_gives_the_same_scene(tmp_path, text, old, where):
     write_colmap(tmp_path, text=text, old=old, where=where)
     scene = load_scene(tmp_path)
-    assert scene.views is not None
     assert scene.views.names == ("001.png", "002.png", "003.png")
     assert np.abs(scene.views.cameras.cam_from_world - np.linalg.inv(world_from_cams(3))).max() < 1e-6
     assert np.abs(scene.views.cameras.Ks[0] - [[30, 0, 16], [0, 31, 12], [0, 0, 1]]).max() < 1e-6
-    assert scene.sfm_points is not None
-    assert scene.sfm_colors is not None
     order = np.argsort(scene.sfm_colors[:, 0])
     wanted = np.random.default_rng(0).uniform(-0.3, 0.3, (5, 3))
     assert np.abs(scene.sfm_points[order] - wanted).max() < 1e-6
@@ -42,7 +36,7 @@ def test_every_kind_and_place_of_a_model_gives_the_same_scene(
     assert scene.up is None
 
 
-def test_a_model_given_itself_finds_its_photographs(tmp_path: Path) -> None:
+def test_a_model_given_itself_finds_its_photographs(tmp_path):
     sparse = write_colmap(tmp_path)
     assert len(load_scene(sparse).views or ()) == 3
     assert load_scene(sparse).name == load_scene(tmp_path).name == tmp_path.name
@@ -54,18 +48,16 @@ def test_a_model_given_itself_finds_its_photographs(tmp_path: Path) -> None:
         load_scene(tmp_path, options=SceneConfig(images="none"))
 
 
-def test_distorted_models_are_undistorted_once_a_camera(tmp_path: Path) -> None:
+def test_distorted_models_are_undistorted_once_a_camera(tmp_path):
     write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30, 16, 12, 0.2))
     views = load_scene(tmp_path).views
-    assert views is not None
-    assert views.images is not None
     assert views.masks is None
     assert 30 < views.cameras.Ks[0, 0, 0] < 30 * 1.3
     assert not (views.images[0] == photograph(1)).all()
     assert len(views.images._remaps._remaps) == 1  # type: ignore[attr-defined]
 
 
-def test_a_model_that_is_no_pinhole_is_a_named_error(tmp_path: Path) -> None:
+def test_a_model_that_is_no_pinhole_is_a_named_error(tmp_path):
     sparse = write_colmap(tmp_path, model="OPENCV", params=(30, 31, 16, 12, 0, 0, 0, 0))
     text = tmp_path / "text"
     text.mkdir()
@@ -77,29 +69,28 @@ def test_a_model_that_is_no_pinhole_is_a_named_error(tmp_path: Path) -> None:
         read_colmap(text, tmp_path / "images", tmp_path)
 
 
-def test_missing_photographs_are_counted_once(tmp_path: Path) -> None:
+def test_missing_photographs_are_counted_once(tmp_path):
     write_colmap(tmp_path, 4)
     for name in ("001.png", "004.png"):
         (tmp_path / "images" / name).unlink()
     with pytest.warns(SceneWarning, match=r"2 of 4 images of the model are missing \(first: '001.png'\)") as caught:
         views = load_scene(tmp_path).views
     assert len(caught) == 1
-    assert views is not None
     assert views.names == ("002.png", "003.png")
     for path in (tmp_path / "images").iterdir():
         path.unlink()
-    with pytest.raises(InputError, match="no view: of 4 images 0 have no pose and 4 are not in"):
+    with pytest.raises(InputError, match="no view: of 4 images 4 are not in"):
         load_scene(tmp_path)
 
 
-def test_a_photograph_of_another_size_is_an_error(tmp_path: Path) -> None:
+def test_a_photograph_of_another_size_is_an_error(tmp_path):
     write_colmap(tmp_path)
     save(tmp_path / "images/002.png", photograph(0, 16, 12))
     with pytest.raises(InputError, match=r"002\.png has 16×12 pixels but its camera 32×24"):
         load_scene(tmp_path)
 
 
-def test_names_that_leave_the_scene_are_refused(tmp_path: Path) -> None:
+def test_names_that_leave_the_scene_are_refused(tmp_path):
     sparse = write_colmap(tmp_path / "scene", text=True)
     outside = save(tmp_path / "x.png", photograph(0))
     images = sparse / "images.txt"
@@ -107,12 +98,11 @@ def test_names_that_leave_the_scene_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="leads out of the scene folder"):
         load_scene(tmp_path / "scene")
     views = load_scene(tmp_path / "scene", options=SceneConfig(allow_outside=True)).views
-    assert views is not None
     assert "../../x.png" in views.names
     assert outside.is_file()
 
 
-def test_several_models_are_named(tmp_path: Path) -> None:
+def test_several_models_are_named(tmp_path):
     write_colmap(tmp_path)
     write_colmap(tmp_path, where="sparse/1")
     with pytest.warns(SceneWarning, match="holds 2 models; 0 is used"):
@@ -120,22 +110,21 @@ def test_several_models_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_every_truncation_of_a_binary_file_names_it_and_the_missing_bytes(tmp_path: Path, name: str) -> None:
+def test_every_truncation_of_a_binary_file_names_it_and_the_missing_bytes(tmp_path, name):
     sparse = write_colmap(tmp_path)
-    check_binary_model(sparse)
     data = (sparse / name).read_bytes()
     for size in range(len(data)):
         (sparse / name).write_bytes(data[:size])
         with pytest.raises(InputError, match=name):
-            check_binary_model(sparse)
+            read_colmap(sparse, tmp_path / "images", tmp_path)
     (sparse / name).write_bytes(data + b"\0")
     with pytest.raises(InputError, match="1 bytes follow the last record"):
-        check_binary_model(sparse)
+        load_scene(tmp_path)
 
 
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("count", [2**20, 2**40, 2**63, 2**64 - 1])
-def test_a_huge_claimed_count_is_refused_before_memory_is_asked_for(tmp_path: Path, name: str, count: int) -> None:
+def test_a_huge_claimed_count_is_refused_before_memory_is_asked_for(tmp_path, name, count):
     sparse = write_colmap(tmp_path)
     data = (sparse / name).read_bytes()
     (sparse / name).write_bytes(struct.pack("<Q", count) + data[8:])
@@ -143,7 +132,7 @@ def test_a_huge_claimed_count_is_refused_before_memory_is_asked_for(tmp_path: Pa
         load_scene(tmp_path)
 
 
-def test_a_missing_file_of_a_model_is_named(tmp_path: Path) -> None:
+def test_a_missing_file_of_a_model_is_named(tmp_path):
     for text, name in ((False, "points3D.bin"), (True, "points3D.txt"), (False, "images.bin")):
         sparse = write_colmap(tmp_path / name, text=text)
         (sparse / name).unlink()
@@ -152,7 +141,7 @@ def test_a_missing_file_of_a_model_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_a_text_file_that_lost_its_last_lines_is_an_error(tmp_path: Path, name: str) -> None:
+def test_a_text_file_that_lost_its_last_lines_is_an_error(tmp_path, name):
     sparse = write_colmap(tmp_path, text=True)
     path = sparse / f"{name}.txt"
     lines = path.read_text().splitlines()
@@ -161,24 +150,24 @@ def test_a_text_file_that_lost_its_last_lines_is_an_error(tmp_path: Path, name: 
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize("promised", [4, 6])
-def test_a_text_file_holds_as_many_entries_as_it_promises(tmp_path: Path, promised: int) -> None:
+@pytest.mark.parametrize("announced", [4, 6])
+def test_a_text_file_holds_as_many_entries_as_it_announces(tmp_path, announced):
     path = write_colmap(tmp_path, text=True) / "points3D.txt"
     text = path.read_text()
     assert "# Number of points: 5" in text
-    path.write_text(text.replace("# Number of points: 5", f"# Number of points: {promised}"))
-    with pytest.raises(InputError, match=rf"points3D\.txt: promises {promised} entries and holds 5"):
+    path.write_text(text.replace("# Number of points: 5", f"# Number of points: {announced}"))
+    with pytest.raises(InputError, match=rf"points3D\.txt: announces {announced} entries and holds 5"):
         load_scene(tmp_path)
 
 
-def test_the_parameter_counts_are_those_of_pycolmap() -> None:
+def test_the_parameter_counts_are_those_of_pycolmap():
     pycolmap = load_pycolmap()
-    for number, count in enumerate(CAMERA_PARAMS):
+    for number, (name, count) in enumerate(CAMERA_PARAMS.items()):
         made = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(number), 1.0, 1, 1)
-        assert len(made.params) == count
+        assert (made.model.name, len(made.params)) == (name, count)
 
 
-def test_pictures_can_be_written_after_pycolmap_came_in() -> None:
+def test_pictures_can_be_written_after_pycolmap_came_in():
     """pycolmap's zlib and the system's must not meet (see load_pycolmap): the process would abort."""
     code = (
         "from gsencoder.data.readers.undistort import load_pycolmap; load_pycolmap(); "
@@ -193,14 +182,14 @@ def test_pictures_can_be_written_after_pycolmap_came_in() -> None:
 @pytest.mark.filterwarnings("ignore::gsencoder.core.errors.SceneWarning")
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.slow
-def test_mutated_models_give_a_scene_or_an_input_error(tmp_path: Path, text: bool) -> None:
+def test_mutated_models_give_a_scene_or_an_input_error(tmp_path, text):
     source = write_colmap(tmp_path, model="OPENCV", params=(30, 31, 16, 12, 0.01, 0, 0, 0), text=text)
     original = {path.name: path.read_bytes() for path in source.iterdir()}
     outcomes = []
 
     @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.nested_given])
     @given(data=st.data())
-    def mutate(data: st.DataObject) -> None:
+    def mutate(data):
         shutil.rmtree(source)
         source.mkdir()
         for name, content in original.items():
@@ -218,7 +207,6 @@ def test_mutated_models_give_a_scene_or_an_input_error(tmp_path: Path, text: boo
             outcomes.append(str(error))
         else:
             outcomes.append("")
-            assert scene.views is not None
             assert np.isfinite(scene.views.cameras.cam_from_world).all()
 
     mutate()
@@ -227,10 +215,9 @@ def test_mutated_models_give_a_scene_or_an_input_error(tmp_path: Path, text: boo
 
 
 @pytest.mark.shared
-def test_the_plush_reprojects_after_undistortion_as_its_model_does(shared: Path) -> None:
+def test_the_plush_reprojects_after_undistortion_as_its_model_does(shared):
     scene = load_scene(shared / "scenes/plush")
     views = scene.views
-    assert views is not None
     assert len(views) == 97
     assert views.masks is None
     model = load_pycolmap().Reconstruction(str(shared / "scenes/plush/sparse"))
@@ -257,44 +244,40 @@ def test_the_plush_reprojects_after_undistortion_as_its_model_does(shared: Path)
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("old", [False, True])
-def test_a_quaternion_of_no_rotation_is_refused_with_its_image_and_file(tmp_path: Path, text: bool, old: bool) -> None:
+def test_a_quaternion_of_no_rotation_is_refused_with_its_image_and_file(tmp_path, text, old):
     sparse = write_colmap(tmp_path, text=text, old=old)
-    name = ("images" if old else "frames") + (".txt" if text else ".bin")
-    for file in (sparse / name, sparse / f"images{Path(name).suffix}"):
-        spoil(file, "0 0 0 0")
+    name = "images.txt" if text else "images.bin"
+    spoil(sparse / name, "0 0 0 0")
     with pytest.raises(InputError, match=rf"image '001\.png': its quaternion .{name}. has length 0, expected 1"):
         load_scene(tmp_path)
 
 
 @pytest.mark.parametrize("text", [False, True])
 @pytest.mark.parametrize("value", ["nan", "inf"])
-def test_a_quaternion_that_is_not_finite_is_refused_with_its_image(tmp_path: Path, text: bool, value: str) -> None:
+def test_a_quaternion_that_is_not_finite_is_refused_with_its_image(tmp_path, text, value):
     sparse = write_colmap(tmp_path, text=text, old=True)
     spoil(sparse / ("images.txt" if text else "images.bin"), f"{value} 0 0 0")
-    with pytest.raises(
-        InputError, match=r"images\..*image '001\.png'.*not finite|image '001\.png': .*images\.bin. has length"
-    ):
+    with pytest.raises(InputError, match=r"image '001\.png': the pose has values that are not finite"):
         load_scene(tmp_path)
 
 
 def spoil(file: Path, quaternion: str) -> None:
     """Gives the first pose of a file another quaternion."""
-    frames = file.stem == "frames"
     if file.suffix == ".bin":
         data = bytearray(file.read_bytes())
-        struct.pack_into("<4d", data, 16 if frames else 12, *map(float, quaternion.split()))
+        struct.pack_into("<4d", data, 12, *map(float, quaternion.split()))
         file.write_bytes(data)
         return
     lines = file.read_text().splitlines()
     row = next(number for number, line in enumerate(lines) if not line.startswith("#"))
-    words, start = lines[row].split(), 2 if frames else 1
-    words[start : start + 4] = quaternion.split()
+    words = lines[row].split()
+    words[1:5] = quaternion.split()
     lines[row] = " ".join(words)
     file.write_text("\n".join(lines) + "\n")
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_a_name_longer_than_any_file_has_is_refused_at_once(tmp_path: Path, text: bool) -> None:
+def test_a_name_longer_than_any_file_has_is_refused_at_once(tmp_path, text):
     sparse = write_colmap(tmp_path, text=text, old=True)
     file = sparse / ("images.txt" if text else "images.bin")
     file.write_bytes(file.read_bytes().replace(b"002.png", b"a/" * 500_000 + b"2.png"))
@@ -309,43 +292,28 @@ def drop(lines: list[str], row: int) -> list[str]:
     return lines[:row] + lines[row + 1 :]
 
 
-def unturned(line: str) -> str:
-    """An image of no rotation and a name with blanks, twelve words that begin like points: x, y and number 0."""
-    words = line.split()
-    return f"{words[0]} 1 0 0 0 0 0 0 {words[8]} my {words[9]} copy"
-
-
 @pytest.mark.parametrize("old", [False, True])
 @pytest.mark.parametrize(
     ("name", "damage", "message"),
     [
-        ("cameras", lambda lines: drop(lines, 0), r"images\.txt: line 5 says that '001.png' has camera 1, which cam"),
+        ("cameras", lambda lines: drop(lines, 0), r"cameras\.txt: announces 1 entries and holds 0"),
         ("cameras", lambda lines: [lines[0][:9]], r"cameras\.txt: line 4 is not CAMERA_ID MODEL"),
         ("cameras", lambda lines: [lines[0].rsplit(" ", 1)[0]], r"cameras\.txt: line 4 is not CAMERA_ID MODEL"),
-        ("cameras", lambda lines: [lines[0].replace("PIN", "pin")], r"cameras\.txt: line 4 is not CAMERA_ID MODEL"),
+        ("cameras", lambda lines: [lines[0].replace("PIN", "pin")], r"camera 1: camera model pinHOLE cannot be"),
         ("images", lambda lines: drop(lines, 0), r"images\.txt: line 5 is not IMAGE_ID QW"),
-        ("images", lambda lines: drop(lines, 1), r"images\.txt: line 6 holds no points of the image above it"),
-        (
-            "images",
-            lambda lines: [lines[0], unturned(lines[2]), *lines[3:]],
-            r"images\.txt: line 6 holds no points of ",
-        ),
         (
             "images",
             lambda lines: [lines[0], "nan 1 -1 " + lines[1], *lines[2:]],
             r"images\.txt: line 6 is not IMAGE_ID",
         ),
         ("images", lambda lines: drop(lines, 2), r"images\.txt: line 7 is not IMAGE_ID QW"),
-        ("images", lambda lines: drop(lines, 5), r"points3D\.txt: line 4 names point 0 of image 3, which images\.txt"),
-        ("images", lambda lines: lines[:4], r"points3D\.txt: line 4 names point 0 of image 3, which images\.txt"),
-        ("points3D", lambda lines: drop(lines, 2), r"points3D\.txt: promises 5 entries and holds 4"),
+        ("images", lambda lines: lines[:4], r"images\.txt: announces 3 entries and holds 2"),
+        ("points3D", lambda lines: drop(lines, 2), r"points3D\.txt: announces 5 entries and holds 4"),
         ("points3D", lambda lines: [*lines[:4], lines[4][:20]], r"points3D\.txt: line 8 is not POINT3D_ID X Y Z"),
         ("points3D", lambda lines: ["a" + lines[0], *lines[1:]], r"points3D\.txt: line 4 is not POINT3D_ID X Y Z"),
     ],
 )
-def test_a_line_that_is_lost_or_damaged_is_named_with_its_file(
-    tmp_path: Path, old: bool, name: str, damage: Callable[[list[str]], list[str]], message: str
-) -> None:
+def test_a_line_that_is_lost_or_damaged_is_named_with_its_file(tmp_path, old, name, damage, message):
     path = write_colmap(tmp_path, text=True, old=old) / f"{name}.txt"
     lines = path.read_text().splitlines()
     start = next(row for row, line in enumerate(lines) if not line.startswith("#"))

@@ -27,13 +27,13 @@ def pose(view: int, count: int = 4) -> torch.Tensor:
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (3, 2), (7, 4), (40, 31)])
 @pytest.mark.parametrize("side", [1, 3, 5])
-def test_means_of_windows_are_those_of_pooling(size: tuple[int, int], side: int) -> None:
+def test_means_of_windows_are_those_of_pooling(size, side):
     maps = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     pooled = torch.nn.functional.avg_pool2d(maps, side, stride=1, padding=side // 2, count_include_pad=False)
     torch.testing.assert_close(window_mean(maps, side), pooled)
 
 
-def test_a_sweep_finds_the_depth_of_a_slanted_wall() -> None:
+def test_a_sweep_finds_the_depth_of_a_slanted_wall():
     photographs = Photographs(wall_views())
     photos = [photographs.at_scale(view) for view in range(4)]
     estimate = sweep(photos[1], pose(1), [photos[0], photos[2], photos[3]], [pose(0), pose(2), pose(3)], 2.0, 5.0)
@@ -45,7 +45,7 @@ def test_a_sweep_finds_the_depth_of_a_slanted_wall() -> None:
     assert error.quantile(0.9) < 0.03
 
 
-def test_depths_agree_where_they_are_true_and_nowhere_else() -> None:
+def test_depths_agree_where_they_are_true_and_nowhere_else():
     photographs = Photographs(wall_views())
     photos = [photographs.at_scale(view) for view in range(3)]
     truths = [torch.from_numpy(seen(cameras(), view)[1]) for view in range(3)]
@@ -59,7 +59,7 @@ def test_depths_agree_where_they_are_true_and_nowhere_else() -> None:
     assert (count_agreeing(0 * truths[1], photos[1], pose(1), others, 0.02) == 0).all()
 
 
-def test_points_go_to_the_world_and_back() -> None:
+def test_points_go_to_the_world_and_back():
     photographs = Photographs(wall_views())
     photo, truth = photographs.at_scale(2), torch.from_numpy(seen(cameras(), 2)[1])
     points = world_points(truth, photo, pose(2))
@@ -67,7 +67,7 @@ def test_points_go_to_the_world_and_back() -> None:
     torch.testing.assert_close(splat_depths(points.reshape(-1, 3), photo, pose(2)), truth)
 
 
-def test_views_that_share_points_at_a_good_angle_are_neighbors() -> None:
+def test_views_that_share_points_at_a_good_angle_are_neighbors():
     made = cameras(6, step=0.2)
     neighbors = source_views(made, wall_points(200), range(6), 2)
     assert all(len(others) == 2 and view not in others for view, others in neighbors.items())
@@ -76,7 +76,7 @@ def test_views_that_share_points_at_a_good_angle_are_neighbors() -> None:
     assert all(others == [] for others in alone.values())
 
 
-def test_holes_in_a_plane_are_filled_with_the_plane() -> None:
+def test_holes_in_a_plane_are_filled_with_the_plane():
     truth = torch.from_numpy(seen(cameras(), 0)[1])
     holes = truth.clone()
     holes[20:40, 30:50] = 0
@@ -86,18 +86,18 @@ def test_holes_in_a_plane_are_filled_with_the_plane() -> None:
     assert not interpolate(torch.zeros(5, 7)).any()
 
 
-def test_a_voxel_gives_the_mean_of_enough_samples_and_nothing_beside_others() -> None:
+def test_a_voxel_gives_the_mean_of_enough_samples_and_nothing_beside_others():
     points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [5.5, 0, 0], [9.1, 0, 0], [9.3, 0, 0]], np.float32)
     colors = np.array([[0] * 3, [10] * 3, [20] * 3, [30] * 3, [40] * 3], np.uint8)
     places, tints = average_by_voxel(points, colors, 1.0, 2)
     np.testing.assert_allclose(places, [[0.2, 0.1, 0.1], [9.2, 0, 0]], atol=1e-6)
     assert tints.tolist() == [[5] * 3, [35] * 3]
-    places, _ = average_by_voxel(points, colors, 1.0, 2, beside=np.array([[9.9, 0.5, 0.5]], np.float32))
+    places, _ = average_by_voxel(points, colors, 1.0, 2, occupied=np.array([[9.9, 0.5, 0.5]], np.float32))
     np.testing.assert_allclose(places, [[0.2, 0.1, 0.1]], atol=1e-6)
     assert average_by_voxel(points[:0], colors[:0], 1.0, 1)[0].shape == (0, 3)
 
 
-def test_what_stands_in_the_way_is_carved_out() -> None:
+def test_what_stands_in_the_way_is_carved_out():
     photographs = Photographs(wall_views())
     photos = {view: photographs.at_scale(view) for view in range(4)}
     depths = {view: torch.from_numpy(seen(cameras(), view)[1]) for view in range(4)}
@@ -113,10 +113,9 @@ def test_what_stands_in_the_way_is_carved_out() -> None:
     assert len(carve(points, colors, unknown, photos, poses, 0.02)[0]) == 5
 
 
-def test_few_points_on_a_wall_become_many_that_lie_on_it() -> None:
+def test_few_points_on_a_wall_become_many_that_lie_on_it():
     photographs, points = Photographs(wall_views()), wall_points()
     cloud = densify(photographs, range(4), points, np.full((len(points), 3), 128, np.uint8), SMALL)
-    assert cloud is not None
     # What fewer than three of the views show stays bare.
     assert cloud.coverage[0] < 0.2 < 0.65 < cloud.coverage[1]
     assert cloud.swept > 500
@@ -126,7 +125,7 @@ def test_few_points_on_a_wall_become_many_that_lie_on_it() -> None:
     assert np.quantile(off, 0.95) < 0.05
 
 
-def test_points_that_cover_the_pictures_are_left_alone() -> None:
+def test_points_that_cover_the_pictures_are_left_alone():
     points = wall_points(20_000)
     assert covered_share(Photographs(wall_views()), range(4), points) > 0.95
     assert densify(Photographs(wall_views()), range(4), points, np.zeros((len(points), 3), np.uint8), SMALL) is None
@@ -144,6 +143,6 @@ def test_points_that_cover_the_pictures_are_left_alone() -> None:
         ("sources", 1),
     ],
 )
-def test_settings_that_mean_nothing_are_refused(name: str, value: float) -> None:
+def test_settings_that_mean_nothing_are_refused(name, value):
     with pytest.raises(InputError, match=name):
         DenseConfig(**{name: value})

@@ -79,7 +79,7 @@ def denser(gaussians: Gaussians) -> Gaussians:
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
-def test_a_room_stays_a_room_wherever_it_lies_and_however_large_it_is(number: int) -> None:
+def test_a_room_stays_a_room_wherever_it_lies_and_however_large_it_is(number):
     first, second = enclosure_of(room()), enclosure_of(moved(room(), number))
     assert first.is_room
     assert second.is_room
@@ -88,19 +88,19 @@ def test_a_room_stays_a_room_wherever_it_lies_and_however_large_it_is(number: in
 
 
 @pytest.mark.parametrize("name", list(BOARDS))
-def test_an_object_stays_an_object_turned_enlarged_and_denser_in_one_half(name: str) -> None:
+def test_an_object_stays_an_object_turned_enlarged_and_denser_in_one_half(name):
     gaussians = made_object(name)
     assert not any(enclosure_of(each).is_room for each in (gaussians, moved(gaussians, 2), denser(gaussians)))
 
 
-def test_a_room_stays_a_room_where_one_half_has_four_times_the_gaussians() -> None:
+def test_a_room_stays_a_room_where_one_half_has_four_times_the_gaussians():
     first, second = enclosure_of(room()), enclosure_of(denser(room()))
     assert second.is_room
     assert second.openness == pytest.approx(first.openness, abs=0.03)
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(0, 1), (0, -1), (1, 1)])
-def test_two_thirds_of_a_room_are_a_room_and_half_of_a_box_is_none(axis: int, sign: int) -> None:
+def test_two_thirds_of_a_room_are_a_room_and_half_of_a_box_is_none(axis, sign):
     def part(gaussians: Gaussians, share: float) -> Gaussians:
         values = sign * gaussians.means[:, axis]
         return gaussians.select(np.flatnonzero(values < np.quantile(values, share)))
@@ -113,7 +113,7 @@ def test_two_thirds_of_a_room_are_a_room_and_half_of_a_box_is_none(axis: int, si
     ("change", "is_room"),
     [
         ({}, True),
-        ({"beside": 0.82}, False),
+        ({"adjacent": 0.82}, False),
         ({"space": 0.27}, False),
         ({"openness": 0.3}, False),
         ({"flatness": 0.56}, False),
@@ -123,25 +123,24 @@ def test_two_thirds_of_a_room_are_a_room_and_half_of_a_box_is_none(axis: int, si
         ({"enough": False}, False),
     ],
 )
-def test_every_sign_of_a_room_with_walls_is_needed(change: dict[str, float], is_room: bool) -> None:
-    walls = Enclosure(flatness=0.4, openness=0.35, space=0.4, beside=0.9, content=0.15)
+def test_every_sign_of_a_room_with_walls_is_needed(change, is_room):
+    walls = Enclosure(flatness=0.4, openness=0.35, space=0.4, adjacent=0.9, content=0.15)
     assert replace(walls, **change).is_room == is_room
 
 
-def test_few_gaussians_show_no_room() -> None:
+def test_few_gaussians_show_no_room():
     gaussians = room()
     few = gaussians.select(np.linspace(0, len(gaussians) - 1, MIN_GAUSSIANS - 1).astype(int))
     assert not enclosure_of(few).is_room
     assert "fewer than 4,000" in enclosure_of(few).reason
 
 
-def test_what_was_decided_is_said_and_an_object_has_no_up_of_its_own() -> None:
+def test_what_was_decided_is_said_and_an_object_has_no_up_of_its_own():
     scene, up = with_up(Scene(name="chair", gaussians=made_object("chair")))
     assert up is None
     seen, reason = with_explained_views(scene, 12)
-    assert seen.views is not None
     assert seen.views.names[0] == "orbit_000"
-    assert "no free space lies beside most of its surfaces" in reason
+    assert "no free space borders most of its surfaces" in reason
     # No direction is up, so that cameras surround it on all sides.
     directions = seen.views.cameras.centers - scene.gaussians.means.mean(axis=0)  # type: ignore[union-attr]
     assert (directions.max(axis=0) > 0.3).all()

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from scene_files import photograph, save
+from scene_files import photograph, save, with_depth
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.check.scene_check import plain_photographs
 from gsencoder.data.readers import images
-from gsencoder.data.readers.depth_images import DepthFiles, DepthSensor
+from gsencoder.data.readers.depth_images import DepthFiles
 from gsencoder.data.readers.images import (
     ImageFiles,
     InstanceFiles,
@@ -41,7 +41,7 @@ def grid(camera: CameraModel = PINHOLE, width: int = 32, height: int = 24) -> Pi
     return PixelGrid(source=camera, pinhole=pinhole_for(camera, "test"), width=width, height=height)
 
 
-def test_color_of_every_mode_becomes_rgb(tmp_path: Path) -> None:
+def test_color_of_every_mode_becomes_rgb(tmp_path):
     rgb = photograph(0)
     assert (read_rgba(save(tmp_path / "rgb.png", rgb))[0] == rgb).all()
     grey = rgb[..., 0].copy()
@@ -57,7 +57,7 @@ def test_color_of_every_mode_becomes_rgb(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", [-1, 65_536])
-def test_grey_values_beyond_sixteen_bits_on_either_side_are_refused(tmp_path: Path, value: int) -> None:
+def test_grey_values_beyond_sixteen_bits_on_either_side_are_refused(tmp_path, value):
     grey = np.full((24, 32), 65_535, np.int32)
     Image.fromarray(grey).save(tmp_path / "grey.tif")
     assert (read_rgba(tmp_path / "grey.tif")[0] == 255).all()
@@ -67,7 +67,7 @@ def test_grey_values_beyond_sixteen_bits_on_either_side_are_refused(tmp_path: Pa
         read_rgba(tmp_path / "grey.tif")
 
 
-def test_alpha_composites_over_black_and_becomes_the_mask(tmp_path: Path) -> None:
+def test_alpha_composites_over_black_and_becomes_the_mask(tmp_path):
     rgba = np.dstack([photograph(0), np.full((24, 32), 255, np.uint8)])
     rgba[:, :8, 3], rgba[:, 8:16, 3], rgba[:, 16:20, 3] = 0, 127, 128
     path = save(tmp_path / "a.png", rgba)
@@ -79,7 +79,7 @@ def test_alpha_composites_over_black_and_becomes_the_mask(tmp_path: Path) -> Non
     assert mask[:, 16:].all()
 
 
-def test_pixels_are_read_as_they_are_stored(tmp_path: Path) -> None:
+def test_pixels_are_read_as_they_are_stored(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(photograph(0)).save(tmp_path / "turned.jpg", exif=exif)
@@ -87,7 +87,7 @@ def test_pixels_are_read_as_they_are_stored(tmp_path: Path) -> None:
     assert read_rgba(tmp_path / "turned.jpg")[0].shape == (24, 32, 3)
 
 
-def test_files_that_are_no_pictures_are_errors_that_name_them(tmp_path: Path) -> None:
+def test_files_that_are_no_pictures_are_errors_that_name_them(tmp_path):
     (tmp_path / "text.png").write_text("not a picture")
     (tmp_path / "empty.jpg").write_bytes(b"")
     (tmp_path / "ps.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n")
@@ -100,7 +100,7 @@ def test_files_that_are_no_pictures_are_errors_that_name_them(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tiff", "bmp"])
-def test_a_truncated_picture_is_an_error_that_names_it(tmp_path: Path, suffix: str) -> None:
+def test_a_truncated_picture_is_an_error_that_names_it(tmp_path, suffix):
     path = save(tmp_path / f"cut.{suffix}", photograph(0, 64, 64))
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
@@ -121,25 +121,21 @@ def bomb(width: int, height: int) -> bytes:
 
 
 @pytest.mark.parametrize("size", [(9000, 9000), (9500, 9500), (60000, 60000), (2**31 - 1, 2**31 - 1)])
-def test_a_decompression_bomb_is_refused_by_its_header(tmp_path: Path, size: tuple[int, int]) -> None:
+def test_a_decompression_bomb_is_refused_by_its_header(tmp_path, size):
     (tmp_path / "bomb.png").write_bytes(bomb(*size))
     for read in (picture_size, picture_info, read_rgba, lambda path: read_integers(path, "depth", wide=True)):
         with pytest.raises(InputError, match=r"bomb\.png"):
             read(tmp_path / "bomb.png")
 
 
-def test_depth_comes_from_png_and_npy_in_world_units(tmp_path: Path) -> None:
+def test_depth_comes_from_png_and_npy_in_world_units(tmp_path):
     values = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 80
     png = save(tmp_path / "d.png", values)
     metres = values * 1e-3
     metres[0, :4] = [np.nan, np.inf, -np.inf, 0]
     np.save(tmp_path / "d.npy", metres)
-    files = DepthFiles(
-        [png, tmp_path / "d.npy", None],
-        [grid()] * 3,
-        RemapCache(),
-        [DepthSensor(scale=scale) for scale in (1e-3, 1.0, 1.0)],
-    )
+    images = [with_depth(png, 1e-3), with_depth(tmp_path / "d.npy"), with_depth(None)]
+    files = DepthFiles(images, [grid()] * 3, RemapCache())
     assert (files[0] == (values * 1e-3).astype(np.float32)).all()
     assert not files[1][0, :4].any()
     assert (files[1][1:] == files[0][1:]).all()
@@ -147,14 +143,11 @@ def test_depth_comes_from_png_and_npy_in_world_units(tmp_path: Path) -> None:
     assert files[2].dtype == np.float32
 
 
-def test_depth_of_a_wrong_kind_is_an_error(tmp_path: Path) -> None:
-    cases = {
-        "eight.png": photograph(0)[..., 0].copy(),
-        "rgb.png": photograph(0),
-    }
+def test_depth_of_a_wrong_kind_is_an_error(tmp_path):
+    cases = {"eight.png": photograph(0)[..., 0].copy(), "rgb.png": photograph(0)}
     for name, values in cases.items():
         with pytest.raises(InputError, match=f"{name}: depth must be a 16-bit"):
-            DepthFiles([save(tmp_path / name, values)], [grid()], RemapCache(), [DepthSensor()])[0]
+            DepthFiles([with_depth(save(tmp_path / name, values))], [grid()], RemapCache())[0]
     np.save(tmp_path / "negative.npy", np.full((24, 32), -1.0))
     np.save(tmp_path / "cube.npy", np.zeros((24, 32, 2)))
     np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object), allow_pickle=True)
@@ -166,7 +159,7 @@ def test_depth_of_a_wrong_kind_is_an_error(tmp_path: Path) -> None:
         ("huge", "depth scale"),
     ):
         with pytest.raises(InputError, match=f"{name}.npy.*{problem}"):
-            DepthFiles([tmp_path / f"{name}.npy"], [grid()], RemapCache(), [DepthSensor()])[0]
+            DepthFiles([with_depth(tmp_path / f"{name}.npy")], [grid()], RemapCache())[0]
     # A header that promises more than the file holds.
     data = (tmp_path / "negative.npy").read_bytes()
     (tmp_path / "cut.npy").write_bytes(data[:-8])
@@ -174,7 +167,7 @@ def test_depth_of_a_wrong_kind_is_an_error(tmp_path: Path) -> None:
         picture_size(tmp_path / "cut.npy")
 
 
-def test_instances_keep_their_numbers(tmp_path: Path) -> None:
+def test_instances_keep_their_numbers(tmp_path):
     wide = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 80
     narrow = (wide % 256).astype(np.uint8)
     paths = [save(tmp_path / "wide.png", wide), save(tmp_path / "narrow.png", narrow), None]
@@ -186,7 +179,7 @@ def test_instances_keep_their_numbers(tmp_path: Path) -> None:
         InstanceFiles([save(tmp_path / "rgb.png", photograph(0))], [grid()], RemapCache())[0]
 
 
-def test_alpha_is_no_mask_and_a_palette_has_numbers_and_a_quick_look_is_large_enough(tmp_path: Path) -> None:
+def test_alpha_is_no_mask_and_a_palette_has_numbers_and_a_quick_look_is_large_enough(tmp_path):
     values = np.zeros((24, 32, 4), np.uint8)
     values[..., 3], values[:5, :, 1] = 255, 9
     assert (read_mask(save(tmp_path / "mask.png", values)) == (np.arange(24) < 5)[:, None]).all()
@@ -198,16 +191,14 @@ def test_alpha_is_no_mask_and_a_palette_has_numbers_and_a_quick_look_is_large_en
     assert read_small(save(tmp_path / "wide.png", photograph(0, 200, 40)), 20).shape == (20, 100, 3)
 
 
-def test_sequences_index_like_lists(tmp_path: Path) -> None:
+def test_sequences_index_like_lists(tmp_path):
     paths = [save(tmp_path / f"{i}.png", photograph(i)) for i in range(4)]
     files = ImageFiles(paths, [grid()] * 4, RemapCache())
     assert len(files) == 4
     assert (files[-1] == photograph(3)).all()
     assert (files[np.int64(2)] == photograph(2)).all()
     assert [(a == photograph(i)).all() for i, a in zip((3, 2, 1, 0), files[::-1], strict=True)] == [True] * 4
-    depths = DepthFiles(
-        [None] * 4, [grid()] * 4, RemapCache(), [DepthSensor(scale=scale) for scale in (1.0, 2.0, 3.0, 4.0)]
-    )[1:3]
+    depths = DepthFiles([with_depth(None)] * 4, [grid()] * 4, RemapCache())[1:3]
     assert len(depths) == 2
     for bad in (4, -5):
         with pytest.raises(IndexError):
@@ -216,7 +207,7 @@ def test_sequences_index_like_lists(tmp_path: Path) -> None:
         files["0"]  # type: ignore[call-overload]
 
 
-def test_a_file_that_changed_its_size_after_loading_is_an_error(tmp_path: Path) -> None:
+def test_a_file_that_changed_its_size_after_loading_is_an_error(tmp_path):
     path = save(tmp_path / "a.png", photograph(0, 31, 24))
     with pytest.raises(InputError, match=r"a\.png: 31×24 pixels, expected 32×24"):
         ImageFiles([path], [grid()], RemapCache())[0]
@@ -224,7 +215,7 @@ def test_a_file_that_changed_its_size_after_loading_is_an_error(tmp_path: Path) 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_mutated_pictures_give_a_picture_or_an_input_error(tmp_path: Path, data: st.DataObject) -> None:
+def test_mutated_pictures_give_a_picture_or_an_input_error(tmp_path, data):
     suffix = data.draw(st.sampled_from(["png", "jpg", "tiff", "webp"]))
     original = save(tmp_path / f"whole.{suffix}", photograph(0)).read_bytes()
     mutated = bytearray(original[: data.draw(st.integers(0, len(original)))])
@@ -259,9 +250,7 @@ def wide_photograph(folder: Path, suffix: str) -> Path:
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
 @pytest.mark.parametrize("params", [(350.0, 350.0, 200.0, 150.0), (350.0, 350.0, 200.0, 150.0, -0.05, 0.01, 0.0, 0.0)])
 @pytest.mark.parametrize(("width", "reduction"), [(60, 2), (37, 4), (150, 1)])
-def test_a_reduced_photograph_is_as_the_full_one_made_smaller(
-    tmp_path: Path, suffix: str, params: tuple[float, ...], width: int, reduction: int
-) -> None:
+def test_a_reduced_photograph_is_as_the_full_one_made_smaller(tmp_path, suffix, params, width, reduction):
     model = "OPENCV" if len(params) > 4 else "PINHOLE"
     camera = CameraModel(model=model, width=400, height=300, params=params)
     small = grid(camera, width, round(width * 0.75))
@@ -278,7 +267,7 @@ def test_a_reduced_photograph_is_as_the_full_one_made_smaller(
 
 
 @pytest.mark.parametrize("turn", [1, *EXCHANGED])
-def test_a_photograph_is_made_smaller_without_a_shift_turned_or_not(tmp_path: Path, turn: int) -> None:
+def test_a_photograph_is_made_smaller_without_a_shift_turned_or_not(tmp_path, turn):
     """Its sides are no multiples of what it could be decoded smaller by: 3 of 104 columns are missing."""
     ramp = np.broadcast_to(np.round(2.5 * np.arange(101)).astype(np.uint8)[:, None], (74, 101, 3))
     path = save(tmp_path / "turned.png", turned(ramp, INVERSE[turn]))
@@ -289,7 +278,7 @@ def test_a_photograph_is_made_smaller_without_a_shift_turned_or_not(tmp_path: Pa
     assert np.abs(color.astype(int) - np.asarray(expected)).max() <= 2
 
 
-def test_a_file_has_the_shape_of_its_photograph_up_to_less_than_a_pixel_and_a_square_one_is_not_turned() -> None:
+def test_a_file_has_the_shape_of_its_photograph_up_to_less_than_a_pixel_and_a_square_one_is_not_turned():
     turning = replace(grid(), turn=6)
     for width, height, fits in ((16, 12, True), (64, 48, True), (17, 12, False), (15, 12, False), (12, 16, False)):
         assert grid().fits(width, height) == fits
@@ -299,7 +288,7 @@ def test_a_file_has_the_shape_of_its_photograph_up_to_less_than_a_pixel_and_a_sq
     assert not grid().is_exchanged(12, 16)
 
 
-def test_a_photograph_is_decoded_once_until_its_file_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_photograph_is_decoded_once_until_its_file_changes(tmp_path, monkeypatch):
     decoded = []
 
     def counted(path: Path, reduction: int) -> object:
@@ -335,9 +324,7 @@ def test_a_photograph_is_decoded_once_until_its_file_changes(tmp_path: Path, mon
         assert len(decoded) == count + added
 
 
-def test_checks_the_fit_of_a_splat_and_a_teacher_decode_each_photograph_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_checks_the_fit_of_a_splat_and_a_teacher_decode_each_photograph_once(tmp_path, monkeypatch):
     """They look at the same views; before, some were decoded four times."""
     room, folder = make_room(0, objects=2, views=5, width=160, height=120), tmp_path / "room"
     write_room(room, folder)
@@ -356,8 +343,6 @@ def test_checks_the_fit_of_a_splat_and_a_teacher_decode_each_photograph_once(
 
     monkeypatch.setattr(images, "read_rgba", counted)
     views = load_scene(folder, options=SceneConfig(image_scale=0.25)).views
-    assert views is not None
-    assert views.images is not None
     assert plain_photographs(views) == ([], 4)
     for view in range(5):
         assert np.isfinite(SmallViews(views).picture(view)).all()

@@ -22,16 +22,13 @@ EVERY = 10
 
 
 @pytest.fixture(scope="module")
-def room() -> Scene:
+def room():
     return make_room(3, objects=4, views=4, width=96, height=72)
 
 
 def write_iphone(scene: Scene, folder: Path, poses: Poses, *, prefix: str = "") -> Path:
     """A scene whose frames are every tenth of the video; depth is a quarter as large as the photographs."""
     views, iphone = scene.views, folder / "iphone"
-    assert views is not None
-    assert views.images is not None
-    assert views.depths is not None
     for name in ("rgb", "depth", "rgb_masks", "colmap", "nerfstudio"):
         (iphone / name).mkdir(parents=True)
     K = views.cameras.Ks[0].astype(float)
@@ -71,30 +68,23 @@ def write_iphone(scene: Scene, folder: Path, poses: Poses, *, prefix: str = "") 
 
 
 def views_of(scene: Scene) -> Views:
-    assert scene.views is not None
     return scene.views
 
 
 @pytest.mark.parametrize(
     ("poses", "prefix"), [("colmap", ""), ("colmap", "iphone/"), ("nerfstudio", ""), ("arkit", "")]
 )
-def test_a_room_is_read_back_from_each_kind_of_poses(room: Scene, tmp_path: Path, poses: Poses, prefix: str) -> None:
+def test_a_room_is_read_back_from_each_kind_of_poses(room, tmp_path, poses, prefix):
     folder = tmp_path / "scene"
     iphone = write_iphone(room, folder, poses, prefix=prefix)
     for path in (folder, iphone):
         recognized = layout_of(path)
-        assert recognized is not None
         assert recognized.name == "ScanNet++"
     assert find_scenes([tmp_path]) == (folder,)
     read = load_scene(folder)
     ours, theirs = views_of(read), views_of(room)
     np.testing.assert_allclose(ours.cameras.cam_from_world, theirs.cameras.cam_from_world, atol=1e-5)
     np.testing.assert_allclose(ours.cameras.Ks, theirs.cameras.Ks, rtol=1e-6)
-    assert ours.images is not None
-    assert ours.depths is not None
-    assert ours.masks is not None
-    assert theirs.images is not None
-    assert theirs.depths is not None
     for view in range(4):
         assert np.abs(ours.images[view].astype(int) - theirs.images[view]).mean() < 3
         np.testing.assert_allclose(ours.depths[view][2::4, 2::4], theirs.depths[view][2::4, 2::4], atol=6e-4)
@@ -104,7 +94,7 @@ def test_a_room_is_read_back_from_each_kind_of_poses(room: Scene, tmp_path: Path
     assert (read.sfm_points is not None) == (poses == "colmap")
 
 
-def test_a_video_that_is_still_to_be_extracted_is_named_with_the_command(room: Scene, tmp_path: Path) -> None:
+def test_a_video_that_is_still_to_be_extracted_is_named_with_the_command(room, tmp_path):
     iphone = write_iphone(room, tmp_path / "scene", "colmap")
     shutil.rmtree(iphone / "rgb")
     with pytest.raises(InputError, match=r"extracted from rgb.mkv to rgb/ .* ffmpeg -i rgb.mkv -start_number 0"):
@@ -118,14 +108,14 @@ def test_a_video_that_is_still_to_be_extracted_is_named_with_the_command(room: S
         load_scene(tmp_path / "scene")
 
 
-def test_a_depth_stream_that_is_still_to_be_extracted_is_said(room: Scene, tmp_path: Path) -> None:
+def test_a_depth_stream_that_is_still_to_be_extracted_is_said(room, tmp_path):
     iphone = write_iphone(room, tmp_path / "scene", "colmap")
     shutil.rmtree(iphone / "depth")
     with pytest.warns(SceneWarning, match=r"depth.bin is still to be extracted to depth/"):
         assert views_of(load_scene(iphone)).depths is None
 
 
-def test_frames_without_a_pose_or_depth_are_counted(room: Scene, tmp_path: Path) -> None:
+def test_frames_without_a_pose_or_depth_are_counted(room, tmp_path):
     iphone = write_iphone(room, tmp_path / "scene", "arkit")
     path = iphone / "pose_intrinsic_imu.json"
     content = json.loads(path.read_text())
@@ -142,7 +132,7 @@ def test_frames_without_a_pose_or_depth_are_counted(room: Scene, tmp_path: Path)
 
 
 @pytest.mark.parametrize("broken", ["[]", '{"frame_000000": 3}', '{"frame_000000": {"aligned_pose": [[1]]}}'])
-def test_poses_that_are_none_are_refused(room: Scene, tmp_path: Path, broken: str) -> None:
+def test_poses_that_are_none_are_refused(room, tmp_path, broken):
     iphone = write_iphone(room, tmp_path / "scene", "arkit")
     (iphone / "pose_intrinsic_imu.json").write_text(broken)
     with pytest.raises(InputError, match="expected an object of frames|aligned_pose must have 4 rows of 4 numbers"):

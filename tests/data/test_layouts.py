@@ -1,7 +1,6 @@
 """Every layout of RGB-D sequences gives the scene that was written; what does not fit is refused or counted."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,30 +16,27 @@ from gsencoder.types import Scene, Views
 
 
 @pytest.fixture(scope="module")
-def room() -> Scene:
+def room():
     return make_room(3, objects=4, views=5, width=96, height=72)
 
 
 def options_for(layout: str, room: Scene) -> SceneConfig:
     """TUM sequences do not say their intrinsics."""
-    assert room.views is not None
     K = room.views.cameras.Ks[0].astype(float)
     stated = (K[0, 0], K[1, 1], K[0, 2], K[1, 2]) if layout == "TUM RGB-D" else None
     return SceneConfig(intrinsics=stated)
 
 
 def views_of(scene: Scene) -> Views:
-    assert scene.views is not None
     return scene.views
 
 
 @pytest.mark.parametrize("layout", WRITERS)
-def test_a_room_is_read_back_from_every_layout(room: Scene, tmp_path: Path, layout: str) -> None:
+def test_a_room_is_read_back_from_every_layout(room, tmp_path, layout):
     folder = tmp_path / "room"
     folder.mkdir()
     WRITERS[layout](room, folder)
     recognized = layout_of(folder)
-    assert recognized is not None
     assert recognized.name == layout
     assert find_scenes([tmp_path]) == (folder,)
     read = load_scene(folder, options=options_for(layout, room))
@@ -52,9 +48,6 @@ def test_a_room_is_read_back_from_every_layout(room: Scene, tmp_path: Path, layo
         ours.cameras.cam_from_world[:, :3, :3], theirs.cameras.cam_from_world[:, :3, :3], atol=1e-6
     )
     np.testing.assert_allclose(ours.cameras.Ks, theirs.cameras.Ks, rtol=1e-6)
-    assert ours.images is not None
-    assert theirs.images is not None
-    assert theirs.depths is not None
     for view in range(len(theirs)):
         np.testing.assert_array_equal(ours.images[view], theirs.images[view])
         if ours.depths is not None:
@@ -63,14 +56,14 @@ def test_a_room_is_read_back_from_every_layout(room: Scene, tmp_path: Path, layo
     assert (read.metres_per_unit, read.up is None) == (1.0, layout == "7-Scenes")
 
 
-def test_the_error_that_recognizes_nothing_lists_every_layout(tmp_path: Path) -> None:
+def test_the_error_that_recognizes_nothing_lists_every_layout(tmp_path):
     with pytest.raises(InputError, match="neither a scene nor a folder of scenes") as error:
         find_scenes([tmp_path])
     for layout in LAYOUTS:
         assert layout.files in str(error.value)
 
 
-def test_a_kinects_depth_is_carried_into_its_photographs(tmp_path: Path) -> None:
+def test_a_kinects_depth_is_carried_into_its_photographs(tmp_path):
     """The color lens stands 25 mm aside, and sees more of the room than the depth sensor does."""
     folder = tmp_path / "seq-01"
     wall = make_room(0, objects=1, views=1, width=640, height=480)
@@ -78,35 +71,34 @@ def test_a_kinects_depth_is_carried_into_its_photographs(tmp_path: Path) -> None
     np.savetxt(folder / "camera-intrinsics.txt", [[585, 0, 320], [0, 585, 240], [0, 0, 1]])
     views = views_of(load_scene(folder))
     np.testing.assert_allclose(views.cameras.Ks[0], [[525, 0, 320], [0, 525, 240], [0, 0, 1]])
-    assert views.depths is not None
     depth = views.depths[0]
     assert not depth[:, 0].any()
     # Inside, depth is missing beside outlines alone, where the sensor's view was blocked.
     assert 0.99 < (depth[60:-60, 60:-60] > 0).mean() < 1
 
 
-def test_times_that_do_not_match_are_refused_with_both_ranges(room: Scene, tmp_path: Path) -> None:
+def test_times_that_do_not_match_are_refused_with_both_ranges(room, tmp_path):
     write_tum(room, tmp_path)
     text = (tmp_path / "groundtruth.txt").read_text().replace("13050311", "13050399")
     (tmp_path / "groundtruth.txt").write_text(text)
-    with pytest.raises(InputError, match=r"5 have no pose within 0.1 s; rgb.txt has times from 1305031102.000 to"):
+    with pytest.raises(InputError, match=r"no view: rgb.txt has times from 1305031102.000 to"):
         load_scene(tmp_path, options=options_for("TUM RGB-D", room))
 
 
-def test_depth_of_another_time_is_not_taken(room: Scene, tmp_path: Path) -> None:
+def test_depth_of_another_time_is_not_taken(room, tmp_path):
     write_tum(room, tmp_path, late=5.0)
     with pytest.warns(SceneWarning, match="5 of 5 depth files are missing"):
         assert views_of(load_scene(tmp_path, options=options_for("TUM RGB-D", room))).depths is None
 
 
-def test_a_sequence_that_does_not_say_its_intrinsics_asks_for_them(room: Scene, tmp_path: Path) -> None:
+def test_a_sequence_that_does_not_say_its_intrinsics_asks_for_them(room, tmp_path):
     write_tum(room, tmp_path)
     with pytest.raises(InputError, match=r"give data.intrinsics=\[fx,fy,cx,cy\]"):
         load_scene(tmp_path)
 
 
 @pytest.mark.parametrize("count", [0, 1, 7])
-def test_poses_of_the_wrong_count_are_refused(room: Scene, tmp_path: Path, count: int) -> None:
+def test_poses_of_the_wrong_count_are_refused(room, tmp_path, count):
     folder = tmp_path / "room"
     write_replica(room, folder)
     rows = np.resize(np.loadtxt(folder / "traj.txt"), (count, 16))
@@ -116,7 +108,7 @@ def test_poses_of_the_wrong_count_are_refused(room: Scene, tmp_path: Path, count
         load_scene(folder)
 
 
-def test_a_trajectory_of_nan_leaves_no_view(room: Scene, tmp_path: Path) -> None:
+def test_a_trajectory_of_nan_leaves_no_view(room, tmp_path):
     folder = tmp_path / "room"
     write_replica(room, folder)
     np.savetxt(folder / "traj.txt", np.full((5, 16), np.nan))
@@ -125,17 +117,16 @@ def test_a_trajectory_of_nan_leaves_no_view(room: Scene, tmp_path: Path) -> None
 
 
 # The checks of shapes read a depth image as soon as there are views.
-def test_a_photograph_in_depths_stead_is_refused(room: Scene, tmp_path: Path, no_jaxtyping: None) -> None:
+def test_a_photograph_in_depths_stead_is_refused(room, tmp_path, no_jaxtyping):
     folder = tmp_path / "room"
     write_replica(room, folder)
     (folder / "results" / "depth000002.png").write_bytes((folder / "results" / "frame000002.png").read_bytes())
     views = views_of(load_scene(folder))
-    assert views.depths is not None
     with pytest.raises(InputError, match="depth must be a 16-bit picture with one channel, got mode RGB"):
         views.depths[2]
 
 
-def test_a_row_of_another_length_is_named(room: Scene, tmp_path: Path) -> None:
+def test_a_row_of_another_length_is_named(room, tmp_path):
     folder = tmp_path / "room"
     write_replica(room, folder)
     lines = (folder / "traj.txt").read_text().splitlines()
@@ -145,15 +136,13 @@ def test_a_row_of_another_length_is_named(room: Scene, tmp_path: Path) -> None:
         load_scene(folder)
 
 
-def test_intrinsics_and_a_depth_sensor_beside_the_camera_can_be_stated(room: Scene, tmp_path: Path) -> None:
+def test_intrinsics_and_a_depth_sensor_beside_the_camera_can_be_stated(room, tmp_path):
     """Depth that is registered already, stated to come from 10 cm aside: every surface moves by f · 0.1 / z pixels."""
     folder = tmp_path / "room"
     write_replica(room, folder)
     aside = (1.0, 0.0, 0.0, 0.1, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     moved = views_of(load_scene(folder, options=SceneConfig(depth_from_color=aside)))
     plain = views_of(load_scene(folder))
-    assert moved.depths is not None
-    assert plain.depths is not None
     K = plain.cameras.Ks[0].astype(float)
     transform = np.eye(4)
     transform[0, 3] = -0.1
@@ -164,7 +153,7 @@ def test_intrinsics_and_a_depth_sensor_beside_the_camera_can_be_stated(room: Sce
         SceneConfig(depth_from_color=(1.0, 2.0, 3.0))
 
 
-def test_transforms_json_may_state_the_depth_sensor(room: Scene, tmp_path: Path) -> None:
+def test_transforms_json_may_state_the_depth_sensor(room, tmp_path):
     from gsencoder.data.synthetic import write_room
 
     write_room(room, tmp_path / "room")
@@ -178,8 +167,6 @@ def test_transforms_json_may_state_the_depth_sensor(room: Scene, tmp_path: Path)
     path.write_text(json.dumps(data))
     moved = views_of(load_scene(tmp_path / "room"))
     stated = views_of(load_scene(tmp_path / "room", options=SceneConfig(depth_from_color=tuple(aside.reshape(-1)))))
-    assert moved.depths is not None
-    assert stated.depths is not None
     np.testing.assert_array_equal(moved.depths[1], stated.depths[1])
     data["depth_from_color"] = "left"
     path.write_text(json.dumps(data))
@@ -187,7 +174,7 @@ def test_transforms_json_may_state_the_depth_sensor(room: Scene, tmp_path: Path)
         load_scene(tmp_path / "room")
 
 
-def test_registered_depth_hides_what_is_behind() -> None:
+def test_registered_depth_hides_what_is_behind():
     """A bar before a wall: from the side the bar covers other parts of the wall, and bares some that have no depth."""
     depth = np.full((40, 60), 4.0, np.float32)
     depth[:, 28:32] = 1.0
@@ -203,7 +190,7 @@ def test_registered_depth_hides_what_is_behind() -> None:
     np.testing.assert_array_equal(register_depth(depth, K, np.eye(4), K, 60, 40), depth)
 
 
-def test_registration_without_depth_and_behind_the_camera_gives_none() -> None:
+def test_registration_without_depth_and_behind_the_camera_gives_none():
     K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]])
     behind = np.eye(4)
     behind[2, 3] = -10
@@ -211,7 +198,7 @@ def test_registration_without_depth_and_behind_the_camera_gives_none() -> None:
     assert not register_depth(np.zeros((40, 60), np.float32), K, np.eye(4), K, 60, 40).any()
 
 
-def test_the_nearest_time_is_taken_within_its_limit() -> None:
+def test_the_nearest_time_is_taken_within_its_limit():
     others = np.array([0.0, 1.0, 2.0])
     assert nearest_within(np.array([-0.01, 0.49, 0.51, 1.99, 2.5]), others, 0.5).tolist() == [0, 0, 1, 2, 2]
     assert nearest_within(np.array([2.6]), others, 0.5).tolist() == [-1]

@@ -18,7 +18,7 @@ def looks(gaussians: Gaussians, **options: object) -> tuple[np.ndarray, np.ndarr
 
 
 @pytest.mark.parametrize("up", [None, np.array([0.0, 0.0, 1.0]), np.array([0.0, 3.0, 0.0])])
-def test_orbit_cameras_see_the_center_from_one_distance(rng: np.random.Generator, up: np.ndarray | None) -> None:
+def test_orbit_cameras_see_the_center_from_one_distance(rng, up):
     ball = rng.normal(size=(4000, 3))
     ball *= (rng.random((4000, 1)) ** (1 / 3)) / np.linalg.norm(ball, axis=1, keepdims=True)
     gaussians = some_gaussians(ball + np.array([4, 5, 6]))
@@ -41,7 +41,7 @@ def test_orbit_cameras_see_the_center_from_one_distance(rng: np.random.Generator
         assert (cameras.cam_from_world[:, 1, :3] @ up < 0).all()
 
 
-def test_floaters_and_transparent_gaussians_do_not_move_the_orbit(rng: np.random.Generator) -> None:
+def test_floaters_and_transparent_gaussians_do_not_move_the_orbit(rng):
     ball = rng.normal(size=(1000, 3))
     clean = robust_ball(some_gaussians(ball))
     far = np.concatenate([ball, rng.normal(size=(30, 3)) * 1e6, 50 + rng.normal(size=(5000, 3))])
@@ -56,7 +56,7 @@ def test_floaters_and_transparent_gaussians_do_not_move_the_orbit(rng: np.random
 
 @pytest.mark.parametrize("count", [1, 500])
 @pytest.mark.parametrize("opacity", [0.0, 1.0])
-def test_one_gaussian_and_coincident_ones_have_orbits(count: int, opacity: float) -> None:
+def test_one_gaussian_and_coincident_ones_have_orbits(count, opacity):
     gaussians = some_gaussians(np.tile([[1.0, 2.0, 3.0]], (count, 1)), np.full(count, opacity), scale=0.2)
     pixel, depth = looks(gaussians, count=1, width=100, height=100)
     assert np.abs(pixel - 50).max() < 1e-2
@@ -65,7 +65,7 @@ def test_one_gaussian_and_coincident_ones_have_orbits(count: int, opacity: float
     assert looks(tiny)[1].min() > 0.04
 
 
-def test_orbits_refuse_nothing_and_nonsense() -> None:
+def test_orbits_refuse_nothing_and_nonsense():
     one = some_gaussians(np.zeros((1, 3)))
     with pytest.raises(InputError, match="at least one Gaussian"):
         orbit_cameras(some_gaussians(np.zeros((0, 3))))

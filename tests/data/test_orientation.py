@@ -45,12 +45,11 @@ def turned_scene(field_room: FieldRoom, folder: Path, orientations: tuple[int, .
 
 def degrees_from_z(scene: Scene) -> tuple[float, float]:
     up = up_of_scene(scene)
-    assert up is not None
     return float(np.degrees(np.arccos(np.clip(up.direction[2], -1, 1)))), up.confidence
 
 
 @pytest.mark.parametrize("orientation", TURNS)
-def test_turning_is_what_pillow_does_and_its_inverse_undoes_it(orientation: int, tmp_path: Path) -> None:
+def test_turning_is_what_pillow_does_and_its_inverse_undoes_it(orientation, tmp_path):
     pixels = photograph(0)
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -66,7 +65,7 @@ def test_turning_is_what_pillow_does_and_its_inverse_undoes_it(orientation: int,
 
 
 @pytest.mark.parametrize("value", [0, 9, 700])
-def test_an_orientation_that_means_nothing_is_none(value: int, tmp_path: Path) -> None:
+def test_an_orientation_that_means_nothing_is_none(value, tmp_path):
     exif = Image.Exif()
     exif[0x0112] = value
     Image.fromarray(photograph(0)).save(tmp_path / "odd.jpg", exif=exif)
@@ -74,17 +73,13 @@ def test_an_orientation_that_means_nothing_is_none(value: int, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("orientations", [(6,) * 8, (8,) * 8, (3,) * 8, MIXED])
-def test_up_is_that_of_upright_pictures_and_poses_are_of_the_stored_pixels(
-    orientations: tuple[int, ...], field_room: FieldRoom, tmp_path: Path
-) -> None:
+def test_up_is_that_of_upright_pictures_and_poses_are_of_the_stored_pixels(orientations, field_room, tmp_path):
     folder, poses = turned_scene(field_room, tmp_path / "turned", orientations)
     scene = load_scene(folder)
     angle, confidence = degrees_from_z(scene)
     assert angle < 2
     assert confidence > 0.95
     views = scene.views
-    assert views is not None
-    assert views.images is not None
     assert views.orientations == orientations
     assert np.allclose(views.cameras.cam_from_world, poses, atol=1e-6)
     for row, orientation in enumerate(orientations):
@@ -93,22 +88,17 @@ def test_up_is_that_of_upright_pictures_and_poses_are_of_the_stored_pixels(
         assert views.cameras.Ks[row, :2, 2].tolist() == [shape[1] / 2, shape[0] / 2]
 
 
-def test_photographs_that_are_stored_upright_have_no_orientations(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_photographs_that_are_stored_upright_have_no_orientations(field_room, tmp_path):
     content = field_room.copy_photographs(tmp_path / "plain")
     views = load_scene(write_colmap_text(tmp_path / "plain", content)).views
-    assert views is not None
     assert views.orientations is None
     assert upright_views(views) is views
 
 
-def test_upright_views_are_those_of_the_room(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_upright_views_are_those_of_the_room(field_room, tmp_path):
     folder, _ = turned_scene(field_room, tmp_path / "turned", MIXED)
     views = upright_scene(load_scene(folder)).views
     plain = load_scene(field_room.room).views
-    assert views is not None
-    assert plain is not None
-    assert views.images is not None
-    assert plain.images is not None
     assert views.orientations is None
     assert np.allclose(views.cameras.cam_from_world, plain.cameras.cam_from_world, atol=1e-6)
     assert np.allclose(views.cameras.Ks, plain.cameras.Ks)
@@ -126,7 +116,6 @@ class _Seen:
         self.pictures: dict[str, np.ndarray] = {}
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        assert views.images is not None
         picture = views.images[view]
         self.pictures[views.names[view]] = picture
         cells = picture[::4, ::4].astype(np.float32) / 255
@@ -144,9 +133,7 @@ def fused(scene: Scene) -> tuple[np.ndarray, _Seen]:
     return fuse(scene, teacher).features.features, teacher
 
 
-def test_a_teacher_sees_upright_pictures_and_its_maps_lie_on_the_stored_pixels(
-    field_room: FieldRoom, tmp_path: Path
-) -> None:
+def test_a_teacher_sees_upright_pictures_and_its_maps_lie_on_the_stored_pixels(field_room, tmp_path):
     folder, _ = turned_scene(field_room, tmp_path / "turned", MIXED)
     plain_folder = tmp_path / "plain"
     content = field_room.copy_photographs(plain_folder)
@@ -165,15 +152,12 @@ def test_a_teacher_sees_upright_pictures_and_its_maps_lie_on_the_stored_pixels(
 
 
 @pytest.mark.parametrize("orientation", MIRRORED)
-def test_mirrored_photographs_are_named_and_teachers_see_them_as_people_do(
-    orientation: int, field_room: FieldRoom, tmp_path: Path
-) -> None:
+def test_mirrored_photographs_are_named_and_teachers_see_them_as_people_do(orientation, field_room, tmp_path):
     folder, _ = turned_scene(field_room, tmp_path / "turned", (orientation,) * 8)
     with pytest.warns(SceneWarning, match="8 of 8 photographs are stored mirrored"):
         scene = load_scene(folder, splat=field_room.splat)
     assert degrees_from_z(replace(scene, gaussians=None))[0] < 2
     teacher = _Seen()
-    assert scene.views is not None
     upright(teacher).feature_map(scene.views, 0)
     stored = folder / "images" / "000.jpg"
     with Image.open(stored) as picture:
@@ -181,7 +165,7 @@ def test_mirrored_photographs_are_named_and_teachers_see_them_as_people_do(
 
 
 @pytest.mark.parametrize("orientation", TURNS)
-def test_a_map_turned_back_has_the_same_value_at_the_same_place(orientation: int) -> None:
+def test_a_map_turned_back_has_the_same_value_at_the_same_place(orientation):
     rng = np.random.default_rng(orientation)
     width, height = 30, 20
     upright_size = (height, width) if orientation > 4 else (width, height)
@@ -189,7 +173,6 @@ def test_a_map_turned_back_has_the_same_value_at_the_same_place(orientation: int
     cells = rng.random((12, 14, 3), np.float32)
     given = FeatureMap(features=cells, grid_from_image=affine, space=FeatureSpace(name="s", channels=3))
     back = stored_map(given, orientation, width, height)
-    assert back.features is not None
     columns, rows = np.meshgrid(np.arange(width), np.arange(height))
     places = np.stack((columns, rows), axis=2)
     upright_places = turned(places, orientation)
@@ -204,9 +187,7 @@ def test_a_map_turned_back_has_the_same_value_at_the_same_place(orientation: int
         assert np.array_equal(cells[cell[1], cell[0]], back.features[int(actual[1]), int(actual[0])])
 
 
-def test_intrinsics_of_the_upright_picture_turn_the_pixels_of_a_file_that_is_stored_sideways(
-    field_room: FieldRoom, tmp_path: Path
-) -> None:
+def test_intrinsics_of_the_upright_picture_turn_the_pixels_of_a_file_that_is_stored_sideways(field_room, tmp_path):
     folder = tmp_path / "upright"
     content = field_room.copy_photographs(folder)
     store_turned(folder, content, (6, 8, 6, 8, 5, 7, 6, 1))
@@ -220,27 +201,20 @@ def test_intrinsics_of_the_upright_picture_turn_the_pixels_of_a_file_that_is_sto
         content["frames"][int(name[0])]["mask_path"] = f"masks/{name}"
     scene = load_scene(write_transforms(folder, content))
     views, plain = scene.views, load_scene(field_room.room).views
-    assert views is not None
-    assert plain is not None
-    assert views.images is not None
-    assert views.masks is not None
     assert views.orientations is None
     assert np.array_equal(views.cameras.cam_from_world, plain.cameras.cam_from_world)
-    assert plain.images is not None
     assert all(np.abs(views.images[row].astype(int) - plain.images[row]).mean() < 4 for row in range(len(views)))
     assert all(np.array_equal(views.masks[row], mask > 0) for row in range(4))
     stated = load_scene(folder, options=SceneConfig(intrinsics=(112.0, 112.0, 80.0, 60.0))).views
-    assert stated is not None
     assert np.allclose(stated.cameras.Ks, views.cameras.Ks)
     # Without a stated size the principal point tells.
     content.pop("w")
     content.pop("h")
     guessed = load_scene(write_transforms(folder, content)).views
-    assert guessed is not None
     assert np.array_equal(guessed.cameras.Ks, views.cameras.Ks)
 
 
-def test_intrinsics_of_the_stored_pixels_leave_them_as_they_are(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_intrinsics_of_the_stored_pixels_leave_them_as_they_are(field_room, tmp_path):
     folder = tmp_path / "stored"
     content = field_room.copy_photographs(folder)
     poses = store_turned(folder, content, (6,) * 8)
@@ -249,12 +223,11 @@ def test_intrinsics_of_the_stored_pixels_leave_them_as_they_are(field_room: Fiel
         frame["transform_matrix"] = (np.linalg.inv(pose) @ np.diag([1, -1, -1, 1])).tolist()
         assert np.allclose(cam_from_world(frame), pose)
     scene = load_scene(write_transforms(folder, content))
-    assert scene.views is not None
     assert scene.views.orientations == (6,) * 8
     assert degrees_from_z(scene)[0] < 2
 
 
-def test_square_pictures_are_taken_as_they_are_stored(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_square_pictures_are_taken_as_they_are_stored(field_room, tmp_path):
     """Their size says nothing, and nerfstudio's matrices are of stored pixels, as COLMAP gives them."""
     folder = tmp_path / "square"
     content = field_room.copy_photographs(folder)
@@ -264,13 +237,11 @@ def test_square_pictures_are_taken_as_they_are_stored(field_room: FieldRoom, tmp
     content.update(w=120, h=120, cx=60.0, cy=60.0)
     store_turned(folder, content, (6,) * 8)
     views = load_scene(write_transforms(folder, content)).views
-    assert views is not None
-    assert views.images is not None
     assert views.orientations == (6,) * 8
     assert np.array_equal(views.images[0], np.asarray(Image.open(folder / "images/000.jpg")))
 
 
-def test_files_of_regions_lie_as_photographs_are_stored(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_files_of_regions_lie_as_photographs_are_stored(field_room, tmp_path):
     folder, _ = turned_scene(field_room, tmp_path / "turned", MIXED)
     labels = np.zeros((120, 160), np.uint8)
     labels[:40, :100] = 7
@@ -279,22 +250,19 @@ def test_files_of_regions_lie_as_photographs_are_stored(field_room: FieldRoom, t
         Image.fromarray(turned(labels, INVERSE[orientation])).save(folder / f"labels/{row:03d}.png")
     scene = load_scene(folder)
     masks = FileMasks(scene, "labels")
-    assert scene.views is not None
     shown = upright_views(scene.views, unmirror=True)
     for row in range(len(MIXED)):
         assert np.array_equal(masks.labels(shown, row), labels)
         assert np.array_equal(turned(masks.labels(scene.views, row), MIXED[row]), labels)
 
 
-def test_views_for_people_and_models_are_upright(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_views_for_people_and_models_are_upright(field_room, tmp_path):
     folder, _ = turned_scene(field_room, tmp_path / "turned", MIXED)
     scene = load_scene(folder, splat=field_room.splat)
     assert scene.gaussians is not None
-    assert scene.views is not None
     features = fuse(scene, PaletteTeacher(), FuseConfig(views=2)).features
     save_features(tmp_path / "features", scene, features)
     loaded = load_features(tmp_path / "features")
-    assert loaded.views is not None
     # What is stored are the poses of the photographs as they are stored, and how these are turned.
     assert loaded.views.orientations == MIXED
     assert np.array_equal(loaded.views.cameras.cam_from_world, scene.views.cameras.cam_from_world)

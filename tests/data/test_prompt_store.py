@@ -12,7 +12,7 @@ from gsencoder.core.files import sealed
 from gsencoder.data.prompts import PICTURES_FOLDER, PROMPTS_FILE, TOKENS_FOLDER, PromptStore
 
 
-def test_what_is_written_is_read(tmp_path: Path) -> None:
+def test_what_is_written_is_read(tmp_path):
     tokens = np.arange(24, dtype=np.float16).reshape(2, 3, 4)
     PromptStore(tmp_path).add("a", "Was ist das?\nGrün", [png(0), png(1)], tokens, "a space")
     prompt = PromptStore(tmp_path).prompts["a"]
@@ -23,7 +23,7 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(store.tokens(prompt.tokens), tokens)
 
 
-def test_questions_about_the_same_thing_share_their_pictures(tmp_path: Path) -> None:
+def test_questions_about_the_same_thing_share_their_pictures(tmp_path):
     store = PromptStore(tmp_path)
     for key in "abc":
         store.add(key, key, [png(0), png(1)], np.zeros((2, 1, 1), np.float16))
@@ -33,7 +33,7 @@ def test_questions_about_the_same_thing_share_their_pictures(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("length", [0, 1])
-def test_a_line_that_was_cut_off_is_written_again(tmp_path: Path, length: int) -> None:
+def test_a_line_that_was_cut_off_is_written_again(tmp_path, length):
     store = PromptStore(tmp_path)
     for number in range(length + 1):
         store.add(str(number), "text", [png(0)])
@@ -45,7 +45,7 @@ def test_a_line_that_was_cut_off_is_written_again(tmp_path: Path, length: int) -
     assert list(PromptStore(tmp_path).prompts) == [*(str(number) for number in range(length)), "next"]
 
 
-def test_a_changed_picture_is_refused(tmp_path: Path) -> None:
+def test_a_changed_picture_is_refused(tmp_path):
     store = PromptStore(tmp_path)
     (name,) = store.add("a", "text", [png(0)]).pictures
     (tmp_path / PICTURES_FOLDER / name).write_bytes(png(1))
@@ -63,13 +63,13 @@ def test_a_changed_picture_is_refused(tmp_path: Path) -> None:
         b'{"key": "a", "text": 3, "pictures": ["x.png"], "tokens": "", "space": ""}',
     ],
 )
-def test_lines_that_no_store_wrote_are_refused(tmp_path: Path, line: bytes) -> None:
+def test_lines_that_no_store_wrote_are_refused(tmp_path, line):
     (tmp_path / PROMPTS_FILE).write_bytes(line + b"\n")
     with pytest.raises(InputError, match="line 1 is no prompt"):
         PromptStore(tmp_path)
 
 
-def test_names_are_those_of_formats_and_tokens_of_other_shapes_are_others(tmp_path: Path) -> None:
+def test_names_are_those_of_formats_and_tokens_of_other_shapes_are_others(tmp_path):
     store = PromptStore(tmp_path)
     jpeg = bytes([255, 216, 255, 224]) + b"no picture"
     values = np.arange(12, dtype=np.float16)
@@ -87,7 +87,7 @@ def test_names_are_those_of_formats_and_tokens_of_other_shapes_are_others(tmp_pa
     assert [len(list((tmp_path / folder).iterdir())) for folder in (PICTURES_FOLDER, TOKENS_FOLDER)] == [2, 2]
 
 
-def test_a_prompt_that_is_written_again_replaces_the_one_before(tmp_path: Path) -> None:
+def test_a_prompt_that_is_written_again_replaces_the_one_before(tmp_path):
     store = PromptStore(tmp_path)
     store.add("a", "old", [png(0)])
     store.add("b", "other", [png(1)])
@@ -97,7 +97,7 @@ def test_a_prompt_that_is_written_again_replaces_the_one_before(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("cut", [1, 2, 40])
-def test_a_cut_line_of_any_length_is_dropped_and_whole_ones_stay(tmp_path: Path, cut: int) -> None:
+def test_a_cut_line_of_any_length_is_dropped_and_whole_ones_stay(tmp_path, cut):
     store = PromptStore(tmp_path)
     for key in ("a", "b", "c"):
         store.add(key, f"text {key}", [png(0)])
@@ -113,7 +113,7 @@ def test_a_cut_line_of_any_length_is_dropped_and_whole_ones_stay(tmp_path: Path,
     assert list(PromptStore(tmp_path).prompts) == ["a", "b", "c", "d"]
 
 
-def test_folders_of_pictures_are_there_once_and_damaged_files_are_named(tmp_path: Path) -> None:
+def test_folders_of_pictures_are_there_once_and_damaged_files_are_named(tmp_path):
     store = PromptStore(tmp_path)
     prompt = store.add("a", "text", [png(0)], np.zeros((1, 2, 3), np.float16))
     (tmp_path / TOKENS_FOLDER / prompt.tokens).unlink()
@@ -139,8 +139,8 @@ def test_folders_of_pictures_are_there_once_and_damaged_files_are_named(tmp_path
         {"space": None},
     ],
 )
-def test_names_that_leave_the_folder_are_no_prompt(tmp_path: Path, changes: dict[str, object]) -> None:
+def test_names_that_leave_the_folder_are_no_prompt(tmp_path, changes):
     row = {"key": "a", "text": "t", "pictures": ["x.png"], "tokens": "", "space": ""}
     (tmp_path / PROMPTS_FILE).write_text(json.dumps(sealed(row)) + "\n" + json.dumps(sealed(row | changes)) + "\n")
-    with pytest.raises(InputError, match="line 2 is no prompt, or not as it was written; remove the folder to make it"):
+    with pytest.raises(InputError, match="line 2 is no prompt, or damaged"):
         PromptStore(tmp_path)

@@ -54,7 +54,7 @@ HOSTILE = {
     "absurd.ply": (GOOD_PLY.replace(b"vertex 8", b"vertex " + b"9" * 40), "line 4"),
     "negative.ply": (GOOD_PLY.replace(b"vertex 8", b"vertex -8"), "line 4"),
     "none.ply": (GOOD_PLY.replace(b"vertex 8", b"vertex 0"), "no Gaussians"),
-    "points.ply": (GOOD_PLY.replace(b"f_dc_", b"color_"), "point cloud or mesh"),
+    "points.ply": (GOOD_PLY.replace(b"f_dc_", b"color_"), "expected a Gaussian splat"),
     "surfels.ply": (GOOD_PLY.replace(b"scale_2", b"thick"), "2D splat"),
     "rest.ply": (GOOD_PLY.replace(b"f_rest_8", b"other_8"), "8 f_rest"),
     "more.ply": (GOOD_PLY.replace(b"f_rest_8", b"f_rest_x"), "8 f_rest"),
@@ -74,17 +74,17 @@ HOSTILE = {
     "short.spz": (b"NGSP" + bytes(5), "32"),
     "version.spz": (struct.pack("<4sI24x", b"NGSP", 9), "version 9"),
     "streams.spz": (spz4(3, [(1, 1)] * 2), "expected 5 streams"),
-    "claim.spz": (spz4(2**32 - 1, [(1, 1)] * 5), "200 times"),
+    "claim.spz": (spz4(2**32 - 1, [(1, 1)] * 5), "exhaust memory"),
     "sizes.spz": (spz4(3, [(2**63, 27)] * 5, bytes(50)), "truncated or damaged"),
     "garbage.spz": (spz4(3, [(4, 27), (4, 3), (4, 9), (4, 9), (4, 12)], bytes(20)), "cannot be unpacked"),
     "degree.spz": (spz4(3, [(1, 1)] * 6, degree=200), "SH degree 200"),
-    "bomb4.spz": (spz4_bomb(3_000_000), "200 times"),
+    "bomb4.spz": (spz4_bomb(3_000_000), "exhaust memory"),
     "gzip.spz": (gzip.compress(b"something else"), "NGSP"),
     "gzip_cut.spz": (samples.spz2_bytes(np.zeros((5, 3)))[:-9], "truncated"),
     "gzip_bad.spz": (b"\x1f\x8b\x08" + b"\xff" * 50, "gzip data"),
     "bomb3.spz": (
         gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 5_000_000, 0, 12, 0, 0) + bytes(100_000_000), 9),
-        "200 times",
+        "exhaust memory",
     ),
     "zip_cut.sog": (samples.zipped(samples.sog_files())[:-30], "damaged"),
     "no_meta.sog": (samples.zipped({"a": b"b"}), "no member 'meta.json'"),
@@ -92,15 +92,15 @@ HOSTILE = {
     "deep.sog": (samples.zipped({"meta.json": b"[" * 100_000}), "not JSON"),
     "meta_bomb.sog": (samples.zipped({"meta.json": bytes(50_000_000)}), "more than the"),
     "version.sog": (sog_with(version=1), "version 1"),
-    "count.sog": (sog_with(count=10**12), "200 times"),
+    "count.sog": (sog_with(count=10**12), "exhaust memory"),
     "count_type.sog": (sog_with(count=True), "count"),
     "few_pixels.sog": (sog_with(count=4000), "too few"),
-    "leaves.sog": (sog_with(quats__files=["../../etc/passwd"]), "without a folder"),
-    "absolute.sog": (sog_with(quats__files=["/etc/passwd"]), "without a folder"),
+    "leaves.sog": (sog_with(quats__files=["../../etc/passwd"]), "expected a file name"),
+    "absolute.sog": (sog_with(quats__files=["/etc/passwd"]), "expected a file name"),
     "missing.sog": (sog_with(quats__files=["gone.webp"]), "no member"),
     "codebook.sog": (sog_with(scales__codebook=[0.0] * 9), "codebook with 9"),
     "codebook_type.sog": (sog_with(scales__codebook=["a"] * 256), "something else than numbers"),
-    "mins.sog": (sog_with(means__mins=[1.0]), "unusable list"),
+    "mins.sog": (sog_with(means__mins=[1.0]), "expected 3 numbers as means.mins"),
     "palette.sog": (sog_with(shN__count=1), "beyond the 1 entries"),
     "bands.sog": (sog_with(shN__bands=9), "shN.bands 9"),
     "pixels.sog": (samples.zipped({**samples.sog_files(), "quats.webp": BIG_WEBP}), "4000×4000"),
@@ -110,7 +110,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_bad_files_end_in_one_clear_line_soon_and_without_large_memory(tmp_path: Path, name: str) -> None:
+def test_bad_files_end_in_one_clear_line_soon_and_without_large_memory(tmp_path, name):
     data, words = HOSTILE[name]
     (tmp_path / name).write_bytes(data)
     tracemalloc.start()
@@ -127,14 +127,14 @@ def test_bad_files_end_in_one_clear_line_soon_and_without_large_memory(tmp_path:
     assert str(caught.value).count(str(tmp_path)) == 1
 
 
-def test_a_null_in_a_codebook_is_a_defect_of_the_rows_that_use_it(tmp_path: Path) -> None:
+def test_a_null_in_a_codebook_is_a_defect_of_the_rows_that_use_it(tmp_path):
     codebook = [None] * 10 + np.linspace(-8, -2, 246).tolist()
     (tmp_path / "a.sog").write_bytes(sog_with(scales__codebook=codebook))
     raw = read_raw(tmp_path / "a.sog")
     assert 0 < np.isnan(raw.log_scales).any(axis=1).sum() < 20
 
 
-def test_paths_that_are_not_files_are_told_apart(tmp_path: Path) -> None:
+def test_paths_that_are_not_files_are_told_apart(tmp_path):
     os.mkfifo(tmp_path / "pipe.ply")
     for path, words in (
         (tmp_path / "gone.ply", "no such file"),
@@ -149,14 +149,14 @@ def test_paths_that_are_not_files_are_told_apart(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_a_file_without_permission_is_an_error_that_says_so(tmp_path: Path) -> None:
+def test_a_file_without_permission_is_an_error_that_says_so(tmp_path):
     (tmp_path / "a.ply").write_bytes(GOOD_PLY)
     (tmp_path / "a.ply").chmod(0)
     with pytest.raises(InputError, match="Permission denied"):
         load_splat(tmp_path / "a.ply")
 
 
-def test_a_link_out_of_a_sog_folder_is_not_followed(tmp_path: Path) -> None:
+def test_a_link_out_of_a_sog_folder_is_not_followed(tmp_path):
     folder = tmp_path / "sog"
     folder.mkdir()
     for name, data in samples.sog_files().items():
@@ -168,7 +168,7 @@ def test_a_link_out_of_a_sog_folder_is_not_followed(tmp_path: Path) -> None:
         load_splat(folder)
 
 
-def test_what_cannot_be_written_is_refused_with_what_can(tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_refused_with_what_can(tmp_path):
     gaussians = samples.make_gaussians(3, 0)
     for name in ("a.splat", "a.sog", "a", "a.ply.gz"):
         with pytest.raises(InputError, match=r"expected \.ply, \.compressed\.ply or \.spz"):
@@ -188,15 +188,13 @@ def test_what_cannot_be_written_is_refused_with_what_can(tmp_path: Path) -> None
 
 
 @pytest.mark.usefixtures("no_jaxtyping")
-def test_an_origin_of_another_shape_is_our_own_error(tmp_path: Path) -> None:
+def test_an_origin_of_another_shape_is_our_own_error(tmp_path):
     with pytest.raises(InputError, match="three finite numbers"):
         save_splat(tmp_path / "a.ply", samples.make_gaussians(3, 0), origin=np.zeros(2))
 
 
 @pytest.mark.parametrize("failure", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])
-def test_a_full_disk_or_a_kill_in_mid_write_leaves_the_old_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: BaseException
-) -> None:
+def test_a_full_disk_or_a_kill_in_mid_write_leaves_the_old_file(tmp_path, monkeypatch, failure):
     gaussians = samples.make_gaussians(50, 0)
     save_splat(tmp_path / "a.spz", gaussians)
     before = (tmp_path / "a.spz").read_bytes()

@@ -21,7 +21,7 @@ def open3d_point_cloud(open3d: Any, path: Path) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "v3.spz"])
-def test_open3d_reads_what_we_write_and_sees_the_same(tmp_path: Path, open3d: Any, name: str, degree: int) -> None:
+def test_open3d_reads_what_we_write_and_sees_the_same(tmp_path, open3d, name, degree):
     gaussians = samples.make_gaussians(500, degree)
     save_splat(tmp_path / name, gaussians, spz_version=3 if "v3" in name else 4)
     seen, ours = open3d_point_cloud(open3d, tmp_path / name), load_splat(tmp_path / name)
@@ -35,7 +35,7 @@ def test_open3d_reads_what_we_write_and_sees_the_same(tmp_path: Path, open3d: An
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "a.splat"])
-def test_we_read_what_open3d_writes(tmp_path: Path, open3d: Any, name: str) -> None:
+def test_we_read_what_open3d_writes(tmp_path, open3d, name):
     gaussians = samples.make_gaussians(200, 0)
     gaussians = replace(gaussians, sh=gaussians.sh.clip(-1.5, 1.5))
     save_splat(tmp_path / "ours.ply", gaussians)
@@ -66,7 +66,7 @@ def assert_same_raw(ours: splats.RawSplat, theirs: object, opacity: float) -> No
 
 @pytest.mark.parametrize("degree", [0, 3])
 @pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "v3.spz"])
-def test_gsply_reads_what_we_write_and_sees_the_same(tmp_path: Path, name: str, degree: int) -> None:
+def test_gsply_reads_what_we_write_and_sees_the_same(tmp_path, name, degree):
     import gsply
 
     save_splat(tmp_path / name, samples.make_gaussians(500, degree), spz_version=3)
@@ -74,7 +74,7 @@ def test_gsply_reads_what_we_write_and_sees_the_same(tmp_path: Path, name: str, 
     assert_same_raw(read_raw(tmp_path / name), read(str(tmp_path / name)), 5e-5)
 
 
-def test_gsply_reads_our_sog_sample_as_we_do(tmp_path: Path) -> None:
+def test_gsply_reads_our_sog_sample_as_we_do(tmp_path):
     import gsply
 
     (tmp_path / "a.sog").write_bytes(samples.zipped(samples.sog_files(200, bands=2)))
@@ -86,7 +86,7 @@ def test_gsply_reads_our_sog_sample_as_we_do(tmp_path: Path) -> None:
     ("name", "count", "degree"),
     [("guitar.compressed.ply", 90_854, 0), ("biker.spz", 152_746, 0), ("playbot_sog", 8_406, 2)],
 )
-def test_real_files_load_whole(shared: Path, name: str, count: int, degree: int) -> None:
+def test_real_files_load_whole(shared, name, count, degree):
     gaussians = load_splat(shared / "fixtures" / name)
     assert (len(gaussians), gaussians.sh_degree) == (count, degree)
     assert 0.5 < np.ptp(gaussians.means, axis=0).max() < 10
@@ -94,7 +94,7 @@ def test_real_files_load_whole(shared: Path, name: str, count: int, degree: int)
 
 
 @pytest.mark.shared
-def test_gsply_and_open3d_agree_with_us_on_the_real_files(shared: Path, open3d: Any) -> None:
+def test_gsply_and_open3d_agree_with_us_on_the_real_files(shared, open3d):
     import gsply
 
     folder = shared / "fixtures"
@@ -108,7 +108,7 @@ def test_gsply_and_open3d_agree_with_us_on_the_real_files(shared: Path, open3d: 
 
 
 @pytest.mark.shared
-def test_a_sog_folder_its_meta_json_and_its_zip_are_one_splat(shared: Path, tmp_path: Path) -> None:
+def test_a_sog_folder_its_meta_json_and_its_zip_are_one_splat(shared, tmp_path):
     folder = shared / "fixtures" / "playbot_sog"
     (tmp_path / "a.sog").write_bytes(samples.zipped({file.name: file.read_bytes() for file in folder.iterdir()}))
     prints = {fingerprint(load_splat(path)) for path in (folder, folder / "meta.json", tmp_path / "a.sog")}

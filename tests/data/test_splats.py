@@ -7,7 +7,6 @@ import subprocess
 import sys
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -24,7 +23,7 @@ SPZ = {"quats": 2e-3, "log_scales": 0.03126, "opacities": 0.00197, "dc": 0.01308
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_an_inria_ply_comes_back_exactly_but_for_logarithms(tmp_path: Path, degree: int) -> None:
+def test_an_inria_ply_comes_back_exactly_but_for_logarithms(tmp_path, degree):
     gaussians = samples.make_gaussians(5000, degree)
     save_splat(tmp_path / "a.ply", gaussians)
     loaded = load_splat(tmp_path / "a.ply")
@@ -35,7 +34,7 @@ def test_an_inria_ply_comes_back_exactly_but_for_logarithms(tmp_path: Path, degr
 
 @pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_an_spz_comes_back_within_its_steps(tmp_path: Path, version: int, degree: int) -> None:
+def test_an_spz_comes_back_within_its_steps(tmp_path, version, degree):
     gaussians = samples.make_gaussians(2000, degree)
     save_splat(tmp_path / "a.spz", gaussians, spz_version=version)
     loaded = load_splat(tmp_path / "a.spz")
@@ -44,7 +43,7 @@ def test_an_spz_comes_back_within_its_steps(tmp_path: Path, version: int, degree
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_a_compressed_ply_in_order_comes_back_within_the_steps_of_each_chunk(tmp_path: Path, degree: int) -> None:
+def test_a_compressed_ply_in_order_comes_back_within_the_steps_of_each_chunk(tmp_path, degree):
     gaussians = samples.make_gaussians(1000, degree)
     save_splat(tmp_path / "a.compressed.ply", gaussians, keep_order=True)
     loaded = load_splat(tmp_path / "a.compressed.ply")
@@ -66,7 +65,7 @@ def test_a_compressed_ply_in_order_comes_back_within_the_steps_of_each_chunk(tmp
     )
 
 
-def test_a_compressed_ply_is_reordered_into_compact_chunks_which_is_more_precise(tmp_path: Path) -> None:
+def test_a_compressed_ply_is_reordered_into_compact_chunks_which_is_more_precise(tmp_path):
     gaussians = samples.make_gaussians(30_000, 0)
     errors = {}
     for keep_order in (True, False):
@@ -79,7 +78,7 @@ def test_a_compressed_ply_is_reordered_into_compact_chunks_which_is_more_precise
     assert errors[False] < errors[True] / 3
 
 
-def test_opacities_0_and_1_are_written_as_finite_logits_and_come_back(tmp_path: Path) -> None:
+def test_opacities_0_and_1_are_written_as_finite_logits_and_come_back(tmp_path):
     gaussians = replace(samples.make_gaussians(6, 0), opacities=np.array([0, 1, 0.5, 1e-12, 1 - 6e-8, 1], np.float32))
     for name, tolerance in (("a.ply", 1e-8), ("a.spz", 0.00197), ("a.compressed.ply", 0.00197)):
         save_splat(tmp_path / name, gaussians, keep_order=True)
@@ -87,20 +86,20 @@ def test_opacities_0_and_1_are_written_as_finite_logits_and_come_back(tmp_path: 
         assert np.abs(load_splat(tmp_path / name).opacities - gaussians.opacities).max() <= tolerance
 
 
-def test_scales_from_1e_minus_9_to_1e4_survive_a_ply(tmp_path: Path) -> None:
+def test_scales_from_1e_minus_9_to_1e4_survive_a_ply(tmp_path):
     scales = np.array([[1e-9, 1e4, 1], [1e-37, 1e37, 3]], np.float32)
     save_splat(tmp_path / "a.ply", replace(samples.make_gaussians(2, 0), scales=scales))
     assert np.abs(load_splat(tmp_path / "a.ply").scales / scales - 1).max() < 1e-5
 
 
-def test_one_gaussian_goes_through_every_format(tmp_path: Path) -> None:
+def test_one_gaussian_goes_through_every_format(tmp_path):
     one = samples.make_gaussians(1, 0)
     for name in ("a.ply", "a.compressed.ply", "a.spz", "A.PLY"):
         save_splat(tmp_path / name, one)
         assert np.abs(load_splat(tmp_path / name).means - one.means).max() < 1e-3
 
 
-def test_a_scene_a_million_metres_away_is_the_scene_at_zero_when_its_ply_has_doubles(tmp_path: Path) -> None:
+def test_a_scene_a_million_metres_away_is_the_scene_at_zero_when_its_ply_has_doubles(tmp_path):
     gaussians = samples.make_gaussians(100, 0)
     origin = np.array([1e6, -2e6, 3e5])
     save_splat(tmp_path / "far.ply", gaussians, origin=origin)
@@ -111,7 +110,7 @@ def test_a_scene_a_million_metres_away_is_the_scene_at_zero_when_its_ply_has_dou
         load_splat(tmp_path / "far.ply")
 
 
-def test_float_columns_far_away_stay_rounded_and_an_origin_does_not_warn(tmp_path: Path) -> None:
+def test_float_columns_far_away_stay_rounded_and_an_origin_does_not_warn(tmp_path):
     raw = samples.make_raw(50, 0)
     far = replace(raw, means=(raw.means + 1e6).astype(np.float32).astype(np.float64))
     (tmp_path / "far.ply").write_bytes(samples.ply_bytes(samples.ply_columns(far)))
@@ -119,7 +118,7 @@ def test_float_columns_far_away_stay_rounded_and_an_origin_does_not_warn(tmp_pat
     assert 1e-3 < np.abs(loaded.means - raw.means).max() <= 0.0626
 
 
-def test_packed_formats_refuse_or_announce_a_far_origin(tmp_path: Path) -> None:
+def test_packed_formats_refuse_or_announce_a_far_origin(tmp_path):
     gaussians, origin = samples.make_gaussians(50, 0), np.full(3, 1e6)
     with pytest.raises(InputError, match=r"save as \.ply"):
         save_splat(tmp_path / "a.compressed.ply", gaussians, origin=origin)
@@ -131,7 +130,7 @@ def test_packed_formats_refuse_or_announce_a_far_origin(tmp_path: Path) -> None:
     assert sorted(os.listdir(tmp_path)) == ["a.spz"]
 
 
-def test_spz_spends_more_bits_on_a_tiny_scene(tmp_path: Path) -> None:
+def test_spz_spends_more_bits_on_a_tiny_scene(tmp_path):
     tiny = samples.make_gaussians(100, 0)
     tiny = replace(tiny, means=tiny.means * np.float32(0.1))
     save_splat(tmp_path / "a.spz", tiny)
@@ -139,7 +138,7 @@ def test_spz_spends_more_bits_on_a_tiny_scene(tmp_path: Path) -> None:
     assert np.abs(load_splat(tmp_path / "a.spz").means - tiny.means).max() <= largest * 2.0**-17
 
 
-def test_values_beyond_a_packed_range_are_clipped_with_one_counted_warning(tmp_path: Path) -> None:
+def test_values_beyond_a_packed_range_are_clipped_with_one_counted_warning(tmp_path):
     gaussians = samples.make_gaussians(100, 1)
     sh = gaussians.sh.copy()
     sh[:7, 1:] = 5
@@ -151,9 +150,7 @@ def test_values_beyond_a_packed_range_are_clipped_with_one_counted_warning(tmp_p
 
 @pytest.mark.parametrize("kinds", ["float", "double"])
 @pytest.mark.parametrize("encoding", ["binary_little_endian", "binary_big_endian", "ascii"])
-def test_any_byte_order_number_type_and_property_order_reads_the_same(
-    tmp_path: Path, encoding: str, kinds: str
-) -> None:
+def test_any_byte_order_number_type_and_property_order_reads_the_same(tmp_path, encoding, kinds):
     raw = samples.make_raw(20, 2)
     columns = samples.ply_columns(raw)
     columns["nx"] = columns["confidence"] = np.zeros(20)
@@ -165,7 +162,7 @@ def test_any_byte_order_number_type_and_property_order_reads_the_same(
         assert np.array_equal(getattr(got, name).astype(np.float32), getattr(raw, name).astype(np.float32)), name
 
 
-def test_doubles_keep_positions_that_float_cannot_hold(tmp_path: Path) -> None:
+def test_doubles_keep_positions_that_float_cannot_hold(tmp_path):
     raw = samples.make_raw(20, 0)
     raw = replace(raw, means=raw.means + 1e7 + 1 / 3)
     for encoding in ("binary_little_endian", "ascii"):
@@ -173,7 +170,7 @@ def test_doubles_keep_positions_that_float_cannot_hold(tmp_path: Path) -> None:
         assert np.array_equal(read_raw(tmp_path / "a.ply").means, raw.means)
 
 
-def test_crlf_headers_and_elements_around_the_vertices_are_skipped(tmp_path: Path) -> None:
+def test_crlf_headers_and_elements_around_the_vertices_are_skipped(tmp_path):
     raw = samples.make_raw(9, 0)
     data = samples.ply_bytes(samples.ply_columns(raw))
     head, body = data.split(b"end_header\n")
@@ -184,7 +181,7 @@ def test_crlf_headers_and_elements_around_the_vertices_are_skipped(tmp_path: Pat
     assert np.array_equal(read_raw(tmp_path / "a.ply").means, raw.means)
 
 
-def test_quaternions_of_any_length_are_normalised_without_a_word(tmp_path: Path) -> None:
+def test_quaternions_of_any_length_are_normalised_without_a_word(tmp_path):
     raw = samples.make_raw(30, 0)
     lengths = np.geomspace(1e-6, 1e6, 30, dtype=np.float32)[:, None]
     (tmp_path / "a.ply").write_bytes(samples.ply_bytes(samples.ply_columns(replace(raw, quats=raw.quats * lengths))))
@@ -203,9 +200,7 @@ def test_quaternions_of_any_length_are_normalised_without_a_word(tmp_path: Path)
         ("logit_opacities", np.nan, "3 with NaN or Inf"),
     ],
 )
-def test_a_defect_is_a_counted_error_that_points_to_repair(
-    tmp_path: Path, field: str, value: float, words: str
-) -> None:
+def test_a_defect_is_a_counted_error_that_points_to_repair(tmp_path, field, value, words):
     raw = samples.make_raw(10, 1)
     array = getattr(raw, field).copy()
     array[[2, 5, 7]] = value
@@ -215,7 +210,7 @@ def test_a_defect_is_a_counted_error_that_points_to_repair(
     assert len(read_raw(tmp_path / "a.ply")) == 10
 
 
-def test_the_content_decides_and_the_suffix_only_where_there_is_no_magic(tmp_path: Path) -> None:
+def test_the_content_decides_and_the_suffix_only_where_there_is_no_magic(tmp_path):
     files = samples.valid_files(tmp_path)
     for name, data in files.items():
         disguise = tmp_path / ("x.splat" if name.endswith(".splat") else "x.sog")
@@ -224,7 +219,7 @@ def test_the_content_decides_and_the_suffix_only_where_there_is_no_magic(tmp_pat
         assert fingerprint(load_splat(disguise)) == fingerprint(load_splat(tmp_path / name))
 
 
-def test_dotsplat_rows_mean_what_their_bytes_say(tmp_path: Path) -> None:
+def test_dotsplat_rows_mean_what_their_bytes_say(tmp_path):
     row = struct.pack("<6f8B", 1, 2, 3, 0.5, 0.25, 2, 255, 0, 51, 102, 128 + 64, 128 - 64, 128, 128)
     (tmp_path / "a.splat").write_bytes(row)
     got = load_splat(tmp_path / "a.splat")
@@ -235,14 +230,14 @@ def test_dotsplat_rows_mean_what_their_bytes_say(tmp_path: Path) -> None:
     assert np.allclose(got.quats, [[np.sqrt(0.5), -np.sqrt(0.5), 0, 0]], atol=1e-6)
 
 
-def test_a_dotsplat_scale_of_zero_is_a_defect(tmp_path: Path) -> None:
+def test_a_dotsplat_scale_of_zero_is_a_defect(tmp_path):
     (tmp_path / "a.splat").write_bytes(struct.pack("<6f8B", 1, 2, 3, 0.5, 0, -2, *range(8)))
     assert read_raw(tmp_path / "a.splat").log_scales[0, 1:].tolist() == [-np.inf, -np.inf]
     with pytest.raises(InputError, match="1 with scales"):
         load_splat(tmp_path / "a.splat")
 
 
-def test_spz_version_2_stores_three_bytes_of_a_quaternion(tmp_path: Path) -> None:
+def test_spz_version_2_stores_three_bytes_of_a_quaternion(tmp_path):
     (tmp_path / "a.spz").write_bytes(samples.spz2_bytes(np.tile([255, 127, 128], (5, 1))))
     raw = read_raw(tmp_path / "a.spz")
     assert raw.format == ".spz version 2"
@@ -251,7 +246,7 @@ def test_spz_version_2_stores_three_bytes_of_a_quaternion(tmp_path: Path) -> Non
     assert (raw.logit_opacities == -20).all()
 
 
-def test_spz_extensions_and_sh_degree_4_are_left_out_with_a_warning(tmp_path: Path) -> None:
+def test_spz_extensions_and_sh_degree_4_are_left_out_with_a_warning(tmp_path):
     header = struct.pack("<4sIIBBBB", b"NGSP", 3, 4, 4, 12, 2, 0)
     (tmp_path / "a.spz").write_bytes(gzip.compress(header + bytes((20 + 72) * 4) + b"extension"))
     with pytest.warns(SceneWarning) as caught:
@@ -260,7 +255,7 @@ def test_spz_extensions_and_sh_degree_4_are_left_out_with_a_warning(tmp_path: Pa
     assert sorted("extensions of other" in str(warning.message) for warning in caught) == [False, True]
 
 
-def test_a_fingerprint_changes_with_one_bit_and_with_the_order_of_rows() -> None:
+def test_a_fingerprint_changes_with_one_bit_and_with_the_order_of_rows():
     gaussians = samples.make_gaussians(10, 1)
     assert fingerprint(gaussians) == fingerprint(samples.make_gaussians(10, 1))
     sh = gaussians.sh.copy()
@@ -269,7 +264,7 @@ def test_a_fingerprint_changes_with_one_bit_and_with_the_order_of_rows() -> None
     assert len({fingerprint(gaussians), *map(fingerprint, others)}) == 4
 
 
-def test_loading_needs_neither_torch_nor_numba(tmp_path: Path) -> None:
+def test_loading_needs_neither_torch_nor_numba(tmp_path):
     save_splat(tmp_path / "a.ply", samples.make_gaussians(3, 0))
     code = f"import sys; from gsencoder.data.splats.files import load_splat; load_splat({str(tmp_path / 'a.ply')!r})"
     code += "; print([m for m in ('torch', 'numba', 'gsply', 'open3d', 'scipy') if m in sys.modules])"
@@ -277,7 +272,7 @@ def test_loading_needs_neither_torch_nor_numba(tmp_path: Path) -> None:
     assert result.stdout.strip() == "[]"
 
 
-def test_a_good_file_gives_no_warning(tmp_path: Path) -> None:
+def test_a_good_file_gives_no_warning(tmp_path):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for name in ("a.ply", "a.compressed.ply", "a.spz"):

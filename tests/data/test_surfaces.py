@@ -8,7 +8,7 @@ from gsencoder.data.enclosure import MAX_SAMPLES, planes_of_gaussians, surfaces_
 from gsencoder.types import Cameras, Gaussians, Views
 
 
-def test_surfaces_of_gaussians_are_their_thin_axes_and_areas_count_opacity() -> None:
+def test_surfaces_of_gaussians_are_their_thin_axes_and_areas_count_opacity():
     rotations = Rotation.random(3, random_state=0)
     scales = np.array([[0.01, 0.2, 0.3], [0.2, 0.01, 0.5], [0.2, 0.3, 0.11]], np.float32)
     some = Gaussians(
@@ -28,7 +28,7 @@ def test_surfaces_of_gaussians_are_their_thin_axes_and_areas_count_opacity() -> 
     np.testing.assert_allclose(surfaces.areas[order], (0.2 * 0.3 * 0.5, 0.2 * 0.5), rtol=1e-6)
 
 
-def test_areas_of_depth_samples_are_those_of_the_surfaces() -> None:
+def test_areas_of_depth_samples_are_those_of_the_surfaces():
     """Of a plane across the view, seen by all pixels, z² / (fx fy) each; of a slanted one more by its cosine."""
     width, height, focal = 64, 48, 60.0
     cameras = Cameras(
@@ -62,7 +62,7 @@ def cloud(means: np.ndarray, opacity: float = 1.0) -> Gaussians:
     )
 
 
-def test_planes_through_means_are_those_that_the_means_lie_on() -> None:
+def test_planes_through_means_are_those_that_the_means_lie_on():
     made = np.random.default_rng(0)
     rotation = Rotation.random(random_state=1).as_matrix()
     flat = np.concatenate((made.uniform(0, 1, (2000, 2)), made.normal(0, 1e-3, (2000, 1))), axis=1)
@@ -75,7 +75,7 @@ def test_planes_through_means_are_those_that_the_means_lie_on() -> None:
     assert surfaces.rest > 10 * surfaces.areas.sum()
 
 
-def test_areas_of_planes_grow_with_the_square_of_the_spacing_and_lone_means_do_not_outvote() -> None:
+def test_areas_of_planes_grow_with_the_square_of_the_spacing_and_lone_means_do_not_outvote():
     made = np.random.default_rng(0)
     dense = np.concatenate((made.uniform(0, 1, (3000, 2)), np.zeros((3000, 1))), axis=1)
     once, wide = planes_of_gaussians(cloud(dense)), planes_of_gaussians(cloud(3 * dense))
@@ -84,7 +84,7 @@ def test_areas_of_planes_grow_with_the_square_of_the_spacing_and_lone_means_do_n
     assert lone.areas.max() < 3 * once.areas.max()
 
 
-def test_faint_few_and_coincident_gaussians_have_no_planes() -> None:
+def test_faint_few_and_coincident_gaussians_have_no_planes():
     made = np.random.default_rng(0)
     flat = np.concatenate((made.uniform(0, 1, (100, 2)), np.zeros((100, 1))), axis=1)
     for gaussians in (cloud(flat, 0.2), cloud(flat[:31]), cloud(np.zeros((100, 3)))):
@@ -93,7 +93,7 @@ def test_faint_few_and_coincident_gaussians_have_no_planes() -> None:
     assert len(planes_of_gaussians(cloud(flat[:32])).areas) == 32
 
 
-def test_of_large_clouds_a_random_choice_is_looked_at_that_a_seed_repeats() -> None:
+def test_of_large_clouds_a_random_choice_is_looked_at_that_a_seed_repeats():
     made = np.random.default_rng(0)
     flat = np.concatenate((made.uniform(0, 1, (MAX_SAMPLES + 5000, 2)), np.zeros((MAX_SAMPLES + 5000, 1))), axis=1)
     first, again = planes_of_gaussians(cloud(flat)), planes_of_gaussians(cloud(flat))

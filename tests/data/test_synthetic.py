@@ -173,7 +173,6 @@ def test_a_written_room_loads_as_the_same_scene(room, tmp_path):
     write_room(room, tmp_path / "room")
     loaded = load_scene(tmp_path / "room")
     assert loaded.metres_per_unit == 1
-    assert loaded.up is not None
     assert loaded.up.tolist() == [0, 0, 1]
     assert loaded.views.names == room.views.names
     assert np.abs(loaded.views.cameras.centers + loaded.origin - room.views.cameras.centers).max() < 1e-6

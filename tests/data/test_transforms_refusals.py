@@ -3,7 +3,6 @@
 import json
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,13 +11,14 @@ from hypothesis import strategies as st
 from scene_files import OPENGL, change, photograph, rewrite, save, world_from_cams, write_transforms
 
 from gsencoder.core.errors import InputError
+from gsencoder.data.readers.posed import ReadOptions
 from gsencoder.data.readers.transforms_json import read_transforms
 from gsencoder.data.scenes import load_scene
 
 
 @pytest.mark.parametrize("key", ["file_path", "depth_file_path", "mask_path", "instance_file_path"])
 @pytest.mark.parametrize("kind", ["dots", "absolute", "link"])
-def test_paths_that_leave_the_scene_folder_are_refused(tmp_path: Path, key: str, kind: str) -> None:
+def test_paths_that_leave_the_scene_folder_are_refused(tmp_path, key, kind):
     folder = tmp_path / "scene"
     data = write_transforms(folder)
     wide = np.full((24, 32), 1, np.uint16)
@@ -29,7 +29,7 @@ def test_paths_that_leave_the_scene_folder_are_refused(tmp_path: Path, key: str,
     path = change(folder, data, **{key: value})
     with pytest.raises(InputError, match=r"frame 1 .* leads out of the scene folder"):
         read_transforms(path)
-    assert len(read_transforms(path, allow_outside=True).images) == 3
+    assert len(read_transforms(path, ReadOptions(allow_outside=True)).images) == 3
 
 
 def matrix(scale: float = 1.0, **entries: float) -> list[list[float]]:
@@ -54,7 +54,7 @@ def matrix(scale: float = 1.0, **entries: float) -> list[list[float]]:
         ({"transform_matrix": (np.array(matrix()) @ np.diag([1, 1, -1, 1])).tolist()}, "mirrors"),
         ({"transform_matrix": [[1, 2], [3, 4]]}, "4 rows"),
         ({"transform_matrix": [["1", 0, 0, 0]] * 4}, "must be a number"),
-        ({"transform_matrix": [[None, 0, 0, 0]] * 4}, "empty entry"),
+        ({"transform_matrix": [[None, 0, 0, 0]] * 4}, "got null"),
         ({"transform_matrix": None}, "4 rows"),
         ({"fl_x": float("nan")}, "fl_x must be finite"),
         ({"cx": float("inf")}, "cx must be finite"),
@@ -78,7 +78,7 @@ def matrix(scale: float = 1.0, **entries: float) -> list[list[float]]:
         ({"depth_file_path": "images/000.png", "depth_unit_scale_factor": 0}, "depth scale must be positive"),
     ],
 )
-def test_a_frame_that_cannot_be_used_is_named(tmp_path: Path, values: dict[str, Any], problem: str) -> None:
+def test_a_frame_that_cannot_be_used_is_named(tmp_path, values, problem):
     path = change(tmp_path, write_transforms(tmp_path), **values)
     with pytest.raises(InputError, match="frame 1") as caught:
         read_transforms(path)
@@ -86,7 +86,7 @@ def test_a_frame_that_cannot_be_used_is_named(tmp_path: Path, values: dict[str, 
     assert "\n" not in str(caught.value)
 
 
-def test_depth_of_another_size_names_both(tmp_path: Path) -> None:
+def test_depth_of_another_size_names_both(tmp_path):
     write_transforms(tmp_path, depth=True)
     save(tmp_path / "depth/002.png", np.ones((12, 24), np.uint16))
     with pytest.raises(InputError, match=r"depth/002.png has 24×12 pixels but .*images/002.png has 32×24"):
@@ -97,7 +97,7 @@ def test_depth_of_another_size_names_both(tmp_path: Path) -> None:
     "content",
     [b"", b"{", b"[]", b"{}", b'{"frames": []}', b'{"frames": {}}', b'{"frames": [1]}', b"\xff\xfe", b"[" * 100_000],
 )
-def test_files_that_are_no_transforms_are_errors(tmp_path: Path, content: bytes) -> None:
+def test_files_that_are_no_transforms_are_errors(tmp_path, content):
     (tmp_path / "transforms.json").write_bytes(content)
     with pytest.raises(InputError, match=r"transforms\.json"):
         load_scene(tmp_path)
@@ -142,7 +142,6 @@ def loads_or_complains(folder: Path) -> None:
         message = str(error)
     else:
         message = ""
-        assert scene.views is not None
         assert np.isfinite(scene.views.cameras.cam_from_world).all()
         for name in ("images", "depths", "masks", "instances"):
             sequence = getattr(scene.views, name)
@@ -157,7 +156,7 @@ def loads_or_complains(folder: Path) -> None:
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 @pytest.mark.slow
-def test_mutated_values_give_a_scene_or_an_input_error(tmp_path: Path, no_jaxtyping: None, data: st.DataObject) -> None:
+def test_mutated_values_give_a_scene_or_an_input_error(tmp_path, no_jaxtyping, data):
     scene = write_transforms(tmp_path, 2, depth=True)
     for _ in range(data.draw(st.integers(1, 3))):
         target = data.draw(st.sampled_from([scene, *scene["frames"]])) if isinstance(scene["frames"], list) else scene
@@ -176,7 +175,7 @@ def test_mutated_values_give_a_scene_or_an_input_error(tmp_path: Path, no_jaxtyp
 @pytest.mark.filterwarnings("ignore::gsencoder.core.errors.SceneWarning")
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_mutated_text_gives_a_scene_or_an_input_error(tmp_path: Path, no_jaxtyping: None, data: st.DataObject) -> None:
+def test_mutated_text_gives_a_scene_or_an_input_error(tmp_path, no_jaxtyping, data):
     text = bytearray(json.dumps(write_transforms(tmp_path, 2, depth=True)).encode())
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(text) - 1))
@@ -187,19 +186,17 @@ def test_mutated_text_gives_a_scene_or_an_input_error(tmp_path: Path, no_jaxtypi
     loads_or_complains(tmp_path)
 
 
-def test_a_depth_beyond_float32_is_refused_where_it_is_read(tmp_path: Path, no_jaxtyping: None) -> None:
+def test_a_depth_beyond_float32_is_refused_where_it_is_read(tmp_path, no_jaxtyping):
     scene = write_transforms(tmp_path, 2, depth=True)
     rewrite(tmp_path, {**scene, "depth_unit_scale_factor": 1e37})
     views = load_scene(tmp_path).views
-    assert views is not None
-    assert views.depths is not None
     with pytest.raises(InputError, match=r"depth/000.png: depth of .* world units; check the depth scale"):
         views.depths[0]
 
 
 @pytest.mark.parametrize("key", ["file_path", "depth_file_path", "mask_path", "instance_file_path"])
 @pytest.mark.parametrize("unit", ["a", "a/", "../", "é/"])
-def test_a_path_longer_than_any_file_has_is_refused_at_once(tmp_path: Path, key: str, unit: str) -> None:
+def test_a_path_longer_than_any_file_has_is_refused_at_once(tmp_path, key, unit):
     data = write_transforms(tmp_path)
     data["frames"][1][key] = unit * 500_000
     rewrite(tmp_path, data)
@@ -211,12 +208,12 @@ def test_a_path_longer_than_any_file_has_is_refused_at_once(tmp_path: Path, key:
 
 
 @pytest.mark.parametrize("up", [[0, 0, 0], [1e-7, 0, 0], [1e7, 0, 0], [1, 0], [1, 0, 0, 0], "z", [None, 0, 1]])
-def test_a_direction_that_is_none_is_refused(tmp_path: Path, up: object) -> None:
-    with pytest.raises(InputError, match="up must be three"):
+def test_a_direction_that_is_none_is_refused(tmp_path, up):
+    with pytest.raises(InputError, match="up must be"):
         read_transforms(rewrite(tmp_path, write_transforms(tmp_path) | {"up": up}))
 
 
 @pytest.mark.parametrize("metres", [0, -1.0])
-def test_a_unit_of_no_length_is_refused(tmp_path: Path, metres: float) -> None:
+def test_a_unit_of_no_length_is_refused(tmp_path, metres):
     with pytest.raises(InputError, match="metres_per_unit must be positive"):
         read_transforms(rewrite(tmp_path, write_transforms(tmp_path) | {"metres_per_unit": metres}))

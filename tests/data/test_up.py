@@ -1,7 +1,6 @@
 """Up is estimated from cameras and surfaces, and turns with the scene."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 @pytest.fixture(scope="module")
-def room() -> Scene:
+def room():
     return replace(make_room(1, objects=6, views=10, width=96, height=72, spacing=0.08), up=None)
 
 
@@ -59,10 +58,9 @@ def degrees(first: np.ndarray, second: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("number", range(2))
-def test_up_of_a_turned_room_turns_with_it(room: Scene, number: int) -> None:
+def test_up_of_a_turned_room_turns_with_it(room, number):
     rotation = Rotation.random(random_state=number).as_matrix()
     other = turned(room, rotation)
-    assert other.views is not None
     for scene, source in (
         (other, "cameras and surfaces"),
         (replace(other, gaussians=None), "cameras and surfaces"),
@@ -70,25 +68,22 @@ def test_up_of_a_turned_room_turns_with_it(room: Scene, number: int) -> None:
         (replace(other, views=None), "surfaces"),
     ):
         up = up_of_scene(scene)
-        assert up is not None
         assert up.source == source
         assert degrees(up.direction, rotation @ UP) < 1.0
         assert up.confidence > 0.4
 
 
-def test_cameras_that_are_tilted_leave_the_last_degrees_to_the_surfaces(room: Scene) -> None:
+def test_cameras_that_are_tilted_leave_the_last_degrees_to_the_surfaces(room):
     """A photographer who rolls the camera by 10° on average."""
-    assert room.views is not None
     roll = Rotation.from_rotvec(np.deg2rad(10) * np.array([0, 0, 1.0])).as_matrix()
     poses = room.views.cameras.cam_from_world.astype(np.float64)
     poses[:, :3] = roll @ poses[:, :3]
     rolled = replace(room.views, cameras=replace(room.views.cameras, cam_from_world=poses.astype(np.float32)))
     up = up_of_scene(replace(room, views=rolled))
-    assert up is not None
     assert degrees(up.direction, UP) < 1.0
 
 
-def test_a_camera_that_moves_ahead_has_the_mean_of_its_own_up() -> None:
+def test_a_camera_that_moves_ahead_has_the_mean_of_its_own_up():
     poses = np.tile(np.eye(4, dtype=np.float32), (5, 1, 1))
     poses[:, 2, 3] = np.arange(5)
     ahead = Cameras(
@@ -100,15 +95,14 @@ def test_a_camera_that_moves_ahead_has_the_mean_of_its_own_up() -> None:
     np.testing.assert_allclose(up_of_cameras(ahead), (0, -1, 0), atol=1e-6)
 
 
-def test_what_is_stated_is_not_estimated(room: Scene) -> None:
+def test_what_is_stated_is_not_estimated(room):
     stated = replace(room, up=np.array([0.0, 1.0, 0.0]))
     scene, up = with_up(stated)
     assert scene is stated
-    assert up is not None
-    assert (up.source, up.describe()) == ("stated", "(0.000, 1.000, 0.000), stated")
+    assert (up.source, up.describe()) == ("files", "(0.000, 1.000, 0.000), of the files")
 
 
-def test_a_splat_without_directions_has_no_up() -> None:
+def test_a_splat_without_directions_has_no_up():
     """Flat Gaussians that face everywhere, and round ones."""
     made = np.random.default_rng(0)
     count = 3000
@@ -131,17 +125,16 @@ def test_a_splat_without_directions_has_no_up() -> None:
         estimate_up(None, None)
 
 
-def test_up_can_be_stated_when_a_scene_is_read(tmp_path: Path) -> None:
+def test_up_can_be_stated_when_a_scene_is_read(tmp_path):
     write_box(tmp_path / "box", box_views(box_cameras(2, width=64, height=48, focal=44.8)))
     scene = load_scene(tmp_path / "box", options=SceneConfig(up=(0.0, -3.0, 4.0)))
-    assert scene.up is not None
     np.testing.assert_allclose(scene.up, (0, -0.6, 0.8))
     for wrong in ((0.0, 0.0, 0.0), (float("inf"), 0.0, 0.0)):
         with pytest.raises(InputError, match="up: expected three finite numbers"):
             SceneConfig(up=wrong)
 
 
-def test_the_candidates_lie_evenly_on_the_sphere() -> None:
+def test_the_candidates_lie_evenly_on_the_sphere():
     """Their mean is zero and their second moments are those of the sphere, a third of the unit matrix."""
     sphere = _sphere(4000)
     np.testing.assert_allclose(np.linalg.norm(sphere, axis=1), 1, atol=1e-12)
@@ -151,7 +144,7 @@ def test_the_candidates_lie_evenly_on_the_sphere() -> None:
     assert 2.5 < nearest.min() <= nearest.max() < 3.5
 
 
-def test_bells_are_one_on_their_axis_and_fall_off_as_a_gaussian_of_six_degrees() -> None:
+def test_bells_are_one_on_their_axis_and_fall_off_as_a_gaussian_of_six_degrees():
     cosines = np.cos(np.deg2rad([0.0, 6, 45, 84, 90, 96, 174, 180]))
     lying, standing = _bells(cosines)
     e = np.exp(-1)
@@ -159,7 +152,7 @@ def test_bells_are_one_on_their_axis_and_fall_off_as_a_gaussian_of_six_degrees()
     np.testing.assert_allclose(standing, [0, 0, 0, e, 1, e, 0, 0], atol=1e-9)
 
 
-def test_support_is_the_area_that_lies_and_half_of_what_stands() -> None:
+def test_support_is_the_area_that_lies_and_half_of_what_stands():
     normals = np.array([[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [np.sqrt(0.5), 0, np.sqrt(0.5)]])
     areas = np.array([0.2, 0.1, 0.4, 0.3])
     np.testing.assert_allclose(_support(UP[None], normals, areas), [0.2 + 0.1 + 0.5 * 0.4], atol=1e-6)
@@ -167,7 +160,7 @@ def test_support_is_the_area_that_lies_and_half_of_what_stands() -> None:
     np.testing.assert_allclose(_support(many, normals, areas), [0.5] * 600 + [0.5], atol=1e-6)
 
 
-def test_a_refined_direction_is_what_floors_and_walls_agree_on() -> None:
+def test_a_refined_direction_is_what_floors_and_walls_agree_on():
     made = np.random.default_rng(0)
     tilt = Rotation.from_rotvec(np.deg2rad([3.0, -2.0, 0])).as_matrix()
     exact = np.concatenate([np.tile(axis, (200, 1)) for axis in np.eye(3)]) @ tilt.T
@@ -182,7 +175,7 @@ def test_a_refined_direction_is_what_floors_and_walls_agree_on() -> None:
     assert degrees(_refine(UP, normals, np.array([1.0, 1.0])), UP) == pytest.approx(2 / 3, abs=0.02)
 
 
-def test_the_side_of_a_bare_splat_with_the_floor_is_down() -> None:
+def test_the_side_of_a_bare_splat_with_the_floor_is_down():
     """A floor, a smaller table top and walls on all sides, upside down or not."""
     made = np.random.default_rng(0)
     floor = np.concatenate((made.uniform(-2, 2, (800, 2)), np.zeros((800, 1))), axis=1)
@@ -203,38 +196,33 @@ def test_the_side_of_a_bare_splat_with_the_floor_is_down() -> None:
     assert _floor_area(UP, means[:1], normals[:1], areas[:1]) == 0
 
 
-def test_a_fitted_splat_whose_gaussians_are_turned_anyhow_has_the_up_of_its_surfaces() -> None:
+def test_a_fitted_splat_whose_gaussians_are_turned_anyhow_has_the_up_of_its_surfaces():
     """Photographs determine colors, and the orientation of small Gaussians hardly."""
     bare = replace(make_room(1, objects=6, views=0), up=None, views=None)
-    assert bare.gaussians is not None
     count = len(bare.gaussians)
     anyhow = Rotation.random(count, random_state=0).as_quat(scalar_first=True).astype(np.float32)
     scales = np.tile(np.array([0.02, 0.02, 0.002], np.float32), (count, 1))
     fitted = replace(bare, gaussians=replace(bare.gaussians, quats=anyhow, scales=scales))
     rotation = Rotation.random(random_state=1).as_matrix()
     _, up = with_up(turned(fitted, rotation))
-    assert up is not None
     assert degrees(up.direction, rotation @ UP) < 1
 
 
-def test_level_cameras_decide_where_gaussians_lean_nowhere(room: Scene) -> None:
+def test_level_cameras_decide_where_gaussians_lean_nowhere(room):
     """As around one soft object: neither normals nor planes through means agree on anything."""
-    assert room.views is not None
     made = np.random.default_rng(0)
     ball = made.normal(size=(3000, 3))
     ball /= np.linalg.norm(ball, axis=1, keepdims=True)
     gaussians = room.gaussians
-    assert gaussians is not None
     anyhow = Rotation.random(3000, random_state=1).as_quat(scalar_first=True).astype(np.float32)
     soft = replace(gaussians.select(np.arange(3000)), means=ball.astype(np.float32), quats=anyhow)
     up = up_of_scene(replace(room, gaussians=soft))
-    assert up is not None
     assert up.source == "cameras"
     assert up.confidence > 0.99
     np.testing.assert_allclose(up.direction, up_of_cameras(room.views.cameras), atol=1e-9)
 
 
-def test_of_two_floors_the_one_below_the_usual_up_counts_twice_as_much() -> None:
+def test_of_two_floors_the_one_below_the_usual_up_counts_twice_as_much():
     """A floor across -y, and across z one of 1.5 or 3 times its area."""
     made = np.random.default_rng(0)
     usual = np.stack((made.uniform(0, 2, 300), np.full(300, 2.0), made.uniform(0, 2, 300)), axis=1)
@@ -248,7 +236,7 @@ def test_of_two_floors_the_one_below_the_usual_up_counts_twice_as_much() -> None
         assert degrees(up.direction, np.array(direction)) < 1
 
 
-def test_surfaces_without_a_normal_lower_confidence(room: Scene) -> None:
+def test_surfaces_without_a_normal_lower_confidence(room):
     surfaces = surfaces_of_depth(room.views)  # type: ignore[arg-type]
     alone = estimate_up(surfaces, None)
     with_rest = estimate_up(
@@ -258,8 +246,7 @@ def test_surfaces_without_a_normal_lower_confidence(room: Scene) -> None:
     assert 0.3 * alone.confidence < with_rest.confidence < 0.6 * alone.confidence
 
 
-def test_confidence_is_how_level_cameras_stand_and_what_surfaces_support(room: Scene) -> None:
-    assert room.views is not None
+def test_confidence_is_how_level_cameras_stand_and_what_surfaces_support(room):
     cameras = room.views.cameras
     level = estimate_up(None, cameras)
     assert (level.source, level.from_cameras) == ("cameras", 0.0)
@@ -272,8 +259,6 @@ def test_confidence_is_how_level_cameras_stand_and_what_surfaces_support(room: S
     assert other.confidence == pytest.approx(1 - 3 * np.mean(np.square(right @ other.direction)), abs=1e-5)
     assert estimate_up(None, cameras.select([0, 1])).confidence == 0
     estimate = up_of_scene(room)
-    assert estimate is not None
-    assert estimate.from_cameras is not None
     assert estimate.from_cameras < 0.02
     assert estimate.to_dict() == {
         "direction": estimate.direction.tolist(), "source": "cameras and surfaces", "confidence": estimate.confidence,
@@ -281,9 +266,8 @@ def test_confidence_is_how_level_cameras_stand_and_what_surfaces_support(room: S
     assert estimate.describe().endswith(f"estimated from cameras and surfaces, confidence {estimate.confidence:.2f}")
 
 
-def test_surfaces_that_lie_far_from_what_cameras_say_do_not_count(room: Scene) -> None:
+def test_surfaces_that_lie_far_from_what_cameras_say_do_not_count(room):
     """Only a wall is seen: its normal is no up, though it has all the area."""
-    assert room.views is not None
     prior = up_of_cameras(room.views.cameras)
     across = np.array([1.0, 0, 0])
     up = estimate_up(Surfaces(np.zeros((50, 3)), np.tile(across, (50, 1)), np.ones(50)), room.views.cameras)
@@ -297,8 +281,8 @@ def test_surfaces_that_lie_far_from_what_cameras_say_do_not_count(room: Scene) -
      ((0, 0, 1), 0.11, True), ((0, 1, 0), 0.06, False)],
 )  # fmt: skip
 def test_surfaces_of_a_bare_splat_need_less_where_they_say_what_is_assumed_anyway(
-    monkeypatch: pytest.MonkeyPatch, direction: tuple[float, ...], confidence: float, used: bool
-) -> None:
+    monkeypatch, direction, confidence, used
+):
     estimate = Up(
         direction=np.array(direction, np.float64), confidence=confidence, source="surfaces", from_cameras=None
     )

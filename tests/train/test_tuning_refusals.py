@@ -37,7 +37,7 @@ def test_a_picture_that_is_gone_ends_the_run_in_a_sentence(model: Path, tmp_path
     pairs = make_pairs(tmp_path / "prompts", 2)
     for path in (tmp_path / "prompts" / "pictures").iterdir():
         path.unlink()
-    with pytest.raises(InputError, match=r"\.png: cannot be read; remove .*prompts to prepare it anew"):
+    with pytest.raises(InputError, match=r"\.png: cannot be read; remove .*prompts to prepare it again"):
         tune(*pairs, model, SHORT, work=made(tmp_path / "work"))
 
 

@@ -13,7 +13,7 @@ from gsencoder.core.errors import InputError, SceneWarning, counted, listed, pri
 from gsencoder.core.files import write_json
 from gsencoder.core.process import Clock
 from gsencoder.core.settings import option
-from gsencoder.data.scenes import DistinctPaths, SceneConfig, kind_of_path
+from gsencoder.data.scenes import SceneConfig, distinct_paths, kind_of_path
 from gsencoder.fusion.folder import holds_features, table_path
 from gsencoder.infer.ask.ask import AskConfig, Asker, Question, Task, check_question
 from gsencoder.infer.ask.batch import (
@@ -298,7 +298,7 @@ def asker_of(config: AskingConfig, vlm: VlmConfig, scene: Scene, folder: Path) -
 
 def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:
     """The folders of features at paths: each path, or the folders in it that are called like one of the scenes."""
-    folders = DistinctPaths()
+    folders: list[Path] = []
     for path in map(Path, paths):
         inner = [path] if holds_features(path) else []
         if not inner and path.is_dir():
@@ -308,8 +308,8 @@ def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:
                 f"{path}: {kind_of_path(path)}; expected a folder of features, which `gsencoder fuse`, `encode`, "
                 "`memory` and `pack` write, or a folder of such folders"
             )
-        folders.add(folder for folder in inner if folder is path or folder.name in scenes)
-    return list(folders.paths)
+        folders += [folder for folder in inner if folder is path or folder.name in scenes]
+    return list(distinct_paths(folders))
 
 
 def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[SetQuestion, ...]:

@@ -1,7 +1,9 @@
 """`gsencoder inspect PATH…`: what splats and scenes hold, and what is wrong with them, without changing them."""
 
 import math
-from dataclasses import dataclass, field
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +22,28 @@ from gsencoder.data.check.agreement import agreement_map
 from gsencoder.data.check.epipolar import EpipolarCheck
 from gsencoder.data.check.findings import Finding
 from gsencoder.data.check.scene_check import DepthCheck
-from gsencoder.data.facts import SceneFacts
+from gsencoder.data.labels.mesh import MeshInstances
+from gsencoder.data.readers.label_images import ArchivedLabels
 from gsencoder.data.readers.layouts import find_splat
-from gsencoder.data.scenes import DistinctPaths, SceneConfig, find_scenes, has_views, load_scene, read_posed, scene_name
+from gsencoder.data.readers.posed import PosedImage, PosedImages
+from gsencoder.data.scenes import (
+    SceneConfig,
+    distinct_paths,
+    find_scenes,
+    has_views,
+    load_scene,
+    read_posed,
+    scene_name,
+)
 from gsencoder.data.seeding.matches import epipolar_distances, fundamental_matrix
 from gsencoder.data.splats.files import READABLE, read_raw
 from gsencoder.data.splats.repair import SplatReport, inspect_splat
+from gsencoder.data.up import Up, up_of_scene
 from gsencoder.data.video import refuse_video
 from gsencoder.infer.draw import contact_sheet, depth_picture
-from gsencoder.types import Views
+from gsencoder.types import Scene, Views
 from gsencoder.types.orientation import turned
+from gsencoder.types.scene import Selected
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,20 +74,20 @@ def run(config: InspectConfig, run: Run) -> None:
         return
     with run.folder(config.out) as folder:
         reports = [_inspect(path, config, run, folder) for path in _paths(config.paths)]
-    # What was written stays, also if nobody reads what is printed.
+    # What was written stays, also if the printed text is cut off.
     for lines in reports:
         run.print(*lines, highlight=False)
 
 
 def _paths(words: tuple[str, ...]) -> tuple[Path, ...]:
     """Splat files and scenes; a folder of scenes stands for all of them."""
-    chosen = DistinctPaths()
+    chosen: list[Path] = []
     for path in map(Path, words):
         if not path.exists():
             # Not after all that stand before it were looked at.
             raise InputError(f"{path}: no such file")
-        chosen.add(find_scenes([path]) if path.is_dir() and not (path / "meta.json").is_file() else [path])
-    return chosen.paths
+        chosen += find_scenes([path]) if path.is_dir() and not (path / "meta.json").is_file() else [path]
+    return distinct_paths(chosen)
 
 
 def _inspect(path: Path, config: InspectConfig, run: Run, folder: Path | None) -> list[Table | str]:
@@ -93,7 +107,6 @@ def _inspect(path: Path, config: InspectConfig, run: Run, folder: Path | None) -
 def _inspect_scene(path: Path, config: InspectConfig, run: Run, folder: Path | None) -> list[Table | str]:
     # Only scenes need Pillow and, for some depth sensors, torch.
     from gsencoder.data.check.scene_check import check_scene, findings_of, is_decided
-    from gsencoder.data.facts import scene_facts
 
     with run.step("read"):
         scene = load_scene(path, options=config.data)
@@ -101,9 +114,10 @@ def _inspect_scene(path: Path, config: InspectConfig, run: Run, folder: Path | N
         assert scene.views is not None
         assert posed is not None
     with run.step("facts"):
-        facts = scene_facts(scene, posed, layout)
-    lines: list[Table | str] = [str(path), scene_table(facts)]
-    results: dict[str, Any] = {"path": str(path), **facts.to_dict()}
+        up = up_of_scene(scene)
+        facts = scene_facts(scene, posed, layout, up)
+    lines: list[Table | str] = [str(path), scene_table(facts, up)]
+    results: dict[str, Any] = {"path": str(path), **facts}
     if config.check:
         with run.step("check"):
             depth, matches = check_scene(scene.views, limit=config.views, track=run.track)
@@ -113,10 +127,7 @@ def _inspect_scene(path: Path, config: InspectConfig, run: Run, folder: Path | N
         if not findings and (depth is not None or matches is not None):
             lines.append("nothing wrong was seen" if is_decided(depth, matches) else "too little to tell")
         results["check"] = check_results(depth, matches)
-        results["findings"] = [
-            {"cause": each.cause, "view": each.view, "factor": each.factor, "message": each.message}
-            for each in findings
-        ]
+        results["findings"] = [asdict(finding) for finding in findings]
         if folder is not None:
             picture = f"{scene_name(path)}.png"
             if save_check_picture(folder / picture, scene.views, depth, matches):
@@ -166,81 +177,181 @@ def _corners(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[str, str]
     return f"({first})", f"({second})"
 
 
-MAX_ROWS = 4
-"""Views in the picture."""
+MAX_ROWS = 4  # Views in the picture
+MAX_DEPTH_IMAGES = 24  # Depth images, evenly spaced, that are read for their coverage and range
+MAX_MASKS = 8  # Photographs, evenly spaced, whose empty pixels are counted
 GOOD, BAD, NOTHING = (44, 160, 44), (214, 39, 40), (64, 64, 64)
 """Colors of pixels whose depth agrees with other views, of those whose does not, and of those that none sees."""
 
 
-def scene_table(facts: SceneFacts) -> Table:
+def scene_facts(scene: Scene, posed: PosedImages, layout: str, up: Up | None) -> dict[str, Any]:
+    """What a loaded scene with views holds, as JSON values; some of its depth images are read.
+
+    Args:
+        posed: the same views as their files describe them.
+        layout: the name of the layout.
+        up: of the scene.
+    """
+    views = scene.views
+    assert views is not None
+    cameras, names = views.cameras, set(views.names)
+    images = [image for image in posed.images if image.name in names]
+    focal = cameras.Ks[:, 0, 0]
+    fields = [
+        float(np.rad2deg(2 * np.median(np.arctan(size / 2 / cameras.Ks[:, axis, axis]))))
+        for axis, size in enumerate((cameras.widths, cameras.heights))
+    ]
+    sizes = Counter(zip(cameras.widths.tolist(), cameras.heights.tolist(), strict=True)).most_common()
+    extent = np.ptp(cameras.centers, axis=0) if len(cameras) else np.zeros(3)
+    unused = [f"folder {name}" for name in posed.unused_folders(scene.folder, layout)]
+    empty = None
+    if views.empty is not None:
+        empty = float(np.mean([views.empty[int(row)].mean() for row in even_indices(len(views), MAX_MASKS)]))
+    return {
+        "layout": layout,
+        "views": len(views),
+        "sizes": [[*size, count] for size, count in sizes],
+        "models": dict(Counter(image.camera.model for image in images).most_common()),
+        "focal": [float(focal.min()), float(focal.max())],
+        "depth": None if views.depths is None else _depth_facts(views.depths, images),
+        "masks": views.masks is not None,
+        "empty": empty,
+        "points": 0 if scene.sfm_points is None else len(scene.sfm_points),
+        "objects": len(scene.objects),
+        "instances": _instances_source(views),
+        "metres_per_unit": scene.metres_per_unit,
+        "up": None if up is None else up.to_dict(),
+        "missing": _missing(scene, views, up),
+        "unused": [*posed.unused, *unused],
+        "field_of_view": fields,
+        "camera_extent": extent.tolist(),
+    }
+
+
+def _instances_source(views: Views) -> str:
+    maps = views.instances
+    while isinstance(maps, Selected):
+        maps = maps.items
+    if isinstance(maps, ArchivedLabels):
+        return f"pictures in {maps.archive.name}"
+    if isinstance(maps, MeshInstances):
+        return "drawn from the labeled mesh"
+    return "" if maps is None else "pictures"
+
+
+def _depth_facts(depths: Sequence[np.ndarray], images: Sequence[PosedImage]) -> dict[str, Any]:
+    """The share of the pixels with depth, its 1st and 99th percentile, and how the sensor differs."""
+    measured_pixels, pixels, values = 0, 0, []
+    for view in even_indices(len(depths), MAX_DEPTH_IMAGES):
+        depth = depths[int(view)]
+        measured = depth[depth > 0]
+        measured_pixels, pixels = measured_pixels + len(measured), pixels + depth.size
+        values.append(measured[:: max(1, len(measured) // 10_000)])
+    sample = np.concatenate(values)
+    near, far = np.percentile(sample, (1, 99)) if len(sample) else (float("nan"),) * 2
+    with_depth = [image for image in images if image.depth is not None]
+    return {
+        "views": len(with_depth),
+        "coverage": measured_pixels / max(1, pixels),
+        "near": float(near),
+        "far": float(far),
+        "sensor": "; ".join(sorted({_sensor(image) for image in with_depth} - {""})[:2]),
+    }
+
+
+def _sensor(image: PosedImage) -> str:
+    """How a depth camera differs from the photograph's, in words."""
+    parts = []
+    if image.depth_camera is not None and image.depth_camera.params[0] != image.camera.params[0]:
+        parts.append(f"f = {image.depth_camera.params[0]:g} (photographs {image.camera.params[0]:g})")
+    if image.depth_from_color is not None:
+        shift = float(np.linalg.norm(image.depth_from_color[:3, 3]))
+        parts.append(f"{shift:.3g} units from the camera")
+    return ", ".join(parts)
+
+
+def _missing(scene: Scene, views: Views, up: Up | None) -> list[str]:
+    """What is not there, and what follows from it."""
+    gaps = []
+    if views.depths is None and scene.sfm_points is None:
+        gaps.append("depth and points: seeds are triangulated from the photographs")
+    elif views.depths is None:
+        gaps.append("depth: visibility is tested against rendered depth, and seeds come from the points")
+    if len(views) > 1 and not np.ptp(views.cameras.centers, axis=0).any():
+        gaps.append("baselines: all cameras stand in one place, so that photographs alone say nothing about depth")
+    if scene.metres_per_unit is None:
+        gaps.append("unit of length: sizes are in world units (metres_per_unit=)")
+    if up is None or up.source != "files":
+        gaps.append("up: it is estimated" if up is not None else "up: boxes have any orientation")
+    return gaps
+
+
+def scene_table(facts: dict[str, Any], up: Up | None) -> Table:
     """The facts of a scene as a table of two columns."""
-    table = Table(show_header=False)
-    table.add_row("layout", facts.layout)
-    sizes = ", ".join(f"{width}×{height} ({count})" for (width, height), count in list(facts.sizes.items())[:4])
-    table.add_row("views", f"{facts.views:,}: {sizes}{', …' if len(facts.sizes) > 4 else ''}")
-    low, high = facts.focal
+    table, metres = Table(show_header=False), facts["metres_per_unit"]
+    unit = "m" if metres == 1 else "units"
+    sizes = ", ".join(f"{width}×{height} ({count})" for width, height, count in facts["sizes"][:4])
+    low, high = facts["focal"]
     focal = f"{low:.1f}" if high - low < 0.05 else f"{low:.1f} to {high:.1f}"
-    table.add_row(
-        "cameras",
-        f"{', '.join(facts.models)}; f = {focal} pixels, {facts.field[0]:.0f}° × {facts.field[1]:.0f}°",
-    )
-    unit = "m" if facts.metres_per_unit == 1 else "units"
-    table.add_row("cameras spread over", " × ".join(f"{length:.3g}" for length in facts.spread) + f" {unit}")
-    if facts.depth is not None:
-        depth = facts.depth
-        table.add_row(
-            "depth",
-            f"{depth.views:,} of {facts.views:,} views, {depth.coverage:.0%} of the pixels, "
-            f"{depth.near:.3g} to {depth.far:.3g} {unit}",
-        )
-        if depth.sensor:
-            table.add_row("depth sensor", f"not registered in the files: {depth.sensor}; carried over on load")
-    if facts.masks:
-        empty = "" if facts.empty is None else f"; {facts.empty:.0%} of the pixels show that nothing is there"
-        table.add_row("masks", f"yes{empty}")
-    if facts.points:
-        table.add_row("points", f"{facts.points:,}")
-    if facts.objects:
-        table.add_row("objects", f"{facts.objects:,} with boxes")
-    if facts.instances:
-        table.add_row("instance maps", facts.instances)
-    table.add_row("unit", "unknown" if facts.metres_per_unit is None else f"{facts.metres_per_unit:g} m")
-    table.add_row("up", "unknown" if facts.up is None else facts.up.describe())
-    for line in facts.missing:
-        table.add_row("missing", line)
-    if facts.unused:
-        table.add_row("not used", ", ".join(facts.unused))
+    across, down = facts["field_of_view"]
+    rows = [
+        ("layout", facts["layout"]),
+        ("views", f"{facts['views']:,}: {sizes}{', …' if len(facts['sizes']) > 4 else ''}"),
+        ("cameras", f"{', '.join(facts['models'])}; f = {focal} pixels, {across:.0f}° × {down:.0f}°"),
+        ("cameras spread over", " × ".join(f"{length:.3g}" for length in facts["camera_extent"]) + f" {unit}"),
+    ]
+    if depth := facts["depth"]:
+        share = f"{depth['views']:,} of {facts['views']:,} views, {depth['coverage']:.0%} of the pixels"
+        rows.append(("depth", f"{share}, {depth['near']:.3g} to {depth['far']:.3g} {unit}"))
+        if depth["sensor"]:
+            sensor = f"not registered in the files: {depth['sensor']}; carried over on load"
+            rows.append(("depth sensor", sensor))
+    if facts["masks"]:
+        empty = facts["empty"]
+        rows.append(("masks", "yes" + (f"; {empty:.0%} of the pixels show that nothing is there" if empty else "")))
+    if facts["points"]:
+        rows.append(("points", f"{facts['points']:,}"))
+    if facts["objects"]:
+        rows.append(("objects", f"{facts['objects']:,} with boxes"))
+    if facts["instances"]:
+        rows.append(("instance maps", facts["instances"]))
+    rows.append(("unit", "unknown" if metres is None else f"{metres:g} m"))
+    rows.append(("up", "unknown" if up is None else up.describe()))
+    rows += [("missing", line) for line in facts["missing"]]
+    if facts["unused"]:
+        rows.append(("not used", ", ".join(facts["unused"])))
+    for row in rows:
+        table.add_row(*row)
     return table
 
 
-def check_lines(facts: SceneFacts, depth: DepthCheck | None, matches: EpipolarCheck | None) -> list[str]:
+def check_lines(facts: dict[str, Any], depth: DepthCheck | None, matches: EpipolarCheck | None) -> list[str]:
     """The figures of the checks, a line each."""
     lines = []
     if depth is not None:
-        agreement = depth.stated
+        agreement = depth.given
         if depth.comparable:
             near, far = depth.offsets
             lines.append(
-                f"depth of {len(depth.views)} of {facts.views:,} views carried into each other: {agreement.share:.0%} "
-                "agree "
-                f"within 2 % where seen ({agreement.compared:,} comparisons); median offset "
-                f"{_percent(agreement.offset, sign=True)}"
+                f"depth of {len(depth.views)} of {facts['views']:,} views carried into each other: "
+                f"{agreement.share:.0%} agree within 2 % where seen ({agreement.compared:,} comparisons); median "
+                f"offset {_percent(agreement.offset, sign=True)}"
             )
             lines.append(f"median offset of neighbors {_percent(near)}, of views far apart {_percent(far)}")
         else:
             lines.append("depth: by their poses no two views see the same place, so it cannot be compared")
         if np.isfinite(depth.color):
             lines.append(f"colors at the same places correlate by {depth.color:.2f}")
-        if depth.registration is not None and np.isfinite(depth.registration.stated):
+        if depth.registration is not None and np.isfinite(depth.registration.given):
             fit = depth.registration
             lines.append(
-                f"details of the photographs correlate by {fit.stated:.2f} with the stated camera, best by "
-                f"{fit.best:.2f} with a focal length of {fit.focal_factor * facts.focal[0]:.0f} pixels"
+                f"details of the photographs correlate by {fit.given:.2f} with the given camera, best by "
+                f"{fit.best:.2f} with a focal length of {fit.focal_factor * facts['focal'][0]:.0f} pixels"
             )
     if matches is not None:
         if matches.pairs:
             lines.append(
-                f"{matches.matches:,} matches of {matches.pairs} pairs of {len(matches.views)} of {facts.views:,} "
+                f"{matches.matches:,} matches of {matches.pairs} pairs of {len(matches.views)} of {facts['views']:,} "
                 f"views: {matches.share:.0%} within 2 pixels of their epipolar lines, {matches.error:.2f} pixels on "
                 "average (pictures of at most 640 pixels)"
             )
@@ -270,9 +381,9 @@ def check_results(depth: DepthCheck | None, matches: EpipolarCheck | None) -> di
     if depth is not None:
         results["depth"] = {
             "views": len(depth.views),
-            "comparisons": depth.stated.compared,
-            "share": depth.stated.share,
-            "offset": depth.stated.offset,
+            "comparisons": depth.given.compared,
+            "share": depth.given.share,
+            "offset": depth.given.offset,
             "offset_near": depth.offsets[0],
             "offset_far": depth.offsets[1],
             "best_share": depth.best.share,
@@ -282,7 +393,7 @@ def check_results(depth: DepthCheck | None, matches: EpipolarCheck | None) -> di
             results["registration"] = {
                 "focal_factor": depth.registration.focal_factor,
                 "shift": depth.registration.shift.tolist(),
-                "given": depth.registration.stated,
+                "given": depth.registration.given,
                 "best": depth.registration.best,
             }
     if matches is not None:

@@ -44,9 +44,8 @@ class RepairConfig(CommonConfig):
     )
     out: Path | None = option(
         None,
-        f"the file to write: of a scene .json (nerfstudio), of a splat {WRITABLE}; FILE.summary.json "
-        "beside "
-        "it holds the changes",
+        f"the file to write: of a scene .json (nerfstudio), of a splat {WRITABLE}; FILE.summary.json next to it holds "
+        "the changes",
         metavar="FILE",
         required=True,
     )
@@ -96,10 +95,13 @@ def run(config: RepairConfig, run: Run) -> None:
     run.print(f"{config.out}: {report.rows_after:,} of {report.rows_before:,} Gaussians")
 
 
+MAX_ROUNDS = 10  # of repairing and checking again
+
+
 def _repair_scene(path: Path, config: RepairConfig, run: Run) -> None:
     """Writes a transforms.json whose poses, depth and cameras fit, and checks that they do."""
     # Only scenes need Pillow and, for some depth sensors, torch.
-    from gsencoder.data.check.repair_scene import repair_posed
+    from gsencoder.data.check.findings import repair_posed
     from gsencoder.data.check.scene_check import check_scene, findings_of, fit_of, is_decided
     from gsencoder.data.readers.transforms_json import transforms_of
 
@@ -115,20 +117,20 @@ def _repair_scene(path: Path, config: RepairConfig, run: Run) -> None:
     if not findings and not is_decided(depth, matches):
         raise InputError(f"{path}: too little to tell whether something is wrong, so there is nothing to repair")
     before, changes, repaired = fit_of(depth, matches), list[str](), posed
-    while True:
-        # A view that is far astray may hide another one.
-        repair = repair_posed(repaired, findings, depth.registration if depth is not None else None)
-        repaired, changes = repair.posed, [*changes, *repair.changes]
+    # A view that is far astray may hide another one.
+    for _ in range(MAX_ROUNDS):
+        repaired, more = repair_posed(repaired, findings, depth.registration if depth is not None else None)
+        changes += more
         content = transforms_of(repaired, config.out.parent)
         with run.step("check"):
             again = _load_back(content, config.out)
             assert again.views is not None
             depth, matches = check_scene(again.views, limit=config.views, track=run.track)
         findings = findings_of(again.views, depth, matches)
-        if wrong := [finding for finding in findings if finding.view is None]:
-            raise InputError(f"{path}: still wrong once repaired: {wrong[0].message}; nothing was written")
-        if not findings:
+        if not findings or any(finding.view is None for finding in findings):
             break
+    if findings:
+        raise InputError(f"{path}: still wrong once repaired: {findings[0].message}; nothing was written")
     after = fit_of(depth, matches)
     run.results.update(path=str(config.out), changes=changes, agreement_before=before, agreement_after=after)
     with run.file(config.out), run.step("write"):
@@ -138,13 +140,13 @@ def _repair_scene(path: Path, config: RepairConfig, run: Run) -> None:
         "" if config.out.resolve().parent == path.resolve() else "; its files lie elsewhere: data.allow_outside=true"
     )
     run.print(
-        f"{config.out}: {len(again.views):,} of {len(posed.images):,} views; {before:.0%} of what views share agreed, "
-        f"{after:.0%} do{outside}"
+        f"{config.out}: {len(repaired.images):,} of {len(posed.images):,} views; {before:.0%} of what views share "
+        f"agreed, {after:.0%} do{outside}"
     )
 
 
 def _load_back(content: dict[str, Any], out: Path) -> Scene:
-    """The scene of a transforms.json that is to stand at `out`; a hidden file beside it holds it meanwhile."""
+    """The scene of a transforms.json that is to stand at `out`; a hidden file next to it holds it meanwhile."""
     partial = out.with_name(f".{out.stem}.partial-{secrets.token_hex(6)}.json")
     try:
         write_json(partial, content)

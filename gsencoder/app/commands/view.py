@@ -12,7 +12,7 @@ from gsencoder.app.scenes import queried_scene
 from gsencoder.core.errors import InputError, printable
 from gsencoder.core.files import write_bytes
 from gsencoder.core.settings import option
-from gsencoder.data.scenes import DistinctPaths, SceneConfig, load_scene
+from gsencoder.data.scenes import SceneConfig, distinct_paths, load_scene
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, select_features
 from gsencoder.infer.page.page import Bundle, FileOptions, fitting_page, load_bundle, scene_container, served_page
@@ -77,7 +77,7 @@ class ViewConfig(FeaturesConfig):
 
 def run(config: ViewConfig, run: Run) -> None:
     """Serves the page until it is interrupted, or writes it."""
-    DistinctPaths().add(map(Path, config.paths))
+    distinct_paths(map(Path, config.paths))
     bundle = load_bundle()
     if config.out is not None:
         run.check_files(config.out)

@@ -1,61 +1,43 @@
-"""How well the depth images of posed views agree: each carried into the others, under the poses and intrinsics given.
+"""How well the depth images and photographs of posed views agree, under the poses and intrinsics given.
 
 A view's depth pixels are points in the world. Where such a point projects into another view with depth z, and that
 view's own depth image says d there, r = z / d − 1 is zero up to noise and the size of a pixel, unless something hides
 the point there. Wrong axes, poses, scales and intrinsics spread r.
 
-Whether depth and photographs belong to one camera: the focal length and place of a color camera under which the
-photographs show the same details at the same places.
-
-Pixels whose depth two views agree on are one place. A color camera beside the depth camera sees it at
-f (X + t) / Z + c; with the right f and t both photographs have the same details there.
+Pixels whose depth two views agree on are one place. A color camera next to the depth camera sees it at
+f (X + t) / Z + c; with the right focal length f and shift t both photographs have the same details there.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from gsencoder.data.readers.depth_images import ray_lengths
-from gsencoder.types import Views
+from gsencoder.types import Cameras, Views
 from gsencoder.types.checks import invert_rigid, transform
 from gsencoder.types.scene import pixel_centers, project_points
 
-MAX_SIDE = 320
-"""Longer side in pixels of the depth images that are compared; larger ones are sampled."""
-SAMPLES = 400
-"""Pixels of each view that are carried into the others."""
-TOLERANCE = 0.02
-"""Depths agree within this share."""
-CLIP = 0.05
-"""Residuals beyond this share count as this much, since what is hidden there is further away by any amount."""
-MIN_SAMPLES = 30
-"""Pairs of views that share fewer samples have no offset of their own."""
+MAX_SIDE = 320  # Longer side in pixels of the depth images that are compared; larger ones are sampled
+SAMPLES = 400  # Pixels of each view that are carried into the others
+TOLERANCE = 0.02  # Depths agree within this share
+CLIP = 0.05  # Residuals beyond this share count as this much, since what is hidden there is further away by any amount
+MIN_SAMPLES = 30  # Pairs of views that share fewer samples have no offset of their own
 EDGE = 0.05
-"""Pixels beside a step of the depth by more than this share are not carried over: a pixel's size decides there."""
+"""Pixels next to a step of the depth by more than this share are not carried over: a pixel's size decides there."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DepthViews:
-    """Depth images of posed views, small, and what their numbers are taken to mean.
+    """Depth images of posed views, small, and what their numbers are taken to mean."""
 
-    Attributes:
-        depths: as the files say, 0 = none.
-        pixels: samples of each view at pixel centers, (u, v) in its small image.
-        values: the depth there; 0 where a view has fewer samples.
-        cam_from_world: poses of the depth cameras.
-        Ks: intrinsics of the small images.
-        scale: world units for each unit of `depths`.
-    """
-
-    depths: Float32[np.ndarray, "V h w"]
-    pixels: Float64[np.ndarray, "V n 2"]
-    values: Float64[np.ndarray, "V n"]
-    cam_from_world: Float64[np.ndarray, "V 4 4"]
-    Ks: Float64[np.ndarray, "V 3 3"]
-    scale: float = 1.0
+    depths: Float32[np.ndarray, "V h w"]  # as the files say, 0 = none
+    pixels: Float64[np.ndarray, "V n 2"]  # samples of each view at pixel centers, (u, v) in its small image
+    values: Float64[np.ndarray, "V n"]  # the depth there; 0 where a view has fewer samples
+    cam_from_world: Float64[np.ndarray, "V 4 4"]  # poses of the depth cameras
+    Ks: Float64[np.ndarray, "V 3 3"]  # intrinsics of the small images
+    scale: float = 1.0  # world units for each unit of `depths`
 
     def __len__(self) -> int:
         return len(self.depths)
@@ -171,19 +153,27 @@ def agreement_map(views: DepthViews, view: int) -> Float32[np.ndarray, "h w"]:
     return share.reshape(height, width).astype(np.float32)
 
 
-def _depth_ratio(
+def depth_at(
     views: DepthViews, other: int, points: Float64[np.ndarray, "n 3"], valid: Bool[np.ndarray, " n"]
-) -> Float64[np.ndarray, " n"]:
-    """The depth of world points in a view, divided by the view's own depth there; NaN where there is none."""
+) -> tuple[Bool[np.ndarray, " n"], Int64[np.ndarray, "m 2"], Float64[np.ndarray, " m"], Float64[np.ndarray, " m"]]:
+    """Which valid world points project into a view, and of these row and column, their depth, and the view's own."""
     height, width = views.depths.shape[1:]
     local = transform(views.cam_from_world[other], points)
     pixels = project_points(local, views.Ks[other])
     with np.errstate(invalid="ignore"):
         inside = valid & (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
-    columns, rows = np.floor(pixels[inside]).astype(np.int64).T
-    measured = views.depths[other][rows, columns].astype(np.float64) * views.scale
+    at = np.floor(pixels[inside]).astype(np.int64)[:, ::-1]
+    measured = views.depths[other][at[:, 0], at[:, 1]].astype(np.float64) * views.scale
+    return inside, at, local[inside, 2], measured
+
+
+def _depth_ratio(
+    views: DepthViews, other: int, points: Float64[np.ndarray, "n 3"], valid: Bool[np.ndarray, " n"]
+) -> Float64[np.ndarray, " n"]:
+    """The depth of world points in a view, divided by the view's own depth there; NaN where there is none."""
+    inside, _, z, measured = depth_at(views, other, points, valid)
     ratio = np.full(len(points), np.nan)
-    ratio[inside] = np.divide(local[inside, 2], measured, out=np.full(len(measured), np.nan), where=measured > 0)
+    ratio[inside] = np.divide(z, measured, out=np.full(len(measured), np.nan), where=measured > 0)
     return ratio
 
 
@@ -191,7 +181,7 @@ def shared_samples(
     views: DepthViews, least: int
 ) -> Iterator[tuple[int, int, Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]]:
     """The samples of one view on which the depth of another agrees within `TOLERANCE`, for each ordered pair of views
-    that shares at least so many: both rows, and the points in the axes of both cameras."""
+    that shares at least `least`: both rows, and the points in the axes of both cameras."""
     points = world_samples(views)
     for view, other in np.ndindex(len(views), len(views)):
         if view == other:
@@ -215,20 +205,14 @@ def world_samples(views: DepthViews) -> Float64[np.ndarray, "V n 3"]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
-    """What residuals say.
+    """What residuals say."""
 
-    Attributes:
-        share: of the samples that another view sees, those whose depth agrees with it within `TOLERANCE`. Samples that
-            lie further away than the other view's surface by more than `CLIP` are hidden there, and do not count.
-        spread: mean of |r|, clipped at `CLIP`.
-        offset: median of r among those within `CLIP`.
-        compared: number of comparisons.
-    """
-
+    # Of the samples that another view sees, those whose depth agrees with it within `TOLERANCE`. Samples that lie
+    # further away than the other view's surface by more than `CLIP` are hidden there, and do not count.
     share: float
-    spread: float
-    offset: float
-    compared: int
+    spread: float  # mean of |r|, clipped at `CLIP`
+    offset: float  # median of r among those within `CLIP`
+    compared: int  # number of comparisons
 
 
 def agreement(residual: Float64[np.ndarray, "*n"]) -> Agreement:
@@ -314,54 +298,34 @@ def view_correlations(correlations: Float64[np.ndarray, "V V"]) -> Float64[np.nd
     return result
 
 
-PICTURE_SIZE = 640
-"""Longer side in pixels of the photographs that are compared; smaller ones keep theirs."""
-FINE, COARSE = 1.0, 12.0
-"""Details are the difference of two Gaussian blurs of these widths in pixels."""
-MIN_SHARED = 60
-"""Pairs of views that share fewer samples say nothing."""
+PICTURE_SIZE = 640  # Longer side in pixels of the photographs that are compared; smaller ones keep theirs
+FINE, COARSE = 1.0, 12.0  # Details are the difference of two Gaussian blurs of these widths in pixels
+MIN_SHARED = 60  # Pairs of views that share fewer samples say nothing
 MAX_PAIRS = 160
 SMALLEST_DETAIL = 1e-4
 """Standard deviation of details, of an intensity from 0 to 1, below which a pair of views shows none."""
 FOCAL_FACTORS: tuple[float, ...] = tuple(np.round(np.geomspace(0.8, 1.25, 13), 4).tolist())
-SHIFTS = (-0.02, -0.01, 0.0, 0.01, 0.02)
-"""Shifts that are tried first, as shares of the median depth."""
+SHIFTS = (-0.02, -0.01, 0.0, 0.01, 0.02)  # Shifts that are tried first, as shares of the median depth
 REFINEMENTS = 5
-BETTER = 0.1
-"""A registration is named if it raises the correlation of details by this much, and to `LEAST` or more."""
+BETTER = 0.1  # A registration is named if it raises the correlation of details by this much, and to `LEAST` or more
 LEAST = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RegistrationFit:
-    """The color camera that fits best.
+    """The color camera that fits best."""
 
-    Attributes:
-        focal_factor: its focal length, as a multiple of the stated one.
-        shift: what is added to x and y in the depth camera's axes to have them in its own, world units.
-        stated: mean correlation of details of pairs of views with the stated camera.
-        best: the same with the best one.
-        pairs: pairs of views that were compared.
-    """
-
-    focal_factor: float
+    focal_factor: float  # its focal length, as a multiple of the given one
+    # What is added to x and y in the depth camera's axes to have them in its own, world units.
     shift: Float64[np.ndarray, "2"]
-    stated: float
-    best: float
-    pairs: int
+    given: float  # mean correlation of details of pairs of views with the given camera
+    best: float  # the same with the best one
+    pairs: int  # pairs of views that were compared
 
     @property
     def differs(self) -> bool:
-        """Whether the stated camera is wrong."""
-        return self.pairs > 0 and self.best >= LEAST and self.best >= self.stated + BETTER
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Pair:
-    """Places that two views share, in the axes of both depth cameras."""
-
-    views: tuple[int, int]
-    points: tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]
+        """Whether the given camera is wrong."""
+        return self.pairs > 0 and self.best >= LEAST and self.best >= self.given + BETTER
 
 
 def fit_registration(views: Views, rows: Int64[np.ndarray, " V"], depth: DepthViews) -> RegistrationFit:
@@ -371,25 +335,33 @@ def fit_registration(views: Views, rows: Int64[np.ndarray, " V"], depth: DepthVi
         rows: the rows of the views that are compared.
         depth: their depth images, under the reading that fits best.
     """
-    pairs = _shared_samples(depth)
-    nothing = RegistrationFit(
-        focal_factor=1.0, shift=np.zeros(2), stated=float("nan"), best=float("nan"), pairs=len(pairs)
-    )
+    pairs = sorted(shared_samples(depth, MIN_SHARED), key=lambda pair: -len(pair[2]))[:MAX_PAIRS]
+    nothing = RegistrationFit(focal_factor=1.0, shift=np.zeros(2), given=np.nan, best=np.nan, pairs=len(pairs))
     if not pairs:
         return nothing
-    samples = [_samples_of_view(pairs, view, views, rows) for view in range(len(rows))]
-    samples = [each for each in samples if len(each.points)]
+    sizes = [len(pair[2]) for pair in pairs]
+    # Of both views of each pair the row and the places in its axes, side by side, and the number of the pair.
+    ends = np.stack([np.repeat([pair[side] for pair in pairs], sizes) for side in (0, 1)])
+    places = np.stack([np.concatenate([pair[side] for pair in pairs]) for side in (2, 3)])
+    numbers = np.repeat(np.arange(len(pairs)), sizes)
+    cameras = views.cameras.select(rows).resized(PICTURE_SIZE, enlarge=False)
+    details = np.zeros((len(rows), int(cameras.heights.max()), int(cameras.widths.max())))
+    for index in np.unique(ends):
+        width, height = int(cameras.widths[index]), int(cameras.heights[index])
+        details[index, :height, :width] = _details(views, int(rows[index]), width, height)
+    typical = float(np.median(places[0, :, 2]))
+    scores: dict[tuple[float, ...], float] = {}
 
     def score(factor: float, shift: Float64[np.ndarray, "2"]) -> float:
         key = (round(factor, 6), *np.round(shift / typical, 6))
         if key not in scores:
-            scores[key] = _correlation(samples, len(pairs), factor, shift)
+            Ks = cameras.Ks.astype(np.float64)
+            Ks[:, :2, :2] *= factor
+            scores[key] = _correlation(details, Ks, cameras, ends, places + np.append(shift, 0.0), numbers)
         return scores[key]
 
-    typical = float(np.median(np.concatenate([pair.points[0][:, 2] for pair in pairs])))
-    scores: dict[tuple[float, ...], float] = {}
-    score_as_stated = score(1.0, np.zeros(2))
-    if not np.isfinite(score_as_stated):
+    score_as_given = score(1.0, np.zeros(2))
+    if not np.isfinite(score_as_given):
         return nothing
     best = max(
         ((factor, np.array((shift * typical, 0.0))) for factor in FOCAL_FACTORS for shift in SHIFTS),
@@ -404,53 +376,7 @@ def fit_registration(views: Views, rows: Int64[np.ndarray, " V"], depth: DepthVi
             best = max([best, *around], key=lambda candidate: score(*candidate))
         steps = steps[0] ** 0.5, steps[1] / 2
     return RegistrationFit(
-        focal_factor=best[0], shift=best[1], stated=score_as_stated, best=score(*best), pairs=len(pairs)
-    )
-
-
-def _shared_samples(depth: DepthViews) -> list[_Pair]:
-    """The pairs of views with the most samples on which their depth agrees."""
-    pairs = [
-        _Pair(views=(view, other), points=(here, there))
-        for view, other, here, there in shared_samples(depth, MIN_SHARED)
-    ]
-    return sorted(pairs, key=lambda pair: -len(pair.points[0]))[:MAX_PAIRS]
-
-
-class _ViewSamples(NamedTuple):
-    """What the correlation needs to know about one view.
-
-    Attributes:
-        details: of its photograph.
-        K: intrinsics of the photograph at that size.
-        points: places that it shares with others, in the axes of its depth camera, pair by pair.
-        entries: where each of them stands among the places of all pairs, first those of the pairs' first views.
-        pairs: number of the pair of each.
-    """
-
-    details: Float64[np.ndarray, "h w"]
-    K: Float64[np.ndarray, "3 3"]
-    points: Float64[np.ndarray, "n 3"]
-    entries: Int64[np.ndarray, " n"]
-    pairs: Int64[np.ndarray, " n"]
-
-
-def _samples_of_view(pairs: list[_Pair], view: int, views: Views, rows: Int64[np.ndarray, " V"]) -> _ViewSamples:
-    sizes = np.array([len(pair.points[0]) for pair in pairs])
-    starts = np.concatenate(([0], np.cumsum(sizes)))
-    points, entries, numbers = [np.empty((0, 3))], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
-    for number, pair in enumerate(pairs):
-        for side in range(2):
-            if pair.views[side] == view:
-                points.append(pair.points[side])
-                entries.append(side * starts[-1] + np.arange(starts[number], starts[number + 1]))
-                numbers.append(np.full(sizes[number], number))
-    row = int(rows[view])
-    small = views.cameras.select([row]).resized(PICTURE_SIZE, enlarge=False)
-    everything = np.concatenate(points)
-    details = _details(views, row, int(small.widths[0]), int(small.heights[0])) if len(everything) else np.zeros((1, 1))
-    return _ViewSamples(
-        details, small.Ks[0].astype(np.float64), everything, np.concatenate(entries), np.concatenate(numbers)
+        focal_factor=best[0], shift=best[1], given=score_as_given, best=score(*best), pairs=len(pairs)
     )
 
 
@@ -464,35 +390,31 @@ def _details(views: Views, row: int, width: int, height: int) -> Float64[np.ndar
     return np.asarray(gaussian_filter(values, FINE) - gaussian_filter(values, COARSE))
 
 
-def _correlation(positions: list[_ViewSamples], pairs: int, factor: float, shift: Float64[np.ndarray, "2"]) -> float:
-    """Mean correlation of the details of pairs of views with a color camera."""
+def _correlation(
+    details: Float64[np.ndarray, "V h w"],
+    Ks: Float64[np.ndarray, "V 3 3"],
+    cameras: Cameras,
+    ends: Int64[np.ndarray, "2 n"],
+    places: Float64[np.ndarray, "2 n 3"],
+    numbers: Int64[np.ndarray, " n"],
+) -> float:
+    """Mean correlation of the details of pairs of views at places that they share."""
     from scipy.ndimage import map_coordinates
 
-    total = sum(len(each.points) for each in positions)
-    values, numbers = np.full(total, np.nan), np.zeros(total, np.int64)
-    for details, K, points, entries, pair in positions:
-        focal = K.copy()
-        focal[0, 0] *= factor
-        focal[1, 1] *= factor
-        shifted_points = points.copy()
-        shifted_points[:, :2] += shift
-        columns, rows = project_points(shifted_points, focal).T - 0.5
-        height, width = details.shape
-        inside = (columns >= 0) & (rows >= 0) & (columns <= width - 1) & (rows <= height - 1)
-        values[entries[inside]] = map_coordinates(details, (rows[inside], columns[inside]), order=1, mode="nearest")
-        numbers[entries] = pair
-    first, second = values.reshape(2, -1)
-    use = np.isfinite(first) & np.isfinite(second)
-    first, second, number = first[use], second[use], numbers[: total // 2][use]
+    pairs = int(numbers[-1]) + 1
+    u, v = (places[..., axis] / places[..., 2] * Ks[ends, axis, axis] + Ks[ends, axis, 2] - 0.5 for axis in (0, 1))
+    use = ((u >= 0) & (v >= 0) & (u <= cameras.widths[ends] - 1) & (v <= cameras.heights[ends] - 1)).all(axis=0)
+    number = numbers[use]
+    values = map_coordinates(details, (ends[:, use], v[:, use], u[:, use]), order=1, mode="nearest")
     count = np.bincount(number, minlength=pairs)
 
     def mean(products: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " p"]:
         return np.asarray(np.bincount(number, products, minlength=pairs) / np.maximum(count, 1))
 
-    centered = first - mean(first)[number], second - mean(second)[number]
-    variances = mean(np.square(centered[0])), mean(np.square(centered[1]))
+    first, second = (each - mean(each)[number] for each in values)
+    variances = mean(np.square(first)), mean(np.square(second))
     clear = (count >= MIN_SHARED // 2) & (np.minimum(*variances) > SMALLEST_DETAIL**2)
     if clear.sum() < max(1, pairs // 2):
         return float("nan")
-    correlations = mean(centered[0] * centered[1])[clear] / np.sqrt(variances[0] * variances[1])[clear]
+    correlations = mean(first * second)[clear] / np.sqrt(variances[0] * variances[1])[clear]
     return float(correlations.mean())

@@ -3,7 +3,7 @@ the poses (Hartley and Zisserman 2004, ch. 9).
 
 Which matches are right is decided without the poses, by a fundamental matrix of each pair alone. That is no proof: far
 views of a wallpaper match well where its motif repeats, while wrong poses fit right matches nowhere. So each view is
-judged by the pairs with its nearest neighbors, and it is called astray only if it has another pose that fits them.
+compared in the pairs with its nearest neighbors, and it is called astray only if it has another pose that fits them.
 """
 
 from collections.abc import Sequence
@@ -26,82 +26,56 @@ from gsencoder.data.seeding.matches import (
 )
 from gsencoder.types import Cameras, Views
 
-PICTURE_SIZE = 640
-"""Longer side in pixels of the photographs that are matched."""
+PICTURE_SIZE = 640  # Longer side in pixels of the photographs that are matched
 FEATURES = 1000
-MIN_MATCHES = 25
-"""Pairs with fewer matches that fit one fundamental matrix are left out …"""
-MIN_SHARE = 0.4
-"""… and those where fewer than this share of all matches do."""
+MIN_MATCHES = 25  # Pairs with fewer matches that fit one fundamental matrix are left out …
+MIN_SHARE = 0.4  # … and those where fewer than this share of all matches do
 INLIER_ERROR = 2.0
-CLIP = 20.0
-"""Errors beyond this many pixels count as this much."""
-TOLERANCE = 2.0
-"""Matches within so many pixels of their lines agree with the poses."""
-BETTER = 0.6
-"""Another reading is named if its error is below this share of the files' own, and …"""
-BAD = 1.0
-"""… the files' own is above so many pixels."""
-UNFIT = 3.0
-"""Photographs whose matches lie farther than so many pixels from their lines do not fit their poses."""
+CLIP = 20.0  # Errors beyond this many pixels count as this much
+TOLERANCE = 2.0  # Matches within this many pixels of their lines agree with the poses
+BETTER = 0.6  # Another reading is named if its error is below this share of the files' own, and …
+BAD = 1.0  # … the files' own is above this many pixels
+UNFIT = 3.0  # Photographs whose matches lie farther than this many pixels from their lines do not fit their poses
 FOCAL_FACTORS: tuple[float, ...] = tuple(np.round(np.geomspace(0.7, 1.43, 31), 4).tolist())
 SMALLEST_FACTOR = 1.03
-NEAREST = 3
-"""Pairs that count are among this many of one of their views that are nearest to each other …"""
-FEWEST_PAIRS = 3
-"""… and nothing is said of fewer."""
+NEAREST = 3  # Pairs that count are among this many of one of their views that are nearest to each other …
+FEWEST_PAIRS = 3  # … and nothing is said of fewer
 FIT_FACTOR, FIT_RANGE = 3.0, (1.0, 6.0)
 """A pair fits if the median error of its matches is at most this many times that of the middle pair, and a number of
 pixels in this range: poses of tracked sequences are off by 3 pixels, those of structure from motion by 0.3."""
-UNKNOWN_PAIRS = 6
-"""Without another reading that fits, poses are only called wrong by so many pairs, of whose matches …"""
-UNKNOWN_SHARE = 0.1
-"""… less than this share is in pairs that fit."""
-STRAY_ERROR = 2.0
-"""A view may be astray if the error of its pairs is above so many pixels, and above …"""
-STRAY_FACTOR = 3.0
-"""… this many times that of the middle one of the other pairs, and less than …"""
+UNKNOWN_PAIRS = (
+    6  # Without another reading that fits, poses are only called wrong by this many pairs, of whose matches …
+)
+UNKNOWN_SHARE = 0.1  # … less than this share is in pairs that fit
+STRAY_ERROR = 2.0  # A view may be astray if the error of its pairs is above this many pixels, and above …
+STRAY_FACTOR = 3.0  # … this many times that of the middle one of the other pairs, and less than …
 STRAY_SHARE = 0.25
 """… this share of their matches is in pairs that fit. It is astray if it has another pose under which two pairs fit
 and …"""
-MOVED_SHARE = 0.5
-"""… this share of the matches is in pairs that do."""
+MOVED_SHARE = 0.5  # … this share of the matches is in pairs that do
 STEPS = 12
-STARTS = 4
-"""Poses from which that one is looked for, the best of those that two pairs give."""
+STARTS = 4  # Poses from which that one is looked for, the best that two pairs give
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EpipolarCheck:
-    """How matched features fit the poses.
+    """How matched features fit the poses."""
 
-    Attributes:
-        views: rows of the views that were looked at.
-        pairs: pairs of them with matches.
-        matches: number of matches of all pairs.
-        error: mean distance of a pair's matches from their epipolar lines, in pixels of pictures of `PICTURE_SIZE`,
-            averaged over pairs; at most `CLIP`; NaN without pairs.
-        share: of the matches that lie within `TOLERANCE`.
-        best_error: the same under the reading that fits best, over the pairs that count.
-        findings: what is wrong.
-        decided: False if there are too few pairs to say anything, or most of the matches do not fit and it cannot be
-            said why.
-        unmatched: names of the views of which nothing can be said: they have no pair that fits, and are not astray.
-        worst: the pair with the largest error, for a picture; None without pairs.
-        cameras: of the views that were looked at, at the size of the matched pictures, as the files give them.
-    """
-
-    views: Int64[np.ndarray, " V"]
-    pairs: int = 0
-    matches: int = 0
+    views: Int64[np.ndarray, " V"]  # rows of the views that were looked at
+    pairs: int = 0  # pairs of them with matches
+    matches: int = 0  # number of matches of all pairs
+    # Mean distance of a pair's matches from their epipolar lines, in pixels of pictures of `PICTURE_SIZE`, averaged
+    # over pairs; at most `CLIP`; NaN without pairs.
     error: float = float("nan")
-    share: float = float("nan")
-    best_error: float = float("nan")
-    findings: tuple[Finding, ...] = ()
+    share: float = float("nan")  # of the matches that lie within `TOLERANCE`
+    best_error: float = float("nan")  # the same under the reading that fits best, over the pairs that count
+    findings: tuple[Finding, ...] = ()  # what is wrong
+    # False if there are too few pairs to say anything, or most of the matches do not fit and it cannot be said why.
     decided: bool = False
+    # Names of the views of which nothing can be said: they have no pair that fits, and are not astray.
     unmatched: tuple[str, ...] = ()
-    worst: PairMatches | None = None
-    cameras: Cameras
+    worst: PairMatches | None = None  # the pair with the largest error, for a picture; None without pairs
+    cameras: Cameras  # of the views that were looked at, at the size of the matched pictures, as the files give them
 
 
 def check_matches(views: Views, *, limit: int = 24, track: Track = untracked) -> EpipolarCheck:
@@ -286,7 +260,7 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
         suspects = []
         for view in views:
             others = [(pair, fits) for pair, fits in remaining if view not in (pair.first, pair.second)]
-            # A neighbor that fits nobody else may itself be the one that is astray.
+            # A neighbor that fits no other may itself be the one that is astray.
             trusted = {end for pair, fits in others if fits for end in (pair.first, pair.second)}
             own = [
                 pair

@@ -1,4 +1,4 @@
-"""What can be wrong with the files of a scene, and how it is said."""
+"""What can be wrong with the files of a scene, how it is said, and how it is mended."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -6,7 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Float64, Int64
 
-from gsencoder.data.check.agreement import Agreement, DepthViews, agreement, residuals
+from gsencoder.core.errors import InputError
+from gsencoder.data.check.agreement import Agreement, DepthViews, RegistrationFit, agreement, residuals
+from gsencoder.data.readers.posed import PosedImage, PosedImages
+from gsencoder.data.readers.undistort import CameraModel, focal_count
 from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 
 ADVICE = {
@@ -16,8 +19,8 @@ ADVICE = {
     "order": "the poses belong to other photographs: each is that of the photograph {factor:+.0f} places away",
     "ray length": "depth is the length of the ray where the coordinate z is expected",
     "depth scale": "the depth scale is wrong: depths should be {factor:.4g} times as large",
-    "depth focal length": "depth has the focal length of another sensor: {factor:.4g} times the stated one",
-    "focal length": "the focal length of the photographs is {factor:.4g} times the stated one",
+    "depth focal length": "depth has the focal length of another sensor: {factor:.4g} times the given one",
+    "focal length": "the focal length of the photographs is {factor:.4g} times the given one",
     "picture size": "the intrinsics are those of pictures of another size: times {factor:.4g} they would fit these",
 }
 """Causes that concern all views."""
@@ -25,25 +28,16 @@ ADVICE = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """Something that is wrong.
+    """Something that is wrong."""
 
-    Attributes:
-        cause: a key of `ADVICE`, "color registration", "stray view", "other picture", "photographs" or
-            "unknown".
-        message: for people.
-        view: name of the view, if it is one alone.
-        factor: of the depth scale or a focal length, or how many places the poses are moved by, where the cause has
-            one.
-    """
-
-    cause: str
-    message: str
-    view: str | None = None
+    cause: str  # a key of `ADVICE`, "color registration", "stray view", "other picture", "photographs" or "unknown"
+    message: str  # for people
+    view: str | None = None  # name of the view, if it is one alone
+    # Of the depth scale or a focal length, or how many places the poses are moved by, where the cause has one.
     factor: float | None = None
 
 
-PLACES = (-2, -1, 1, 2)
-"""So many places in the order of the views poses may be moved by."""
+PLACES = (-2, -1, 1, 2)  # Places in the order of the views by which poses may be moved
 
 
 def other_poses(cam_from_world: Float64[np.ndarray, "V 4 4"]) -> dict[str, Float64[np.ndarray, "V 4 4"]]:
@@ -68,29 +62,21 @@ SCALES = (1e-3, 1e-2, 0.1, 0.2, 0.25, 0.5, 2.0, 4.0, 5.0, 10.0, 1e2, 1e3)
 NEAR_FACTORS: tuple[float, ...] = tuple(np.round(np.geomspace(0.8, 1.25, 25), 4).tolist())
 """Factors of the depth scale and of the focal length that are tried first; the best is refined."""
 REFINEMENTS = 6
-MIN_COMPARED = 0.02
-"""A reading under which fewer samples than this share of all pairs can be compared says nothing."""
+MIN_COMPARED = 0.02  # A reading under which fewer samples than this share of all pairs can be compared says nothing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reading:
-    """One way to take the numbers of a scene.
+    """One way to take the numbers of a scene."""
 
-    Attributes:
-        cause: what would be wrong with the files if this reading is right; empty for the files' own.
-        factor: of the depth scale or of the focal length, or the places that poses are moved by, where the cause has
-            one.
-        views: the depth images under this reading.
-        agreement: of them.
-    """
-
-    cause: str
-    views: DepthViews
-    agreement: Agreement
+    cause: str  # what would be wrong with the files if this reading is right; empty for the files' own
+    views: DepthViews  # the depth images under this reading
+    agreement: Agreement  # of them
+    # Of the depth scale or of the focal length, or the places that poses are moved by, where the cause has one.
     factor: float | None = None
 
 
-def stated_reading(views: DepthViews) -> Reading:
+def reading_of_files(views: DepthViews) -> Reading:
     """The files' own reading."""
     return Reading(cause="", views=views, agreement=agreement(residuals(views)))
 
@@ -98,11 +84,7 @@ def stated_reading(views: DepthViews) -> Reading:
 def other_readings(
     views: DepthViews, rows: Int64[np.ndarray, " V"], all_poses: Float[np.ndarray, "n 4 4"]
 ) -> list[Reading]:
-    """Every other reading, those with a factor at the factor where depths agree best.
-
-    Args:
-        all_poses: cam_from_world of all views.
-    """
+    """Every other reading, those with a factor at the factor where depths agree best."""
     fixed: list[tuple[str, float | None, DepthViews]] = [
         (cause, None, replace(views, cam_from_world=poses))
         for cause, poses in other_poses(views.cam_from_world).items()
@@ -139,3 +121,89 @@ def _best_factor(cause: str, apply: Callable[[float], DepthViews], factors: Sequ
         step = step**0.5
     corrected = apply(best)
     return Reading(cause=cause, views=corrected, agreement=agreement(residuals(corrected)), factor=best)
+
+
+LEFT_OUT = ("stray view", "other picture")
+CHANGES = {
+    "axes": "poses: axes exchanged",
+    "inverse": "poses: inverse exchanged",
+    "inverse and axes": "poses: inverse and axes exchanged",
+    "order": "poses moved by {0:+.0f} places",
+    "ray length": 'depth_measure is "ray"',
+    "depth scale": "depth_unit_scale_factor times {0:.4g}",
+    "depth focal length": "focal length of the depth times {0:.4g}",
+    "focal length": "focal length times {0:.4g}",
+    "picture size": "intrinsics times {0:.4g}",
+    "color registration": "focal length of photographs times {0:.4g}, depth_from_color with a shift of {1:.3g} units",
+}
+
+
+def repair_posed(
+    posed: PosedImages, findings: Sequence[Finding], registration: RegistrationFit | None = None
+) -> tuple[PosedImages, list[str]]:
+    """Posed images read as the findings say they should be, without the views that do not fit, and what was changed.
+
+    Args:
+        registration: of the same check, for the finding "color registration".
+    """
+    if not findings:
+        raise InputError(f"{posed.source}: nothing wrong was seen, so there is nothing to repair")
+    images, changes = list(posed.images), []
+    for finding in findings:
+        cause, factor = finding.cause, finding.factor or 1.0
+        if cause in LEFT_OUT:
+            continue
+        if cause not in CHANGES or (cause == "color registration" and registration is None):
+            raise InputError(f"{posed.source}: {finding.message}; this cannot be repaired here")
+        if cause == "color registration" and any(image.depth_from_color is not None for image in images):
+            raise InputError(
+                f"{posed.source}: depth is carried over by a depth_from_color of the files that does not fit; "
+                "calibrate the cameras again, or give data.depth_from_color="
+            )
+        poses = np.stack([image.cam_from_world for image in images])
+        poses = other_poses(poses).get(cause, poses)
+        if cause == "order":
+            poses = np.roll(poses, round(factor), axis=0)
+        images = [
+            _mended(replace(image, cam_from_world=pose), cause, factor, registration)
+            for image, pose in zip(images, poses, strict=True)
+        ]
+        changes.append(CHANGES[cause].format(factor, 0.0 if registration is None else np.hypot(*registration.shift)))
+    astray = {str(finding.view) for finding in findings if finding.cause in LEFT_OUT}
+    if astray:
+        changes.append(f"left out, since they do not fit: {', '.join(sorted(astray))}")
+    return replace(posed, images=tuple(image for image in images if image.name not in astray)), changes
+
+
+def _mended(image: PosedImage, cause: str, factor: float, fit: RegistrationFit | None) -> PosedImage:
+    depth_camera = image.depth_camera or image.camera
+    if cause == "ray length":
+        return replace(image, depth_measure="ray")
+    if cause == "depth scale":
+        return replace(image, depth_scale=image.depth_scale * factor)
+    if cause == "depth focal length":
+        return replace(image, depth_camera=focal_times(depth_camera, factor))
+    if cause == "picture size":
+        return replace(image, camera=focal_times(image.camera, factor, principal_point=True))
+    if cause == "focal length":
+        depth = None if image.depth_camera is None else focal_times(depth_camera, factor)
+        return replace(image, camera=focal_times(image.camera, factor), depth_camera=depth)
+    if cause == "color registration" and fit is not None:
+        # The poses were the depth camera's; the photograph's stands next to it.
+        color_from_depth, depth_from_color = np.eye(4), np.eye(4)
+        color_from_depth[:2, 3], depth_from_color[:2, 3] = fit.shift, -fit.shift
+        return replace(
+            image,
+            depth_camera=depth_camera,
+            depth_from_color=depth_from_color,
+            camera=focal_times(image.camera, fit.focal_factor),
+            cam_from_world=color_from_depth @ image.cam_from_world,
+        )
+    return image
+
+
+def focal_times(camera: CameraModel, factor: float, *, principal_point: bool = False) -> CameraModel:
+    """A camera with its focal lengths multiplied; its distortion is that of directions, and stays."""
+    count = focal_count(camera) + 2 * principal_point
+    params = tuple(value * factor if index < count else value for index, value in enumerate(camera.params))
+    return replace(camera, params=params)

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -15,6 +16,7 @@ from gsencoder.data.check.agreement import (
     DepthViews,
     RegistrationFit,
     color_correlations,
+    depth_at,
     depth_views,
     fit_registration,
     grey_pictures,
@@ -24,33 +26,22 @@ from gsencoder.data.check.agreement import (
     world_samples,
 )
 from gsencoder.data.check.epipolar import EpipolarCheck, check_matches
-from gsencoder.data.check.findings import ADVICE, Finding, Reading, other_readings, stated_reading
+from gsencoder.data.check.findings import ADVICE, Finding, Reading, other_readings, reading_of_files
 from gsencoder.types import Cameras, Scene, Views
 from gsencoder.types.checks import invert_rigid, transform
-from gsencoder.types.scene import project_points
 
 REACHES = (0.15,) * 4 + (0.1,) * 4 + (0.07,) * 3 + (0.05, 0.04, 0.03, 0.03, 0.03)
 """Samples are matched to the surface on their pixel's ray in another view if its depth differs by at most this share,
 one for each step: at first far, then near, so that what is hidden there is left out."""
-HUBER = 0.01
-"""Distances beyond this share of the depth count linearly."""
+HUBER = 0.01  # Distances beyond this share of the depth count linearly
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PoseFit:
-    """How far a view would have to move to lie on the others' surfaces.
+class PoseFit(NamedTuple):
+    """How far a view would have to move to lie on the others' surfaces."""
 
-    Attributes:
-        moved: distance in world units.
-        turned: angle in radians.
-        before: mean clipped residual of the view, as `Agreement.spread`.
-        after: the same once it is moved.
-    """
-
-    moved: float
-    turned: float
-    before: float
-    after: float
+    moved: float  # distance in world units
+    turned: float  # angle in radians
+    spread: float  # mean clipped residual of the view once it is moved, as `Agreement.spread`
 
 
 def view_spreads(residual: Float64[np.ndarray, "V V n"]) -> Float64[np.ndarray, " V"]:
@@ -62,7 +53,7 @@ def view_spreads(residual: Float64[np.ndarray, "V V n"]) -> Float64[np.ndarray, 
 
 
 def surface_normals(views: DepthViews, view: int) -> Float64[np.ndarray, "h w 3"]:
-    """Unit normals of a depth image in the world, from differences between neighboring pixels; NaN beside pixels
+    """Unit normals of a depth image in the world, from differences between neighboring pixels; NaN next to pixels
     without depth."""
     depth = views.depths[view].astype(np.float64) * views.scale
     depth[depth <= 0] = np.nan
@@ -77,89 +68,70 @@ def surface_normals(views: DepthViews, view: int) -> Float64[np.ndarray, "h w 3"
 
 
 def fit_pose(views: DepthViews, view: int, normals: list[Float64[np.ndarray, "h w 3"]]) -> PoseFit:
-    """Moves one view by point-to-plane steps (Chen and Medioni 1992) onto the surfaces of the others, which stay."""
+    """Moves one view by point-to-plane steps (Chen and Medioni 1992) onto the surfaces of the others, which stay.
+
+    `normals` are those of all views, by `surface_normals`.
+    """
     from scipy.spatial.transform import Rotation
 
     points = world_samples(views)[view]
     points = points[views.values[view] > 0]
-    center = invert_rigid(views.cam_from_world[view])[:3, 3]
-    motion = np.eye(4)
-    height, width = views.depths.shape[1:]
+    centers = invert_rigid(views.cam_from_world)[:, :3, 3]
+    center, motion = centers[view], np.eye(4)
     for reach in REACHES:
         here = transform(motion, points)
         normal_matrix, normal_vector = np.zeros((6, 6)), np.zeros(6)
         for other in range(len(views)):
             if other == view:
                 continue
-            local = transform(views.cam_from_world[other], here)
-            pixels = project_points(local, views.Ks[other])
-            inside = (local[:, 2] > 0) & (pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1)
-            columns, rows = np.floor(pixels[inside]).astype(np.int64).T
-            measured = views.depths[other][rows, columns] * views.scale
-            z = local[inside, 2]
-            good = (measured > 0) & (np.abs(z - measured) <= reach * measured)
-            normal = normals[other][rows[good], columns[good]]
-            finite = np.isfinite(normal).all(axis=1)
-            normal, observed = normal[finite], here[inside][good][finite]
+            inside, at, z, measured = depth_at(views, other, here, np.ones(len(here), bool))
+            normal = normals[other][at[:, 0], at[:, 1]]
+            good = (measured > 0) & (np.abs(z - measured) <= reach * measured) & np.isfinite(normal).all(axis=1)
+            normal, observed, measured, z = normal[good], here[inside][good], measured[good], z[good]
             # Along the ray of the pixel the surface lies at the measured depth.
-            eye = invert_rigid(views.cam_from_world[other])[:3, 3]
-            target = eye + (observed - eye) * (measured[good] / z[good])[finite, None]
+            target = centers[other] + (observed - centers[other]) * (measured / z)[:, None]
             distance = np.einsum("ni,ni->n", observed - target, normal)
-            scale = HUBER * measured[good][finite]
+            scale = HUBER * measured
             weight = np.minimum(1, scale / np.maximum(np.abs(distance), 1e-12)) / np.square(scale)
             jacobian = np.hstack((np.cross(observed - center, normal), normal))
             normal_matrix += (jacobian * weight[:, None]).T @ jacobian
             normal_vector -= jacobian.T @ (weight * distance)
-        step = (
-            np.linalg.solve(normal_matrix + 1e-6 * np.trace(normal_matrix) / 6 * np.eye(6), normal_vector)
-            if normal_matrix.any()
-            else np.zeros(6)
-        )
+        if not normal_matrix.any():
+            break
+        step = np.linalg.solve(normal_matrix + 1e-6 * np.trace(normal_matrix) / 6 * np.eye(6), normal_vector)
         turn = np.eye(4)
         turn[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix()
         turn[:3, 3] = center + step[3:] - turn[:3, :3] @ center
         motion = turn @ motion
     poses = views.cam_from_world.copy()
     poses[view] = poses[view] @ invert_rigid(motion)
-    before, after = (view_spreads(residuals(each))[view] for each in (views, replace(views, cam_from_world=poses)))
-    moved_center = transform(motion, center[None])[0] - center
     return PoseFit(
-        moved=float(np.linalg.norm(moved_center)),
+        moved=float(np.linalg.norm(transform(motion, center[None])[0] - center)),
         turned=float(np.linalg.norm(Rotation.from_matrix(motion[:3, :3]).as_rotvec())),
-        before=float(before),
-        after=float(after),
+        spread=float(view_spreads(residuals(replace(views, cam_from_world=poses)))[view]),
     )
 
 
-BETTER = 0.95
-"""Another reading of the files is named if its spread is below this share of the files' own."""
-SMALLEST_FACTOR = 1.015
-"""Factors nearer to one are within what sensors are calibrated to."""
-UNFIT = 0.5
-"""If a smaller share of the depth agrees under every reading, poses and depth do not belong together."""
-CLEAR = 0.7
-"""Where the files' own reading compares nothing, another one is named if this share agrees under it."""
+BETTER = 0.95  # Another reading of the files is named if its spread is below this share of the files' own
+SMALLEST_FACTOR = 1.015  # Factors nearer to one are within what sensors are calibrated to
+UNFIT = 0.5  # If a smaller share of the depth agrees under every reading, poses and depth do not belong together
+CLEAR = 0.7  # Where the files' own reading compares nothing, another one is named if this share agrees under it
 COMPARABLE = 0.02
 """Samples that land in another view, as a share of all pairs, below which depth says nothing about poses."""
 STRAY, STRAY_SPREAD = 0.9, 0.002
 """A view is astray if moving it brings its spread below this share, and it is above what pixels alone make."""
-SUSPECTS = 8
-"""So many views, those that fit worst, are tried to be moved."""
+SUSPECTS = 8  # Views, of the worst fit, that are tried to be moved
 OTHER_PICTURE = 0.8
 """A view whose colors correlate with the others' by less than this share of the median shows something else."""
-UNRELATED = 0.3
-"""Photographs whose colors correlate by less than this across views show something else than the depth."""
+UNRELATED = 0.3  # Photographs whose colors correlate by less than this across views show something else than the depth
 SAME_FACTOR = 0.03
 """Depth and photographs whose focal lengths are off by factors this near to each other share one wrong camera."""
 OFF_CENTER = 1.3
 """A principal point this many times as far right and down as the middle, or more, is that of a larger picture; one that
-is so many times as near to the corner, that of a smaller one …"""
-EQUALLY = 0.05
-"""… if it is equally far right and down, to this share."""
-PHOTOGRAPHS = 4
-"""So many are looked at for pictures of one color."""
-SUSPICIOUS = 0.9
-"""`suspicious_depth` looks for the cause where a smaller share of the depth agrees."""
+is this many times as near to the corner, that of a smaller one …"""
+EQUALLY = 0.05  # … if it is equally far right and down, to this share
+PHOTOGRAPHS = 4  # Photographs that are looked at for pictures of one color
+SUSPICIOUS = 0.9  # `suspicious_depth` looks for the cause where a smaller share of the depth agrees
 
 
 UNRELATED_MESSAGE = (
@@ -169,27 +141,16 @@ UNRELATED_MESSAGE = (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class DepthCheck:
-    """How the depth images and photographs of a scene agree.
+    """How the depth images and photographs of a scene agree."""
 
-    Attributes:
-        views: rows of the views that were looked at.
-        stated: agreement of depth as the files have it.
-        best: that of the reading that fits best; `stated` unless a finding names another.
-        offsets: see `pair_offsets`, under the reading that fits best.
-        findings: what is wrong, causes that concern all views first.
-        color: median correlation of the photographs' intensities at the same places; NaN without photographs.
-        registration: of photographs and depth; None without photographs.
-        depth: the depth images, as the files have them.
-    """
-
-    views: Int64[np.ndarray, " V"]
-    stated: Agreement
-    best: Agreement
-    offsets: tuple[float, float]
-    findings: tuple[Finding, ...]
-    color: float
-    registration: RegistrationFit | None
-    depth: DepthViews
+    views: Int64[np.ndarray, " V"]  # rows of the views that were looked at
+    given: Agreement  # agreement of depth as the files have it
+    best: Agreement  # that of the reading that fits best; `given` unless a finding names another
+    offsets: tuple[float, float]  # see `pair_offsets`, under the reading that fits best
+    findings: tuple[Finding, ...]  # what is wrong, causes that concern all views first
+    color: float  # median correlation of the photographs' intensities at the same places; NaN without photographs
+    registration: RegistrationFit | None  # of photographs and depth; None without photographs
+    depth: DepthViews  # the depth images, as the files have them
 
     @property
     def comparable(self) -> bool:
@@ -244,7 +205,7 @@ def wrong_size(cameras: Cameras) -> Finding | None:
 def fit_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> float:
     """The share of what views share that agrees: of depth if it can be compared, else of matches; NaN of neither."""
     if depth is not None and depth.comparable:
-        return depth.stated.share
+        return depth.given.share
     return matches.share if matches is not None else float("nan")
 
 
@@ -267,9 +228,7 @@ def warn_of_faults(scene: Scene) -> None:
     if finding is not None:
         mends = "" if finding.cause == "unknown" else ", and gsencoder repair can mend it"
         warnings.warn(
-            f"scene {scene.name}: {finding.message}; gsencoder inspect says more{mends}",
-            SceneWarning,
-            stacklevel=2,
+            f"scene {scene.name}: {finding.message}; gsencoder inspect says more{mends}", SceneWarning, stacklevel=2
         )
 
 
@@ -291,10 +250,10 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
     rows = even_indices(len(views), limit)
     names = tuple(views.names[int(view)] for view in rows)
     small = depth_views(views, rows)
-    stated = stated_reading(small)
-    best = _best_reading(stated, small, rows, views)
+    given = reading_of_files(small)
+    best = _best_reading(given, small, rows, views)
     comparable = best.agreement.compared >= _needed(small)
-    findings = _reading_findings(stated, best) if comparable else []
+    findings = _reading_findings(given, best) if comparable else []
     fits = comparable and best.agreement.share >= UNFIT
     stray = _stray_views(best.views, names) if fits else []
     color, registration = float("nan"), None
@@ -317,7 +276,7 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
             )
     return DepthCheck(
         views=rows,
-        stated=stated.agreement,
+        given=given.agreement,
         best=best.agreement,
         offsets=pair_offsets(residuals(best.views)),
         findings=(*findings, *stray, *other),
@@ -331,21 +290,21 @@ def suspicious_depth(views: Views, *, limit: int = 10) -> tuple[Agreement, Findi
     """A quick look at few views: how well their depth agrees and, if not well, the likely cause."""
     rows = even_indices(len(views), limit)
     small = depth_views(views, rows)
-    stated = stated_reading(small)
-    if stated.agreement.compared >= _needed(small) and stated.agreement.share >= SUSPICIOUS:
-        return stated.agreement, None
-    best = _best_reading(stated, small, rows, views)
+    given = reading_of_files(small)
+    if given.agreement.compared >= _needed(small) and given.agreement.share >= SUSPICIOUS:
+        return given.agreement, None
+    best = _best_reading(given, small, rows, views)
     if best.agreement.compared < _needed(small):
-        return stated.agreement, None
-    return stated.agreement, next(iter(_reading_findings(stated, best)), None)
+        return given.agreement, None
+    return given.agreement, next(iter(_reading_findings(given, best)), None)
 
 
 def _needed(views: DepthViews) -> float:
-    """So many samples must land in other views before their depth says anything."""
+    """The number of samples that must land in other views before their depth says anything."""
     return COMPARABLE * len(views) * (len(views) - 1) * views.values.shape[1]
 
 
-def _best_reading(stated: Reading, depth: DepthViews, rows: Int64[np.ndarray, " V"], views: Views) -> Reading:
+def _best_reading(given: Reading, depth: DepthViews, rows: Int64[np.ndarray, " V"], views: Views) -> Reading:
     """The files' own reading, or another one that fits clearly better."""
     candidates = [
         reading
@@ -353,30 +312,30 @@ def _best_reading(stated: Reading, depth: DepthViews, rows: Int64[np.ndarray, " 
         if reading.agreement.compared >= _needed(depth)
         and (reading.cause == "order" or reading.factor is None or _differs(reading.factor))
     ]
-    best = min(candidates, key=lambda reading: reading.agreement.spread, default=stated)
-    if stated.agreement.compared < _needed(depth):
+    best = min(candidates, key=lambda reading: reading.agreement.spread, default=given)
+    if given.agreement.compared < _needed(depth):
         # Views that share nothing are no fault; only a reading under which they agree says that they should.
-        return best if best.agreement.share >= CLEAR else stated
-    return best if best.agreement.spread < BETTER * stated.agreement.spread else stated
+        return best if best.agreement.share >= CLEAR else given
+    return best if best.agreement.spread < BETTER * given.agreement.spread else given
 
 
 def _differs(factor: float) -> bool:
     return abs(float(np.log(factor))) >= float(np.log(SMALLEST_FACTOR))
 
 
-def _reading_findings(stated: Reading, best: Reading) -> list[Finding]:
+def _reading_findings(given: Reading, best: Reading) -> list[Finding]:
     """What the reading that fits best says about the files."""
     share = best.agreement.share
     if share < UNFIT:
         message = (
-            f"poses and depth do not belong together: {stated.agreement.share:.0%} of the depth agrees across views, "
+            f"poses and depth do not belong together: {given.agreement.share:.0%} of the depth agrees across views, "
             f"and no other reading of the files has more than {share:.0%}"
         )
         return [Finding(cause="unknown", message=message)]
-    if best is stated:
+    if best is given:
         return []
     message = ADVICE[best.cause].format(factor=best.factor)
-    shares = f"{stated.agreement.share:.0%} of the depth agrees across views, {share:.0%} if so read"
+    shares = f"{given.agreement.share:.0%} of the depth agrees across views, {share:.0%} if so read"
     return [Finding(cause=best.cause, message=f"{message} ({shares})", factor=best.factor)]
 
 
@@ -385,33 +344,35 @@ def _with_registration(findings: list[Finding], fit: RegistrationFit) -> list[Fi
     finding."""
     if not fit.differs:
         return findings
-    correlations = f"details of the photographs correlate by {fit.stated:.2f} across views, {fit.best:.2f} if so"
+    correlations = f"details of the photographs correlate by {fit.given:.2f} across views, {fit.best:.2f} if so"
     focal = next((finding for finding in findings if finding.cause == "depth focal length"), None)
     if focal is not None and focal.factor and abs(np.log(fit.focal_factor / focal.factor)) < SAME_FACTOR:
         message = f"{ADVICE['focal length'].format(factor=focal.factor)}, and so is that of the depth ({correlations})"
         return [Finding(cause="focal length", message=message, factor=focal.factor)]
     x, y = fit.shift
     message = (
-        f"color and depth are not registered: the photographs have {fit.focal_factor:.4g} times the stated focal "
-        f"length, and their camera stands {np.hypot(x, y):.3g} units beside the depth camera ({correlations})"
+        f"color and depth are not registered: the photographs have {fit.focal_factor:.4g} times the given focal "
+        f"length, and their camera stands {np.hypot(x, y):.3g} units from the depth camera ({correlations})"
     )
     return [*findings, Finding(cause="color registration", message=message, factor=fit.focal_factor)]
 
 
 def _stray_views(views: DepthViews, names: tuple[str, ...]) -> list[Finding]:
-    """Views that fit clearly better once they are moved; those that fit worst are judged first, and others without
-    those that are astray."""
-    spreads = view_spreads(residuals(views))
-    suspects = np.argsort(-np.nan_to_num(spreads))[:SUSPECTS]
+    """Views that fit clearly better once they are moved; the worst are tried first, and others without
+    the views that are astray."""
+    suspects = np.argsort(-np.nan_to_num(view_spreads(residuals(views))))[:SUSPECTS]
     normals = [surface_normals(views, view) for view in range(len(views))]
     findings, rows = [], list(range(len(views)))
     for view in map(int, suspects):
-        fit = fit_pose(views.select(rows), rows.index(view), [normals[row] for row in rows])
-        if fit.before > STRAY_SPREAD and fit.after < STRAY * fit.before:
+        others, index = views.select(rows), rows.index(view)
+        before = float(view_spreads(residuals(others))[index])
+        if not before > STRAY_SPREAD:
+            continue
+        fit = fit_pose(others, index, [normals[row] for row in rows])
+        if fit.spread < STRAY * before:
             rows.remove(view)
-            message = (
-                f"its pose does not fit the other views: {fit.moved:.3g} units and {np.rad2deg(fit.turned):.2f}° off"
-            )
+            off = f"{fit.moved:.3g} units and {np.rad2deg(fit.turned):.2f}° off"
+            message = f"its pose does not fit the other views: {off}"
             findings.append(Finding(cause="stray view", message=message, view=names[view]))
     return sorted(findings, key=lambda finding: names.index(str(finding.view)))
 

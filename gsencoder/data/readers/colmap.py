@@ -1,160 +1,208 @@
-"""COLMAP models, binary and text, with or without rigs and frames, read by pycolmap.
+"""COLMAP models, binary and text: cameras, poses and points.
 
-Validation of the binary files of a COLMAP model: every record that a count announces must be there.
-
-pycolmap does not look for the end of a file: a cameras.bin that was cut short loads with whatever was in memory, and
-a wrong count in points3D.bin asks for all memory before it fails.
-So every record is walked first; nothing is decoded here.
-The layout is COLMAP's, little-endian: src/colmap/scene/reconstruction_io_binary.cc.
+Each record is checked before it is taken: a file that was cut short is named, and no count asks for memory. Rigs and
+frames are not read, since images.bin and images.txt hold the pose of each image in all versions. The layouts are
+those of COLMAP's src/colmap/scene/reconstruction_io_binary.cc and reconstruction_io_text.cc.
 """
 
 import io
-import itertools
 import math
 import re
-import shutil
 import struct
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
-from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float64, UInt8
 
-from gsencoder.core.errors import InputError, SceneWarning, readable
-from gsencoder.core.files import MODEL_BYTES, check_foreign, open_foreign, read_foreign
-from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
+from gsencoder.core.errors import InputError, readable
+from gsencoder.core.files import MODEL_BYTES, open_foreign, read_foreign
+from gsencoder.data.readers.posed import PosedImage, PosedImages, ReadOptions, inside, rigid_pose, warn_left_out
 from gsencoder.data.readers.undistort import CameraModel, check_camera, load_pycolmap
 
-CAMERA_PARAMS = (3, 4, 4, 5, 8, 8, 12, 5, 4, 5, 12)
-"""How many parameters the camera models 0 (SIMPLE_PINHOLE) to 10 (THIN_PRISM_FISHEYE) have; later ones ask pycolmap."""
-_SENSOR = struct.calcsize("<iI")
+CAMERA_PARAMS = {
+    "SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12, "FOV": 5, "SIMPLE_RADIAL_FISHEYE": 4, "RADIAL_FISHEYE": 5, "THIN_PRISM_FISHEYE": 12,
+}  # fmt: skip
+"""The number of parameters of the camera models 0 to 10; later ones ask pycolmap."""
+QUATERNION_TOLERANCE = 1e-3
+"""How far from 1 the length of a quaternion may be; the rest is taken for rounding in the file."""
+
+
+class _Image(NamedTuple):
+    """One image of a model; `pose` is qw qx qy qz tx ty tz of cam_from_world."""
+
+    name: str
+    camera: int
+    pose: tuple[float, ...]
+
+
+class _Model(NamedTuple):
+    cameras: dict[int, CameraModel]
+    images: list[_Image]
+    points: Float64[np.ndarray, "P 3"]
+    colors: UInt8[np.ndarray, "P 3"]
 
 
 class _Walker:
     """A position in one file's bytes; every step checks that the bytes are there."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at = path, read_foreign(path, MODEL_BYTES), 0
+        if not path.is_file():
+            raise InputError(f"{path.parent}: {path.name} is missing; a COLMAP model has cameras, images and points3D")
+        with readable(path):
+            self.path, self.data, self.at = path, read_foreign(path, MODEL_BYTES), 0
 
-    def take(self, layout: struct.Struct, field: str) -> tuple[int, ...]:
-        self.skip(layout.size, field)
-        return layout.unpack_from(self.data, self.at - layout.size)
+    def take(self, layout: str, field: str) -> tuple:
+        size = struct.calcsize(layout)
+        self.skip(size, field)
+        return struct.unpack_from(layout, self.data, self.at - size)
 
     def skip(self, size: int, field: str) -> None:
         if self.at + size > len(self.data):
-            raise InputError(
-                f"{self.path}: ends at byte {len(self.data)} inside {field}, which needs {self.at + size} bytes; "
-                "the file is cut short or damaged"
-            )
+            self.fail(f"ends at byte {len(self.data)} inside {field}, which needs {self.at + size} bytes")
         self.at += size
 
     def count(self, smallest: int, field: str) -> int:
         """A record count, which the rest of the file must be able to hold."""
-        (count,) = self.take(_U64, f"the number of {field}")
-        if count * smallest > len(self.data) - self.at:
-            raise InputError(
-                f"{self.path}: announces {count} {field} (at least {count * smallest} bytes) but "
-                f"{len(self.data) - self.at} bytes follow; the file is cut short or damaged"
-            )
-        return count
+        (count,) = self.take("<Q", f"the number of {field}")
+        left = len(self.data) - self.at
+        if count * smallest > left:
+            self.fail(f"announces {count} {field} (at least {count * smallest} bytes) but {left} bytes follow")
+        return int(count)
+
+    def end(self) -> None:
+        if self.at != len(self.data):
+            self.fail(f"{len(self.data) - self.at} bytes follow the last record")
 
     def fail(self, fault: str) -> None:
-        raise InputError(f"{self.path}: {fault}; the file is damaged")
+        raise InputError(f"{self.path}: {fault}; the file is cut short or damaged")
 
 
-_U64, _U32 = struct.Struct("<Q"), struct.Struct("<I")
-_CAMERA = struct.Struct("<IiQQ")
-_FLAG = struct.Struct("<B")
-
-
-def _params_of(model: int, walker: _Walker) -> int:
-    if 0 <= model < len(CAMERA_PARAMS):
-        return CAMERA_PARAMS[model]
-    pycolmap = load_pycolmap()
-    names = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items()}
-    if model < 0 or model not in names or names[model] == "INVALID":
-        walker.fail(f"camera model number {model} is unknown to pycolmap {pycolmap.__version__}")
-    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(model), 1.0, 1, 1)
-    return len(camera.params)
-
-
-def _cameras(walker: _Walker) -> None:
-    for i in range(walker.count(_CAMERA.size, "cameras")):
-        _, model, _, _ = walker.take(_CAMERA, f"camera {i}")
-        walker.skip(8 * _params_of(model, walker), f"the parameters of camera {i}")
-
-
-def _images(walker: _Walker) -> None:
+def _read_binary(model: Path) -> _Model:
+    walker, cameras, images = _Walker(model / "cameras.bin"), dict[int, CameraModel](), list[_Image]()
+    for i in range(walker.count(24, "cameras")):
+        number, kind, width, height = walker.take("<IiQQ", f"camera {i}")
+        name, count = _camera_model(kind, walker)
+        params = walker.take(f"<{count}d", f"the parameters of camera {i}")
+        cameras[number] = CameraModel(model=name, width=width, height=height, params=params)
+    walker.end()
+    walker = _Walker(model / "images.bin")
     for i in range(walker.count(73, "images")):
-        walker.skip(64, f"image {i}")
+        _, *pose, camera = walker.take("<I7dI", f"image {i}")
         end = walker.data.find(b"\0", walker.at)
         if end < 0:
             walker.fail(f"the name of image {i} has no end")
         try:
-            walker.data[walker.at : end].decode("utf-8")
+            name = walker.data[walker.at : end].decode("utf-8")
         except UnicodeDecodeError:
             walker.fail(f"the name of image {i} is not UTF-8")
         walker.at = end + 1
         walker.skip(24 * walker.count(24, f"observations of image {i}"), f"the observations of image {i}")
-
-
-def _walk_points(walker: _Walker) -> None:
+        images.append(_Image(name, camera, tuple(pose)))
+    walker.end()
+    walker, rows = _Walker(model / "points3D.bin"), []
     for i in range(walker.count(51, "points")):
-        walker.skip(43, f"point {i}")
+        rows.append(walker.take("<Q3d3Bd", f"point {i}")[1:7])
         walker.skip(8 * walker.count(8, f"observations of point {i}"), f"the track of point {i}")
+    walker.end()
+    return _Model(cameras, images, *_points(rows))
 
 
-def _rigs(walker: _Walker) -> None:
-    for i in range(walker.count(8, "rigs")):
-        walker.skip(4, f"rig {i}")
-        (sensors,) = walker.take(_U32, f"rig {i}")
-        if not sensors:
-            continue
-        walker.skip(_SENSOR, f"rig {i}")
-        for _ in range(sensors - 1):
-            walker.skip(_SENSOR, f"the sensors of rig {i}")
-            if walker.take(_FLAG, f"the sensors of rig {i}")[0]:
-                walker.skip(56, f"the sensors of rig {i}")
+def _camera_model(number: int, walker: _Walker) -> tuple[str, int]:
+    """The name and the number of parameters of a camera model."""
+    if 0 <= number < len(CAMERA_PARAMS):
+        return list(CAMERA_PARAMS.items())[number]
+    pycolmap = load_pycolmap()
+    names = {int(value): name for name, value in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    if number not in names:
+        walker.fail(f"camera model number {number} is unknown to pycolmap {pycolmap.__version__}")
+    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId(number), 1.0, 1, 1)
+    return names[number], len(camera.params)
 
 
-def _frames(walker: _Walker) -> None:
-    for i in range(walker.count(68, "frames")):
-        walker.skip(64, f"frame {i}")
-        (images,) = walker.take(_U32, f"frame {i}")
-        walker.skip(16 * images, f"the images of frame {i}")
+def _points(rows: list[tuple[Any, ...]]) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    table = np.array(rows, np.float64).reshape(-1, 6)
+    return table[:, :3].copy(), table[:, 3:].astype(np.uint8)
 
 
-_FILES: dict[str, Callable[[_Walker], None]] = {
-    "cameras.bin": _cameras,
-    "images.bin": _images,
-    "points3D.bin": _walk_points,
-    "rigs.bin": _rigs,
-    "frames.bin": _frames,
-}
+def _read_text(model: Path) -> _Model:
+    cameras, images, points = dict[int, CameraModel](), list[_Image](), list[tuple[Any, ...]]()
+    for where, words in _rows(model / "cameras.txt"):
+        with _expected(where, words, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"):
+            number, width, height = int(words[0]), int(words[2]), int(words[3])
+            params = tuple(map(float, words[4:]))
+            if len(params) != CAMERA_PARAMS.get(words[1], len(params)):
+                raise ValueError
+        cameras[number] = CameraModel(model=words[1], width=width, height=height, params=params)
+    observations = False
+    for where, words in _rows(model / "images.txt", blank=True):
+        # The line after an image holds X Y POINT3D_ID of its observations; some tools leave empty ones away.
+        if observations and (not words or _are_observations(words)):
+            observations = False
+        elif words:
+            with _expected(where, words, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
+                int(words[0])
+                image = _Image(" ".join(words[9:]) or words[9], int(words[8]), tuple(map(float, words[1:8])))
+            images.append(image)
+            observations = True
+    for where, words in _rows(model / "points3D.txt"):
+        with _expected(where, words, "POINT3D_ID X Y Z R G B ERROR TRACK[]"):
+            int(words[0])
+            x, y, z = map(float, words[1:4])
+            red, green, blue, _ = int(words[4]), int(words[5]), int(words[6]), float(words[7])
+            if not 0 <= min(red, green, blue) <= max(red, green, blue) <= 255:
+                raise ValueError
+        points.append((x, y, z, red, green, blue))
+    for name, entries in (("cameras", cameras), ("images", images), ("points3D", points)):
+        _check_count(model / f"{name}.txt", len(entries))
+    return _Model(cameras, images, *_points(points))
 
 
-def check_binary_model(folder: Path) -> None:
-    """Walks the records of every .bin file of a model."""
-    for name, walk in _FILES.items():
-        path = folder / name
-        if not path.is_file():
-            if name in ("rigs.bin", "frames.bin"):  # Written since COLMAP 3.12.
-                continue
-            raise InputError(f"{folder}: {name} is missing; a binary COLMAP model has cameras, images and points3D")
-        try:
-            walker = _Walker(path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error})") from error
-        walk(walker)
-        if walker.at != len(walker.data):
-            walker.fail(f"{len(walker.data) - walker.at} bytes follow the last record")
+def _lines(file: Path) -> Iterator[str]:
+    if not file.is_file():
+        raise InputError(f"{file.parent}: {file.name} is missing; a COLMAP model has cameras, images and points3D")
+    with readable(file), io.TextIOWrapper(open_foreign(file, MODEL_BYTES), encoding="utf-8", errors="replace") as lines:
+        yield from lines
 
 
-QUATERNION_TOLERANCE = 1e-3
-"""How far from 1 the length of a quaternion may be; the rest is taken for rounding in the file."""
+def _rows(file: Path, *, blank: bool = False) -> Iterator[tuple[str, list[str]]]:
+    """Where each line with values stands, and its words; with `blank`, empty lines too."""
+    for number, line in enumerate(_lines(file), 1):
+        words = line.split()
+        if (words or blank) and not line.startswith("#"):
+            yield f"{file}: line {number}", words
+
+
+@contextmanager
+def _expected(where: str, words: list[str], form: str) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, IndexError):
+        raise InputError(f"{where} is not {form}: {' '.join(words)[:80]!r}") from None
+
+
+def _are_observations(words: list[str]) -> bool:
+    """Whether a line may hold X Y POINT3D_ID triples; the first and the last are looked at."""
+    try:
+        triples = [(float(x), float(y), int(point)) for x, y, point in (words[:3], words[-3:])]
+    except ValueError:
+        return False
+    return len(words) % 3 == 0 and bool(np.isfinite(triples).all())
+
+
+def _check_count(file: Path, count: int) -> None:
+    """Compares with the count in the file's comments: a text file that was cut short has no other sign."""
+    for line in _lines(file):
+        if not line.startswith("#"):
+            return
+        announced = re.match(r"# Number of \w+: (\d{1,15})\b", line)
+        if announced and int(announced[1]) != count:
+            raise InputError(
+                f"{file}: announces {announced[1]} entries and holds {count}; the file is cut short or was edited"
+            )
 
 
 def is_colmap_model(folder: Path) -> bool:
@@ -166,259 +214,81 @@ def read_colmap(
     model: Path,
     images: Path,
     root: Path,
+    options: ReadOptions = ReadOptions(),
     *,
-    allow_outside: bool = False,
     base_names: bool = False,
     masks: Path | None = None,
 ) -> PosedImages:
-    """Reads a model and finds its photographs.
+    """Reads a model (.bin before .txt where both are there) and finds its photographs.
 
     Args:
-        model: folder of cameras, images and points3D (.bin before .txt where both are there), rigs and frames.
         images: folder that the names of the model are relative to.
-        root: the scene folder, which names may not leave.
+        root: the scene folder, which names may not leave unless the options allow it.
         base_names: photographs lie in `images` itself, whatever folders the names of the model begin with.
 
     Returns:
-        The registered pictures sorted by name, in the model's own world, and its points with their colors. The unit
-        of length and up are unknown.
+        The pictures sorted by name, in the model's own world, and its points with their colors. The unit of length and
+        up are unknown.
     """
-    reconstruction = _load(model)
+    is_binary = (model / "cameras.bin").is_file()
+    content = _read_binary(model) if is_binary else _read_text(model)
     masks = masks if masks is not None and masks.is_dir() else None
     posed: list[PosedImage] = []
     missing: list[str] = []
-    unregistered = 0
-    cameras: dict[int, CameraModel] = {}
-    for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
+    checked: set[int] = set()
+    for image in sorted(content.images):
         where = f"{model}: image {image.name[:120]!r}"
-        if not image.has_pose:
-            unregistered += 1
-            continue
         name = Path(image.name).name if base_names else image.name
-        path = inside(images, name, where, root=root, allow_outside=allow_outside)
+        path = inside(images, name, where, root=root, allow_outside=options.allow_outside)
         if not path.is_file():
             missing.append(image.name)
             continue
-        if image.camera_id not in cameras:
-            if image.camera_id not in reconstruction.cameras:
-                raise InputError(f"{where}: its camera {image.camera_id} is not in the model")
-            colmap_camera = reconstruction.cameras[image.camera_id]
-            camera = CameraModel(
-                model=colmap_camera.model.name,
-                width=int(colmap_camera.width),
-                height=int(colmap_camera.height),
-                params=tuple(float(value) for value in colmap_camera.params),
-            )
-            check_camera(camera, f"{model}: camera {image.camera_id}")
-            cameras[image.camera_id] = camera
-        cam_from_world = image.cam_from_world()
-        length = math.hypot(*map(float, cam_from_world.rotation.quat))
-        # pycolmap takes a quaternion of zeros for no rotation.
-        if not abs(length - 1) <= QUATERNION_TOLERANCE:
-            raise InputError(
-                f"{where}: its quaternion ({_pose_file(model)}) has length {length:.4g}, expected 1; export the model "
-                "again, or remove the image"
-            )
-        pose = np.eye(4)
-        pose[:3] = cam_from_world.matrix()
+        if image.camera not in content.cameras:
+            raise InputError(f"{where}: its camera {image.camera} is not in the model")
+        camera = content.cameras[image.camera]
+        if image.camera not in checked:
+            check_camera(camera, f"{model}: camera {image.camera}")
+            checked.add(image.camera)
+        length = math.hypot(*image.pose[:4])
+        if math.isfinite(length) and abs(length - 1) > QUATERNION_TOLERANCE:
+            file = "images.bin" if is_binary else "images.txt"
+            raise InputError(f"{where}: its quaternion ({file}) has length {length:.4g}, expected 1")
         posed.append(
             PosedImage(
                 name=image.name,
-                camera=cameras[image.camera_id],
-                cam_from_world=rigid_pose(pose, where),
+                camera=camera,
+                cam_from_world=rigid_pose(_matrix(image.pose), where),
                 image=path,
-                mask=None if masks is None else _find_mask(masks, image.name, where, allow_outside=allow_outside),
+                mask=None if masks is None else _find_mask(masks, image.name, where, options),
             )
         )
-    total = len(reconstruction.images)
+    total = len(content.images)
     if not posed:
         first = f" (first: {missing[0][:200]!r})" if missing else ""
-        raise InputError(
-            f"{model}: no view: of {total} images {unregistered} have no pose "
-            f"and {len(missing)} are not in {images}{first}"
-        )
+        raise InputError(f"{model}: no view: of {total} images {len(missing)} are not in {images}{first}")
     warn_left_out(missing, total, str(model), "images of the model", f"not in {images}, they are left out")
-    if unregistered:
-        warnings.warn(
-            f"{model}: {unregistered} of {total} images have no pose and are left out", SceneWarning, stacklevel=2
-        )
     if masks is not None:
         without = [f"{image.name}.png" for image in posed if image.mask is None]
         warn_left_out(without, len(posed), str(masks), "masks", "all pixels of those views are used")
-    points, colors = _points(reconstruction)
-    return PosedImages(source=str(model), images=tuple(posed), points=points, colors=colors)
+    return PosedImages(source=str(model), images=tuple(posed), points=content.points, colors=content.colors)
 
 
-def _find_mask(masks: Path, name: str, where: str, *, allow_outside: bool) -> Path | None:
+def _matrix(pose: tuple[float, ...]) -> Float64[np.ndarray, "4 4"]:
+    w, x, y, z, *shift = pose
+    matrix = np.eye(4)
+    matrix[:3, :3] = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    matrix[:3, 3] = shift
+    return matrix
+
+
+def _find_mask(masks: Path, name: str, where: str, options: ReadOptions) -> Path | None:
     """The mask of an image, as COLMAP calls it (the image's name and .png), or with .png in place of the ending."""
     for candidate in (f"{name}.png", str(PurePosixPath(name).with_suffix(".png"))):
-        path = inside(masks, candidate, where, root=masks.parent, allow_outside=allow_outside)
+        path = inside(masks, candidate, where, root=masks.parent, allow_outside=options.allow_outside)
         if path.is_file():
             return path
     return None
-
-
-def _pose_file(model: Path) -> str:
-    """The file that holds the poses: that of the frames where there is one (since COLMAP 3.12)."""
-    suffix = "bin" if (model / "cameras.bin").is_file() else "txt"
-    return f"frames.{suffix}" if (model / f"frames.{suffix}").is_file() else f"images.{suffix}"
-
-
-def _image_lines(file: Path) -> tuple[list[str], bool, bool]:
-    """The lines of an images.txt, two for each image, whether the file itself has them, and whether any has points."""
-    lines: list[str] = []
-    lost, with_points, complete = 0, 0, True
-    with io.TextIOWrapper(open_foreign(file), encoding="utf-8", errors="replace") as stream:
-        for number, line in enumerate(stream, 1):
-            words = line.split()
-            comment = not words or words[0].startswith("#")
-            if len(lines) % 2:
-                if comment or _are_points(words):
-                    lines.append("" if comment else line.strip())
-                    with_points += not comment
-                    continue
-                lost, complete = lost or number, False
-                lines.append("")
-            elif comment:
-                continue
-            _check_image_line(words, f"{file}: line {number}")
-            lines.append(line.strip())
-    if lost and with_points:
-        raise InputError(
-            f"{file}: line {lost} holds no points of the image above it; expected two lines an image, of which the "
-            "second may be empty (X Y POINT3D_ID …)"
-        )
-    if len(lines) % 2:
-        lines, complete = [*lines, ""], False
-    return lines, complete, with_points > 0
-
-
-def _are_points(words: list[str]) -> bool:
-    """Whether a line may hold X Y POINT3D_ID triples; the first and the last are looked at."""
-    try:
-        return len(words) % 3 == 0 and all(
-            np.isfinite([float(x), float(y), int(point)]).all() for x, y, point in (words[:3], words[-3:])
-        )
-    except ValueError:
-        return False
-
-
-def _check_image_line(words: list[str], where: str) -> None:
-    with _expected(where, words, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"):
-        [int(words[0]), int(words[8])]
-        name, pose = words[9], [float(word) for word in words[1:8]]
-    if not np.isfinite(pose).all():
-        raise InputError(f"{where}: image {name[:120]!r}: the pose has values that are not finite")
-
-
-def _load(model: Path) -> Any:
-    pycolmap = load_pycolmap()
-    binary = (model / "cameras.bin").is_file()
-    for path in sorted(model.glob("*.bin" if binary else "*.txt")):
-        with readable(path):
-            check_foreign(path, MODEL_BYTES)
-    if binary:
-        check_binary_model(model)
-    else:
-        for name in ("cameras.txt", "images.txt", "points3D.txt"):
-            if not (model / name).is_file():
-                raise InputError(f"{model}: {name} is missing; a COLMAP model has cameras, images and points3D")
-    reconstruction = pycolmap.Reconstruction()
-    try:
-        if binary:
-            reconstruction.read_binary(str(model))
-        else:
-            _read_text(reconstruction, model)
-        # Names are decoded when they are asked for, so a name that is not UTF-8 shows only here.
-        [image.name for image in reconstruction.images.values()]
-    except InputError:
-        raise
-    except Exception as error:
-        if not binary:
-            _check_lines(model)
-        message = " ".join(str(error).split())[:200]
-        raise InputError(f"{model}: pycolmap cannot read this model ({type(error).__name__}: {message})") from error
-    if not binary:
-        _check_text_counts(model, reconstruction)
-    return reconstruction
-
-
-def _read_text(reconstruction: Any, model: Path) -> None:
-    """Reads a text model, also one whose images.txt has one line an image, or no points for the tracks of points3D.txt
-    to name (tracks are not used)."""
-    lines, complete, with_points = _image_lines(model / "images.txt")
-    points = [] if with_points else [words[:8] for _, words in _rows(model / "points3D.txt")]
-    if complete and not points:
-        reconstruction.read_text(str(model))
-        return
-    with TemporaryDirectory(prefix="gsencoder_model_") as folder:
-        for file in model.glob("[cprf]*.txt"):
-            shutil.copy(file, folder)
-        Path(folder, "images.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        if points:
-            Path(folder, "points3D.txt").write_text("\n".join(map(" ".join, points)) + "\n", encoding="utf-8")
-        reconstruction.read_text(folder)
-
-
-def _check_lines(model: Path) -> None:
-    """Raises InputError with the line of a text model that pycolmap cannot read, or that names what is not there."""
-    pycolmap = load_pycolmap()
-    counts = {pycolmap.CameraModelId(number).name: count for number, count in enumerate(CAMERA_PARAMS)}
-    cameras, points = set[int](), dict[int, int]()
-    for where, words in _rows(model / "cameras.txt"):
-        with _expected(where, words, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]"):
-            cameras.add(int(words[0]))
-            if len([int(words[2]), int(words[3]), *map(float, words[4:])]) != 2 + counts[words[1]]:
-                raise ValueError
-    lines = _image_lines(model / "images.txt")[0]
-    for image, seen in zip(lines[::2], lines[1::2], strict=True):
-        words = image.split()
-        points[int(words[0])] = len(seen.split()) // 3
-        if int(words[8]) not in cameras:
-            where = next(where for where, row in _rows(model / "images.txt") if row == words)
-            raise InputError(f"{where} says that {words[9]!r} has camera {words[8]}, which cameras.txt lacks")
-    for where, words in _rows(model / "points3D.txt"):
-        with _expected(where, words, "POINT3D_ID X Y Z R G B ERROR TRACK[]"):
-            [int(words[0]), words[7], *map(float, words[1:8])]
-            track = list(map(int, words[8:]))
-            seen_by = list(zip(track[::2], track[1::2], strict=True))
-        for number, point in seen_by:
-            if point >= points.get(number, 0):
-                raise InputError(f"{where} names point {point} of image {number}, which images.txt lacks")
-
-
-def _rows(file: Path) -> Iterator[tuple[str, list[str]]]:
-    """Where each line with values stands, and its words."""
-    with io.TextIOWrapper(open_foreign(file), encoding="utf-8", errors="replace") as stream:
-        for number, line in enumerate(stream, 1):
-            if (words := line.split()) and not words[0].startswith("#"):
-                yield f"{file}: line {number}", words
-
-
-@contextmanager
-def _expected(where: str, words: list[str], form: str) -> Iterator[None]:
-    try:
-        yield
-    except (ValueError, IndexError, KeyError):
-        raise InputError(f"{where} is not {form}: {' '.join(words)[:80]!r}") from None
-
-
-def _check_text_counts(model: Path, reconstruction: Any) -> None:
-    """Compares what was read with the counts in the files' comments: a text file cut short has no other sign."""
-    entries = {"cameras": reconstruction.cameras, "images": reconstruction.images, "points3D": reconstruction.points3D}
-    for name, values in entries.items():
-        with io.TextIOWrapper(open_foreign(model / f"{name}.txt"), encoding="utf-8", errors="replace") as lines:
-            for line in itertools.takewhile(lambda line: line.startswith("#"), lines):
-                promised = re.match(r"# Number of \w+: (\d{1,15})\b", line)
-                if promised and int(promised[1]) != len(values):
-                    raise InputError(
-                        f"{model / name}.txt: promises {promised[1]} entries and holds {len(values)}; "
-                        "the file is cut short or was edited (correct or remove its comment)"
-                    )
-
-
-def _points(reconstruction: Any) -> tuple[np.ndarray, np.ndarray]:
-    sfm_points = list(reconstruction.points3D.values())
-    points = np.array([point.xyz for point in sfm_points], np.float64).reshape(-1, 3)
-    colors = np.array([point.color for point in sfm_points], np.uint8).reshape(-1, 3)
-    return points, colors

@@ -1,9 +1,7 @@
 """Depth images of sensors as lazy sequences: z in world units, in the pixels of the photographs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal, no_type_check
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -11,11 +9,10 @@ from jaxtyping import Float32, Float64
 from gsencoder.core.errors import InputError
 from gsencoder.core.threads import kernel
 from gsencoder.data.readers.images import PictureFiles, PixelGrid, load_npy, read_integers
+from gsencoder.data.readers.posed import PosedImage
 from gsencoder.data.readers.undistort import RemapCache, pinhole_for
+from gsencoder.types.checks import invert_rigid
 from gsencoder.types.scene import pixel_centers, unproject_points
-
-DepthMeasure = Literal["z", "ray"]
-"""What the numbers of a depth file are: the coordinate z in the camera, or the distance from its center."""
 
 
 def ray_lengths(K: Float64[np.ndarray, "3 3"], width: int, height: int) -> Float64[np.ndarray, "height width"]:
@@ -24,42 +21,16 @@ def ray_lengths(K: Float64[np.ndarray, "3 3"], width: int, height: int) -> Float
     return np.asarray(np.linalg.norm(rays, axis=2))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DepthSensor:
-    """How the numbers of a depth file become depth of the photograph.
-
-    Attributes:
-        scale: world units for each step of the file.
-        no_depth: a step that means none, besides 0.
-        measure: whether a depth is the coordinate z or the length of the ray.
-        color_from_depth: where the sensor stands beside the photograph's camera, world units; None = in one place.
-    """
-
-    scale: float = 1.0
-    no_depth: int | None = None
-    measure: DepthMeasure = "z"
-    color_from_depth: Float64[np.ndarray, "4 4"] | None = None
-
-
 class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
     """Sensor depth as float32 [H, W], z in world units, 0 = none; a view without a file is all zero.
 
     PNG holds integers and .npy any number type; both are multiplied by the view's scale. In .npy, NaN and infinity
-    also mean none. Depth of a sensor that stands beside the photograph's camera is carried over (registration.py).
+    also mean none. Depth of a sensor that stands elsewhere is carried over (`register_depth`).
     """
 
-    def __init__(
-        self,
-        paths: Sequence[Path | None],
-        grids: Sequence[PixelGrid],
-        remaps: RemapCache,
-        sensors: Sequence[DepthSensor],
-    ) -> None:
-        super().__init__(paths, grids, remaps)
-        self._sensors = tuple(sensors)
-
-    def _slice(self, rows: slice) -> "DepthFiles":
-        return DepthFiles(self._paths[rows], self._grids[rows], self._remaps, self._sensors[rows])
+    def __init__(self, images: Sequence[PosedImage], grids: Sequence[PixelGrid], remaps: RemapCache) -> None:
+        super().__init__([image.depth for image in images], grids, remaps)
+        self._images = tuple(images)
 
     def _load(self, view: int) -> Float32[np.ndarray, "H W"]:
         path, grid = self._paths[view], self._grids[view]
@@ -73,23 +44,21 @@ class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
                 raise InputError(f"{path}: depth has negative values")
         else:
             values = read_integers(path, "depth", wide=True).astype(np.float64)
-        sensor = self._sensors[view]
-        if sensor.no_depth is not None:
-            values[values == sensor.no_depth] = 0
-        if sensor.color_from_depth is None:
-            depth = self._nearest(view, values) * sensor.scale
-            if sensor.measure == "ray":
+        image = self._images[view]
+        if image.no_depth is not None:
+            values[values == image.no_depth] = 0
+        if image.depth_from_color is None:
+            depth = self._nearest(view, values) * image.depth_scale
+            if image.depth_measure == "ray":
                 depth /= ray_lengths(grid.pinhole.matrix(grid.width, grid.height), grid.width, grid.height)
         else:
-            depth = self._registered(view, values * sensor.scale, sensor)
+            depth = self._registered(view, values * image.depth_scale, image)
         if depth.size and depth.max() > np.finfo(np.float32).max:
             raise InputError(f"{path}: depth of {depth.max():g} world units; check the depth scale")
         return depth.astype(np.float32)
 
-    def _registered(self, view: int, depth: np.ndarray, sensor: DepthSensor) -> Float32[np.ndarray, "H W"]:
+    def _registered(self, view: int, depth: np.ndarray, image: PosedImage) -> Float32[np.ndarray, "H W"]:
         """The depth of a sensor that stands elsewhere, as the photograph's camera sees it."""
-        # The kernel needs numba and torch, which scenes without such sensors do without.
-
         grid = self._grids[view]
         depth = self._of_source(view, depth)
         source = grid.source
@@ -98,13 +67,13 @@ class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
         if remap is not None:
             depth = remap.nearest(depth)
         K = pinhole.matrix(pinhole.width, pinhole.height)
-        if sensor.measure == "ray":
+        if image.depth_measure == "ray":
             depth = depth / ray_lengths(K, pinhole.width, pinhole.height)
-        assert sensor.color_from_depth is not None
+        assert image.depth_from_color is not None
         return register_depth(
             depth.astype(np.float32),
             K,
-            sensor.color_from_depth,
+            invert_rigid(image.depth_from_color),
             grid.pinhole.matrix(grid.width, grid.height),
             grid.width,
             grid.height,
@@ -131,11 +100,7 @@ def register_depth(
 
     Args:
         depth: z in the depth camera, 0 = none.
-        depth_K: its intrinsics, pixel centers at .5.
-        color_from_depth: rigid, in the unit of the depth.
         color_K: intrinsics of the color camera at the size of the result.
-        width: of the result, pixels.
-        height: of the result, pixels.
     """
     result = np.full((height, width), np.inf, np.float32)
     _register(

@@ -1,42 +1,35 @@
-"""Pictures on disk as lazy sequences of views: files that are decoded on access, undistorted and
-scaled. `depth_images.py` has depth of sensors, `masks.py` masks.
+"""Pictures on disk as lazy sequences of views: files that are decoded on access, undistorted and scaled.
 
 - Distorted pictures are resampled once (undistort.py): color bilinearly, everything else by the nearest pixel.
 - A smaller scale averages color over areas; depth and instances take the pixel at the new center. Photographs are
   decoded and undistorted at half, a quarter or an eighth of their size where that is at least twice the view's.
 - Photographs that were read last are kept, up to `KEPT_BYTES`: checks, seeds and teachers look at the same ones.
-- A file whose width and height are exchanged is turned by the photograph's EXIF orientation. Masks, depth and instance
-  maps of another size than the photograph are enlarged or reduced by the nearest pixel.
-
-One picture file, decoded: photographs, masks, integers of depth and instance maps, and .npy arrays.
-
-- The size in a file's header is checked before anything is decoded; more than `PIXEL_LIMIT` pixels are refused.
-- Only PNG, JPEG, WebP, TIFF, BMP and PPM are opened, and .npy for depth. A file that cannot be decoded to its
-  end is an InputError that names it.
-- Pixels are as they are stored, as COLMAP takes them, whatever the EXIF orientation says: poses and intrinsics belong
-  to these. `picture_info` reads the orientation.
-- Grey becomes RGB by repetition, 16-bit grey keeps its upper 8 bits. An alpha channel composites the color over
-  black, which is what a splat rendered without a background gives.
+- A file whose width and height are exchanged is turned by the photograph's EXIF orientation; else pixels are as they
+  are stored, as COLMAP takes them: poses and intrinsics belong to these. Masks, depth and instance maps of another size
+  than the photograph are enlarged or reduced by the nearest pixel.
+- Of PNG, JPEG, WebP, TIFF, BMP and PPM (and .npy for depth) the size in the header is checked before anything is
+  decoded. Grey becomes RGB by repetition, 16-bit grey keeps its upper 8 bits. An alpha channel composites the color
+  over black, which is what a splat rendered without a background gives.
 """
 
 import io
 import math
 import operator
 import threading
-import warnings
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int32, UInt8
+from jaxtyping import Bool, Int32, UInt8
 
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError
 from gsencoder.core.files import check_foreign
 from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, check_camera
 from gsencoder.types.orientation import EXCHANGED, turned
+from gsencoder.types.scene import Selected
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -48,8 +41,7 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
 EXIF_ORIENTATION = 0x0112
 TIFF_UNDO = (0, 0, 0, 3, 1, 5, 2, 6, 4)
 """By EXIF orientation: Pillow's number (`Image.Transpose`) of what turns an upright picture back."""
-DEEP_GREY = ("I;16", "I;16B", "I;16L", "I")
-"""Pillow's modes of pictures with one channel of more than 8 bits."""
+DEEP_GREY = ("I;16", "I;16B", "I;16L", "I")  # Pillow's modes of pictures with one channel of more than 8 bits
 
 
 def check_picture_size(path: Path, width: int, height: int) -> None:
@@ -182,7 +174,7 @@ def read_rgba(path: Path, *, reduction: int = 1) -> tuple[UInt8[np.ndarray, "H W
     """Color (composited over black) and alpha, None where the file has none.
 
     Args:
-        reduction: 1, 2, 4 or 8: JPEG is decoded so many times smaller, and files of other formats are not.
+        reduction: 1, 2, 4 or 8: JPEG is decoded this many times smaller, and files of other formats are not.
     """
     with open_picture(path) as file:
         if file.format == "JPEG" and reduction > 1:
@@ -250,29 +242,21 @@ def read_integers(path: Path, subject: str, *, wide: bool, data: io.BytesIO | No
 
 
 Array = TypeVar("Array", bound=np.ndarray)
-KEPT_BYTES = 64 << 20
-"""Of all photographs that are kept; scenes with more decode them each time they are looked at."""
+KEPT_BYTES = 64 << 20  # Of all photographs that are kept; scenes with more decode them each time they are looked at
 _kept: dict[Any, UInt8[np.ndarray, "_ _ 3"]] = {}
 _kept_lock = threading.Lock()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PixelGrid:
-    """How the pixels of a view's file become the pixels of the view.
+    """How the pixels of a view's file become the pixels of the view."""
 
-    Attributes:
-        source: the camera that the file's pixels belong to.
-        pinhole: the camera without distortion, at full size.
-        width: of the view, after scaling.
-        height: of the view, after scaling.
-        turn: EXIF orientation by which a file is turned whose width and height are those of `source` exchanged; 1 = no
-            such file is read.
-    """
-
-    source: CameraModel
-    pinhole: Pinhole
-    width: int
-    height: int
+    source: CameraModel  # the camera that the file's pixels belong to
+    pinhole: Pinhole  # the camera without distortion, at full size
+    width: int  # of the view, after scaling
+    height: int  # of the view, after scaling
+    # EXIF orientation by which a file is turned whose width and height are those of `source` exchanged; 1 = no such
+    # file is read.
     turn: int = 1
 
     @property
@@ -298,7 +282,7 @@ class PixelGrid:
 
 
 class PictureFiles(Sequence[Array]):
-    """Files of V views, read on access. Slices are sequences of the same kind; nothing is kept in memory."""
+    """Files of V views, read on access; nothing is kept in memory."""
 
     def __init__(self, paths: Sequence[Path | None], grids: Sequence[PixelGrid], remaps: RemapCache) -> None:
         self._paths, self._grids, self._remaps = tuple(paths), tuple(grids), remaps
@@ -312,14 +296,11 @@ class PictureFiles(Sequence[Array]):
     def __getitem__(self, index: slice) -> Sequence[Array]: ...
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
-            return self._slice(index)
+            return Selected(self, list(range(len(self)))[index])
         view = operator.index(index)
         if not -len(self) <= view < len(self):
             raise IndexError(f"view {view} of {len(self)}")
         return self._load(view % len(self))
-
-    def _slice(self, rows: slice) -> "PictureFiles[Array]":
-        return type(self)(self._paths[rows], self._grids[rows], self._remaps)
 
     @property
     def grids(self) -> tuple[PixelGrid, ...]:
@@ -339,8 +320,7 @@ class PictureFiles(Sequence[Array]):
         source = self._grids[view].source
         if shape != (source.height, source.width):
             raise InputError(
-                f"{self._paths[view]}: {shape[1]}×{shape[0]} pixels, expected {source.width}×{source.height}, as the "
-                "photograph had when the scene was loaded"
+                f"{self._paths[view]}: {shape[1]}×{shape[0]} pixels, expected {source.width}×{source.height}"
             )
 
     def _turned(self, view: int, pixels: np.ndarray) -> np.ndarray:
@@ -446,11 +426,6 @@ def files_by_stem(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]:
     return stems
 
 
-def is_lost(pose: Float64[np.ndarray, "4 4"]) -> bool:
-    """Whether a pose says that tracking was lost there: sequences write -inf, inf or NaN."""
-    return not np.isfinite(pose).all()
-
-
 def pinhole_of(
     fx: float, fy: float, cx: float, cy: float, picture: Path, where: str, *, size: tuple[int, int] | None = None
 ) -> CameraModel:
@@ -460,33 +435,6 @@ def pinhole_of(
     check_camera(camera, where)
     if not (0.25 * width < cx < 0.75 * width and 0.25 * height < cy < 0.75 * height):
         raise InputError(
-            f"{where}: principal point {cx:g}, {cy:g} does not belong to pictures of {width}×{height} "
-            f"({picture.name}); scale the intrinsics to the size of the pictures"
+            f"{where}: principal point {cx:g}, {cy:g} does not belong to pictures of {width}×{height} ({picture.name})"
         )
     return camera
-
-
-@dataclass(slots=True)
-class SkippedFrames:
-    """Frames that a reader left out, counted by reason, for one warning each."""
-
-    source: str
-    total: int
-    reasons: dict[str, list[str]] = field(default_factory=dict)
-
-    def add(self, reason: str, name: str) -> None:
-        """Counts a frame."""
-        self.reasons.setdefault(reason, []).append(name)
-
-    def warn(self) -> None:
-        """One warning for each reason, with the number of frames and the first one's name."""
-        for reason, names in self.reasons.items():
-            warnings.warn(
-                f"{self.source}: {len(names)} of {self.total} frames {reason} and are left out (first: {names[0]!r})",
-                SceneWarning,
-                stacklevel=3,
-            )
-
-    def describe(self) -> str:
-        """The counts, for an error."""
-        return ", ".join(f"{len(names)} {reason}" for reason, names in self.reasons.items()) or "none has a picture"

@@ -88,9 +88,7 @@ def read_labels(path: Path) -> Int32[np.ndarray, "H W"]:
     if values.dtype.kind not in "iu":
         raise InputError(f"{path}: expected labels as integers, one a pixel and 0 = none, got {values.dtype}")
     if values.size and (int(values.min()) < 0 or int(values.max()) > LARGEST_LABEL):
-        raise InputError(
-            f"{path}: expected labels from 0 (none) to {LARGEST_LABEL:,}, got {values.min()} to {values.max()}"
-        )
+        raise InputError(f"{path}: expected labels from 0 to {LARGEST_LABEL:,}, got {values.min()} to {values.max()}")
     return np.asarray(values, np.int32)
 
 
@@ -112,8 +110,7 @@ def _load_safetensors(path: Path) -> np.ndarray:
     raise InputError(f"{path}: expected one array [H, W] of labels, got {actual}")
 
 
-MAX_MEMBER_BYTES = 64 << 20
-"""Larger files in an archive are no label images."""
+MAX_MEMBER_BYTES = 64 << 20  # Larger files in an archive are no label images
 
 
 class ArchivedLabels(LabelFiles):

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
-from gsencoder.data.readers.posed import PosedImages, choose_origin
+from gsencoder.data.readers.posed import PosedImages, ReadOptions, choose_origin
 from gsencoder.data.readers.rgbd import (
     is_replica,
     is_scannet_export,
@@ -32,36 +32,13 @@ COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReadOptions:
-    """What the user says about a scene's files, beyond the files themselves.
-
-    Attributes:
-        allow_outside: whether files may lie outside the folder of the scene.
-        depth_scale: world units for each step of a depth file; None = that of the layout.
-        images: folder of the photographs of a COLMAP model; empty = images/ beside the model.
-        intrinsics: fx, fy, cx, cy of the photographs, for layouts that do not state them; None = those of the layout.
-    """
-
-    allow_outside: bool = False
-    depth_scale: float | None = None
-    images: str = ""
-    intrinsics: tuple[float, float, float, float] | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
-    """One way in which scenes are stored.
+    """One way in which scenes are stored."""
 
-    Attributes:
-        name: for people.
-        files: what is recognized, for people.
-        matches: whether a folder has this layout.
-        read: the posed images of a folder, and the folder of the scene.
-    """
-
-    name: str
-    files: str
-    matches: Callable[[Path], bool]
+    name: str  # for people
+    files: str  # what is recognized, for people
+    matches: Callable[[Path], bool]  # whether a folder has this layout
+    # The posed images of a folder, and the folder of the scene.
     read: Callable[[Path, ReadOptions], tuple[PosedImages, Path]]
 
 
@@ -75,17 +52,12 @@ def colmap_model_in(root: Path) -> Path | None:
     return next((root / file for file in COLMAP_FOLDERS if is_colmap_model(root / file)), None)
 
 
-def read_transforms_file(path: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
-    """The posed images of a transforms.json of any name, and its folder."""
-    return read_transforms(path, allow_outside=options.allow_outside, depth_scale=options.depth_scale), path.parent
-
-
 def _read_transforms(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
     transforms, model = transforms_in(root), colmap_model_in(root)
     assert transforms is not None
     if model is not None and not str(model.relative_to(root)).startswith("colmap"):
         _warn(f"{root}: holds {transforms.name} and a COLMAP model; {transforms.name} is used (give {model} instead)")
-    return read_transforms_file(transforms, options)
+    return read_transforms(transforms, options), root
 
 
 def _read_colmap(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
@@ -94,9 +66,8 @@ def _read_colmap(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
     if model.name == "0" and model != root:
         others = sorted(path.name for path in model.parent.iterdir() if path != model and is_colmap_model(path))
         if others:
-            _warn(
-                f"{model.parent}: holds {1 + len(others)} models; 0 is used (or give the folder of {', '.join(others)})"
-            )
+            names = ", ".join(others)
+            _warn(f"{model.parent}: holds {1 + len(others)} models; 0 is used (or give the folder of {names})")
     if options.images:
         images = Path(options.images)
         images = images if images.is_absolute() or images.is_dir() else root / images
@@ -104,30 +75,19 @@ def _read_colmap(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
             raise InputError(f"images={options.images}: no such folder (looked from here and in {root})")
         # A folder that the user names may be read.
         masks = next((home / MASKS for home in (root, images.parent) if (home / MASKS).is_dir()), None)
-        return read_colmap(model, images, images, allow_outside=options.allow_outside, masks=masks), root
+        return read_colmap(model, images, images, options, masks=masks), root
     homes = [root, root.parent, root.parent.parent] if model == root else [root]
     home = next((home for home in homes if (home / "images").is_dir()), None)
     if home is None:
         searched = ", ".join(str(home / "images") for home in homes)
         raise InputError(f"{model}: a COLMAP model without photographs; looked for {searched}; say images=FOLDER")
-    return read_colmap(model, home / "images", home, allow_outside=options.allow_outside, masks=home / MASKS), home
+    return read_colmap(model, home / "images", home, options, masks=home / MASKS), home
 
 
-def _read_tum(root: Path, options: ReadOptions) -> tuple[PosedImages, Path]:
-    posed = read_tum(
-        root,
-        allow_outside=options.allow_outside,
-        depth_scale=options.depth_scale,
-        intrinsics=options.intrinsics,
-    )
-    return posed, root
-
-
-def _reader_of(reader: Callable[..., PosedImages]) -> Callable[[Path, ReadOptions], tuple[PosedImages, Path]]:
-    return lambda root, options: (
-        reader(root, allow_outside=options.allow_outside, depth_scale=options.depth_scale),
-        root,
-    )
+def _in_place(
+    reader: Callable[[Path, ReadOptions], PosedImages],
+) -> Callable[[Path, ReadOptions], tuple[PosedImages, Path]]:
+    return lambda root, options: (reader(root, options), root)
 
 
 LAYOUTS = (
@@ -147,31 +107,31 @@ LAYOUTS = (
         name="ScanNet++",
         files="dslr/ or iphone/ of ScanNet++ (frames extracted to iphone/rgb)",
         matches=is_scannetpp,
-        read=_reader_of(read_scannetpp),
+        read=_in_place(read_scannetpp),
     ),
     Layout(
         name="ScanNet",
         files="color/, pose/, depth/ and intrinsic/ of ScanNet",
         matches=is_scannet_export,
-        read=_reader_of(read_scannet),
+        read=_in_place(read_scannet),
     ),
     Layout(
         name="7-Scenes",
         files="frame-NNNNNN.color.png, .depth.png and .pose.txt of 7-Scenes",
         matches=is_seven_scenes,
-        read=_reader_of(read_seven_scenes),
+        read=_in_place(read_seven_scenes),
     ),
     Layout(
         name="TUM RGB-D",
         files="rgb.txt, depth.txt and groundtruth.txt of TUM RGB-D",
         matches=is_tum,
-        read=_read_tum,
+        read=_in_place(read_tum),
     ),
     Layout(
         name="Replica",
         files="results/ and traj.txt of Replica (NICE-SLAM)",
         matches=is_replica,
-        read=_reader_of(read_replica),
+        read=_in_place(read_replica),
     ),
 )
 
@@ -182,8 +142,8 @@ def layout_of(folder: Path) -> Layout | None:
 
 
 def describe_layouts() -> str:
-    """All layouts, for a message."""
-    return "; ".join(layout.files for layout in LAYOUTS)
+    """What a scene holds, for a message."""
+    return f"a scene holds one of: {'; '.join(layout.files for layout in LAYOUTS)}; a splat"
 
 
 def _warn(message: str) -> None:
@@ -191,8 +151,7 @@ def _warn(message: str) -> None:
 
 
 SPLAT_SUFFIXES = (".ply", ".splat", ".spz", ".sog")
-SPLAT_NAMES = ("splat.ply", "point_cloud.ply")
-"""What a reconstruction that lies beside its photographs is called."""
+SPLAT_NAMES = ("splat.ply", "point_cloud.ply")  # What a reconstruction that lies with its photographs is called
 
 
 def find_splat(root: Path) -> Path:
@@ -213,7 +172,7 @@ def find_splat(root: Path) -> Path:
     if splats:
         names = ", ".join(path.name for path in splats[:5])
         raise InputError(f"{root}: holds {len(splats)} splats ({names}) and no views; give one of them")
-    raise InputError(f"{root}: not a scene; a scene holds one of: {describe_layouts()}; a splat")
+    raise InputError(f"{root}: not a scene; {describe_layouts()}")
 
 
 def file_of_scene(option: str, name: str | Path, folder: Path) -> Path:
@@ -239,11 +198,11 @@ def read_bare_splat(path: Path) -> tuple[Gaussians, Float64[np.ndarray, "3"]]:
 
 
 def warn_of_unused_splat(folder: Path) -> None:
-    """Says so where a reconstruction lies beside the views and nobody asked for it."""
-    beside = [name for name in SPLAT_NAMES if (folder / name).is_file()]
-    if beside:
+    """Says so where a reconstruction lies with the views and is not used."""
+    splats = [name for name in SPLAT_NAMES if (folder / name).is_file()]
+    if splats:
         warnings.warn(
-            f"{folder}: {beside[0]} lies beside the views and is not used; say splat={beside[0]} if it belongs to them",
+            f"{folder}: {splats[0]} lies with the views and is not used; say splat={splats[0]} if it belongs to them",
             SceneWarning,
             stacklevel=3,
         )

@@ -25,41 +25,28 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.data.readers.images import PictureFiles, PixelGrid, read_mask, read_rgba, read_small
 from gsencoder.data.readers.undistort import RemapCache
 
-LOOKED_AT = 16
-"""So many photographs, evenly spaced, are looked at."""
-EXCEPTIONS = 3
-"""So many of them may lack the background, since the object fills them."""
+LOOKED_AT = 16  # Photographs that are looked at, evenly spaced
+EXCEPTIONS = 3  # Photographs that may lack the background, since the object fills them
 MIN_PICTURES = 3
-BORDER_SHARE = 0.8
-"""Share of a picture's border that has the color."""
+BORDER_SHARE = 0.8  # Share of a picture's border that has the color
 EXACT, LOSSY = 2, 10
 """Largest difference of a color's channels from the background's, of 255, in files that keep every value and others."""
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
-SMALLEST_OBJECT = 24
-"""Islands of fewer pixels in the background of a lossy file are noise."""
-DARK = 24
-"""A darker color may also be a part of the picture that the lens or undistortion leaves empty …"""
+SMALLEST_OBJECT = 24  # Islands of fewer pixels in the background of a lossy file are noise
+DARK = 24  # A darker color may also be a part of the picture that the lens or undistortion leaves empty …
 SAME_OUTLINE = 0.97
 """… which is the same in all pictures: of the pixels that are dark in either, this share is dark in both."""
-MIN_SHARE, MAX_SHARE = 0.02, 0.995
-"""Mean share of the pictures' pixels that a background has."""
-SEAM = 2
-"""Pixels this near to the background mix both colors, and are not used."""
-SMALL_SIDE = 400
-"""JPEG files are looked at in about this many pixels a side."""
+MIN_SHARE, MAX_SHARE = 0.02, 0.995  # Mean share of the pictures' pixels that a background has
+SEAM = 2  # Pixels this near to the background mix both colors, and are not used
+SMALL_SIDE = 400  # JPEG files are looked at in about this many pixels a side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Background:
-    """A background of one color.
+    """A background of one color."""
 
-    Attributes:
-        color: RGB.
-        share: of the pixels that have it, in the photographs that were looked at.
-    """
-
-    color: tuple[int, int, int]
-    share: float
+    color: tuple[int, int, int]  # RGB
+    share: float  # of the pixels that have it, in the photographs that were looked at
 
     def describe(self) -> str:
         """The color and the share in words."""
@@ -70,7 +57,7 @@ class Background:
 def find_background(paths: Sequence[Path]) -> Background | None:
     """The background that nearly all photographs have in common; None where there is none.
 
-    Photographs are looked at until so many lack a background that there can be none, which is after four in most
+    Photographs are looked at until too many lack a background, which is after four in most
     scenes.
 
     Args:
@@ -166,7 +153,7 @@ def _is_one_outline(regions: Sequence[Bool[np.ndarray, "h w"]]) -> bool:
 def outline(path: Path, background: Background | None) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
     """Which pixels of a photograph show something, and which show that nothing is there; those between do neither.
 
-    Alpha of one half and more shows something, none (below 1/64) that nothing is there. Beside a background of one
+    Alpha of one half and more shows something, none (below 1/64) that nothing is there. Next to a background of one
     color the two nearest pixels do neither.
 
     Args:
@@ -197,9 +184,6 @@ class _OutlineFiles(PictureFiles[Bool[np.ndarray, "H W"]]):
     ) -> None:
         super().__init__(paths, grids, remaps)
         self._outlined, self._background = tuple(outlined), background
-
-    def _slice(self, rows: slice) -> "_OutlineFiles":
-        return type(self)(self._paths[rows], self._grids[rows], self._remaps, self._outlined[rows], self._background)
 
     def _outline(self, view: int) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]] | None:
         """Used and empty pixels of the photograph, at the size of its file."""

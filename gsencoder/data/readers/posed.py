@@ -1,71 +1,62 @@
 """Posed images, the result of every reader of views, and checks that readers share: paths, numbers, poses, origin."""
 
-import math
+import sys
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, UInt8
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.depth_images import DepthMeasure
 from gsencoder.data.readers.undistort import CameraModel
+from gsencoder.types.checks import invert_rigid
 
-RIGID_TOLERANCE = 1e-3
-"""Largest difference from 1 of a singular value of a rotation; below it is rounding in the file."""
-MAX_PATH = 4096
-"""Largest number of characters of a path: PATH_MAX of Linux, which other systems do not exceed."""
-MAX_COORDINATE = 1e12
-"""Largest coordinate, where float64 has steps of a tenth of a millimeter."""
+RIGID_TOLERANCE = 1e-3  # Largest difference from 1 of a singular value of a rotation; below it is rounding in the file
+MAX_PATH = 4096  # Largest number of characters of a path: PATH_MAX of Linux, which other systems do not exceed
+MAX_COORDINATE = 1e12  # Largest coordinate, where float64 has steps of a tenth of a millimeter
 ORIGIN_STEP = 1000.0
+DepthMeasure = Literal["z", "ray"]
+"""What the numbers of a depth file are: the coordinate z in the camera, or the distance from its center."""
 FOLDERS_OF_LAYOUT = {"COLMAP": "sparse colmap", "ScanNet": "pose intrinsic", "ScanNet++": "scans colmap nerfstudio"}
-"""Folders that are read beside those of the files of views."""
+"""Folders that are read with those of the files of views."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadOptions:
+    """What the user says about a scene's files, beyond the files themselves."""
+
+    allow_outside: bool = False  # whether files may lie outside the folder of the scene
+    images: str = ""  # folder of the photographs of a COLMAP model; empty = images/ next to the model
+    # fx, fy, cx, cy of the photographs, for layouts that do not state them; None = those of the layout.
+    intrinsics: tuple[float, float, float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PosedImage:
-    """One view of a scene as its files describe it.
+    """One view of a scene as its files describe it."""
 
-    Attributes:
-        name: unique in the scene.
-        camera: intrinsics with distortion.
-        cam_from_world: rigid, OpenCV axes, in the world of the file (no origin subtracted).
-        image: an existing photograph.
-        depth: sensor depth, or None.
-        depth_camera: the camera of the depth map; None = that of the photograph.
-        depth_from_color: where the depth camera stands, rigid, from the axes of the photograph's camera to its own, in
-            world units; None = both look from one place.
-        depth_scale: world units for each step of the depth file.
-        no_depth: a step of the depth file that means none, besides 0.
-        depth_measure: whether a depth is the coordinate z or the length of the ray.
-        mask: pixels to use, or None.
-        instance: instance map, or None.
-    """
-
-    name: str
-    camera: CameraModel
-    cam_from_world: Float64[np.ndarray, "4 4"]
-    image: Path
-    depth: Path | None = None
-    depth_camera: CameraModel | None = None
+    name: str  # unique in the scene
+    camera: CameraModel  # intrinsics with distortion
+    cam_from_world: Float64[np.ndarray, "4 4"]  # rigid, OpenCV axes, in the world of the file (no origin subtracted)
+    image: Path  # an existing photograph
+    depth: Path | None = None  # sensor depth, or None
+    depth_camera: CameraModel | None = None  # the camera of the depth map; None = that of the photograph
+    # Where the depth camera stands, rigid, from the axes of the photograph's camera to its own, in world units; None =
+    # both look from one place.
     depth_from_color: Float64[np.ndarray, "4 4"] | None = None
-    depth_scale: float = 1.0
-    no_depth: int | None = None
-    depth_measure: DepthMeasure = "z"
-    mask: Path | None = None
-    instance: Path | None = None
+    depth_scale: float = 1.0  # world units for each step of the depth file
+    no_depth: int | None = None  # a step of the depth file that means none, besides 0
+    depth_measure: DepthMeasure = "z"  # whether a depth is the coordinate z or the length of the ray
+    mask: Path | None = None  # pixels to use, or None
+    instance: Path | None = None  # instance map, or None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PosedImages:
-    """The views of a scene and its world; coordinates are those of the files, in float64.
-
-    Attributes:
-        points_file: a .ply that holds the points; None where another file does.
-        unused: what the files say that was not used, in words.
-    """
+    """The views of a scene and its world; coordinates are those of the files, in float64."""
 
     source: str
     images: tuple[PosedImage, ...]
@@ -73,11 +64,11 @@ class PosedImages:
     up: Float64[np.ndarray, "3"] | None = None
     points: Float64[np.ndarray, "P 3"] = field(default_factory=lambda: np.zeros((0, 3)))
     colors: UInt8[np.ndarray, "_ 3"] = field(default_factory=lambda: np.zeros((0, 3), np.uint8))
-    points_file: Path | None = None
-    unused: tuple[str, ...] = ()
+    points_file: Path | None = None  # a .ply that holds the points; None where another file does
+    unused: tuple[str, ...] = ()  # what the files say that was not used, in words
 
     def unused_folders(self, root: Path | None, layout: str) -> tuple[str, ...]:
-        """Folders in that of the scene, and beside those of its photographs, of which nothing was read."""
+        """Folders in that of the scene, and next to those of its photographs, of which nothing was read."""
         if root is None:
             return ()
         paths = [path for each in self.images for path in (each.image, each.depth, each.mask, each.instance)]
@@ -105,29 +96,26 @@ def choose_origin(points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3"
 
 
 def rigid_pose(matrix: Float64[np.ndarray, "4 4"], where: str) -> Float64[np.ndarray, "4 4"]:
-    """The pose with the nearest exact rotation, by SVD, since files hold a few digits only."""
+    """The pose with the nearest exact rotation, by SVD, since files hold a few digits only; `where` begins errors."""
     if not np.isfinite(matrix).all():
         raise InputError(f"{where}: the pose has values that are not finite")
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise InputError(f"{where}: the last row of the pose must be 0 0 0 1, got {matrix[3].tolist()}")
-    if np.abs(matrix[:3, 3]).max() > MAX_COORDINATE:
-        raise InputError(
-            f"{where}: the camera is {np.abs(matrix[:3, 3]).max():g} units away; at most {MAX_COORDINATE:g}"
-        )
-    if np.abs(matrix[:3, :3]).max() > 1e6:
-        raise InputError(
-            f"{where}: the pose is not rigid (entries of {np.abs(matrix[:3, :3]).max():g} in its rotation)"
-        )
+    far, largest = np.abs(matrix[:3, 3]).max(), np.abs(matrix[:3, :3]).max()
+    if far > MAX_COORDINATE:
+        raise InputError(f"{where}: the camera is {far:g} units away; at most {MAX_COORDINATE:g}")
+    if largest > 1e6:
+        raise InputError(f"{where}: the pose is not rigid (entries of {largest:g} in its rotation)")
     left, stretch, right = np.linalg.svd(matrix[:3, :3])
+    values = ", ".join(f"{value:.6g}" for value in stretch)
     if np.abs(stretch - 1).max() > RIGID_TOLERANCE:
         if stretch[2] <= 1e-9 * stretch[0] or stretch[0] < 1e-9:
-            raise InputError(f"{where}: the pose is singular (singular values {_list(stretch)}), expected a rotation")
+            raise InputError(f"{where}: the pose is singular (singular values {values}), expected a rotation")
         if stretch[0] - stretch[2] <= RIGID_TOLERANCE * stretch[0]:
             raise InputError(
-                f"{where}: the pose has a uniform scale of {stretch.mean():.6g}; divide its rotation by it "
-                "(poses must be rigid, scene scale belongs in the translations)"
+                f"{where}: the pose has a uniform scale of {stretch.mean():.6g}; divide its rotation by it"
             )
-        raise InputError(f"{where}: the pose is not rigid (singular values {_list(stretch)}, expected 1, 1, 1)")
+        raise InputError(f"{where}: the pose is not rigid (singular values {values}, expected 1, 1, 1)")
     rotation = left @ right
     if np.linalg.det(rotation) < 0:
         raise InputError(f"{where}: the pose mirrors the world (determinant -1), expected a rotation")
@@ -136,23 +124,14 @@ def rigid_pose(matrix: Float64[np.ndarray, "4 4"], where: str) -> Float64[np.nda
     return pose
 
 
-def _list(values: np.ndarray) -> str:
-    return ", ".join(f"{value:.6g}" for value in values)
-
-
 def inside(folder: Path, relative: str, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
-    """`folder / relative`, which may not leave `root` through "..", an absolute path or a link unless allowed.
-
-    Args:
-        relative: as written in the files of the scene.
-        root: the scene folder; None = `folder`.
-    """
+    """`folder / relative`, which may not leave `root` (None = `folder`) through "..", an absolute path or a link unless
+    allowed; `where` begins errors."""
     root = folder if root is None else root
     # No file has a longer path, and resolving links takes time quadratic in the length.
     if len(relative) > MAX_PATH:
-        raise InputError(
-            f"{where}: {relative[:80]!r}… is not a path ({len(relative):,} characters, at most {MAX_PATH:,})"
-        )
+        limit = f"{len(relative):,} characters, at most {MAX_PATH:,}"
+        raise InputError(f"{where}: {relative[:80]!r}… is not a path ({limit})")
     try:
         path = folder / relative
         leaves = not path.resolve().is_relative_to(root.resolve())
@@ -161,8 +140,7 @@ def inside(folder: Path, relative: str, where: str, *, root: Path | None = None,
         raise InputError(f"{where}: {relative[:80]!r} is not a path ({type(error).__name__})") from error
     if leaves and not allow_outside:
         raise InputError(
-            f"{where}: {relative[:200]!r} leads out of the scene folder {root}; "
-            "copy the file into it, or set allow_outside=true if you trust the scene"
+            f"{where}: {relative[:200]!r} leads out of the scene folder {root} (allow_outside=true allows it)"
         )
     return path
 
@@ -174,11 +152,7 @@ def number(values: Mapping[str, object], key: str, where: str) -> float | None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"{where}: {key} must be a number, got {str(value)[:40]!r}")
-    try:
-        finite = math.isfinite(value)
-    except OverflowError:
-        finite = False
-    if not finite:
+    if not abs(value) <= sys.float_info.max:
         raise InputError(f"{where}: {key} must be finite, got {str(value)[:40]}")
     return float(value)
 
@@ -191,4 +165,53 @@ def warn_left_out(missing: Iterable[str], total: int, source: str, subject: str,
             f"{source}: {len(names)} of {total} {subject} are missing (first: {names[0][:200]!r}); {result}",
             SceneWarning,
             stacklevel=3,
+        )
+
+
+class Frames:
+    """The views of a sequence as they are read, and the frames that are left out, counted by reason."""
+
+    def __init__(self, root: Path, total: int, options: ReadOptions) -> None:
+        self.root, self.total, self.options = root, total, options
+        self.images: list[PosedImage] = []
+        self._skipped: dict[str, list[str]] = {}
+
+    def skip(self, reason: str, name: str) -> None:
+        """Leaves a frame out."""
+        self._skipped.setdefault(reason, []).append(name)
+
+    def check_inside(self, name: str, *files: Path | None) -> None:
+        """Raises InputError where a file of a frame leads out of the folder."""
+        for file in filter(None, files):
+            relative = str(file.relative_to(self.root))
+            inside(self.root, relative, f"{self.root}: {name[:120]}", allow_outside=self.options.allow_outside)
+
+    def pose(self, world_from_cam: Float64[np.ndarray, "4 4"], name: str, where: str) -> np.ndarray | None:
+        """cam_from_world of a frame; None, and the frame is left out, where tracking was lost: sequences write -inf,
+        inf or NaN there."""
+        if not np.isfinite(world_from_cam).all():
+            self.skip("lost tracking", name)
+            return None
+        return invert_rigid(rigid_pose(world_from_cam, where))
+
+    def finish(self, *, depth: bool, up: bool = True, source: str = "") -> PosedImages:
+        """The views, in metres, with z up or an unknown up; warns once for each reason to leave frames out, and, with
+        `depth`, of views that lack it."""
+        counts = ", ".join(f"{len(names)} {reason}" for reason, names in self._skipped.items()) or "none has a picture"
+        if not self.images:
+            raise InputError(f"{self.root}: no view: of {self.total} pictures {counts}")
+        for reason, names in self._skipped.items():
+            warnings.warn(
+                f"{self.root}: {len(names)} of {self.total} frames {reason} and are left out (first: {names[0]!r})",
+                SceneWarning,
+                stacklevel=3,
+            )
+        if depth:
+            without = [image.name for image in self.images if image.depth is None]
+            warn_left_out(without, len(self.images), str(self.root), "depth files", "those views have no depth")
+        return PosedImages(
+            source=source or str(self.root),
+            images=tuple(self.images),
+            metres_per_unit=1.0,
+            up=np.array([0.0, 0.0, 1.0]) if up else None,
         )

@@ -1,21 +1,17 @@
 """ScanNet++ scenes: a dslr/ folder with nerfstudio/transforms.json and colmap/, and an iphone/ folder with a video.
 
 The DSLR photographs of dslr/resized_images (fisheye, masks in resized_anon_masks) are read through its
-transforms.json, else through its COLMAP model; the other folder is read by itself, which is used where dslr/ has no
-photographs, or where it is given itself. The world is that of the laser scan: metres, z up. The COLMAP models and
-the meshes are in it; nerfstudio/transforms.json is not, since its poses went through nerfstudio's convention, which
-exchanges x and y and turns z around. They are taken back here.
+transforms.json, else through its COLMAP model; iphone/ is used where dslr/ has no photographs, or where it is given
+itself. The world is that of the laser scan: metres, z up. The COLMAP models and the meshes are in it;
+nerfstudio/transforms.json is not, since nerfstudio's convention exchanges x and y and turns z around. They are taken
+back here.
 
-The iphone/ folder of a ScanNet++ scene.
-
-It is published as streams: rgb.mkv (rgb.mp4 in older releases), rgb_mask.mkv and depth.bin. The data set's toolkit
+iphone/ is published as streams: rgb.mkv (rgb.mp4 in older releases), rgb_mask.mkv and depth.bin. The data set's toolkit
 (iphone/prepare_iphone_data.py) extracts them to rgb/frame_NNNNNN.jpg, rgb_masks/frame_NNNNNN.png and
 depth/frame_NNNNNN.png, counted from 0; these are what is read here. Depth is in millimetres, in the photographs' field
-of view at its own size (256 × 192).
-
-Poses are taken from colmap/ (every tenth frame, OPENCV cameras, points), else from nerfstudio/transforms.json, else
-from pose_intrinsic_imu.json: `aligned_pose` there is world_from_camera with OpenCV axes of ARKit's tracking, carried
-into the world of the scan, and `intrinsic` is K.
+of view at its own size (256 × 192). Poses are taken from colmap/ (every tenth frame, OPENCV cameras, points), else from
+nerfstudio/transforms.json, else from pose_intrinsic_imu.json: `aligned_pose` there is world_from_camera with OpenCV
+axes of ARKit's tracking, carried into the world of the scan, and `intrinsic` is K.
 """
 
 import warnings
@@ -27,11 +23,10 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
-from gsencoder.data.readers.images import SkippedFrames, files_by_stem, is_lost, picture_size, pinhole_of
-from gsencoder.data.readers.posed import PosedImage, PosedImages, inside, rigid_pose, warn_left_out
+from gsencoder.data.readers.images import files_by_stem, picture_size, pinhole_of
+from gsencoder.data.readers.posed import Frames, PosedImage, PosedImages, ReadOptions, inside, warn_left_out
 from gsencoder.data.readers.transforms_json import read_json, read_transforms
 from gsencoder.data.readers.undistort import CameraModel
-from gsencoder.types.checks import invert_rigid
 
 PICTURES, DEPTHS, MASKS = "rgb", "depth", "rgb_masks"
 VIDEOS = ("rgb.mkv", "rgb.mp4")
@@ -42,8 +37,13 @@ NERFSTUDIO_FROM_SCAN = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0
 """(x, y, z) of the scan is (y, x, -z) in transforms.json; the matrix is its own inverse."""
 
 
-def is_iphone(folder: Path) -> bool:
-    """Whether a folder is such a folder, extracted or not."""
+NERFSTUDIO = ("nerfstudio/transforms.json", "nerfstudio/transforms_undistorted.json")
+DSLR_PICTURES = ("resized_images", "undistorted_images")
+DSLR_MASKS = ("resized_anon_masks", "undistorted_anon_masks")
+
+
+def _is_iphone(folder: Path) -> bool:
+    """Whether a folder is an iphone/ folder, extracted or not."""
     has_poses = is_colmap_model(folder / "colmap") or any(
         (folder / name).is_file() for name in (TRANSFORMS_FILE, ARKIT_POSES)
     )
@@ -51,16 +51,41 @@ def is_iphone(folder: Path) -> bool:
     return has_poses and ((folder / PICTURES).is_dir() or streams or folder.name == "iphone")
 
 
-def read_iphone(folder: Path, *, allow_outside: bool = False, depth_scale: float | None = None) -> PosedImages:
-    """Reads the extracted frames that have a pose.
+def _is_dslr(folder: Path) -> bool:
+    pictures = any((folder / name).is_dir() for name in DSLR_PICTURES)
+    return pictures and (any((folder / name).is_file() for name in NERFSTUDIO) or is_colmap_model(folder / "colmap"))
 
-    Args:
-        allow_outside: let links in it lead out of it.
-        depth_scale: metres for each step of a depth file; None = 0.001.
 
-    Warns:
-        SceneWarning: depth is not extracted, or missing for some frames.
-    """
+def device_folder(folder: Path) -> Path | None:
+    """The folder of one capture device: the given one, or dslr/ or else iphone/ in it; None where there is neither."""
+    candidates = (folder, folder / "dslr", folder / "iphone")
+    return next((each for each in candidates if _is_dslr(each) or _is_iphone(each)), None)
+
+
+def is_scannetpp(folder: Path) -> bool:
+    """Whether a folder is such a scene, or its dslr/ or iphone/ folder."""
+    return device_folder(folder) is not None
+
+
+def read_scannetpp(root: Path, options: ReadOptions = ReadOptions()) -> PosedImages:
+    """Reads a scene, or its dslr/ or iphone/ folder; warns of a depth stream that is still to be extracted."""
+    folder = device_folder(root)
+    if folder is None:
+        raise InputError(f"{root}: neither dslr/ nor iphone/ with poses of ScanNet++")
+    posed = _read_dslr(folder, options) if _is_dslr(folder) else _read_iphone(folder, options)
+    return replace(posed, metres_per_unit=1.0, up=np.array([0.0, 0.0, 1.0]))
+
+
+def _read_dslr(folder: Path, options: ReadOptions) -> PosedImages:
+    for transforms, pictures, masks in zip(NERFSTUDIO, DSLR_PICTURES, DSLR_MASKS, strict=True):
+        if (folder / pictures).is_dir() and (folder / transforms).is_file():
+            return _in_world_of_scan(
+                read_transforms(folder / transforms, options, pictures=folder / pictures, masks=folder / masks)
+            )
+    return read_colmap(folder / "colmap", folder / DSLR_PICTURES[0], folder, options, masks=folder / DSLR_MASKS[0])
+
+
+def _read_iphone(folder: Path, options: ReadOptions) -> PosedImages:
     pictures = folder / PICTURES
     if not pictures.is_dir():
         video = next((name for name in VIDEOS if (folder / name).is_file()), None)
@@ -72,20 +97,13 @@ def read_iphone(folder: Path, *, allow_outside: bool = False, depth_scale: float
         )
     if is_colmap_model(folder / "colmap"):
         # Names in the model of some releases begin with the name of a folder.
-        posed = read_colmap(folder / "colmap", pictures, folder, allow_outside=allow_outside, base_names=True)
+        posed = read_colmap(folder / "colmap", pictures, folder, options, base_names=True)
     elif (folder / TRANSFORMS_FILE).is_file():
-        posed = in_world_of_scan(
-            read_transforms(
-                folder / TRANSFORMS_FILE,
-                allow_outside=allow_outside,
-                pictures=pictures,
-                masks=folder / MASKS if (folder / MASKS).is_dir() else None,
-            )
-        )
+        file, masks = folder / TRANSFORMS_FILE, folder / MASKS
+        posed = _in_world_of_scan(read_transforms(file, options, pictures=pictures, masks=masks))
     else:
-        posed = _read_arkit(folder, allow_outside=allow_outside)
-    scale = depth_scale or MILLIMETRES
-    images = tuple(_with_files(image, folder, scale, allow_outside=allow_outside) for image in posed.images)
+        posed = _read_arkit(folder, options)
+    images = tuple(_with_files(image, folder, options) for image in posed.images)
     if (folder / DEPTHS).is_dir():
         without_depth = [image.name for image in images if image.depth is None]
         warn_left_out(without_depth, len(images), str(folder), "depth files", "those views have no depth")
@@ -99,48 +117,34 @@ def read_iphone(folder: Path, *, allow_outside: bool = False, depth_scale: float
     return replace(posed, images=images)
 
 
-def in_world_of_scan(posed: PosedImages) -> PosedImages:
+def _in_world_of_scan(posed: PosedImages) -> PosedImages:
     """Views of a nerfstudio/transforms.json of ScanNet++, in the world of its scan."""
     images = tuple(replace(image, cam_from_world=image.cam_from_world @ NERFSTUDIO_FROM_SCAN) for image in posed.images)
     # Row vectors times R are Rᵀ times column vectors: the inverse of the exchange.
     return replace(posed, images=images, points=posed.points @ NERFSTUDIO_FROM_SCAN[:3, :3])
 
 
-def _read_arkit(folder: Path, *, allow_outside: bool) -> PosedImages:
+def _read_arkit(folder: Path, options: ReadOptions) -> PosedImages:
     """Frames with the poses of ARKit."""
     path = folder / ARKIT_POSES
-    frames = read_json(path)
-    if not isinstance(frames, dict) or not all(isinstance(frame, dict) for frame in frames.values()):
+    entries = read_json(path)
+    if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
         raise InputError(f"{path}: expected an object of frames with aligned_pose and intrinsic")
     pictures = files_by_stem(folder / PICTURES, (".jpg", ".jpeg", ".png"))
-    skipped = SkippedFrames(str(folder / PICTURES), len(pictures))
-    images: list[PosedImage] = []
+    frames = Frames(folder, len(pictures), options)
     for stem, picture in pictures.items():
-        where = f"{path}: {stem[:120]}"
-        inside(folder, str(picture.relative_to(folder)), where, allow_outside=allow_outside)
-        if stem not in frames:
-            skipped.add(f"are not in {ARKIT_POSES}", picture.name)
+        where, entry = f"{path}: {stem[:120]}", entries.get(stem)
+        frames.check_inside(stem, picture)
+        if entry is None or entry.get("aligned_pose") is None:
+            frames.skip(f"are not in {ARKIT_POSES}" if entry is None else "have no aligned_pose", picture.name)
             continue
-        if frames[stem].get("aligned_pose") is None:
-            skipped.add("have no aligned_pose", picture.name)
+        pose = frames.pose(_matrix(entry, "aligned_pose", 4, where), picture.name, where)
+        if pose is None:
             continue
-        pose = _matrix(frames[stem], "aligned_pose", 4, where)
-        if is_lost(pose):
-            skipped.add("lost tracking", picture.name)
-            continue
-        K = _matrix(frames[stem], "intrinsic", 3, where)
-        images.append(
-            PosedImage(
-                name=picture.name,
-                camera=pinhole_of(K[0, 0], K[1, 1], K[0, 2], K[1, 2], picture, where),
-                cam_from_world=invert_rigid(rigid_pose(pose, where)),
-                image=picture,
-            )
-        )
-    if not images:
-        raise InputError(f"{folder}: no view: of {len(pictures)} pictures in {PICTURES}/ {skipped.describe()}")
-    skipped.warn()
-    return PosedImages(source=str(path), images=tuple(images))
+        K = _matrix(entry, "intrinsic", 3, where)
+        camera = pinhole_of(K[0, 0], K[1, 1], K[0, 2], K[1, 2], picture, where)
+        frames.images.append(PosedImage(name=picture.name, camera=camera, cam_from_world=pose, image=picture))
+    return frames.finish(depth=False, source=str(path))
 
 
 def _matrix(frame: dict[str, object], key: str, size: int, where: str) -> Float64[np.ndarray, "n n"]:
@@ -153,12 +157,13 @@ def _matrix(frame: dict[str, object], key: str, size: int, where: str) -> Float6
     return matrix
 
 
-def _with_files(image: PosedImage, folder: Path, scale: float, *, allow_outside: bool) -> PosedImage:
-    """A frame with its mask and depth."""
+def _with_files(image: PosedImage, folder: Path, options: ReadOptions) -> PosedImage:
+    """A frame with its mask and depth, whose camera is the photograph's, scaled, without distortion."""
     mask, depth = (folder / name / f"{image.image.stem}.png" for name in (MASKS, DEPTHS))
     for file in (mask, depth):
         if file.is_file():
-            inside(folder, str(file.relative_to(folder)), f"{folder}: {image.name}", allow_outside=allow_outside)
+            relative, where = str(file.relative_to(folder)), f"{folder}: {image.name}"
+            inside(folder, relative, where, allow_outside=options.allow_outside)
     if mask.is_file():
         image = replace(image, mask=mask)
     if not depth.is_file():
@@ -167,69 +172,4 @@ def _with_files(image: PosedImage, folder: Path, scale: float, *, allow_outside:
     x, y = width / image.camera.width, height / image.camera.height
     fx, fy, cx, cy = image.camera.pinhole_params()
     camera = CameraModel(model="PINHOLE", width=width, height=height, params=(fx * x, fy * y, cx * x, cy * y))
-    return replace(image, depth=depth, depth_camera=camera, depth_scale=scale)
-
-
-NERFSTUDIO = ("nerfstudio/transforms.json", "nerfstudio/transforms_undistorted.json")
-DSLR_PICTURES = ("resized_images", "undistorted_images")
-DSLR_MASKS = ("resized_anon_masks", "undistorted_anon_masks")
-
-
-def device_folder(folder: Path) -> Path | None:
-    """The folder of one capture device: the given one, or dslr/ or else iphone/ in it; None where there is neither."""
-    for candidate in (folder, folder / "dslr", folder / "iphone"):
-        if _is_dslr(candidate) or is_iphone(candidate):
-            return candidate
-    return None
-
-
-def is_scannetpp(folder: Path) -> bool:
-    """Whether a folder is such a scene, or its dslr/ or iphone/ folder."""
-    return device_folder(folder) is not None
-
-
-def _is_dslr(folder: Path) -> bool:
-    pictures = any((folder / name).is_dir() for name in DSLR_PICTURES)
-    return pictures and (any((folder / name).is_file() for name in NERFSTUDIO) or is_colmap_model(folder / "colmap"))
-
-
-def read_scannetpp(root: Path, *, allow_outside: bool = False, depth_scale: float | None = None) -> PosedImages:
-    """Reads a scene.
-
-    Args:
-        root: of the scene, or its dslr/ or iphone/ folder.
-        allow_outside: let links in it lead out of it.
-        depth_scale: metres for each step of a depth file; None = 0.001.
-
-    Warns:
-        SceneWarning: a depth stream that is still to be extracted.
-    """
-    folder = device_folder(root)
-    if folder is None:
-        raise InputError(f"{root}: neither dslr/ nor iphone/ with poses of ScanNet++")
-    if _is_dslr(folder):
-        posed = _read_dslr(folder, allow_outside=allow_outside)
-    else:
-        posed = read_iphone(folder, allow_outside=allow_outside, depth_scale=depth_scale)
-    return replace(posed, metres_per_unit=1.0, up=np.array([0.0, 0.0, 1.0]))
-
-
-def _read_dslr(folder: Path, *, allow_outside: bool) -> PosedImages:
-    for index, pictures in enumerate(DSLR_PICTURES):
-        transforms = folder / NERFSTUDIO[index]
-        if (folder / pictures).is_dir() and transforms.is_file():
-            masks = folder / DSLR_MASKS[index]
-            posed = read_transforms(
-                transforms,
-                allow_outside=allow_outside,
-                pictures=folder / pictures,
-                masks=masks if masks.is_dir() else None,
-            )
-            return in_world_of_scan(posed)
-    return read_colmap(
-        folder / "colmap",
-        folder / DSLR_PICTURES[0],
-        folder,
-        allow_outside=allow_outside,
-        masks=folder / DSLR_MASKS[0],
-    )
+    return replace(image, depth=depth, depth_camera=camera, depth_scale=MILLIMETRES)

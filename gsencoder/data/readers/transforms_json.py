@@ -1,4 +1,4 @@
-"""transforms.json of nerfstudio, instant-ngp and Blender (NeRF synthetic).
+"""transforms.json of nerfstudio, instant-ngp and Blender (NeRF synthetic), and JSON files of cameras and objects.
 
 `transform_matrix` is world_from_camera with OpenGL axes (x right, y up, z backward); y and z are turned round on load.
 Values of a frame come before those of the file. Distortion (k1, k2, k3, k4, p1, p2) is OpenCV's, of the perspective
@@ -7,15 +7,13 @@ or, for OPENCV_FISHEYE or `is_fisheye`, of the equidistant model. `ply_file_path
 which one a splat may be in (`gsencoder.fusion.fit`). Intrinsics may be of the upright picture where the file is
 stored sideways (EXIF); its width and height, which differ, tell.
 
-Beside the keys of those programs these are read: `instance_file_path` (integers, 0 = none) for a frame, and
+Besides the keys of those programs these are read: `instance_file_path` (integers, 0 = none) for a frame, and
 `metres_per_unit` and `up` for the file; for both, `depth_camera` (an object with fl_x, fl_y, cx and cy, for the depth
 file's pixels) and `depth_from_color` (4×4, OpenCV axes, world units), where depth is not registered to color,
 `depth_measure` ("z", the default, or "ray", the distance from the camera) and `no_depth` (a step that means none,
 besides 0).
 
-Cameras from a JSON file: poses that a user asks from, in world coordinates.
-
-A file holds one camera or a list of cameras, each an object of
+A camera file holds one camera or a list of cameras that a user asks from, each an object of
 
     cam_from_world     4×4 (or its upper 3 rows), OpenCV axes; or, in its place,
     transform_matrix   world_from_camera with OpenGL axes, as in nerfstudio's transforms.json
@@ -37,14 +35,7 @@ from jaxtyping import Float64, UInt8
 from gsencoder.core.errors import InputError, listed
 from gsencoder.core.files import check_written, read_foreign_text
 from gsencoder.data.readers.images import picture_info, picture_size
-from gsencoder.data.readers.posed import (
-    PosedImage,
-    PosedImages,
-    inside,
-    number,
-    rigid_pose,
-    warn_left_out,
-)
+from gsencoder.data.readers.posed import PosedImage, PosedImages, ReadOptions, inside, number, rigid_pose, warn_left_out
 from gsencoder.data.readers.undistort import CameraModel, check_camera, focal_count
 from gsencoder.data.splats.ply import read_points
 from gsencoder.types import Cameras, SceneObject
@@ -53,8 +44,7 @@ from gsencoder.types.orientation import EXCHANGED
 from gsencoder.types.scene import intrinsic_matrix
 
 PERSPECTIVE = ("", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "PERSPECTIVE")
-NERFSTUDIO_DEPTH_SCALE = 1e-3
-"""nerfstudio's own default for depth_unit_scale_factor: integer millimetres."""
+NERFSTUDIO_DEPTH_SCALE = 1e-3  # nerfstudio's own default for depth_unit_scale_factor: integer millimetres
 GUESSED_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
 CAMERA_KEYS = {
@@ -62,20 +52,25 @@ CAMERA_KEYS = {
     "camera_angle_y", "camera_model", "is_fisheye", "depth_unit_scale_factor", "integer_depth_scale", "depth_camera",
     "depth_from_color", "depth_measure", "no_depth",
 }  # fmt: skip
+FILES_OF_FRAME = {
+    "depth": ("depth_file_path", "depth_path"), "mask": ("mask_path",), "instance": ("instance_file_path",)
+}  # fmt: skip
 FILE_KEYS = {"frames", "metres_per_unit", "up", "ply_file_path"}
-FRAME_KEYS = {"file_path", "transform_matrix", "depth_file_path", "depth_path", "mask_path", "instance_file_path"}
+FRAME_KEYS = {"file_path", "transform_matrix", *(key for keys in FILES_OF_FRAME.values() for key in keys)}
 """Keys that are read here: of cameras, for the file or a frame, and of one of these alone."""
+MISSING = {
+    "image": ("listed images", "their frames are left out"),
+    "depth": ("listed depth files", "those views have no depth"),
+    "mask": ("listed masks", "all pixels of those views are used"),
+    "instance": ("listed instance maps", "those views have no instances"),
+}
 
-TRANSFORMS = ("transforms.json", "transforms_train.json")
-"""The names that such files have."""
+TRANSFORMS = ("transforms.json", "transforms_train.json")  # The names that such files have
 
 
 def read_json(path: Path, *, unique_keys: bool = False) -> Any:
-    """The content of a JSON file.
-
-    Args:
-        unique_keys: refuse objects that have a key twice, of which JSON's readers take the last.
-    """
+    """The content of a JSON file; with `unique_keys`, objects that have a key twice are refused, of which readers take
+    the last."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         keys = [key for key, _ in pairs]
@@ -95,20 +90,13 @@ def read_json(path: Path, *, unique_keys: bool = False) -> Any:
 
 
 def read_transforms(
-    path: Path,
-    *,
-    allow_outside: bool = False,
-    depth_scale: float | None = None,
-    pictures: Path | None = None,
-    masks: Path | None = None,
+    path: Path, options: ReadOptions = ReadOptions(), *, pictures: Path | None = None, masks: Path | None = None
 ) -> PosedImages:
-    """Reads a transforms.json.
+    """Reads a transforms.json; its folder is the scene folder, which paths in it may not leave unless options allow it.
 
     Args:
-        path: the JSON file; its folder is the scene folder, which paths in it may not leave.
-        depth_scale: world units for each step of a depth file; None = what the file says, else millimetres.
         pictures: the folder that `file_path` is relative to; None = that of the file.
-        masks: the folder that `mask_path` is relative to; None = that of the file.
+        masks: the folder that `mask_path` is relative to; None, or one that does not exist = that of the file.
 
     Returns:
         Posed pictures in OpenCV axes. The unit is the metre and up is +z where the file says so, or where it has
@@ -117,9 +105,10 @@ def read_transforms(
     data = read_json(path)
     if not isinstance(data, dict) or not isinstance(data.get("frames"), list) or not data["frames"]:
         raise InputError(f"{path}: expected an object with a list of frames (nerfstudio, instant-ngp or Blender)")
-    frames, root, source = data["frames"], path.parent, path.name
+    frames, root, allow_outside = data["frames"], path.parent, options.allow_outside
+    homes = {"mask": masks} if masks is not None and masks.is_dir() else {}
     images: list[PosedImage] = []
-    missing: dict[str, list[str]] = {"image": [], "depth": [], "mask": [], "instance": []}
+    missing: dict[str, list[str]] = {kind: [] for kind in MISSING}
     names: set[str] = set()
     metric_depth = False
     for index, frame in enumerate(frames):
@@ -134,79 +123,84 @@ def read_transforms(
         if image is None:
             missing["image"].append(name)
             continue
-        beside: dict[str, Path | None] = {}
-        for kind, keys in (
-            ("depth", ("depth_file_path", "depth_path")),
-            ("mask", ("mask_path",)),
-            ("instance", ("instance_file_path",)),
-        ):
-            file_name = next((frame[key] for key in keys if frame.get(key) is not None), None)
-            beside[kind] = None
-            if file_name is None:
+        files: dict[str, Path | None] = dict.fromkeys(FILES_OF_FRAME)
+        for kind, keys in FILES_OF_FRAME.items():
+            key = next((key for key in keys if frame.get(key) is not None), None)
+            if key is None:
                 continue
-            if not isinstance(file_name, str):
-                raise InputError(f"{where}: {keys[0]} must be a path, got {str(file_name)[:40]!r}")
-            home = masks if kind == "mask" and masks is not None else root
-            file = inside(home, file_name, where, allow_outside=allow_outside)
+            if not isinstance(frame[key], str):
+                raise InputError(f"{where}: {key} must be a path, got {str(frame[key])[:40]!r}")
+            file = inside(homes.get(kind, root), frame[key], where, allow_outside=allow_outside)
             if file.is_file():
-                beside[kind] = file
+                files[kind] = file
             else:
-                missing[kind].append(file_name)
-        camera = _camera(data, frame, image, where)
-        file_scale = number(data | frame, "depth_unit_scale_factor", where)
-        if frame.get("depth_file_path") is None:
-            file_scale = number(data | frame, "integer_depth_scale", where) if frame.get("depth_path") else None
-        elif file_scale is not None:
-            metric_depth = True
-        scale = next(value for value in (depth_scale, file_scale, NERFSTUDIO_DEPTH_SCALE) if value is not None)
-        if not 0 < scale < math.inf:
-            raise InputError(f"{where}: the depth scale must be positive, got {scale}")
+                missing[kind].append(frame[key])
+        metric_depth |= None not in (frame.get("depth_file_path"), (data | frame).get("depth_unit_scale_factor"))
         pose = rigid_pose(read_matrix(frame, "transform_matrix", where), where)
-        depth_camera, depth_from_color = _depth_sensor(data | frame, beside["depth"], where)
-        measure, no_depth = (data | frame).get("depth_measure", "z"), number(data | frame, "no_depth", where)
-        if measure not in ("z", "ray"):
-            raise InputError(f"{where}: depth_measure must be z or ray, got {str(measure)[:40]!r}")
-        if no_depth is not None and (no_depth < 0 or no_depth != int(no_depth)):
-            raise InputError(f"{where}: no_depth must be an integer of at least 0, got {no_depth:g}")
         images.append(
             PosedImage(
                 name=name,
-                camera=camera,
+                camera=_camera(data, frame, image, where),
                 cam_from_world=invert_rigid(pose @ OPENCV_FROM_OPENGL),
                 image=image,
-                depth=beside["depth"],
-                depth_camera=depth_camera,
-                depth_from_color=depth_from_color,
-                depth_scale=scale,
-                depth_measure=measure,
-                no_depth=None if no_depth is None else int(no_depth),
-                mask=beside["mask"],
-                instance=beside["instance"],
+                mask=files["mask"],
+                instance=files["instance"],
+                **_depth(data | frame, frame, files["depth"], where),
             )
         )
-    total = len(frames)
     if not images:
-        raise InputError(f"{path}: none of the {total} listed images exists (first: {missing['image'][0][:200]!r})")
-    warn_left_out(missing["image"], total, source, "listed images", "their frames are left out")
-    warn_left_out(missing["depth"], total, source, "listed depth files", "those views have no depth")
-    warn_left_out(missing["mask"], total, source, "listed masks", "all pixels of those views are used")
-    warn_left_out(missing["instance"], total, source, "listed instance maps", "those views have no instances")
+        first = missing["image"][0][:200]
+        raise InputError(f"{path}: none of the {len(frames)} listed images exists (first: {first!r})")
+    for kind, words in MISSING.items():
+        warn_left_out(missing[kind], len(frames), path.name, *words)
     points, colors, points_file = _points(data, path, allow_outside=allow_outside)
-    metres = number(data, "metres_per_unit", str(path))
+    metres, up = number(data, "metres_per_unit", str(path)), None
     if metres is not None and metres <= 0:
         raise InputError(f"{path}: metres_per_unit must be positive, got {metres:g}")
+    if data.get("up") is not None:
+        up = _up(data["up"], path)
+    elif metric_depth:
+        up = np.array([0, 0, 1.0])
     return PosedImages(
         source=str(path),
         images=tuple(images),
-        metres_per_unit=metres if metres is not None else (1.0 if metric_depth else None),
-        up=_up(data.get("up"), path)
-        if data.get("up") is not None
-        else (np.array([0, 0, 1.0]) if metric_depth else None),
+        metres_per_unit=1.0 if metres is None and metric_depth else metres,
+        up=up,
         points=points,
         colors=colors,
         points_file=points_file,
         unused=_unused_keys(path, data, frames),
     )
+
+
+def _depth(values: dict[str, Any], frame: dict[str, Any], depth: Path | None, where: str) -> dict[str, Any]:
+    """What `PosedImage` says about the depth of a frame; a sensor is None where it is the photograph's camera."""
+    key = "integer_depth_scale" if frame.get("depth_file_path") is None else "depth_unit_scale_factor"
+    has_scale = frame.get("depth_file_path") is not None or frame.get("depth_path")
+    given = number(values, key, where) if has_scale else None
+    scale = NERFSTUDIO_DEPTH_SCALE if given is None else given
+    measure, no_depth = values.get("depth_measure", "z"), number(values, "no_depth", where)
+    camera, camera_keys, from_color = None, values.get("depth_camera"), values.get("depth_from_color")
+    if not 0 < scale < math.inf:
+        raise InputError(f"{where}: the depth scale must be positive, got {scale}")
+    if measure not in ("z", "ray"):
+        raise InputError(f"{where}: depth_measure must be z or ray, got {str(measure)[:40]!r}")
+    if no_depth is not None and (no_depth < 0 or no_depth != int(no_depth)):
+        raise InputError(f"{where}: no_depth must be an integer of at least 0, got {no_depth:g}")
+    if camera_keys is not None and depth is not None:
+        if not isinstance(camera_keys, dict):
+            raise InputError(f"{where}: depth_camera must be an object with fl_x, fl_y, cx and cy")
+        camera = _camera({}, camera_keys, depth, f"{where}: depth_camera")
+    if from_color is not None:
+        from_color = rigid_pose(read_matrix(values, "depth_from_color", where), f"{where}: depth_from_color")
+    return {
+        "depth": depth,
+        "depth_camera": camera,
+        "depth_from_color": from_color,
+        "depth_scale": scale,
+        "depth_measure": measure,
+        "no_depth": None if no_depth is None else int(no_depth),
+    }
 
 
 def _points(
@@ -244,43 +238,22 @@ def _find_image(root: Path, name: str, where: str, *, allow_outside: bool) -> Pa
     return None
 
 
-def _depth_sensor(
-    values: dict[str, Any], depth: Path | None, where: str
-) -> tuple[CameraModel | None, Float64[np.ndarray, "4 4"] | None]:
-    """The camera of the depth map and where it stands, from `depth_camera` and `depth_from_color`."""
-    camera = None
-    camera_keys = values.get("depth_camera")
-    if camera_keys is not None and depth is not None:
-        if not isinstance(camera_keys, dict):
-            raise InputError(f"{where}: depth_camera must be an object with fl_x, fl_y, cx and cy")
-        camera = _camera({}, camera_keys, depth, f"{where}: depth_camera")
-    if values.get("depth_from_color") is None:
-        return camera, None
-    return camera, rigid_pose(read_matrix(values, "depth_from_color", where), f"{where}: depth_from_color")
-
-
 def read_matrix(values: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "4 4"]:
     """A matrix of 4 rows, or of the upper 3, of a JSON object; whether it is a pose is not asked."""
-    value = values.get(key)
-    rows = value if isinstance(value, list) else []
-    good = len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)
-    if not good:
+    rows = values.get(key)
+    if not isinstance(rows, list) or not (
+        len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)
+    ):
         raise InputError(f"{where}: {key} must have 4 rows (or the upper 3) of 4 numbers")
     matrix = np.eye(4)
-    for i, row in enumerate(rows):
-        for j, entry in enumerate(row):
-            element = number({key: entry}, key, where)
-            if element is None:
-                raise InputError(f"{where}: {key} has an empty entry in row {i}")
-            matrix[i, j] = element
+    matrix[: len(rows)] = [[_number({key: entry}, key, where) for entry in row] for row in rows]
     return matrix
 
 
 def _up(value: object, path: Path) -> Float64[np.ndarray, "3"]:
     if not isinstance(value, list) or len(value) != 3:
         raise InputError(f"{path}: up must be three numbers")
-    parts = [number({"up": entry}, "up", str(path)) for entry in value]
-    up = np.array([np.nan if part is None else part for part in parts])
+    up = np.array([_number({"up": entry}, "up", str(path)) for entry in value])
     length = math.hypot(*up.tolist())
     if not 1e-6 < length < 1e6:
         raise InputError(f"{path}: up must be three finite numbers that are not all zero, got {value}")
@@ -297,9 +270,7 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
         raise InputError(f"{where}: no focal length; expected fl_x, or camera_angle_x in radians")
     cx, cy = number(both, "cx", where), number(both, "cy", where)
     k1, k2, k3, k4, p1, p2 = (number(both, key, where) or 0.0 for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    fx, fy = fx if fx is not None else fy, fy if fy is not None else fx
-    assert fx is not None
-    assert fy is not None
+    fx, fy = (next(focal for focal in pair if focal is not None) for pair in ((fx, fy), (fy, fx)))
     base = (fx, fy, w / 2 if cx is None else cx, h / 2 if cy is None else cy)
     further = number(both, "k5", where) or number(both, "k6", where)
     model = both.get("camera_model", "")
@@ -312,9 +283,7 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
     elif model not in PERSPECTIVE:
         raise InputError(f"{where}: camera model {model[:40]!r} is not supported; expected OPENCV or OPENCV_FISHEYE")
     elif k4 or further:
-        raise InputError(
-            f"{where}: k4, k5, k6 of a perspective camera have no agreed meaning; expected k1 to k3, p1, p2"
-        )
+        raise InputError(f"{where}: k4, k5, k6 of a perspective camera are not supported; expected k1 to k3, p1, p2")
     elif k3:
         camera = CameraModel(model="FULL_OPENCV", width=w, height=h, params=(*base, k1, k2, p1, p2, k3, 0.0, 0.0, 0.0))
     else:
@@ -325,7 +294,7 @@ def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str
 
 def _size_of_camera(values: dict[str, Any], image: Path, where: str) -> tuple[int, int]:
     """The size of the picture that intrinsics are of: as its pixels are stored, or of the upright picture, where only
-    that has the stated width and height, or else, of the two, where the principal point is as far right as down."""
+    that has that width and height, or else, of the two, where the principal point is as far right as down."""
     stored = picture_size(image)
     w, h, cx, cy = (number(values, key, where) for key in ("w", "h", "cx", "cy"))
     is_sideways = image.suffix.lower() != ".npy" and picture_info(image)[2] in EXCHANGED
@@ -335,10 +304,8 @@ def _size_of_camera(values: dict[str, Any], image: Path, where: str) -> tuple[in
     if not sizes:
         key, pixels, actual = ("w", w, stored[0]) if w not in (None, stored[0]) else ("h", h, stored[1])
         raise InputError(
-            f"{where}: {key} is {pixels:g} but the image {image} has {actual} pixels; give the images at the size "
-            "of the intrinsics (image_scale makes them smaller on load)"
+            f"{where}: {key} is {pixels:g} but the image {image} has {actual} pixels; give it at this size"
         )
-
     return min(sizes, key=lambda size: abs((cx or 0) / size[0] - (cy or 0) / size[1]))
 
 
@@ -426,8 +393,7 @@ def _relative(path: Path, folder: Path) -> str:
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
-MAX_NAME = 1000
-"""Largest number of characters of a name, as in a text table."""
+MAX_NAME = 1000  # Largest number of characters of a name, as in a text table
 
 
 def read_objects(path: Path) -> tuple[SceneObject, ...]:
@@ -438,39 +404,25 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
     rows = read_json(path)
     if not isinstance(rows, list):
         raise InputError(f"{path}: expected a list of objects")
-    objects: list[SceneObject] = []
+    objects: dict[int, SceneObject] = {}
     for index, row in enumerate(rows):
         where = f"{path}: object {index}"
         if not isinstance(row, dict):
             raise InputError(f"{where}: expected an object with id, name, aabb_min and aabb_max")
-        name = row.get("name")
-        if name is not None and not isinstance(name, str):
-            raise InputError(f"{where}: name must be a word or null, got {str(name)[:40]!r}")
-        if name is not None and len(name) > MAX_NAME:
-            raise InputError(f"{where}: name has {len(name):,} characters, expected at most {MAX_NAME:,}")
+        name, placed = row.get("name"), row.get("placed", True)
+        if name is not None and not (isinstance(name, str) and len(name) <= MAX_NAME):
+            raise InputError(f"{where}: name must be null or a word of at most {MAX_NAME:,} characters")
         lower, upper = _corner(row, "aabb_min", where), _corner(row, "aabb_max", where)
         if (lower > upper).any():
             raise InputError(f"{where}: aabb_min {lower.tolist()} is not below aabb_max {upper.tolist()}")
-        placed = row.get("placed", True)
         if not isinstance(placed, bool):
             raise InputError(f"{where}: placed must be true or false, got {str(placed)[:40]!r}")
-        objects.append(
-            SceneObject(
-                id=_count(row, "id", where, None, minimum=1),
-                name=name,
-                aabb_min=lower,
-                aabb_max=upper,
-                placed=placed,
-                views=_count(row, "views", where, 0),
-                max_pixels=_count(row, "max_pixels", where, 0),
-            )
-        )
-    ids: set[int] = set()
-    for item in objects:
-        if item.id in ids:
-            raise InputError(f"{path}: id {item.id} belongs to several objects")
-        ids.add(item.id)
-    return tuple(objects)
+        counts = {key: _count(row, key, where, 0) for key in ("views", "max_pixels")}
+        key = _count(row, "id", where, None, minimum=1)
+        if key in objects:
+            raise InputError(f"{path}: id {key} belongs to several objects")
+        objects[key] = SceneObject(id=key, name=name, aabb_min=lower, aabb_max=upper, placed=placed, **counts)
+    return tuple(objects.values())
 
 
 def _count(row: dict[str, Any], key: str, where: str, default: int | None, minimum: int = 0) -> int:
@@ -482,30 +434,24 @@ def _count(row: dict[str, Any], key: str, where: str, default: int | None, minim
 
 def _corner(row: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "3"]:
     values = row.get(key)
-    good = isinstance(values, list) and len(values) == 3
-    good = good and all(isinstance(v, (int, float)) and not isinstance(v, bool) and abs(v) < 1e15 for v in values or [])
-    if not good or not all(map(math.isfinite, values or [])):
+    if not isinstance(values, list) or len(values) != 3:
         raise InputError(f"{where}: {key} must be three finite numbers, got {str(values)[:60]}")
-    return np.array(values, np.float64)
+    corner = np.array([_number({key: value}, key, where) for value in values])
+    if np.abs(corner).max() >= MAX_CORNER:
+        raise InputError(f"{where}: {key} must lie within {MAX_CORNER:g}, got {values}")
+    return corner
 
 
+MAX_CORNER = 1e15
 MAX_CAMERAS = 10_000
-MAX_PIXELS = 1 << 24
-"""A blend of so many pixels takes gigabytes."""
+MAX_PIXELS = 1 << 24  # A blend of this many pixels takes gigabytes
 POSES = ("cam_from_world", "transform_matrix")
 INTRINSICS = (("fx", "fl_x"), ("fy", "fl_y"), ("cx",), ("cy",), ("width", "w"), ("height", "h"))
 """Each with the names that it may have."""
 
 
 def read_cameras(path: Path, origin: Float64[np.ndarray, "3"]) -> Cameras:
-    """Reads the cameras of a JSON file.
-
-    Args:
-        origin: of the scene, which is taken off the poses in float64.
-
-    Returns:
-        The cameras in the order of the file, relative to the origin.
-    """
+    """Reads the cameras of a JSON file; `origin` of the scene is taken off the poses in float64."""
     data = read_json(path, unique_keys=True)
     entries = data if isinstance(data, list) else [data]
     if not 1 <= len(entries) <= MAX_CAMERAS:
@@ -564,5 +510,6 @@ def _key(entry: dict[str, Any], names: tuple[str, ...], where: str) -> str:
 
 def _number(entry: dict[str, Any], key: str, where: str) -> float:
     value = number(entry, key, where)
-    assert value is not None
+    if value is None:
+        raise InputError(f"{where}: {key} must be a number, got null")
     return value

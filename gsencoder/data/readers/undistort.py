@@ -23,38 +23,28 @@ from jaxtyping import Bool, Float32, Float64
 from gsencoder.core.errors import InputError
 from gsencoder.types.scene import intrinsic_matrix, pixel_centers, project_points, unproject_points
 
-MAX_HALF_FIELD = math.radians(85)
-"""Rays further from the optical axis than this (a field of view of 170°) are not used."""
+MAX_HALF_FIELD = math.radians(85)  # Rays further from the optical axis than this (a field of view of 170°) are not used
 MIN_ZOOM, MAX_ZOOM = 0.7, 1.3
-MIN_USED = 0.5
-"""A camera of which fewer pixels than this share can be undistorted is refused."""
+MIN_USED = 0.5  # A camera of which fewer pixels than this share can be undistorted is refused
 MAX_SIDE = 65_535
-PIXEL_TOLERANCE = 0.01
-"""How far, in pixels, a ray may come back from its place when a model is inverted there."""
+PIXEL_TOLERANCE = 0.01  # How far, in pixels, a ray may come back from its place when a model is inverted there
 
-_FOCALS = {"SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 1, "RADIAL": 1, "SIMPLE_FISHEYE": 1, "SIMPLE_RADIAL_FISHEYE": 1}
-_FOCALS |= {"RADIAL_FISHEYE": 1, "SIMPLE_DIVISION": 1}
-_FOCALS |= dict.fromkeys(
-    ("PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "FOV", "FISHEYE", "EUCM", "DIVISION"), 2
-)
-_FOCALS |= dict.fromkeys(("THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"), 2)
+_FOCALS = {
+    "SIMPLE_PINHOLE": 1, "SIMPLE_RADIAL": 1, "RADIAL": 1, "SIMPLE_FISHEYE": 1, "SIMPLE_RADIAL_FISHEYE": 1,
+    "RADIAL_FISHEYE": 1, "SIMPLE_DIVISION": 1, "PINHOLE": 2, "OPENCV": 2, "FULL_OPENCV": 2, "OPENCV_FISHEYE": 2,
+    "FOV": 2, "FISHEYE": 2, "EUCM": 2, "DIVISION": 2, "THIN_PRISM_FISHEYE": 2, "RAD_TAN_THIN_PRISM_FISHEYE": 2,
+}  # fmt: skip
 _STRAIGHT_AT_ZERO = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraModel:
-    """A camera as a file describes it, distortion included.
+    """A camera as a file describes it, distortion included."""
 
-    Attributes:
-        model: one of COLMAP's camera model names.
-        width: of the picture, pixels.
-        height: of the picture, pixels.
-        params: COLMAP's parameters of that model: focal lengths, principal point (pixel centers at .5), distortion.
-    """
-
-    model: str
-    width: int
-    height: int
+    model: str  # one of COLMAP's camera model names
+    width: int  # of the picture, pixels
+    height: int  # of the picture, pixels
+    # COLMAP's parameters of that model: focal lengths, principal point (pixel centers at .5), distortion.
     params: tuple[float, ...]
 
     @property
@@ -101,13 +91,10 @@ def check_camera(camera: CameraModel, where: str) -> None:
     """Raises InputError where the camera cannot be used; `where` begins the message."""
     if camera.model not in _FOCALS:
         raise InputError(
-            f"{where}: camera model {camera.model} cannot be undistorted to a pinhole within 170°; "
-            f"convert the images to one of {', '.join(sorted(_FOCALS))}"
+            f"{where}: camera model {camera.model} cannot be undistorted; expected one of {', '.join(sorted(_FOCALS))}"
         )
     if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
-        raise InputError(
-            f"{where}: picture size {camera.width}×{camera.height}, expected 1 to {MAX_SIDE} pixels a side"
-        )
+        raise InputError(f"{where}: picture size {camera.width}×{camera.height}, expected sides of 1 to {MAX_SIDE}")
     if len(camera.params) < _FOCALS[camera.model] + 2 or not all(map(math.isfinite, camera.params)):
         raise InputError(f"{where}: intrinsics of {camera.model} must be finite numbers, got {list(camera.params)}")
     fx, fy, cx, cy = camera.pinhole_params()
@@ -115,8 +102,7 @@ def check_camera(camera: CameraModel, where: str) -> None:
     # A fisheye lens that sees half of the world has a focal length of a third of its picture.
     if not (min(fx, fy) >= 1e-4 * side and max(fx, fy, abs(cx), abs(cy)) <= 1e4 * side):
         raise InputError(
-            f"{where}: focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is not a camera's; "
-            f"expected pixels, focal lengths of at least {1e-4 * side:g} and none beyond {1e4 * side:g}"
+            f"{where}: focal length {fx:g}, {fy:g} or principal point {cx:g}, {cy:g} is not a camera's in pixels"
         )
     if camera.is_pinhole:
         half = max(abs(side_x) / fx for side_x in (cx, camera.width - cx))
@@ -150,7 +136,7 @@ def load_pycolmap() -> Any:
 
 def _colmap_camera(camera: CameraModel, where: str) -> Any:
     pycolmap = load_pycolmap()
-    # pycolmap reads past the end of a short parameter list unless it is checked first.
+    # Pycolmap reads past the end of a short parameter list unless it is checked first.
     converted = pycolmap.Camera(
         model=camera.model, width=camera.width, height=camera.height, params=list(camera.params)
     )
@@ -213,15 +199,10 @@ def pinhole_for(camera: CameraModel, where: str) -> Pinhole:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Remap:
-    """For each pixel of a pinhole picture its place in the file's picture; NaN where it has none.
+    """For each pixel of a pinhole picture its place in the file's picture; NaN where it has none."""
 
-    Attributes:
-        x: columns in the file's picture, pixel centers at .5.
-        y: rows in the file's picture.
-    """
-
-    x: Float32[np.ndarray, "H W"]
-    y: Float32[np.ndarray, "H W"]
+    x: Float32[np.ndarray, "H W"]  # columns in the file's picture, pixel centers at .5
+    y: Float32[np.ndarray, "H W"]  # rows in the file's picture
 
     @property
     def valid(self) -> Bool[np.ndarray, "H W"]:
@@ -278,7 +259,7 @@ class RemapCache:
         self._remaps: dict[tuple[Pinhole, CameraModel, int], Remap] = {}
 
     def get(self, target: Pinhole, source: CameraModel, reduction: int = 1) -> Remap | None:
-        """The remap between pictures that are both so many times smaller, or None if they have the same pixels."""
+        """The remap between pictures that are both reduced by this factor, or None if they have the same pixels."""
         if (
             source.is_pinhole
             and (target.width, target.height) == (source.width, source.height)

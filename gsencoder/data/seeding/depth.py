@@ -22,18 +22,12 @@ from gsencoder.core.threads import ahead, kernel
 from gsencoder.types import Cameras, Views
 from gsencoder.types.scene import pixel_centers, unproject_points
 
-AXIS_BITS = 19
-"""Bits of a voxel index along one axis: 524,288 voxels, or 10 km at 2 cm."""
-OUT_OF_REACH = 2.0**62
-"""Voxels that no integer counts."""
-MIN_SLOTS = 1 << 12
-"""Size of the hash table at first, a power of two like every later one."""
-LAYER = 0.25
-"""Height of a layer along the normal, in voxels."""
-SAME_SURFACE_COS = 0.95
-"""Two sums of a voxel are one surface if their normals are closer than this (18°) …"""
-SAME_SURFACE_OFFSET = 0.1
-"""… and their planes closer than this, in voxels."""
+AXIS_BITS = 19  # Bits of a voxel index along one axis: 524,288 voxels, or 10 km at 2 cm
+OUT_OF_REACH = 2.0**62  # Voxels that no integer counts
+MIN_SLOTS = 1 << 12  # Size of the hash table at first, a power of two like every later one
+LAYER = 0.25  # Height of a layer along the normal, in voxels
+SAME_SURFACE_COS = 0.95  # Two sums of a voxel are one surface if their normals are closer than this (18°) …
+SAME_SURFACE_OFFSET = 0.1  # … and their planes closer than this, in voxels
 
 _LAYERS = 8
 _DIRECTIONS = 6
@@ -41,19 +35,12 @@ _COLUMNS = 10  # position, normal, color, count
 
 
 class SurfaceSamples(NamedTuple):
-    """Points on surfaces.
+    """Points on surfaces."""
 
-    Attributes:
-        points: world positions.
-        normals: unit, away from the surface.
-        colors: RGB in [0, 1].
-        counts: how many samples each stands for.
-    """
-
-    points: Float32[np.ndarray, "n 3"]
-    normals: Float32[np.ndarray, "n 3"]
-    colors: Float32[np.ndarray, "n 3"]
-    counts: Int64[np.ndarray, " n"]
+    points: Float32[np.ndarray, "n 3"]  # world positions
+    normals: Float32[np.ndarray, "n 3"]  # unit, away from the surface
+    colors: Float32[np.ndarray, "n 3"]  # RGB in [0, 1]
+    counts: Int64[np.ndarray, " n"]  # how many samples each stands for
 
 
 class SurfaceGrid:
@@ -85,7 +72,7 @@ class SurfaceGrid:
             reach = self.voxel * (1 << (AXIS_BITS - 1))
             raise InputError(
                 f"seeds: a sample lies further than {reach:.6g} units ({1 << (AXIS_BITS - 1)} voxels) from the "
-                "cameras' middle; look at the pose, remove far samples (max_depth) or take a larger voxel"
+                "cameras' middle; look at the pose, or take a larger voxel"
             )
         self._rows = rows
 
@@ -108,7 +95,7 @@ class SurfaceGrid:
         )
 
     def _make_room(self, rows: int) -> None:
-        """Makes the arrays large enough for so many rows, and the hash table twice as large."""
+        """Makes the arrays large enough for this many rows, and the hash table twice as large."""
         if rows > len(self._keys):
             size = max(rows, 2 * len(self._keys))
             self._keys = np.concatenate([self._keys[: self._rows], np.empty(size - self._rows, np.int64)])
@@ -216,38 +203,28 @@ def _surfaces(voxel_of: np.ndarray, sums: np.ndarray, voxel: float) -> np.ndarra
     rows, columns = np.concatenate(pairs, axis=1) if pairs else np.zeros((2, 0), np.int64)
     graph = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(len(sums), len(sums)))
     _, label = connected_components(graph, directed=False)
-    # scipy does not promise an order of its labels: number the surfaces by their first row.
+    # Scipy does not promise an order of its labels: number the surfaces by their first row.
     _, first_row, inverse = np.unique(label, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first_row))[inverse]
 
 
-LINEAR = 3.0
-"""A second difference of inverse depth within this many of its noise's standard deviations counts as zero."""
-RELATIVE_FLOOR = 1e-3
-"""… and so does one below this share of the view's mean inverse depth."""
-SMOOTHING_RADIUS = 2
-"""Half width in pixels of the window over which inverse depth is averaged."""
+LINEAR = 3.0  # A second difference of inverse depth within this many of its noise's standard deviations counts as zero
+RELATIVE_FLOOR = 1e-3  # … and so does one below this share of the view's mean inverse depth
+SMOOTHING_RADIUS = 2  # Half width in pixels of the window over which inverse depth is averaged
 BETWEEN = 0.3
 """A pixel floats between two surfaces if the steps beyond its neighbors are below this share of those towards them."""
 OCCLUSION = 0.01
 """A pixel lies behind its neighbor's outline if that is nearer by this share of its depth, 15 mm at 1.5 m."""
 
-SMALLEST_DEPTH, LARGEST_DEPTH = 1e-9, 1e12
-"""Depths outside are taken for a wrong scale, world units."""
+SMALLEST_DEPTH, LARGEST_DEPTH = 1e-9, 1e12  # Depths outside are taken for a wrong scale, world units
 
 
 class SurfacePixels(NamedTuple):
-    """What one depth image says about the surfaces in it.
+    """What one depth image says about the surfaces in it."""
 
-    Attributes:
-        depth: z after smoothing, world units.
-        normals: unit, camera axes, towards the camera.
-        use: pixels that lie on a surface.
-    """
-
-    depth: Float32[np.ndarray, "H W"]
-    normals: Float32[np.ndarray, "H W 3"]
-    use: Bool[np.ndarray, "H W"]
+    depth: Float32[np.ndarray, "H W"]  # z after smoothing, world units
+    normals: Float32[np.ndarray, "H W 3"]  # unit, camera axes, towards the camera
+    use: Bool[np.ndarray, "H W"]  # pixels that lie on a surface
 
 
 def surface_pixels(
@@ -277,9 +254,7 @@ def surface_pixels(
     return SurfacePixels(smooth, normals, use)
 
 
-def depth_samples(
-    views: Views, *, voxel: float, min_cos: float = 0.1, max_depth: float | None = None
-) -> tuple[SurfaceSamples, list[str]]:
+def depth_samples(views: Views, *, voxel: float) -> tuple[SurfaceSamples, list[str]]:
     """Surface samples of all RGB-D frames on a grid of `voxel` world units, two views in memory at a time.
 
     Returns the samples and the names of the views that gave none. Raises InputError where there is no depth or image,
@@ -297,9 +272,7 @@ def depth_samples(
         depth, image = read_rgbd(views, view)
         if views.masks is not None:
             depth = np.where(views.masks[view], depth, np.float32(0))
-        if max_depth is not None:
-            depth = np.where(depth <= max_depth, depth, np.float32(0))
-        pixels = surface_pixels(depth, views.cameras.Ks[view], min_cos=min_cos)
+        pixels = surface_pixels(depth, views.cameras.Ks[view])
         return *_to_world(pixels, views.cameras, view), image[pixels.use]
 
     empty = []
@@ -324,8 +297,7 @@ def read_rgbd(views: Views, view: int) -> tuple[Float32[np.ndarray, "H W"], UInt
     bad = np.count_nonzero(~np.isfinite(depth) | (depth < 0))
     if bad:
         raise InputError(
-            f"view {views.names[view]!r}: {bad} of {depth.size} depths are NaN, infinite or negative; "
-            "write 0 where there is no depth"
+            f"view {views.names[view]!r}: {bad} of {depth.size} depths are NaN, infinite or negative; 0 means none"
         )
     # Beyond this their inverses, and lengths in voxels, leave float32.
     far = np.count_nonzero((depth > 0) & ~((depth >= SMALLEST_DEPTH) & (depth <= LARGEST_DEPTH)))
@@ -379,14 +351,14 @@ def _smooth(inverse, valid, step):
 @kernel
 @no_type_check
 def _gradient(inverse, valid, step):
-    """Gradient along the rows, [H, W], and the pixels that float between two surfaces or show beside a nearer one."""
+    """Gradient along the rows, [H, W], and the pixels that float between two surfaces or show next to a nearer one."""
     height, width = inverse.shape
     gradient, astray = np.zeros_like(inverse), np.zeros(inverse.shape, np.bool_)
     steps = np.zeros(width + 3, inverse.dtype)
     has_step = np.zeros(width + 3, np.bool_)
     occlusion, flatter = np.float32(OCCLUSION), np.float32(BETWEEN)
     for y in range(height):
-        # steps[x + 1] and steps[x + 2] lead to pixel x and on from it; there are none beyond the border.
+        # Steps[x + 1] and steps[x + 2] lead to pixel x and on from it; there are none beyond the border.
         for x in range(1, width):
             has_step[x + 1] = valid[y, x] & valid[y, x - 1]
             steps[x + 1] = inverse[y, x] - inverse[y, x - 1] if has_step[x + 1] else 0
@@ -401,7 +373,7 @@ def _gradient(inverse, valid, step):
                 gradient[y, x] = (before + after) / 2
             elif not (steep and before * after < 0):
                 gradient[y, x] = before if abs(before) < abs(after) else after
-            # The surfaces that a floating pixel lies between go on beside it, less steep than the steps towards it.
+            # The surfaces that a floating pixel lies between go on next to it, less steep than the steps towards it.
             beyond = max(abs(steps[x]), abs(steps[x + 3]))
             between = steep and before * after > 0 and beyond < flatter * smaller
             # How much nearer the neighbor is, beyond what the pixel's own surface explains by its slope on the other

@@ -3,20 +3,15 @@
 Where few features match, as on smooth walls and in small pictures, a first sweep of small pictures over all depths that
 the cameras allow finds rough points; they tell the second one at which depths to look.
 
-Dense seeds from photographs: there is no densification, so every surface must be seeded before the first step.
-
-Two sources, both checked against other photographs. Textured pixels get the depth of a plane sweep (stereo.py), if
-two other views find a surface at the same place. Pixels between those are given depths interpolated between their
-neighbors', and kept if their colors agree in two other views and no other view sees through them.
-
-Depths of the pixels for which a plane sweep gives none, interpolated between those of their neighbors.
-
-An interpolated depth is used where its color agrees in two other photographs and no other view sees through it.
+There is no densification, so every surface must be seeded before the first step. Textured pixels get the depth of a
+plane sweep (stereo.py), if two other views find a surface at the same place. Pixels between those are given depths
+interpolated between their neighbors', and kept if their colors agree in two other photographs and no other view sees
+through them.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -25,6 +20,7 @@ from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Track, untracked
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.data.seeding.matches import (
     Triangulation,
@@ -53,8 +49,7 @@ from gsencoder.data.seeding.stereo import (
 from gsencoder.geometry import transform
 from gsencoder.types import Cameras, Gaussians, Views
 
-COLOR_TOLERANCE = 0.06
-"""Largest mean difference of the colors (0 to 1) of one surface in two photographs."""
+COLOR_TOLERANCE = 0.06  # Largest mean difference of the colors (0 to 1) of one surface in two photographs
 
 
 def interpolated_depths(
@@ -68,8 +63,6 @@ def interpolated_depths(
 
     Args:
         consistent: depths of plane sweeps, 0 = unknown.
-        poses: their cam_from_world.
-        points: further points on surfaces, world units.
     """
     cloud = torch.cat((torch.from_numpy(points), torch.from_numpy(back_project(consistent, photos, poses)[0])))
     return {
@@ -90,7 +83,6 @@ def supported_depths(
     Args:
         interpolated: depth of each pixel of each view (`interpolated_depths`).
         consistent: depths of plane sweeps, 0 = unknown; pixels that have one are left out.
-        poses: their cam_from_world.
         neighbors: the other views that each is compared with.
 
     Returns:
@@ -154,18 +146,13 @@ def interpolate(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     return torch.where(depth > 0, depth, torch.where(result > 0, 1 / result.clamp(min=1e-9), 0))
 
 
-MIN_VIEWS = 2
-"""So many photographs must show a point's place to be empty: one pose may be off."""
+MIN_VIEWS = 2  # Photographs that must show a point's place to be empty: one pose may be off
 
 
 def outside_hull(
     points: Float32[np.ndarray, "P 3"], photographs: Photographs, training: Sequence[int]
 ) -> Bool[np.ndarray, " P"]:
-    """Which points lie where photographs show that nothing is.
-
-    Args:
-        points: world units relative to the scene's origin.
-    """
+    """Which points lie where photographs show that nothing is."""
     cameras, seen_empty = photographs.cameras, np.zeros(len(points), np.int64)
     for view in training:
         empty = photographs.empty(view)
@@ -180,58 +167,37 @@ def outside_hull(
 
 FILLED_SPACING = 2.0
 """Interpolated seeds stand on a grid this many times coarser: they lie where photographs show little detail."""
-MAX_SEE_THROUGH = 1
-"""A point that no view confirms may be seen through by this many views."""
-MIN_SPACING = 0.1
+MAX_SEE_THROUGH = 1  # A point that no view confirms may be seen through by this many views
 MIN_CORRELATION = 0.6
 """Normalized cross-correlation of two windows, −1 to 1, from which they are taken to show the same surface."""
-CELL = 1 / 40
-"""Side of the cells in which coverage is counted, as a share of the picture's longer side."""
+CELL = 1 / 40  # Side of the cells in which coverage is counted, as a share of the picture's longer side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DenseConfig:
     """When seeds are added, and how many."""
 
-    enough: float = field(
-        default=0.95,
-        metadata={"help": "seeds are added where points reach less than this share of the pictures' cells; 0 = never"},
+    enough: float = option(
+        0.95, "seeds are added where points reach less than this share of the pictures' cells; 0 = never", ge=0, le=1
     )
-    spacing: float = field(default=6.0, metadata={"help": "distance of seeds in pixels of a typical photograph"})
-    samples: int = field(default=3, metadata={"help": "pixels that must agree on a seed, from all photographs"})
-    size: int = field(default=200, metadata={"help": "longer side in pixels of the pictures that are compared"})
-    sources: int = field(default=4, metadata={"help": "other photographs that each is compared with"})
+    spacing: float = option(6.0, "distance of seeds in pixels of a typical photograph", ge=0.1, lt=math.inf)
+    samples: int = option(3, "pixels that must agree on a seed, from all photographs", ge=1)
+    size: int = option(200, "longer side in pixels of the pictures that are compared", ge=32)
+    sources: int = option(4, "other photographs that each is compared with", ge=2)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.enough <= 1:
-            raise InputError(f"enough: expected a share from 0 to 1, got {self.enough}")
-        if not MIN_SPACING <= self.spacing < math.inf:
-            raise InputError(f"spacing: expected {MIN_SPACING} pixels or more, got {self.spacing}")
-        if self.samples < 1:
-            raise InputError(f"samples: expected at least 1 pixel, got {self.samples}")
-        if self.size < 32:
-            raise InputError(f"size: expected at least 32 pixels, got {self.size}")
-        if self.sources < 2:
-            raise InputError(f"sources: expected at least 2 photographs to compare with, got {self.sources}")
+        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DenseSeeds:
-    """Structure-from-motion points and the seeds that were added to them.
+    """Structure-from-motion points and the seeds that were added to them."""
 
-    Attributes:
-        points: all of them, world units relative to the scene's origin.
-        colors: RGB.
-        swept: how many came from plane sweeps.
-        filled: how many were interpolated.
-        coverage: mean share of the pictures' cells with a point, before and after.
-    """
-
-    points: Float32[np.ndarray, "P 3"]
-    colors: UInt8[np.ndarray, "P 3"]
-    swept: int
-    filled: int
-    coverage: tuple[float, float]
+    points: Float32[np.ndarray, "P 3"]  # all of them, world units relative to the scene's origin
+    colors: UInt8[np.ndarray, "P 3"]  # RGB
+    swept: int  # how many came from plane sweeps
+    filled: int  # how many were interpolated
+    coverage: tuple[float, float]  # mean share of the pictures' cells with a point, before and after
 
 
 def covered_share(photographs: Photographs, views: Sequence[int], points: Float32[np.ndarray, "P 3"]) -> float:
@@ -289,7 +255,7 @@ def densify(
     filled = back_project(supported_depths(interpolated, consistent, photos, poses, neighbors), photos, poses)
     voxel = config.spacing * _pixel_size(cameras, consistent)
     swept = carve(*average_by_voxel(*swept, voxel, config.samples), consistent, photos, poses, DEPTH_TOLERANCE)
-    filled = average_by_voxel(*filled, FILLED_SPACING * voxel, config.samples, beside=swept[0])
+    filled = average_by_voxel(*filled, FILLED_SPACING * voxel, config.samples, occupied=swept[0])
     filled = carve(*filled, consistent, photos, poses, DEPTH_TOLERANCE)
     sparse, swept, filled = (
         (positions[inside], rgb[inside])
@@ -353,12 +319,10 @@ def carve(
     poses: Mapping[int, Tensor],
     tolerance: float,
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Removes points in free space: those that more views see through, to a surface behind, than confirm.
+    """Removes points in free space: points that more views see through, to a surface behind, than confirm.
 
     Args:
-        points: world units.
         consistent: depths of each view, 0 = unknown.
-        poses: their cam_from_world.
         tolerance: relative difference of depths that agree; what lies in front by twice as much is seen through.
     """
     positions = torch.from_numpy(points)
@@ -377,13 +341,14 @@ def average_by_voxel(
     voxel: float,
     samples: int,
     *,
-    beside: Float32[np.ndarray, "Q 3"] | None = None,
+    occupied: Float32[np.ndarray, "Q 3"] | None = None,
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Means of the points and colors of each voxel with at least so many samples; none where `beside` has points."""
+    """Means of the points and colors of each voxel with at least `samples` samples, except `occupied` ones."""
     cells = np.floor(points.astype(np.float64) / voxel).astype(np.int64)
-    occupied = np.floor(np.empty((0, 3)) if beside is None else beside.astype(np.float64) / voxel).astype(np.int64)
+    others = points[:0] if occupied is None else occupied
+    taken = np.floor(others.astype(np.float64) / voxel).astype(np.int64)
     cells_used, inverse, counts = np.unique(
-        np.concatenate((cells, occupied)), axis=0, return_inverse=True, return_counts=True
+        np.concatenate((cells, taken)), axis=0, return_inverse=True, return_counts=True
     )
     inverse = inverse.reshape(-1)
     keep = counts >= samples
@@ -410,37 +375,26 @@ def consistent_depths(
     return consistent
 
 
-MAX_DENSE_SPACING = 4.0
-"""Spacing of dense seeds is clipped to this many medians: outliers must not become large blobs."""
+MAX_DENSE_SPACING = 4.0  # Spacing of dense seeds is clipped to this many medians: outliers must not become large blobs
 MIN_COVERAGE = 0.25
 """Where triangulated points reach a smaller share of the pictures' cells, a sweep over all depths finds rough points.
 """
-ROUGH_SIZE = 80
-"""Longer side in pixels of the pictures of that sweep."""
+ROUGH_SIZE = 80  # Longer side in pixels of the pictures of that sweep
 ROUGH_PLANES = 192
-ROUGH_TOLERANCE = 0.06
-"""Largest relative difference of two rough depths of one surface."""
+ROUGH_TOLERANCE = 0.06  # Largest relative difference of two rough depths of one surface
 
 
-SAME_PLACE = 1e-6
-"""Cameras that are this near to each other, relative to their coordinates, differ by rounding."""
-FLAT = 0.01
-"""Standard deviation of colors (0 to 1) below which a photograph is of one color."""
+SAME_PLACE = 1e-6  # Cameras that are this near to each other, relative to their coordinates, differ by rounding
+FLAT = 0.01  # Standard deviation of colors (0 to 1) below which a photograph is of one color
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PhotographSeeds:
-    """Seeds of posed photographs, and where they come from.
+    """Seeds of posed photographs, and where they come from."""
 
-    Attributes:
-        dense: all of them.
-        triangulation: the points of matched features among them.
-        rough: number of points of the sweep over all depths, which only guided the second one.
-    """
-
-    dense: DenseSeeds
-    triangulation: Triangulation
-    rough: int
+    dense: DenseSeeds  # all of them
+    triangulation: Triangulation  # the points of matched features among them
+    rough: int  # number of points of the sweep over all depths, which only guided the second one
 
 
 def seeds_of_photographs(
@@ -469,13 +423,7 @@ def seeds_of_photographs(
     if covered_share(photographs, rows, points) < MIN_COVERAGE:
         rough = _rough_points(photographs, rows, cameras, track)
     dense = densify(
-        photographs,
-        rows,
-        points,
-        triangulation.colors,
-        config,
-        guide=np.concatenate((points, rough)),
-        track=track,
+        photographs, rows, points, triangulation.colors, config, guide=np.concatenate((points, rough)), track=track
     )
     if dense is None:
         dense = DenseSeeds(points=points, colors=triangulation.colors, swept=0, filled=0, coverage=(1.0, 1.0))

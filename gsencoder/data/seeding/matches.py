@@ -1,12 +1,9 @@
-"""Features of photographs and their matches: SIFT by pycolmap, in a database of its own.
-
-Points for posed photographs that came without any: SIFT features matched by pycolmap, triangulated with poses held.
-
-Matches are verified by the epipolar lines of the given poses; nothing is estimated but the points.
-"""
+"""Features of photographs and their matches (SIFT by pycolmap, in a database of its own), and the points that are
+triangulated from them with the given poses held: matches are verified by the epipolar lines of these."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,6 +18,8 @@ from gsencoder.data.readers.undistort import load_pycolmap
 from gsencoder.types import Cameras, Views
 from gsencoder.types.checks import invert_rigid
 
+DATABASE = "database.db"
+
 
 def picture_name(view: int) -> str:
     """The name of a view in the database."""
@@ -28,13 +27,7 @@ def picture_name(view: int) -> str:
 
 
 def detect_features(
-    pycolmap: Any,
-    database_path: Path,
-    pictures: Path,
-    views: Views,
-    cameras: Cameras,
-    features: int,
-    track: Track,
+    pycolmap: Any, database_path: Path, pictures: Path, views: Views, cameras: Cameras, features: int, track: Track
 ) -> None:
     """Writes the pictures at the size of `cameras`, and their features into a new database."""
     from PIL import Image
@@ -119,19 +112,45 @@ def epipolar_distances(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PairMatches:
-    """Pixels of two views that look alike.
+    """Pixels of two views that look alike."""
 
-    Attributes:
-        first: row of a view.
-        second: row of another.
-        first_pixels: (u, v) in the first.
-        second_pixels: the same features in the second.
-    """
+    first: int  # row of a view
+    second: int  # row of another
+    first_pixels: Float64[np.ndarray, "M 2"]  # (u, v) in the first
+    second_pixels: Float64[np.ndarray, "M 2"]  # the same features in the second
 
-    first: int
-    second: int
-    first_pixels: Float64[np.ndarray, "M 2"]
-    second_pixels: Float64[np.ndarray, "M 2"]
+
+@contextmanager
+def _matched(
+    views: Views, cameras: Cameras, pairs: Sequence[tuple[int, int]], features: int, track: Track
+) -> Iterator[tuple[Any, Path]]:
+    """pycolmap, and a folder with images/ and the database of the features of views and of their matches."""
+    pycolmap = load_pycolmap()
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
+    with TemporaryDirectory(prefix="gsencoder_match_") as name:
+        folder = Path(name)
+        (folder / "images").mkdir()
+        try:
+            detect_features(pycolmap, folder / DATABASE, folder / "images", views, cameras, features, track)
+            match_pairs(pycolmap, folder / DATABASE, folder / "pairs.txt", pairs)
+            yield pycolmap, folder
+        except (RuntimeError, ValueError) as error:
+            message = " ".join(str(error).split())[:160]
+            raise InputError(f"pycolmap cannot match these photographs: {message}") from error
+
+
+def _matches_in(
+    database: Any, count: int, pairs: Sequence[tuple[int, int]]
+) -> Iterator[tuple[tuple[int, int], np.ndarray, PairMatches]]:
+    """Of each pair of views with matches their numbers in the database, the rows of matched features, and pixels."""
+    ids = image_ids(database, count)
+    keypoints = [database.read_keypoints(number)[:, :2].astype(np.float64) for number in ids]
+    for first, second in pairs:
+        if database.exists_matches(ids[first], ids[second]):
+            rows = database.read_matches(ids[first], ids[second])
+            pixels = keypoints[first][rows[:, 0]], keypoints[second][rows[:, 1]]
+            pair = PairMatches(first=first, second=second, first_pixels=pixels[0], second_pixels=pixels[1])
+            yield (ids[first], ids[second]), rows, pair
 
 
 def match_photographs(
@@ -141,41 +160,16 @@ def match_photographs(
 
     Args:
         cameras: of the same views, at the size in which features are detected.
+        features: largest number of features of a photograph.
     """
-    pycolmap = load_pycolmap()
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
-    matched = []
-    with TemporaryDirectory(prefix="gsencoder_match_") as name:
-        folder = Path(name)
-        database_path, pictures = folder / "database.db", folder / "images"
-        pictures.mkdir()
-        try:
-            detect_features(pycolmap, database_path, pictures, views, cameras, features, track)
-            match_pairs(pycolmap, database_path, folder / "pairs.txt", pairs)
-        except (RuntimeError, ValueError) as error:
-            message = " ".join(str(error).split())[:160]
-            raise InputError(f"pycolmap cannot match these photographs: {message}") from error
-        with pycolmap.Database.open(database_path) as database:
-            ids = image_ids(database, len(views))
-            keypoints = [database.read_keypoints(number)[:, :2].astype(np.float64) for number in ids]
-            for first, second in pairs:
-                if database.exists_matches(ids[first], ids[second]):
-                    rows = database.read_matches(ids[first], ids[second])
-                    matched.append(
-                        PairMatches(
-                            first=first,
-                            second=second,
-                            first_pixels=keypoints[first][rows[:, 0]],
-                            second_pixels=keypoints[second][rows[:, 1]],
-                        )
-                    )
-    return matched
+    matched = _matched(views, cameras, pairs, features, track)
+    with matched as (pycolmap, folder), pycolmap.Database.open(folder / DATABASE) as database:
+        return [pair for _, _, pair in _matches_in(database, len(views), pairs)]
 
 
 DEPTHS = (0.25, 0.5, 1.0, 2.0, 4.0)
 """Depths of the points that stand for what a view may show, as multiples of the typical distance."""
-RAYS = 5
-"""Rows and columns of the rays on which these points lie."""
+RAYS = 5  # Rows and columns of the rays on which these points lie
 MAX_ANGLE = np.deg2rad(75.0)
 """Views of a surface from directions that differ more are not matched: their features look different."""
 FORWARD_BASELINES = 10.0
@@ -258,8 +252,7 @@ def depth_range_of_cameras(cameras: Cameras) -> DepthRange:
 
 MAX_EPIPOLAR_ERROR = 2.0
 """Largest distance of a match from the epipolar line, in pixels of the pictures that are matched."""
-MIN_MATCHES = 15
-"""Pairs of views with fewer verified matches are not used."""
+MIN_MATCHES = 15  # Pairs of views with fewer verified matches are not used
 FITTING_SHARE, ENOUGH_MATCHES = 0.1, 100
 """Of this many matches or more, a smaller share lies on the epipolar lines only where poses are wrong: 0.18 to 0.9 of
 those of eight choices of views, and 0.00 to 0.11 (once 0.20) with other axes, inverse or exchanged poses."""
@@ -267,19 +260,13 @@ those of eight choices of views, and 0.00 to 0.11 (once 0.20) with other axes, i
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Triangulation:
-    """Points that were triangulated.
+    """Points that were triangulated."""
 
-    Attributes:
-        points: world units, in the world of the cameras; sorted, so that a rerun gives the same array.
-        colors: RGB.
-        pairs: pairs of views with verified matches.
-        error: mean reprojection error in pixels of the pictures that were matched; NaN without points.
-    """
-
+    # World units, in the world of the cameras; sorted, so that a rerun gives the same array.
     points: Float32[np.ndarray, "P 3"]
-    colors: UInt8[np.ndarray, "P 3"]
-    pairs: int
-    error: float
+    colors: UInt8[np.ndarray, "P 3"]  # RGB
+    pairs: int  # pairs of views with verified matches
+    error: float  # mean reprojection error in pixels of the pictures that were matched; NaN without points
 
 
 def triangulate(
@@ -296,29 +283,18 @@ def triangulate(
     """
     if views.images is None or len(views) < 2:
         raise InputError(f"triangulate: expected two posed photographs or more, got {len(views)}")
-    pycolmap = load_pycolmap()
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
     cameras = views.cameras.resized(size, enlarge=False)
-    with TemporaryDirectory(prefix="gsencoder_triangulate_") as name:
-        folder = Path(name)
-        database_path, pictures = folder / "database.db", folder / "images"
-        pictures.mkdir()
-        try:
-            detect_features(pycolmap, database_path, pictures, views, cameras, features, track)
-            pairs = choose_pairs(cameras, neighbors)
-            match_pairs(pycolmap, database_path, folder / "pairs.txt", pairs)
-            verified = _verify(pycolmap, database_path, cameras, pairs)
-            if not verified:
-                return _result(None, verified)
-            model = _posed_model(pycolmap, database_path, cameras)
-            options = pycolmap.IncrementalPipelineOptions()
-            options.random_seed = 0
-            options.num_threads = 1
-            model = pycolmap.triangulate_points(model, database_path, pictures, folder, options=options)
-            model.extract_colors_for_all_images(pictures)
-        except (RuntimeError, ValueError) as error:
-            message = " ".join(str(error).split())[:160]
-            raise InputError(f"triangulate: pycolmap cannot use these photographs: {message}") from error
+    pairs = choose_pairs(cameras, neighbors)
+    with _matched(views, cameras, pairs, features, track) as (pycolmap, folder):
+        verified = _verify(pycolmap, folder / DATABASE, cameras, pairs)
+        if not verified:
+            return _result(None, verified)
+        model = _posed_model(pycolmap, folder / DATABASE, cameras)
+        options = pycolmap.IncrementalPipelineOptions()
+        options.random_seed = 0
+        options.num_threads = 1
+        model = pycolmap.triangulate_points(model, folder / DATABASE, folder / "images", folder, options=options)
+        model.extract_colors_for_all_images(folder / "images")
         return _result(model, verified)
 
 
@@ -328,15 +304,8 @@ def _verify(
     """Writes the matches that lie on the epipolar lines of the poses; returns the pairs that have enough of them."""
     verified, total, fitting = [], 0, 0
     with pycolmap.Database.open(database_path) as database:
-        ids = image_ids(database, len(cameras))
-        keypoints = [database.read_keypoints(number)[:, :2].astype(np.float64) for number in ids]
-        for first, second in pairs:
-            if not database.exists_matches(ids[first], ids[second]):
-                continue
-            matches = database.read_matches(ids[first], ids[second])
-            good = on_epipolar_lines(
-                cameras, first, second, keypoints[first][matches[:, 0]], keypoints[second][matches[:, 1]]
-            )
+        for ids, rows, pair in _matches_in(database, len(cameras), pairs):
+            good = on_epipolar_lines(cameras, pair.first, pair.second, pair.first_pixels, pair.second_pixels)
             count = int(good.sum())
             if len(good) >= MIN_MATCHES:
                 total, fitting = total + len(good), fitting + count
@@ -344,15 +313,15 @@ def _verify(
                 continue
             geometry = pycolmap.TwoViewGeometry()
             geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
-            geometry.inlier_matches = matches[good]
-            database.write_two_view_geometry(ids[first], ids[second], geometry)
-            verified.append((first, second))
+            geometry.inlier_matches = rows[good]
+            database.write_two_view_geometry(*ids, geometry)
+            verified.append((pair.first, pair.second))
     if total >= ENOUGH_MATCHES and fitting < FITTING_SHARE * total:
         warnings.warn(
             f"the photographs do not seem to fit their poses: of {total:,} matched features {fitting:,} lie on their "
-            "epipolar lines; `gsencoder inspect` says what is wrong, as far as it can be told",
+            "epipolar lines; `gsencoder inspect` looks for the cause",
             SceneWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     return verified
 

@@ -12,13 +12,10 @@ from gsencoder.data.seeding.depth import SurfaceGrid, read_rgbd
 from gsencoder.data.seeding.points import flat_gaussians, seed_from_points
 from gsencoder.types import Gaussians, Views
 
-LATTICE = 0.5
-"""Spacing of the samples on a triangle, in voxels."""
-LARGEST_SPACING = 2.0
-"""Upper limit of a Gaussian's spacing in voxels: samples of a mesh leave no wider gap."""
+LATTICE = 0.5  # Spacing of the samples on a triangle, in voxels
+LARGEST_SPACING = 2.0  # Upper limit of a Gaussian's spacing in voxels: samples of a mesh leave no wider gap
 TRIANGLES = 20_000
-MAX_SAMPLES = 200_000_000
-"""A mesh that needs more samples than this for its area is in other units than the voxel."""
+MAX_SAMPLES = 200_000_000  # A mesh that needs more samples than this for its area is in other units than the voxel
 
 
 def seed_from_mesh(path: str | Path, *, voxel: float, origin: Float64[np.ndarray, "3"] | None = None) -> Gaussians:
@@ -68,14 +65,7 @@ def mesh_bounds(path: str | Path) -> tuple[Float64[np.ndarray, "3"], Float64[np.
     return together.min(axis=0), together.max(axis=0)
 
 
-def seed_from_tsdf(
-    views: Views,
-    *,
-    voxel: float,
-    truncation: float = 4.0,
-    max_depth: float | None = None,
-    min_weight: float = 1.0,
-) -> Gaussians:
+def seed_from_tsdf(views: Views, *, voxel: float, truncation: float = 4.0, min_weight: float = 1.0) -> Gaussians:
     """Flat Gaussians on the vertices of the mesh that RGB-D frames fuse to: the setting of SplatDistill, section 3.1.
 
     Slower than seeds from the frames themselves, and thin objects melt into what they lie on, but the noise of many
@@ -84,7 +74,6 @@ def seed_from_tsdf(
     Args:
         voxel: edge of the grid in world units; the signed distances are kept on one of half the size.
         truncation: how far the signed distance reaches, in voxels of that finer grid.
-        max_depth: depths beyond are not used; None = all.
         min_weight: how many frames must agree on a voxel.
     """
     if not len(views) or views.depths is None or views.images is None:
@@ -106,13 +95,13 @@ def seed_from_tsdf(
         depth, image = read_rgbd(views, view)
         if views.masks is not None:
             depth = np.where(views.masks[view], depth, np.float32(0))
-        far = float(depth.max(initial=0)) if max_depth is None else max_depth
+        far = float(depth.max(initial=0))
         if not (depth > 0).any():
             continue
         count += 1
         z = geometry.Image(core.Tensor(np.ascontiguousarray(depth)))
         rgb = geometry.Image(core.Tensor(np.ascontiguousarray(image, np.float32) / np.float32(255)))
-        # open3d's pixel centers lie on whole numbers.
+        # Open3d's pixel centers lie on whole numbers.
         K = views.cameras.Ks[view].astype(np.float64)
         K[:2, 2] -= 0.5
         intrinsic, pose = core.Tensor(K), core.Tensor(views.cameras.cam_from_world[view].astype(np.float64))
@@ -139,8 +128,8 @@ def _open3d() -> Any:
         import open3d
     except (ImportError, OSError) as error:
         raise InputError(
-            f"seeds: source=tsdf needs open3d, which does not load ({' '.join(str(error).split())[:120]}); "
-            "`pip install open3d`, and on Debian or Ubuntu `apt-get install libusb-1.0-0 libgl1`"
+            f"seeds: source=tsdf needs open3d, which does not load ({' '.join(str(error).split())[:120]}); on "
+            "Debian or Ubuntu: apt-get install libusb-1.0-0 libgl1"
         ) from error
     return open3d
 
@@ -156,9 +145,7 @@ def _parts(path: Path) -> list[Any]:
         return loaded.dump(concatenate=False)
     except Exception as error:  # trimesh's readers raise whatever their parsers do.
         message = " ".join(f"{type(error).__name__}: {error}".split())[:160]
-        raise InputError(
-            f"{path}: not a mesh that trimesh can read ({message}); expected .ply, .obj, .glb, .stl or .off"
-        ) from error
+        raise InputError(f"{path}: not a mesh that trimesh can read ({message})") from error
 
 
 def _lattices(mesh: Any, vertices: np.ndarray, voxel: float, path: str | Path) -> Iterator[tuple[np.ndarray, ...]]:
@@ -166,8 +153,7 @@ def _lattices(mesh: Any, vertices: np.ndarray, voxel: float, path: str | Path) -
     faces = np.asarray(mesh.faces, np.int64)
     if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
         raise InputError(
-            f"{path}: its triangles name vertices from {faces.min()} to {faces.max()}, and it has {len(vertices)}; "
-            "the file is damaged"
+            f"{path}: its triangles name vertices up to {faces.max()} of {len(vertices)}; the file is damaged"
         )
     corners = vertices[faces]
     # The longest edge becomes the first, so that slivers take few samples.
@@ -185,8 +171,7 @@ def _lattices(mesh: Any, vertices: np.ndarray, voxel: float, path: str | Path) -
     samples = float((columns + 1) @ (rows + 1))
     if samples > MAX_SAMPLES:
         raise InputError(
-            f"{path}: covering the mesh every {step:g} units takes {samples:.3g} samples; its unit is not the voxel's: "
-            "give a larger voxel, or the scene's metres_per_unit"
+            f"{path}: {samples:.3g} samples every {step:g} units; give a larger voxel, or the scene's metres_per_unit"
         )
     columns, rows = columns.astype(np.int64), rows.astype(np.int64)
     keep = np.flatnonzero(~flat)

@@ -13,20 +13,18 @@ SIZE = 0.6
 """In-plane standard deviation as a share of the spacing. Rendered against the photographs of RGB-D rooms 0.55 is
 sharpest by PSNR (0.5: −0.2 dB, 0.6: −0.2, 0.7: −1.0), but lets 1.3 % of the light through against 0.8 % at 0.6, and
 what passes takes its features to the surface behind."""
-THICKNESS = 0.1
-"""Standard deviation along the normal as a share of the in-plane one: about 1.2 mm at 2 cm."""
+THICKNESS = 0.1  # Standard deviation along the normal as a share of the in-plane one: about 1.2 mm at 2 cm
 OPACITY = 0.95
 """A measured surface is opaque; what lies behind it must not take its features. The last 5 % leave a later
 optimization a gradient, which a logit of 7 (0.999) would not."""
 NEIGHBORS = 12
-ENOUGH = 6
-"""So many neighbors of the same surface settle the spacing."""
+ENOUGH = 6  # Neighbors of the same surface that settle the spacing
 SAME_FACING_COS = 0.5
 OVER_ANY = 1.5
-"""… but it is at most so many times the spacing of all samples around, of whatever facing: two sheets make √2, and a
+"""… but it is at most this many times the spacing of all samples around, of whatever facing: two sheets make √2, and a
 scrap of surface with no like neighbor must not swell over the others."""
 STRETCH = 3.0
-"""A spacing may be so many times the median of the neighbors' own: a stray point must not become a great blob."""
+"""A spacing is at most this many times the median of the neighbors' own: a stray point must not become a great blob."""
 
 
 def flat_gaussians(
@@ -40,9 +38,6 @@ def flat_gaussians(
     """One Gaussian a point, flat along its normal, SH degree 0, opacity 0.95.
 
     Args:
-        points: distinct positions in world units.
-        normals: unit.
-        colors: RGB in [0, 1].
         largest: upper limit of the spacing, which also holds where there is no neighbor.
         thickness: standard deviation along the normal as a share of the in-plane one.
     """
@@ -58,9 +53,7 @@ def flat_gaussians(
 
 
 def surface_spacing(
-    points: Float32[np.ndarray, "n 3"],
-    normals: Float32[np.ndarray, "n 3"],
-    largest: float | Float32[np.ndarray, " n"],
+    points: Float32[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"], largest: float | Float32[np.ndarray, " n"]
 ) -> Float32[np.ndarray, " n"]:
     """Distance between samples of the same surface, √(area of a disc / samples in it), for each point.
 
@@ -117,8 +110,7 @@ def quats_from_normals(normals: Float32[np.ndarray, "n 3"]) -> Float32[np.ndarra
 
 LARGEST_ANGLE = 0.1
 """A point's spacing is at most this share of its distance to the nearest camera, so that strays near one stay small."""
-LARGEST_SPACING = 30.0
-"""… and at most this many times the median spacing of all points, where not told otherwise."""
+LARGEST_SPACING = 30.0  # … and at most this many times the median spacing of all points, by default
 PCA_CHUNK = 100_000
 
 
@@ -138,7 +130,7 @@ def seed_from_points(
 
     Args:
         points: positions in world units relative to the scene's origin.
-        colors: RGB beside them; None makes them mid-grey, with a warning.
+        colors: RGB; None makes them mid-grey, with a warning.
         views: cameras, which orient the normals and limit the size of strays.
         voxel: edge of the grid in world units; None keeps every distinct point.
         largest_spacing: upper limit of a point's spacing, in median spacings of all points.
@@ -189,9 +181,7 @@ def average_in_voxels(
             raise InputError(f"seeds: voxel must be a positive length, got {voxel}")
         scaled = np.floor(points.astype(np.float64) / voxel)
         if np.abs(scaled).max() > 2**62:
-            raise InputError(
-                f"seeds: a voxel of {voxel:g} is too small for points {np.abs(points).max():g} from the origin"
-            )
+            raise InputError(f"seeds: a voxel of {voxel:g} is too small for points up to {np.abs(points).max():g}")
         cells = scaled.astype(np.int64)
     _, inverse, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     inverse = inverse.reshape(-1)
@@ -208,9 +198,7 @@ def typical_spacing(points: Float32[np.ndarray, "n 3"]) -> float:
     return float(np.median(distances)) if distances.size else 1.0
 
 
-def sheet_normals(
-    points: Float32[np.ndarray, "n 3"],
-) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
+def sheet_normals(points: Float32[np.ndarray, "n 3"]) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, " n"]]:
     """Unit normals from the principal axes of each point's nearest neighbors, and how flat these lie.
 
     Flatness is the ratio of the standard deviations along the normal and along the middle axis: 0 = a sheet, 1 = a
@@ -232,8 +220,7 @@ def sheet_normals(
 
 
 SPACING_SAMPLE = 100_000
-NEIGHBOR = 4
-"""A point of a square grid has so many neighbors at one step."""
+NEIGHBOR = 4  # Neighbors of a point of a square grid at one step
 
 
 def scene_spacing(means: Float32[np.ndarray, "N 3"]) -> float:

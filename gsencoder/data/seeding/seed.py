@@ -3,17 +3,14 @@
 One flat Gaussian stands on each piece of surface in each voxel, as wide as its neighbors are apart, in the color
 that the photographs show. Such a splat renders well enough for features to be lifted onto it at once.
 
-A frame that turns and moves with a room, so that seeds on a grid in it do not depend on the world's axes.
-
-In most rooms surfaces face along three directions at right angles (a Manhattan world, Coughlan and Yuille 1999). The
-axes are those with the largest Σ (n · axis)⁴ over the normals n of depth images; other scenes have such axes too, which
-mean little there but turn with the scene.
+The grid turns and moves with the room: its axes are those with the largest Σ (n · axis)⁴ over the normals n of depth
+images, the walls' and the floor's in most rooms (a Manhattan world, Coughlan and Yuille 1999).
 """
 
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
 from typing import Literal
@@ -24,6 +21,7 @@ from jaxtyping import Float64
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Track, untracked
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.readers.layouts import file_of_scene
 from gsencoder.data.seeding.depth import depth_samples, read_rgbd, surface_pixels
 from gsencoder.data.seeding.mesh import mesh_bounds, seed_from_mesh, seed_from_tsdf
@@ -31,14 +29,11 @@ from gsencoder.data.seeding.points import flat_gaussians, seed_from_points, typi
 from gsencoder.types import Gaussians, Scene, Views
 from gsencoder.types.checks import invert_rigid, transform
 
-MAX_VIEWS = 12
-"""So many depth images are looked at, evenly spaced."""
+MAX_VIEWS = 12  # Depth images that are looked at, evenly spaced
 MAX_SIDE = 240
 """Longer side in pixels of these depth images; of larger ones every second, third … row and column is taken."""
-SAMPLES = 2000
-"""So many normals of each are used."""
-STARTS = 4
-"""The axes of so many cameras are where the search begins."""
+SAMPLES = 2000  # Normals of each that are used
+STARTS = 4  # Cameras whose axes the search begins at
 STEPS = 40
 
 
@@ -71,7 +66,7 @@ def _normals(views: Views) -> Float64[np.ndarray, "n 3"]:
         depth = views.depths[int(view)]
         step = -(-max(depth.shape) // MAX_SIDE)
         K = views.cameras.Ks[view] / np.array([[step], [step], [1]], np.float32)
-        # Depth that cannot be is refused by whoever reads all of it.
+        # Depth that cannot be is refused where all of it is read.
         with np.errstate(all="ignore"):
             pixels = surface_pixels(np.ascontiguousarray(depth[::step, ::step]), K)
         local = pixels.normals[pixels.use].astype(np.float64)
@@ -110,11 +105,9 @@ EXTENT_IN_VOXELS = 300
 """A mesh without a unit and without cameras: the diagonal of its box is taken to be this many voxels."""
 
 
-SAMPLED_VIEWS = 8
-"""So many depth images are read for that estimate."""
+SAMPLED_VIEWS = 8  # Depth images that are read for that estimate
 
-SMALLEST_VOXEL, LARGEST_VOXEL = 1e-12, 1e12
-"""In units of the scene."""
+SMALLEST_VOXEL, LARGEST_VOXEL = 1e-12, 1e12  # In units of the scene
 
 
 Source = Literal["depth", "points", "photographs", "mesh", "tsdf"]
@@ -124,38 +117,17 @@ Source = Literal["depth", "points", "photographs", "mesh", "tsdf"]
 class SeedConfig:
     """How Gaussians are made from what a scene holds."""
 
-    source: Literal["auto"] | Source = field(
-        default="auto",
-        metadata={
-            "help": "depth = RGB-D frames; points = structure-from-motion points; photographs = matched features and "
-            "plane sweeps; mesh = a file; tsdf = RGB-D frames fused to a mesh first; auto = depth if the views have "
-            "it, else points if the scene has them, else photographs"
-        },
+    source: Literal["auto"] | Source = option(
+        "auto",
+        "depth = RGB-D frames; points = structure-from-motion points; photographs = matched features and plane sweeps; "
+        "mesh = a file; tsdf = RGB-D frames fused to a mesh first; auto = depth if the views have it, else points if "
+        "the scene has them, else photographs",
     )
-    voxel: float = field(default=0.02, metadata={"help": "edge of the grid in metres"})
-    voxel_units: float | None = field(
-        default=None, metadata={"help": "edge of the grid in the scene's own units, where its unit is unknown"}
-    )
-    mesh: str = field(
-        default="",
-        metadata={"help": "the file of source=mesh, in world coordinates: in each scene's folder, else from here"},
-    )
-    min_cos: float = field(
-        default=0.1, metadata={"help": "surfaces seen at a slant beyond arccos(min_cos) are not taken from depth"}
-    )
-    max_depth: float | None = field(
-        default=None, metadata={"help": "depths beyond, in metres (scene units where unknown), are not used"}
-    )
+    voxel: float = option(0.02, "edge of the grid in metres", gt=0, lt=math.inf)
+    mesh: str = option("", "the file of source=mesh, in world coordinates: in each scene's folder, else from here")
 
     def __post_init__(self) -> None:
-        if self.source not in ("auto", "depth", "points", "photographs", "mesh", "tsdf"):
-            raise InputError(f"source: expected auto, depth, points, photographs, mesh or tsdf, got {self.source!r}")
-        for name in ("voxel", "voxel_units", "max_depth"):
-            value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise InputError(f"{name}: expected a positive length, got {value}")
-        if not 0 <= self.min_cos < 1:
-            raise InputError(f"min_cos: expected a number in [0, 1), got {self.min_cos}")
+        check_limits(self)
         if self.source == "mesh" and not self.mesh:
             raise InputError("source=mesh needs the mesh's file (mesh=PATH)")
 
@@ -171,8 +143,7 @@ def choose_source(scene: Scene, config: SeedConfig = SeedConfig()) -> Source:
     if scene.views is not None and scene.views.images is not None:
         return "photographs"
     raise InputError(
-        f"seeds: scene {scene.name!r} has neither photographs nor structure-from-motion points; "
-        "give a mesh (source=mesh mesh=PATH) or a splat"
+        f"seeds: scene {scene.name!r} has neither photographs nor points; give a mesh (seeds.mesh=) or a splat"
     )
 
 
@@ -209,39 +180,26 @@ def seed(scene: Scene, config: SeedConfig = SeedConfig(), *, track: Track = untr
 
         return seed_from_photographs(views, track=track)
     voxel = _voxel(scene, config, lambda: _depth_voxel(views), "one hundredth of the median depth")
-    unit = scene.metres_per_unit or 1.0
-    max_depth = None if config.max_depth is None else config.max_depth / unit
-    if source == "tsdf":
-        return seed_from_tsdf(views, voxel=voxel, max_depth=max_depth)
-    return seed_from_depth(views, voxel=voxel, min_cos=config.min_cos, max_depth=max_depth)
+    return seed_from_tsdf(views, voxel=voxel) if source == "tsdf" else seed_from_depth(views, voxel=voxel)
 
 
-def seed_from_depth(views: Views, *, voxel: float, min_cos: float = 0.1, max_depth: float | None = None) -> Gaussians:
+def seed_from_depth(views: Views, *, voxel: float) -> Gaussians:
     """Flat Gaussians on the surfaces that RGB-D frames show, one for each surface in each voxel.
 
     Frames are read one at a time. Depth is smoothed within its own noise; pixels that float between two surfaces are
-    dropped; samples are averaged by voxel, facing and layer, so that thin objects keep their
-    edges. The grid stands in a frame that turns and moves with the scene. The order of the views
-    changes no more than rounding, unless there are more than those a frame is taken from.
-
-    Args:
-        views: posed depth and images; masked pixels are not used.
-        voxel: edge of the grid, world units.
-        min_cos: surfaces seen at a slant beyond arccos(min_cos) are not taken.
-        max_depth: depths beyond are not used, world units; None = all.
+    dropped; samples are averaged by voxel (its edge in world units), facing and layer, so that thin objects keep their
+    edges. The grid stands in a frame that turns and moves with the scene. The order of the views changes no more than
+    rounding, unless there are more than those a frame is taken from.
     """
-    if not 0 < voxel < math.inf:
-        raise InputError(f"seeds: voxel must be a positive length, got {voxel}")
     frame = room_frame(views)
     world_from_frame = np.eye(4) if frame is None else invert_rigid(frame)
     if frame is not None:
         poses = views.cameras.cam_from_world.astype(np.float64) @ world_from_frame
         views = replace(views, cameras=replace(views.cameras, cam_from_world=poses.astype(np.float32)))
-    samples, empty = depth_samples(views, voxel=voxel, min_cos=min_cos, max_depth=max_depth)
+    samples, empty = depth_samples(views, voxel=voxel)
     if not len(samples.points):
         raise InputError(
-            f"seeds: none of the {len(views)} depth images shows a surface (0 means no depth); "
-            "check the depth files and their scale"
+            f"seeds: none of the {len(views)} depth images shows a surface; check the files and their scale"
         )
     if empty:
         warnings.warn(
@@ -257,28 +215,22 @@ def seed_from_depth(views: Views, *, voxel: float, min_cos: float = 0.1, max_dep
 
 
 def _voxel(scene: Scene, config: SeedConfig, estimate: Callable[[], float], how: str) -> float:
-    """The voxel in scene units."""
-    voxel = _voxel_in_units(scene, config, estimate, how)
+    """The voxel in scene units; InputError where float32 cannot count in it, which tells of a wrong unit."""
+    if scene.metres_per_unit is not None:
+        voxel = config.voxel / scene.metres_per_unit
+    else:
+        voxel = estimate()
+        warnings.warn(
+            f"seeds: the unit of scene {scene.name!r} is unknown, so the voxel is {voxel:.4g} of its units, {how}; "
+            "give data.metres_per_unit= to choose",
+            SceneWarning,
+            stacklevel=3,
+        )
     if not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
         raise InputError(
             f"seeds: a voxel of {voxel:g} units of scene {scene.name!r} is outside {SMALLEST_VOXEL:g} to "
-            f"{LARGEST_VOXEL:g}; check voxel, voxel_units and metres_per_unit"
+            f"{LARGEST_VOXEL:g}; check voxel and metres_per_unit"
         )
-    return voxel
-
-
-def _voxel_in_units(scene: Scene, config: SeedConfig, estimate: Callable[[], float], how: str) -> float:
-    if config.voxel_units is not None:
-        return config.voxel_units
-    if scene.metres_per_unit is not None:
-        return config.voxel / scene.metres_per_unit
-    voxel = estimate()
-    warnings.warn(
-        f"seeds: the unit of scene {scene.name!r} is unknown, so the voxel is {voxel:.4g} of its units, {how}; "
-        "give metres_per_unit= or voxel_units= to choose",
-        SceneWarning,
-        stacklevel=4,
-    )
     return voxel
 
 
@@ -289,9 +241,7 @@ def _depth_voxel(views: Views) -> float:
     depths = [depth[depth > 0] for depth in (read_rgbd(views, int(view))[0] for view in some)]
     values = np.concatenate(depths)
     if not values.size:
-        raise InputError(
-            f"seeds: {len(some)} of {len(views)} depth images were looked at, and none has a depth above 0"
-        )
+        raise InputError(f"seeds: none of {len(some)} depth images that were looked at has a depth above 0")
     return float(np.median(values)) / TYPICAL_DEPTH_IN_VOXELS
 
 

@@ -17,39 +17,28 @@ from gsencoder.geometry import invert_rigid, project_points, transform, unprojec
 from gsencoder.types import Cameras
 from gsencoder.types.scene import pixel_centers
 
-WINDOW = 5
-"""Side of the windows that are compared, in pixels of the small pictures."""
-PLANE_STEP = 0.7
-"""Neighboring planes move a pixel by so many pixels in the view where it moves most."""
+WINDOW = 5  # Side of the windows that are compared, in pixels of the small pictures
+PLANE_STEP = 0.7  # Neighboring planes move a pixel by this many pixels in the view where it moves most
 MAX_PLANES = 128
-SMALLEST_DEPTH = 1e-6
-"""Points nearer to a camera, or behind it, are in no picture, world units."""
-MIN_CONTRAST = 0.01
-"""Windows whose colors deviate less (of 1) say nothing."""
-DEPTH_TOLERANCE = 0.02
-"""Largest relative difference of two depths of one surface."""
+SMALLEST_DEPTH = 1e-6  # Points nearer to a camera, or behind it, are in no picture, world units
+MIN_CONTRAST = 0.01  # Windows whose colors deviate less (of 1) say nothing
+DEPTH_TOLERANCE = 0.02  # Largest relative difference of two depths of one surface
 BEST_ANGLE = np.deg2rad(8.0)
 """Views whose rays meet at about this angle are compared: further ones look different, nearer ones measure little."""
 
 
 class DepthMap(NamedTuple):
-    """Depths of one view at the size of its small picture.
+    """Depths of one view at the size of its small picture."""
 
-    Attributes:
-        depth: z in world units; 0 = not found.
-        score: mean zero-mean normalized cross-correlation with the two most alike views, −1 to 1.
-        step: relative distance of neighboring planes at each pixel's depth.
-    """
-
-    depth: Float[Tensor, "h w"]
-    score: Float[Tensor, "h w"]
-    step: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]  # z in world units; 0 = not found
+    score: Float[Tensor, "h w"]  # mean zero-mean normalized cross-correlation with the two most alike views, −1 to 1
+    step: Float[Tensor, "h w"]  # relative distance of neighboring planes at each pixel's depth
 
 
 def source_views(
     cameras: Cameras, points: Float32[np.ndarray, "P 3"], rows: Sequence[int], count: int
 ) -> dict[int, list[int]]:
-    """For each of the chosen views the others to compare it with: those that share many points at a good angle.
+    """For each of the chosen views the others to compare it with: views that share many points at a good angle.
 
     A shared point counts exp(−(ln(angle / BEST_ANGLE))²), so that both half and twice the best angle count a little
     over a half.
@@ -124,10 +113,7 @@ def sweep(
     """Depths of a view by comparing it with others.
 
     Args:
-        pose: its cam_from_world.
         sources: views to compare with, at least two, so that occluded pixels are recognized.
-        source_poses: their cam_from_world.
-        near: smallest depth, world units.
         max_planes: largest number of planes; a wide range of depths needs more.
     """
     rays = _points_at(torch.ones(reference.height, reference.width), reference)
@@ -251,7 +237,6 @@ def count_agreeing(
 
     Args:
         depth: of the view, 0 = unknown.
-        pose: its cam_from_world.
     """
     points = world_points(depth, photo, pose).reshape(-1, 3)
     votes = torch.zeros(len(points), dtype=torch.int64)

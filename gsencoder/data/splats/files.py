@@ -1,6 +1,6 @@
 """Splat files of all formats: `load_splat` and `save_splat`, and `read_raw` for inspection and repair.
 
-The format is told by the first bytes, and by the suffix where a format has no magic (.splat):
+The format is known by the first bytes, and by the suffix where a format has no magic (.splat):
 
     INRIA .ply           read, write   SH 0–3; any property order, number type and byte order on reading
     compressed .ply      read, write   PlayCanvas; chunks of 256
@@ -46,8 +46,7 @@ from gsencoder.types import Gaussians
 __all__ = ["RawSplat", "fingerprint", "gaussians_from_raw", "load_property", "load_splat", "read_raw", "save_splat"]
 
 READABLE = ".ply, .compressed.ply, .spz, .splat, .sog or a SOG folder"
-HEADER_BYTES = 1 << 16
-"""The names of a splat's properties stand in these first bytes of a .ply."""
+HEADER_BYTES = 1 << 16  # The names of a splat's properties stand in these first bytes of a .ply
 WRITABLE = ".ply, .compressed.ply or .spz"
 _WHY = {
     "nonfinite": "with NaN or Inf",
@@ -61,7 +60,7 @@ def load_splat(path: str | Path, *, origin: Float64[np.ndarray, "3"] | None = No
     """Reads a splat file of any known format.
 
     Args:
-        path: a file, or a SOG folder. Told by content first, suffix second.
+        path: a file, or a SOG folder. Known by content first, suffix second.
         origin: world coordinates of the scene's origin. It is subtracted in float64 before positions become float32,
             so a .ply with double columns keeps its precision far from zero. Where a file has float32 columns, what
             they rounded away is lost (0.06 at 10⁶), and no origin brings it back.
@@ -90,9 +89,7 @@ def gaussians_from_raw(
     bad = {name: int(rows.sum()) for name, rows in unusable_rows(raw).items()}
     if any(bad.values()):
         counts = ", ".join(f"{count:,} {_WHY[name]}" for name, count in bad.items() if count)
-        raise InputError(
-            f"{where}: of {len(raw):,} rows {counts}; look with 'gsencoder inspect', mend with 'gsencoder repair'"
-        )
+        raise InputError(f"{where}: of {len(raw):,} rows {counts}; mend with 'gsencoder repair'")
     shift = _checked_origin(origin)
     means64 = raw.means - shift if shift.any() else raw.means
     means = means64.astype(np.float32)
@@ -182,7 +179,7 @@ def _read_file(path: Path, size: int) -> RawSplat:
 
 
 def load_property(path: str | Path, name: str) -> Float64[np.ndarray, " N"]:
-    """One value for each Gaussian that a .ply holds beside those of a splat (see `further` of `save_splat`)."""
+    """One value for each Gaussian that a .ply holds besides those of a splat (see `further` of `save_splat`)."""
     path = Path(path)
     try:
         with open_foreign(path) as stream:

@@ -1,19 +1,13 @@
 """Packed splats: Niantic's .spz and PlayCanvas' .sog.
 
-Niantic's .spz: 8-bit attributes and 24-bit fixed-point positions, in gzip (versions 2, 3) or zstd streams (4).
+.spz has 8-bit attributes and 24-bit fixed-point positions, in gzip (versions 2, 3) or zstd streams (4): a 32-byte
+header in the clear, a table of compressed and unpacked sizes, one zstd frame an attribute. Sections lie in the order
+positions, alphas, colors, scales, rotations, SH. By convention y points up and z backwards; numbers are read and
+written as they stand, as gsply and open3d do. Reference: nianticlabs/spz.
 
-Version 4 is not gzip: a 32-byte header in the clear, a table of compressed and unpacked sizes, one zstd frame an
-attribute. Sections lie in the order positions, alphas, colors, scales, rotations, SH in all versions.
-
-The format's convention is that y points up and z backwards. Numbers are read and written as they stand, as gsply and
-open3d do; a tool that turns the axes on export has to be turned back by the caller.
-
-Reference: nianticlabs/spz.
-
-PlayCanvas' SOG version 2: a meta.json with WebP images, in a folder or in a .sog zip.
-
-Reference: https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog. Read only. gsply reads it too,
-but unpacks zips and images of any size and indexes codebooks without a check.
+SOG version 2 is a meta.json with WebP images, in a folder or in a .sog zip; read only. gsply reads it too, but unpacks
+zips and images of any size and indexes codebooks without a check. Reference:
+https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog.
 """
 
 import io
@@ -65,9 +59,7 @@ def read_spz(path: Path, stream: BinaryIO, size: int) -> RawSplat:
     sizes = [section for section in sizes if section]
     offset = table + 16 * len(sizes)
     if streams != len(sizes) or table < 32 or offset > size:
-        raise InputError(
-            f"{path}: expected {len(sizes)} streams listed within the file, got {streams} at byte {table:,}"
-        )
+        raise InputError(f"{path}: expected {len(sizes)} streams within the file, got {streams} at byte {table:,}")
     # Imported where it is used.
     import imagecodecs
 
@@ -107,8 +99,7 @@ def _read_gzip(path: Path, data: bytes) -> RawSplat:
         raise InputError(f"{path}: the gzip data is damaged: {error}") from error
     if len(body) < sum(sizes) or not (unpack.eof or tail):
         raise InputError(
-            f"{path}: {count:,} Gaussians need {sum(sizes):,} bytes, the file unpacks to {len(body):,} and ends early; "
-            "it is truncated"
+            f"{path}: {count:,} Gaussians need {sum(sizes):,} bytes, it unpacks to {len(body):,}: truncated"
         )
     if flags & _EXTENSIONS:
         _warn_extensions(path, None)
@@ -244,8 +235,7 @@ _PALETTE_COLUMNS = 64
 _KEYS = ("version", "asset", "count", "means", "scales", "quats", "sh0", "shN")
 _QUAT_TAG = 252
 
-Load = Callable[[str, int], bytes]
-"""A file of the set by its name; longer than the limit is an error."""
+Load = Callable[[str, int], bytes]  # A file of the set by its name; longer than the limit is an error
 
 
 def read_sog_folder(path: Path) -> RawSplat:
@@ -303,9 +293,7 @@ def _read(path: Path, load: Load, size: int) -> RawSplat:
         raise InputError(f"{path}: meta.json is not JSON: {str(error)[:120]}") from error
     if not isinstance(meta, dict) or meta.get("version") != 2:
         version = meta.get("version", 1) if isinstance(meta, dict) else "none"
-        raise InputError(
-            f"{path}: meta.json has version {str(version)[:20]}; expected SOG version 2 (splat-transform converts)"
-        )
+        raise InputError(f"{path}: meta.json has version {str(version)[:20]}; expected SOG version 2")
     count = meta.get("count")
     if not isinstance(count, int) or isinstance(count, bool) or count < 0:
         raise InputError(f"{path}: meta.json has count {str(count)[:20]!r}; expected a number of Gaussians")
@@ -316,16 +304,14 @@ def _read(path: Path, load: Load, size: int) -> RawSplat:
         files = _field(path, meta, section, "files")
         name = files[index] if isinstance(files, list) and index < len(files) else None
         if not isinstance(name, str) or not name or Path(name).name != name or "\\" in name or ":" in name:
-            raise InputError(
-                f"{path}: meta.json names {str(name)[:60]!r} for {section}; expected a file name without a folder"
-            )
+            raise InputError(f"{path}: meta.json names {str(name)[:60]!r} for {section}; expected a file name")
         count_wanted = rows or count
         # Pixels beyond the count are padding to whole rows; a lossless WebP is no larger than its pixels.
         allowed = 2 * count_wanted + (1 << 16)
         image = _decode_webp(path, name, load(name, 5 * allowed), allowed)
         if image.shape[0] * image.shape[1] < count_wanted or (width is not None and image.shape[1] != width):
             raise InputError(
-                f"{path}: {name} has {image.shape[1]}×{image.shape[0]} pixels, too few for {count_wanted:,} entries"
+                f"{path}: {name} has {image.shape[1]}×{image.shape[0]} pixels, too few for {count_wanted:,}"
             )
         return image.reshape(-1, 4)[:count_wanted]
 
@@ -357,15 +343,13 @@ def _read(path: Path, load: Load, size: int) -> RawSplat:
 def _harmonics(path: Path, meta: dict[str, Any], texels: Callable[..., np.ndarray]) -> Float32[np.ndarray, "N k 3"]:
     bands, entries = _field(path, meta, "shN", "bands"), _field(path, meta, "shN", "count")
     if type(bands) is not int or type(entries) is not int or not 1 <= bands <= 3 or not 1 <= entries <= 1 << 16:
-        raise InputError(
-            f"{path}: meta.json has shN.bands {str(bands)[:9]}, shN.count {str(entries)[:9]}; expected 1–3, 1–65536"
-        )
+        raise InputError(f"{path}: shN.bands {str(bands)[:9]}, shN.count {str(entries)[:9]}; expected 1–3, 1–65536")
     k = (bands + 1) ** 2 - 1
     labels = texels("shN", 1)[:, :2].astype(np.int64) @ np.array([1, 256])
     beyond = int((labels >= entries).sum())
     if beyond:
         raise InputError(
-            f"{path}: {beyond:,} Gaussians point beyond the {entries:,} entries of the SH palette; it is damaged"
+            f"{path}: {beyond:,} Gaussians point beyond the {entries:,} entries of the SH palette; damaged"
         )
     rows = -(-entries // _PALETTE_COLUMNS) * _PALETTE_COLUMNS * k
     palette = _look_up(path, meta, "shN", texels("shN", 0, _PALETTE_COLUMNS * k, rows)[:, :3])
@@ -382,9 +366,7 @@ def _field(path: Path, meta: dict[str, Any], section: str, name: str) -> Any:
 def _numbers(path: Path, meta: dict[str, Any], section: str, name: str, length: int) -> np.ndarray:
     values = _field(path, meta, section, name)
     if not isinstance(values, list) or len(values) > 256 or (length and len(values) != length):
-        raise InputError(
-            f"{path}: meta.json has an unusable list {section}.{name}; expected {length or 'up to 256'} numbers"
-        )
+        raise InputError(f"{path}: meta.json: expected {length or 'up to 256'} numbers as {section}.{name}")
     if not all(value is None or type(value) in (int, float) for value in values):
         raise InputError(f"{path}: meta.json has something else than numbers in {section}.{name}")
     try:
@@ -399,9 +381,7 @@ def _look_up(
 ) -> Float32[np.ndarray, "n 3"]:
     book = _numbers(path, meta, section, "codebook", 0)
     if codes.size and int(codes.max()) >= len(book):
-        raise InputError(
-            f"{path}: {section} uses entry {codes.max()} of a codebook with {len(book)}; the file is damaged"
-        )
+        raise InputError(f"{path}: {section} uses entry {codes.max()} of a codebook with {len(book)}; damaged")
     with np.errstate(over="ignore"):
         return book.astype(np.float32)[codes]
 
@@ -417,9 +397,7 @@ def _decode_webp(path: Path, name: str, data: bytes, allowed: int) -> UInt8[np.n
     else:
         raise InputError(f"{path}: {name} is not a lossless WebP image")
     if width * height > allowed:
-        raise InputError(
-            f"{path}: {name} claims {width}×{height} pixels, more than the {allowed:,} that the count allows"
-        )
+        raise InputError(f"{path}: {name} claims {width}×{height} pixels, more than the {allowed:,} of the count")
     # Few scenes need it, and it is slow to import.
     import imagecodecs
 

@@ -1,13 +1,9 @@
-"""Splats in .ply files, INRIA's layout and PlayCanvas' compressed one, and in .splat files.
+"""Splats in .ply files and in .splat files.
 
-PLY headers, and the INRIA layout of Gaussians in them (the files that most trainers write).
-
-Reference: Kerbl et al., 3D Gaussian Splatting for Real-Time Radiance Field Rendering, 2023 (the layout is its code's).
-
-PlayCanvas' compressed .ply: chunks of 256 Gaussians with their bounds, 16 bytes a Gaussian, SH in bytes.
-
-Reference: the PLAYCANVAS splat-transform and SuperSplat tools. Writing is gsply's; reading is here, because gsply's
-kernels do not check what a damaged file makes them index, and hold opacities to a logit of ±10.
+INRIA's layout, which most trainers write, is that of the code of Kerbl et al., 3D Gaussian Splatting, 2023. PlayCanvas'
+compressed .ply (splat-transform, SuperSplat) has chunks of 256 Gaussians with their bounds, 16 bytes a Gaussian, SH in
+bytes. Writing it is gsply's; reading is here, because gsply's kernels do not check what a damaged file makes them
+index, and hold opacities to a logit of ±10.
 """
 
 import re
@@ -82,9 +78,7 @@ def read_header(path: Path, stream: BinaryIO) -> PlyHeader:
     head = stream.read(MAX_HEADER)
     end = re.search(rb"\nend_header[ \t]*\r?\n", head)
     if end is None:
-        raise InputError(
-            f"{path}: no 'end_header' line in the first {len(head):,} bytes; the .ply is truncated or damaged"
-        )
+        raise InputError(f"{path}: no 'end_header' line in the first {len(head):,} bytes; truncated or damaged")
     lines = head[: end.start()].decode("ascii", errors="replace").splitlines()
     encoding, order = "", "<"
     elements: list[tuple[str, int, list[tuple[str, str]], str]] = []
@@ -135,8 +129,7 @@ def element_start(path: Path, header: PlyHeader, name: str, size: int) -> int:
     for element in header.elements:
         if element.dtype is None:
             raise InputError(
-                f"{path}: element {element.name!r} has the list property {element.first_bad!r} before or in {name!r}; "
-                "expected a splat with plain numbers (a mesh .ply is not a splat)"
+                f"{path}: {element.name!r} has the list property {element.first_bad!r}; expected a splat, not a mesh"
             )
         end = offset + element.count * element.dtype.itemsize
         if element.name == name:
@@ -161,15 +154,11 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
     if missing == ["scale_2"]:
         raise InputError(f"{path}: has scale_0 and scale_1 only, a 2D splat (surfels); expected three scales")
     if missing:
-        raise InputError(
-            f"{path}: the .ply lacks {', '.join(missing)}; expected a Gaussian splat, not a point cloud or mesh"
-        )
+        raise InputError(f"{path}: the .ply lacks {', '.join(missing)}; expected a Gaussian splat")
     colors = {name for name in names if re.fullmatch(r"f_rest_\d+", name)}
     rest = len(colors)
     if rest not in (0, 9, 24, 45, 72) or any(f"f_rest_{i}" not in names for i in range(rest)):
-        raise InputError(
-            f"{path}: has {rest} f_rest properties; expected f_rest_0 … with 0, 9, 24 or 45 of them (SH 0 to 3)"
-        )
+        raise InputError(f"{path}: has {rest} f_rest properties; expected 0, 9, 24 or 45 (SH 0 to 3)")
     per_channel = rest // 3
     coefficients = min(per_channel + 1, SH_COEFFICIENTS[-1])
     if coefficients < per_channel + 1:
@@ -241,8 +230,8 @@ def _filtered(
 
 
 def read_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
-    """Positions of the element `vertex` of a point cloud, and its colors if it has red, green and blue; those that are
-    no integers are taken for shares of 1."""
+    """Positions of the element `vertex` of a point cloud, and its colors if it has red, green and blue; others than
+    integers are taken for shares of 1."""
     with readable(path), open_foreign(path) as stream:
         if stream.read(4)[:3] != b"ply":
             raise InputError(f"{path}: not a .ply file; expected a point cloud")
@@ -289,8 +278,7 @@ def _ascii_rows(path: Path, stream: BinaryIO, header: PlyHeader, vertex: PlyElem
     # A row has at least one digit and one separator a value.
     if skipped + vertex.count * len(names) * 2 > size - header.start + 1:
         raise InputError(
-            f"{path}: the header claims {vertex.count:,} rows of {len(names)} numbers, more than {size:,} bytes hold; "
-            "it is truncated or its header is wrong"
+            f"{path}: the header claims {vertex.count:,} rows, more than {size:,} bytes hold; truncated or wrong"
         )
     stream.seek(header.start)
     lines = islice(stream, skipped, skipped + vertex.count)
@@ -304,9 +292,7 @@ def _ascii_rows(path: Path, stream: BinaryIO, header: PlyHeader, vertex: PlyElem
         raise InputError(f"{path}: a row of the ascii .ply cannot be read: {str(error)[:120]}") from error
     if table.shape != (vertex.count, len(names)):
         actual = f"{table.shape[0]:,} rows of {table.shape[1]} numbers"
-        raise InputError(
-            f"{path}: expected {vertex.count:,} rows of {len(names)} numbers, got {actual}; the file is truncated"
-        )
+        raise InputError(f"{path}: expected {vertex.count:,} rows of {len(names)} numbers, got {actual}: truncated")
     # Columns get names again; numbers stay float64, so that text with many digits keeps them.
     return table.view(np.dtype([(name, np.float64) for name in names])).reshape(-1)
 
@@ -388,9 +374,7 @@ def read_compressed(path: Path, stream: BinaryIO, header: PlyHeader, size: int) 
     if missing or any(vertex.dtype[name].kind != "u" or vertex.dtype[name].itemsize != 4 for name in _PACKED):
         raise InputError(f"{path}: the packed .ply lacks {', '.join(missing) or 'uint columns'} in its header")
     if chunk.count * _CHUNK < count:
-        raise InputError(
-            f"{path}: {chunk.count:,} chunks hold {chunk.count * _CHUNK:,} Gaussians at most, header claims {count:,}"
-        )
+        raise InputError(f"{path}: {chunk.count:,} chunks of {_CHUNK} are too few for {count:,} Gaussians")
     coefficients = 0
     if rest is not None:
         assert rest.dtype is not None
@@ -401,9 +385,7 @@ def read_compressed(path: Path, stream: BinaryIO, header: PlyHeader, size: int) 
             or set(names) != {f"f_rest_{i}" for i in range(len(names))}
             or rest.count != count
         ):
-            raise InputError(
-                f"{path}: element 'sh' has {rest.count:,} rows of {len(names)}; expected {count:,} of 9, 24 or 45"
-            )
+            raise InputError(f"{path}: 'sh' has {rest.count:,} rows of {len(names)}; expected {count:,} of 9, 24 or 45")
 
     stream.seek(starts["chunk"])
     bounds = np.fromfile(stream, chunk.dtype, chunk.count)
@@ -481,9 +463,7 @@ _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), (
 def read_dotsplat(path: Path, stream: BinaryIO, size: int) -> RawSplat:
     """Colors are SH degree 0; scales are stored as standard deviations; quaternion bytes are 128 + 128·q."""
     if size % _ROW.itemsize:
-        raise InputError(
-            f"{path}: {size:,} bytes is not a whole number of {_ROW.itemsize}-byte rows; the .splat is truncated"
-        )
+        raise InputError(f"{path}: {size:,} bytes is not a whole number of {_ROW.itemsize}-byte rows; truncated")
     rows = np.fromfile(stream, _ROW)
     rgba = rows["rgba"].astype(np.float64) / 255
     return RawSplat(

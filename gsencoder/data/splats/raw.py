@@ -13,22 +13,17 @@ from jaxtyping import Bool, Float, Float32, Float64, Integer
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 
-LOGIT_LIMIT = 20.0
-"""Opacities 0 and 1 are written as this logit: 2e-9 away from the true value, and finite."""
+LOGIT_LIMIT = 20.0  # Opacities 0 and 1 are written as this logit: 2e-9 away from the true value, and finite
 
-MAX_EXPANSION = 200
-"""A packed file may unpack to this many times its size …"""
+MAX_EXPANSION = 200  # A packed file may unpack to this many times its size …
 
-ALWAYS_ALLOWED = 16 << 20
-"""… or to this many bytes, whichever is more."""
+ALWAYS_ALLOWED = 16 << 20  # … or to this many bytes, whichever is more
 
 SH_COEFFICIENTS = (1, 4, 9, 16)
 
-ENOUGH = 100
-"""Fewer Gaussians say nothing about how their values were stored."""
+ENOUGH = 100  # Fewer Gaussians say nothing about how their values were stored
 
-SAMPLE = 4096
-"""Gaussians whose neighbors and coordinates are looked at."""
+SAMPLE = 4096  # Gaussians whose neighbors and coordinates are looked at
 
 OVERLAP = 3.0
 """Scales are 0.4 to 0.8 times the distance to the nearest neighbor in real splats (median of both), and up to 1.5 where
@@ -41,25 +36,16 @@ that leave no gaps have about two in a step."""
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RawSplat:
-    """One splat as its file stores it; nothing is checked but the structure.
+    """One splat as its file stores it; nothing is checked but the structure."""
 
-    Attributes:
-        means: centers in the file's own coordinates.
-        quats: wxyz, of any length (INRIA files are not normalized).
-        log_scales: natural logarithms of the standard deviations; −inf where the file says 0 or less.
-        logit_opacities: logits; formats that store 0 … 255 give ±20 at the two ends.
-        sh: color coefficients, degree-major, K = 1, 4, 9 or 16.
-        format: the file format in words.
-        unused: properties and other parts of the file that were not read, in words.
-    """
-
-    means: Float64[np.ndarray, "N 3"]
-    quats: Float32[np.ndarray, "N 4"]
+    means: Float64[np.ndarray, "N 3"]  # centers in the file's own coordinates
+    quats: Float32[np.ndarray, "N 4"]  # wxyz, of any length (INRIA files are not normalized)
+    # Natural logarithms of the standard deviations; −inf where the file says 0 or less.
     log_scales: Float32[np.ndarray, "N 3"]
-    logit_opacities: Float32[np.ndarray, " N"]
-    sh: Float32[np.ndarray, "N K 3"]
-    format: str
-    unused: tuple[str, ...] = ()
+    logit_opacities: Float32[np.ndarray, " N"]  # logits; formats that store 0 … 255 give ±20 at the two ends
+    sh: Float32[np.ndarray, "N K 3"]  # color coefficients, degree-major, K = 1, 4, 9 or 16
+    format: str  # the file format in words
+    unused: tuple[str, ...] = ()  # properties and other parts of the file that were not read, in words
 
     def __len__(self) -> int:
         return len(self.means)
@@ -201,7 +187,7 @@ def odd_values(raw: RawSplat) -> list[str]:
 
 
 def _step(values: Float64[np.ndarray, " n"], scale: float) -> float:
-    """The step of coordinates that is coarse beside a scale; 0 where there is none."""
+    """The step of coordinates that is coarse for a scale; 0 where there is none."""
     step = float(np.spacing(np.float32(np.median(np.abs(values)))))
     if step > COARSE * scale and (values == values.astype(np.float32)).all():
         return step
@@ -219,6 +205,5 @@ def check_expansion(path: Path, unpacked: int, size: int) -> None:
     allowed = max(MAX_EXPANSION * size, ALWAYS_ALLOWED)
     if unpacked > allowed:
         raise InputError(
-            f"{path}: claims to unpack to {unpacked:,} bytes from {size:,}, more than {MAX_EXPANSION} times its size; "
-            "the file is damaged or made to exhaust memory"
+            f"{path}: claims to unpack to {unpacked:,} bytes from {size:,}; damaged or made to exhaust memory"
         )

@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt64
+from jaxtyping import Bool, Float32, Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.raw import (
@@ -57,33 +57,22 @@ class Defect:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SplatReport:
-    """What `inspect_splat` found. Statistics are over rows whose values are finite; lengths in the file's units.
+    """What `inspect_splat` found. Statistics are over rows whose values are finite; lengths in the file's units."""
 
-    Attributes:
-        count: Gaussians in the file.
-        format: the file format in words.
-        sh_degree: 0 to 3.
-        extent_min, extent_max: bounding box of the means; None where no row is finite.
-        robust_min, robust_max: the box between the 1st and 99th percentile of each axis.
-        median_scale: median over all axes of all Gaussians, None where there is none or it is infinite.
-        opacity_quantiles: opacity by quantile, "0.0" to "1.0".
-        unused: parts of the file that were not read.
-        defects: every kind that occurs, in the order of `OF_ROWS`.
-        findings: of `odd_values`.
-    """
-
-    count: int
-    format: str
-    sh_degree: int
+    count: int  # Gaussians in the file
+    format: str  # the file format in words
+    sh_degree: int  # 0 to 3
+    # Bounding box of the means; None where no row is finite.
     extent_min: tuple[float, ...] | None
     extent_max: tuple[float, ...] | None
+    # The box between the 1st and 99th percentile of each axis.
     robust_min: tuple[float, ...] | None
     robust_max: tuple[float, ...] | None
-    median_scale: float | None
-    opacity_quantiles: dict[str, float]
-    defects: tuple[Defect, ...]
-    unused: tuple[str, ...] = ()
-    findings: tuple[str, ...] = ()
+    median_scale: float | None  # median over all axes of all Gaussians, None where there is none or it is infinite
+    opacity_quantiles: dict[str, float]  # opacity by quantile, "0.0" to "1.0"
+    defects: tuple[Defect, ...]  # every kind that occurs, in the order of `OF_ROWS`
+    unused: tuple[str, ...] = ()  # parts of the file that were not read
+    findings: tuple[str, ...] = ()  # of `odd_values`
 
     @property
     def loadable(self) -> bool:
@@ -239,44 +228,24 @@ def _floaters(means: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
 
 
 def _duplicates(raw: RawSplat) -> Bool[np.ndarray, " N"]:
-    """Rows equal to an earlier one, bit for bit. Equal hashes are compared, so a collision is not a duplicate."""
+    """Rows equal to an earlier one, bit for bit."""
     arrays = [
         raw.means,
         raw.quats,
         raw.log_scales,
         raw.logit_opacities[:, None],
-        raw.sh.reshape(len(raw), raw.sh.shape[1] * 3),
+        raw.sh.reshape(len(raw), 3 * raw.sh.shape[1]),
     ]
     defective = np.zeros(len(raw), bool)
-    # Equal rows have equal means: only those few need their other columns hashed.
-    rows = _repeated(_hash(arrays[:1]))
-    if rows.size == 0:
-        return defective
-    arrays = [array[rows] for array in arrays]
-    hashes = _hash(arrays)
-    order = np.argsort(hashes, kind="stable")
-    starts = np.flatnonzero(np.r_[True, hashes[order][1:] != hashes[order][:-1]])
-    first = np.repeat(order[starts], np.diff(np.r_[starts, order.size]))
-    equal = order != first
-    for array in arrays:
-        bits = np.ascontiguousarray(array).view(np.uint32)
-        equal &= (bits[order] == bits[first]).all(axis=1)
-    defective[rows[order[equal]]] = True
+    # Equal rows have equal means: only those few need their other columns compared.
+    _, group, counts = np.unique(_row_bytes(arrays[:1]), return_inverse=True, return_counts=True)
+    rows = np.flatnonzero(counts[group] > 1)
+    _, first = np.unique(_row_bytes([array[rows] for array in arrays]), return_index=True)
+    defective[np.delete(rows, first)] = True
     return defective
 
 
-def _hash(arrays: Sequence[np.ndarray]) -> UInt64[np.ndarray, " N"]:
-    """A multiplicative hash of the bits of each row."""
-    total = np.zeros(len(arrays[0]), np.uint64)
-    for array in arrays:
-        for column in np.ascontiguousarray(array).view(np.uint32).T:
-            total = (total ^ column) * np.uint64(0x9E3779B97F4A7C15)
-            total ^= total >> np.uint64(29)
-    return total
-
-
-def _repeated(hashes: UInt64[np.ndarray, " N"]) -> np.ndarray:
-    """Rows whose hash occurs more than once."""
-    order = np.sort(hashes)
-    twice = order[1:][order[1:] == order[:-1]]
-    return np.flatnonzero(np.isin(hashes, twice)) if twice.size else np.zeros(0, np.int64)
+def _row_bytes(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """The bytes of each row as one value."""
+    table = np.concatenate([np.ascontiguousarray(array).view(np.uint32) for array in arrays], axis=1)
+    return np.ascontiguousarray(table).view(f"V{4 * table.shape[1]}").reshape(-1)

@@ -14,8 +14,7 @@ from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
-from gsencoder.data.check.findings import Finding
-from gsencoder.data.check.repair_scene import repair_posed
+from gsencoder.data.check.findings import Finding, repair_posed
 from gsencoder.data.readers.transforms_json import read_transforms, transforms_of
 from gsencoder.data.readers.undistort import CameraModel
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
@@ -123,7 +122,7 @@ def test_inspect_shows_what_a_scene_holds_and_draws_its_check(
     record = json.loads((out / "summary.json").read_text())["results"]["scenes"][0]
     assert record["layout"] == "transforms.json"
     assert record["depth"]["views"] == VIEWS
-    assert record["up"] == {"direction": [0, 0, 1], "source": "stated", "confidence": 1.0}
+    assert record["up"] == {"direction": [0, 0, 1], "source": "files", "confidence": 1.0}
     assert record["findings"] == []
     assert record["check"]["depth"]["share"] > 0.95
     with Image.open(out / record["picture"]) as picture:

@@ -29,12 +29,12 @@ NAMES = tuple(f"{view}.png" for view in range(6))
 
 
 @pytest.fixture(scope="module")
-def cameras() -> Cameras:
+def cameras():
     return box_cameras(6, width=320, height=240, focal=200.0)
 
 
 @pytest.fixture(scope="module")
-def matches(cameras: Cameras) -> list[PairMatches]:
+def matches(cameras):
     """Points in the middle, seen by every view."""
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (60, 3)) + cameras.centers.mean(axis=0)
     pixels = cameras.project(points)[0].astype(np.float64)
@@ -45,7 +45,7 @@ def matches(cameras: Cameras) -> list[PairMatches]:
     ]
 
 
-def test_views_without_a_pair_that_fits_are_named_as_unmatched(cameras: Cameras, matches: list[PairMatches]) -> None:
+def test_views_without_a_pair_that_fits_are_named_as_unmatched(cameras, matches):
     alone = [pair for pair in matches if 5 not in (pair.first, pair.second)]
     check = judge_matches(alone, cameras, cameras, np.arange(6), NAMES)
     assert check.decided
@@ -99,9 +99,7 @@ def judged(cameras: Cameras, matches: list[PairMatches]) -> tuple[list[tuple[str
     return [(finding.cause, finding.view) for finding in check.findings], check.decided
 
 
-def test_matches_of_one_point_lie_on_their_lines_and_errors_are_clipped(
-    cameras: Cameras, matches: list[PairMatches]
-) -> None:
+def test_matches_of_one_point_lie_on_their_lines_and_errors_are_clipped(cameras, matches):
     assert max(mean_error(cameras, [pair]) for pair in matches) < 0.01
     far = replace(
         matches[0], second_pixels=matches[0].second_pixels + np.random.default_rng(0).normal(size=(60, 2)) * 1e4
@@ -110,7 +108,7 @@ def test_matches_of_one_point_lie_on_their_lines_and_errors_are_clipped(
     assert mean_error(cameras, [far, matches[1]]) == pytest.approx(mean_error(cameras, [far]) / 2, abs=0.01)
 
 
-def test_the_distance_from_a_line_is_the_larger_of_both() -> None:
+def test_the_distance_from_a_line_is_the_larger_of_both():
     """Views side by side: lines are rows, and in the second picture, of twice the focal length, twice as far apart."""
     cameras = replace(box_cameras(2), cam_from_world=np.tile(np.eye(4, dtype=np.float32), (2, 1, 1)))
     cameras.cam_from_world[1, 0, 3] = -1
@@ -124,7 +122,7 @@ def test_the_distance_from_a_line_is_the_larger_of_both() -> None:
 
 
 @pytest.mark.parametrize("cause", ["axes", "inverse", "inverse and axes"])
-def test_poses_that_were_exchanged_are_read_back(cameras: Cameras, matches: list[PairMatches], cause: str) -> None:
+def test_poses_that_were_exchanged_are_read_back(cameras, matches, cause):
     wrong = with_poses(cameras, other_poses(cameras.cam_from_world.astype(np.float64))[cause])
     if cause == "inverse and axes":
         # The inverse of a turned inverse: what the reading of that name undoes.
@@ -137,7 +135,7 @@ def test_poses_that_were_exchanged_are_read_back(cameras: Cameras, matches: list
 
 
 @pytest.mark.parametrize("places", [-2, -1, 1, 2])
-def test_poses_of_the_next_photographs_are_read_back(cameras: Cameras, matches: list[PairMatches], places: int) -> None:
+def test_poses_of_the_next_photographs_are_read_back(cameras, matches, places):
     wrong = with_poses(cameras, np.roll(cameras.cam_from_world, -places, axis=0))
     cause, factor, _, error = _best_reading(wrong, wrong, np.arange(6), matches)
     assert (cause, factor) == ("order", places)
@@ -145,7 +143,7 @@ def test_poses_of_the_next_photographs_are_read_back(cameras: Cameras, matches: 
 
 
 @pytest.mark.parametrize("factor", [FOCAL_FACTORS[0], FOCAL_FACTORS[11], FOCAL_FACTORS[-3]])
-def test_another_focal_length_is_read_back(cameras: Cameras, matches: list[PairMatches], factor: float) -> None:
+def test_another_focal_length_is_read_back(cameras, matches, factor):
     Ks = cameras.Ks.copy()
     Ks[:, :2, :2] /= np.float32(factor)
     wrong = replace(cameras, Ks=Ks)
@@ -155,7 +153,7 @@ def test_another_focal_length_is_read_back(cameras: Cameras, matches: list[PairM
     np.testing.assert_allclose(best.Ks, cameras.Ks, rtol=1e-5)
 
 
-def test_the_next_photographs_are_those_of_the_scene_and_not_of_the_views_that_were_looked_at() -> None:
+def test_the_next_photographs_are_those_of_the_scene_and_not_of_the_views_that_were_looked_at():
     right, rows = box_cameras(9, width=320, height=240, focal=200.0), np.array([1, 3, 4, 7])
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (60, 3)) + right.centers.mean(axis=0)
     pixels = right.project(points)[0].astype(np.float64)[rows]
@@ -170,9 +168,7 @@ def test_the_next_photographs_are_those_of_the_scene_and_not_of_the_views_that_w
     np.testing.assert_array_equal(best.cam_from_world, right.cam_from_world[rows])
 
 
-def test_the_figures_of_a_check_are_means_of_pairs_a_share_of_matches_and_the_worst_pair(
-    cameras: Cameras, matches: list[PairMatches]
-) -> None:
+def test_the_figures_of_a_check_are_means_of_pairs_a_share_of_matches_and_the_worst_pair(cameras, matches):
     rough = shifted(matches[1], cameras, 9.0)
     rough = replace(rough, first_pixels=rough.first_pixels[:20], second_pixels=rough.second_pixels[:20])
     errors = [mean_error(cameras, [pair]) for pair in (matches[0], rough, matches[2])]
@@ -186,51 +182,43 @@ def test_the_figures_of_a_check_are_means_of_pairs_a_share_of_matches_and_the_wo
     assert check.share == pytest.approx((120 + near.sum()) / 140)
 
 
-def test_once_all_poses_are_read_rightly_a_view_is_astray_by_what_is_usual_then(
-    cameras: Cameras, matches: list[PairMatches]
-) -> None:
+def test_once_all_poses_are_read_rightly_a_view_is_astray_by_what_is_usual_then(cameras, matches):
     wrong = turned_to_error(cameras, matches, 2, 4.5)
     axes = with_poses(wrong, other_poses(wrong.cam_from_world.astype(np.float64))["axes"])
     assert judged(axes, matches) == ([("axes", None), ("stray view", "2.png")], True)
 
 
-def test_two_views_astray_are_both_named_the_worse_one_first(cameras: Cameras, matches: list[PairMatches]) -> None:
+def test_two_views_astray_are_both_named_the_worse_one_first(cameras, matches):
     assert astray(turned(cameras, {1: 3.0, 4: 6.0}), matches) == ["4.png", "1.png"]
     assert astray(cameras, matches) == []
 
 
 @pytest.mark.parametrize(("error", "named"), [(1.9, False), (2.1, True)])
-def test_a_view_is_astray_above_two_pixels(
-    cameras: Cameras, matches: list[PairMatches], error: float, named: bool
-) -> None:
+def test_a_view_is_astray_above_two_pixels(cameras, matches, error, named):
     assert astray(turned_to_error(cameras, matches, 2, error), matches, limit=0.5) == ["2.png"] * named
 
 
 @pytest.mark.parametrize(("usual", "named"), [(2.2, True), (2.7, False)])
-def test_a_view_is_astray_above_three_times_what_is_usual(
-    cameras: Cameras, matches: list[PairMatches], usual: float, named: bool
-) -> None:
+def test_a_view_is_astray_above_three_times_what_is_usual(cameras, matches, usual, named):
     rough = [pair if 2 in (pair.first, pair.second) else shifted(pair, cameras, usual) for pair in matches]
     assert astray(turned_to_error(cameras, matches, 2, 7.5), rough, limit=4.0) == ["2.png"] * named
 
 
-def test_of_few_views_none_is_astray(cameras: Cameras, matches: list[PairMatches]) -> None:
+def test_of_few_views_none_is_astray(cameras, matches):
     """With three views each has two pairs, and the others one."""
     wrong = turned(cameras, {0: 5.0})
     assert astray(wrong, [pair for pair in matches if pair.second < 3]) == []
     assert astray(wrong, [pair for pair in matches if pair.second < 4]) == ["0.png"]
 
 
-def test_two_pairs_are_enough_to_call_a_view_astray_and_one_is_not(
-    cameras: Cameras, matches: list[PairMatches]
-) -> None:
+def test_two_pairs_are_enough_to_call_a_view_astray_and_one_is_not(cameras, matches):
     wrong = turned(cameras, {0: 5.0})
     two = [pair for pair in matches if pair.second < 4 and (pair.first, pair.second) != (0, 3)]
     assert astray(wrong, two) == ["0.png"]
     assert astray(wrong, [pair for pair in two if (pair.first, pair.second) != (0, 2)]) == []
 
 
-def test_a_view_without_a_pose_that_fits_is_not_astray(cameras: Cameras, matches: list[PairMatches]) -> None:
+def test_a_view_without_a_pose_that_fits_is_not_astray(cameras, matches):
     """Each of its pairs fits a fundamental matrix, but they fit no one pose: a motif that repeats itself."""
     poses = turned(cameras, {2: 8.0}), turned(cameras, {2: -8.0}), cameras
     assert all(astray(wrong, matches) == ["2.png"] for wrong in poses[:2])
@@ -255,7 +243,7 @@ def seen_from(cameras: Cameras, pair: PairMatches, view: int, degrees: float) ->
     return replace(pair, first_pixels=pixels[pair.first], second_pixels=pixels[pair.second])
 
 
-def test_a_pose_that_fits_one_pair_alone_is_none_of_a_view_astray(cameras: Cameras, matches: list[PairMatches]) -> None:
+def test_a_pose_that_fits_one_pair_alone_is_none_of_a_view_astray(cameras, matches):
     pairs = {(pair.first, pair.second): pair for pair in matches if pair.second < 4}
     del pairs[0, 3]
     assert astray(turned(cameras, {0: 8.0}), [*pairs.values()]) == ["0.png"]
@@ -263,9 +251,7 @@ def test_a_pose_that_fits_one_pair_alone_is_none_of_a_view_astray(cameras: Camer
     assert astray(cameras, [*pairs.values()]) == []
 
 
-def test_a_pose_that_does_not_halve_the_error_is_none_of_a_view_astray(
-    cameras: Cameras, matches: list[PairMatches]
-) -> None:
+def test_a_pose_that_does_not_halve_the_error_is_none_of_a_view_astray(cameras, matches):
     """Two of three pairs fit it; the third, 20 pixels off and more, fits neither."""
     pairs = {(pair.first, pair.second): pair for pair in matches if pair.second < 4}
     far = np.random.default_rng(0).normal(size=(60, 2)) * 1e4
@@ -275,7 +261,7 @@ def test_a_pose_that_does_not_halve_the_error_is_none_of_a_view_astray(
         assert astray(wrong, [*pairs.values()]) == named
 
 
-def test_far_pairs_that_do_not_fit_accuse_nobody(cameras: Cameras, matches: list[PairMatches]) -> None:
+def test_far_pairs_that_do_not_fit_accuse_nobody(cameras, matches):
     near = {(pair.first, pair.second) for pair in near_pairs(cameras, matches)}
     assert 3 <= len(near) < len(matches)
     wallpaper = [
@@ -288,7 +274,7 @@ def test_far_pairs_that_do_not_fit_accuse_nobody(cameras: Cameras, matches: list
     assert judge_matches(wallpaper, cameras, cameras, np.arange(6), NAMES).error > 3
 
 
-def test_a_view_is_judged_by_the_pairs_with_the_views_next_to_it(matches: list[PairMatches]) -> None:
+def test_a_view_is_judged_by_the_pairs_with_the_views_next_to_it(matches):
     """Places on a line that look the same way: the nearest three of the first one are those next to it."""
     poses = np.tile(np.eye(4), (6, 1, 1))
     poses[:, 0, 3] = -np.array([0, 1, 2, 4, 8, 16])
@@ -300,7 +286,7 @@ def test_a_view_is_judged_by_the_pairs_with_the_views_next_to_it(matches: list[P
     assert (0, 1) not in [(pair.first, pair.second) for pair in near_pairs(line, matches, 0)]
 
 
-def test_a_pose_is_found_from_matches(cameras: Cameras, matches: list[PairMatches]) -> None:
+def test_a_pose_is_found_from_matches(cameras, matches):
     poses = turned(cameras, {3: 12.0}).cam_from_world.astype(np.float64)
     poses[3, :3, 3] += 0.3
     own = [pair for pair in matches if 3 in (pair.first, pair.second)]
@@ -313,7 +299,7 @@ def test_a_pose_is_found_from_matches(cameras: Cameras, matches: list[PairMatche
     np.testing.assert_array_equal(found.cam_from_world[others], wrong.cam_from_world[others])
 
 
-def test_nothing_is_said_on_little_evidence(cameras: Cameras, matches: list[PairMatches]) -> None:
+def test_nothing_is_said_on_little_evidence(cameras, matches):
     wrong = turned(cameras, {0: 9.0, 2: -9.0, 4: 5.0})
     assert judged(wrong, []) == ([], False)
     for pairs in (1, 2):
@@ -322,9 +308,7 @@ def test_nothing_is_said_on_little_evidence(cameras: Cameras, matches: list[Pair
     assert judged(cameras, matches[:3]) == ([], True)
 
 
-def test_poses_that_fit_nowhere_are_called_wrong_by_six_pairs_and_not_by_five(
-    cameras: Cameras, matches: list[PairMatches]
-) -> None:
+def test_poses_that_fit_nowhere_are_called_wrong_by_six_pairs_and_not_by_five(cameras, matches):
     poses = cameras.cam_from_world.astype(np.float64)
     poses[:, :3, :3] = Rotation.random(6, random_state=3).as_matrix() @ poses[:, :3, :3]
     wrong = with_poses(cameras, poses)
@@ -336,7 +320,7 @@ def test_poses_that_fit_nowhere_are_called_wrong_by_six_pairs_and_not_by_five(
     )
 
 
-def test_groups_of_three_neighbors_are_spread_over_all_views() -> None:
+def test_groups_of_three_neighbors_are_spread_over_all_views():
     assert _spread_triples(24, 24).tolist() == list(range(24))
     assert _spread_triples(25, 6).tolist() == [0, 1, 2, 22, 23, 24]
     rows = _spread_triples(100, 24)
@@ -346,7 +330,7 @@ def test_groups_of_three_neighbors_are_spread_over_all_views() -> None:
     assert _spread_triples(10, 2).tolist() == [0, 1, 2]
 
 
-def test_matches_that_fit_no_fundamental_matrix_are_left_out(matches: list[PairMatches]) -> None:
+def test_matches_that_fit_no_fundamental_matrix_are_left_out(matches):
     made = np.random.default_rng(0)
     pair = matches[0]
     noisy = pair.second_pixels.copy()

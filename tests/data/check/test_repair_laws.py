@@ -9,8 +9,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.check.agreement import RegistrationFit
-from gsencoder.data.check.findings import Finding
-from gsencoder.data.check.repair_scene import focal_times, repair_posed
+from gsencoder.data.check.findings import Finding, focal_times, repair_posed
 from gsencoder.data.readers.posed import PosedImage, PosedImages
 from gsencoder.data.readers.transforms_json import DISTORTION, read_transforms, transforms_of
 from gsencoder.data.readers.undistort import CameraModel
@@ -53,64 +52,61 @@ def with_poses(scene: PosedImages, change: Any) -> PosedImages:
         ("order", 2.0, lambda poses: np.roll(poses, -2, axis=0)),
     ],
 )
-def test_poses_are_mended_by_undoing_the_fault(cause: str, factor: float | None, break_it: Any) -> None:
+def test_poses_are_mended_by_undoing_the_fault(cause, factor, break_it):
     right = posed()
-    repair = repair_posed(with_poses(right, break_it), [finding(cause, factor=factor)])
-    for mended, image in zip(repair.posed.images, right.images, strict=True):
+    repaired, changes = repair_posed(with_poses(right, break_it), [finding(cause, factor=factor)])
+    for mended, image in zip(repaired.images, right.images, strict=True):
         np.testing.assert_allclose(mended.cam_from_world, image.cam_from_world, atol=1e-12)
-    assert len(repair.changes) == 1
+    assert len(changes) == 1
 
 
-def test_depth_is_mended_in_its_scale_its_measure_and_its_focal_length() -> None:
+def test_depth_is_mended_in_its_scale_its_measure_and_its_focal_length():
     right = posed()
-    scaled = repair_posed(right, [finding("depth scale", factor=0.2)])
-    assert {image.depth_scale for image in scaled.posed.images} == {0.2 * 1e-3}
-    assert scaled.changes == ("depth_unit_scale_factor times 0.2",)
-    ray = repair_posed(right, [finding("ray length")])
-    assert {image.depth_measure for image in ray.posed.images} == {"ray"}
-    focal = repair_posed(right, [finding("depth focal length", factor=1.1)])
-    assert {image.camera for image in focal.posed.images} == {PINHOLE}
-    for image in focal.posed.images:
-        assert image.depth_camera is not None
+    scaled, changes = repair_posed(right, [finding("depth scale", factor=0.2)])
+    assert {image.depth_scale for image in scaled.images} == {0.2 * 1e-3}
+    assert changes == ["depth_unit_scale_factor times 0.2"]
+    ray, _ = repair_posed(right, [finding("ray length")])
+    assert {image.depth_measure for image in ray.images} == {"ray"}
+    focal, _ = repair_posed(right, [finding("depth focal length", factor=1.1)])
+    assert {image.camera for image in focal.images} == {PINHOLE}
+    for image in focal.images:
         assert image.depth_camera.params == pytest.approx((55.0, 56.1, 32.0, 24.0))
 
 
-def test_a_focal_length_is_wrong_for_the_depth_too_where_that_has_a_camera() -> None:
-    alone = repair_posed(posed(), [finding("focal length", factor=2.0)]).posed.images[0]
+def test_a_focal_length_is_wrong_for_the_depth_too_where_that_has_a_camera():
+    alone = repair_posed(posed(), [finding("focal length", factor=2.0)])[0].images[0]
     assert (alone.camera.params, alone.depth_camera) == ((100.0, 102.0, 32.0, 24.0), None)
     other = replace(PINHOLE, params=(40.0, 40.0, 30.0, 20.0))
-    both = repair_posed(posed(depth_camera=other), [finding("focal length", factor=2.0)]).posed.images[0]
-    assert both.depth_camera is not None
+    both = repair_posed(posed(depth_camera=other), [finding("focal length", factor=2.0)])[0].images[0]
     assert both.depth_camera.params == (80.0, 80.0, 30.0, 20.0)
 
 
-def test_distortion_and_principal_point_stay_when_the_focal_length_changes() -> None:
+def test_distortion_and_principal_point_stay_when_the_focal_length_changes():
     radial = CameraModel(model="SIMPLE_RADIAL", width=64, height=48, params=(50.0, 32.0, 24.0, 0.1))
     assert focal_times(radial, 2.0).params == (100.0, 32.0, 24.0, 0.1)
 
 
-def test_a_color_camera_beside_the_depth_camera_leaves_the_depth_where_it_was() -> None:
+def test_a_color_camera_beside_the_depth_camera_leaves_the_depth_where_it_was():
     right = posed()
-    fit = RegistrationFit(focal_factor=0.9, shift=np.array([0.02, -0.01]), stated=0.1, best=0.9, pairs=9)
-    repair = repair_posed(right, [finding("color registration", factor=0.9)], fit)
-    for mended, image in zip(repair.posed.images, right.images, strict=True):
-        assert mended.depth_from_color is not None
+    fit = RegistrationFit(focal_factor=0.9, shift=np.array([0.02, -0.01]), given=0.1, best=0.9, pairs=9)
+    repaired, changes = repair_posed(right, [finding("color registration", factor=0.9)], fit)
+    for mended, image in zip(repaired.images, right.images, strict=True):
         np.testing.assert_allclose(mended.depth_from_color @ mended.cam_from_world, image.cam_from_world, atol=1e-12)
         np.testing.assert_allclose(
             mended.cam_from_world[:3, 3] - image.cam_from_world[:3, 3], (0.02, -0.01, 0), atol=1e-12
         )
         assert mended.depth_camera == PINHOLE
         assert mended.camera.params == pytest.approx((45.0, 45.9, 32.0, 24.0))
-    assert "0.0224 units" in repair.changes[0]
-    with pytest.raises(InputError, match="calibrate the cameras anew"):
-        repair_posed(repair.posed, [finding("color registration", factor=0.9)], fit)
+    assert "0.0224 units" in changes[0]
+    with pytest.raises(InputError, match="calibrate the cameras again"):
+        repair_posed(repaired, [finding("color registration", factor=0.9)], fit)
 
 
-def test_views_that_do_not_fit_are_left_out_and_the_others_mended() -> None:
+def test_views_that_do_not_fit_are_left_out_and_the_others_mended():
     findings = [finding("stray view", view="2.png"), finding("ray length"), finding("other picture", view="0.png")]
-    repair = repair_posed(posed(), findings)
-    assert [image.name for image in repair.posed.images] == ["1.png", "3.png"]
-    assert repair.changes == ('depth_measure is "ray"', "left out, since they do not fit: 0.png, 2.png")
+    repaired, changes = repair_posed(posed(), findings)
+    assert [image.name for image in repaired.images] == ["1.png", "3.png"]
+    assert changes == ['depth_measure is "ray"', "left out, since they do not fit: 0.png, 2.png"]
     for findings in ([], [finding("unknown")], [finding("color registration")]):
         with pytest.raises(InputError, match=r"^here: "):
             repair_posed(posed(), findings)
@@ -122,7 +118,7 @@ def model(name: str, extra: tuple[float, ...]) -> CameraModel:
 
 
 @pytest.mark.parametrize("name", DISTORTION)
-def test_every_camera_that_can_be_written_is_read_back(tmp_path: Path, name: str) -> None:
+def test_every_camera_that_can_be_written_is_read_back(tmp_path, name):
     import json
 
     from PIL import Image
@@ -164,13 +160,12 @@ def test_every_camera_that_can_be_written_is_read_back(tmp_path: Path, name: str
             image.image, image.depth, image.mask, image.instance,
         )  # fmt: skip
         assert (back.depth_scale, back.no_depth, back.depth_measure) == (1e-3, 65535, "ray")
-        assert back.depth_camera is not None
         assert back.depth_camera.pinhole_params() == PINHOLE.pinhole_params()
         np.testing.assert_array_equal(back.depth_from_color, aside)
 
 
 @pytest.mark.parametrize("camera", [model("FULL_OPENCV", (0.0,) * 5 + (0.1, 0.0, 0.0)), model("FOV", (0.5,))])
-def test_a_camera_that_a_transforms_json_cannot_express_is_refused(tmp_path: Path, camera: CameraModel) -> None:
+def test_a_camera_that_a_transforms_json_cannot_express_is_refused(tmp_path, camera):
     scene = posed(1)
     with pytest.raises(InputError, match=f"camera model {camera.model} cannot be written"):
         transforms_of(replace(scene, images=(replace(scene.images[0], camera=camera),)), tmp_path)

@@ -14,8 +14,8 @@ from PIL import Image
 from rgbd_layouts import write_scannet_frames
 
 from gsencoder.app import main as cli
+from gsencoder.app.commands.inspect import scene_facts
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.facts import scene_facts
 from gsencoder.data.labels.mesh import MeshInstances, draw_instances
 from gsencoder.data.labels.scans import find_labels, is_placed, with_counted_views
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
@@ -167,7 +167,7 @@ def source_of_maps(folder: Path) -> str:
     """What `inspect` says of a scene's instance maps."""
     posed, _, layout = read_posed(folder, SceneConfig())
     assert posed is not None
-    return scene_facts(load_scene(folder), posed, layout).instances
+    return str(scene_facts(load_scene(folder), posed, layout, None)["instances"])
 
 
 def test_archives_of_instances_come_before_maps_of_the_mesh_and_the_filtered_one_first(

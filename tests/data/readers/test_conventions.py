@@ -9,9 +9,9 @@ import pytest
 from field_scenes import FieldRoom, with_fields, write_colmap_text, write_ply, write_transforms
 from PIL import Image
 
+from gsencoder.app.commands.inspect import scene_facts
 from gsencoder.app.main import main
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.facts import scene_facts
 from gsencoder.data.readers.transforms_json import transforms_of
 from gsencoder.data.scenes import SceneConfig, load_scene, read_posed
 from gsencoder.data.seeding.seed import choose_source, seed
@@ -30,24 +30,21 @@ def save_mask(path: Path, pixels: np.ndarray = MASK) -> None:
 
 def masks_of(folder: Path, **options: Any) -> list[np.ndarray] | None:
     views = load_scene(folder, options=SceneConfig(**options)).views
-    assert views is not None
     return None if views.masks is None else [np.asarray(mask) for mask in views.masks]
 
 
 def unused_of(folder: Path) -> tuple[str, ...]:
     scene = load_scene(folder)
     posed, _, layout = read_posed(folder.absolute())
-    assert posed is not None
-    return scene_facts(scene, posed, layout).unused
+    return tuple(scene_facts(scene, posed, layout, None)["unused"])
 
 
 @pytest.mark.parametrize("shrink", [1, 2])
-def test_masks_beside_the_images_of_a_colmap_scene_are_read(field_room: FieldRoom, tmp_path: Path, shrink: int) -> None:
+def test_masks_beside_the_images_of_a_colmap_scene_are_read(field_room, tmp_path, shrink):
     folder = write_colmap_text(tmp_path, field_room.copy_photographs(tmp_path))
     for image in (folder / "images").iterdir():
         save_mask(folder / "masks" / f"{image.name}.png", MASK[::shrink, ::shrink])
     masks = masks_of(folder)
-    assert masks is not None
     assert all(np.array_equal(mask, MASK > 0) for mask in masks)
     assert unused_of(folder) == ()
     # Photographs elsewhere, as the command reconstruct has them, keep the masks of the scene.
@@ -55,7 +52,7 @@ def test_masks_beside_the_images_of_a_colmap_scene_are_read(field_room: FieldRoo
     assert masks_of(folder, images=str(folder / "pictures")) is not None
 
 
-def test_masks_follow_the_folders_of_the_images(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_masks_follow_the_folders_of_the_images(field_room, tmp_path):
     content = field_room.copy_photographs(tmp_path)
     names = []
     for number, frame in enumerate(content["frames"]):
@@ -70,34 +67,29 @@ def test_masks_follow_the_folders_of_the_images(field_room: FieldRoom, tmp_path:
     for name in names:
         save_mask(tmp_path / "masks" / f"{name}.png")
     masks = masks_of(write_colmap_text(tmp_path, content, names=names))
-    assert masks is not None
     assert not any(mask.all() for mask in masks)
 
 
-def test_a_mask_may_have_png_in_place_of_the_ending_and_missing_ones_are_counted(
-    field_room: FieldRoom, tmp_path: Path
-) -> None:
+def test_a_mask_may_have_png_in_place_of_the_ending_and_missing_ones_are_counted(field_room, tmp_path):
     content = field_room.copy_photographs(tmp_path)
     folder = write_colmap_text(tmp_path, content)
     for image in sorted((folder / "images").iterdir())[:3]:
         save_mask(folder / "masks" / f"{image.stem}.png")
     with pytest.warns(SceneWarning, match="5 of 8 masks are missing .*all pixels of those views are used"):
         masks = masks_of(folder)
-    assert masks is not None
     assert [mask.all() for mask in masks] == [False] * 3 + [True] * 5
 
 
-def test_where_masks_have_both_names_those_of_colmap_are_taken(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_where_masks_have_both_names_those_of_colmap_are_taken(field_room, tmp_path):
     folder = write_colmap_text(tmp_path, field_room.copy_photographs(tmp_path))
     for image in (folder / "images").iterdir():
         save_mask(folder / "masks" / f"{image.name}.png", MASK)
         save_mask(folder / "masks" / f"{image.stem}.png", 255 - MASK)
     masks = masks_of(folder)
-    assert masks is not None
     assert all(np.array_equal(mask, MASK > 0) for mask in masks)
 
 
-def test_masks_that_belong_to_no_image_are_called(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_masks_that_belong_to_no_image_are_called(field_room, tmp_path):
     folder = write_colmap_text(tmp_path, field_room.copy_photographs(tmp_path))
     save_mask(folder / "masks" / "left.png")
     with pytest.warns(SceneWarning, match="8 of 8 masks are missing"):
@@ -106,7 +98,7 @@ def test_masks_that_belong_to_no_image_are_called(field_room: FieldRoom, tmp_pat
         assert unused_of(folder) == ("folder masks",)
 
 
-def test_a_link_to_masks_outside_of_the_scene_is_refused(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_a_link_to_masks_outside_of_the_scene_is_refused(field_room, tmp_path):
     folder = tmp_path / "scene"
     write_colmap_text(folder, field_room.copy_photographs(folder))
     save_mask(tmp_path / "others" / "000.png.png")
@@ -123,17 +115,13 @@ def points_of(field_room: FieldRoom, **changes: np.ndarray) -> np.ndarray:
     return with_fields(rows, names, **(tints | changes))
 
 
-def test_points_that_a_transforms_json_names_are_the_scenes_and_make_its_seeds(
-    field_room: FieldRoom, tmp_path: Path
-) -> None:
+def test_points_that_a_transforms_json_names_are_the_scenes_and_make_its_seeds(field_room, tmp_path):
     content = {**field_room.copy_photographs(tmp_path), "ply_file_path": "points/sparse_pc.ply"}
     (tmp_path / "points").mkdir()
     points = points_of(field_room)
     write_ply(tmp_path / "points/sparse_pc.ply", points)
     folder = write_transforms(tmp_path, content)
     scene = load_scene(folder)
-    assert scene.sfm_points is not None
-    assert scene.sfm_colors is not None
     assert np.array_equal(scene.sfm_points[:, 2], points["z"])
     assert np.array_equal(scene.sfm_colors[:, 1], points["green"])
     assert choose_source(scene) == "points"
@@ -142,13 +130,10 @@ def test_points_that_a_transforms_json_names_are_the_scenes_and_make_its_seeds(
         assert len(seed(scene)) > len(points) / 2
     # `repair` writes the scene again with its points.
     posed = read_posed(folder)[0]
-    assert posed is not None
     assert transforms_of(posed, folder)["ply_file_path"] == "points/sparse_pc.ply"
 
 
-def test_colors_of_points_may_be_shares_or_missing_and_points_that_are_not_finite_are_left_out(
-    field_room: FieldRoom, tmp_path: Path
-) -> None:
+def test_colors_of_points_may_be_shares_or_missing_and_points_that_are_not_finite_are_left_out(field_room, tmp_path):
     content = {**field_room.copy_photographs(tmp_path), "ply_file_path": "points.ply"}
     points = points_of(field_room)
     x = points["x"].copy()
@@ -158,7 +143,6 @@ def test_colors_of_points_may_be_shares_or_missing_and_points_that_are_not_finit
     folder = write_transforms(tmp_path, content)
     with pytest.warns(SceneWarning, match="1 of [0-9]+ points are not finite"):
         scene = load_scene(folder)
-    assert scene.sfm_colors is not None
     assert np.array_equal(scene.sfm_colors[:, 0], np.delete(points["red"], 3))
     write_ply(tmp_path / "points.ply", with_fields(points, ("red", "green", "blue")))
     scene = load_scene(folder)
@@ -169,7 +153,7 @@ def test_colors_of_points_may_be_shares_or_missing_and_points_that_are_not_finit
 @pytest.mark.parametrize(
     ("name", "problem"), [("../points.ply", "leads out"), (7, "must be a path"), ("mesh.ply", "not a .ply")]
 )
-def test_points_that_cannot_be_used_are_refused(name: Any, problem: str, field_room: FieldRoom, tmp_path: Path) -> None:
+def test_points_that_cannot_be_used_are_refused(name, problem, field_room, tmp_path):
     folder = tmp_path / "scene"
     content = {**field_room.copy_photographs(folder), "ply_file_path": name}
     (folder / "mesh.ply").write_bytes(b"no points")
@@ -177,14 +161,14 @@ def test_points_that_cannot_be_used_are_refused(name: Any, problem: str, field_r
         load_scene(write_transforms(folder, content))
 
 
-def test_points_that_are_missing_are_called(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_points_that_are_missing_are_called(field_room, tmp_path):
     content = {**field_room.copy_photographs(tmp_path), "ply_file_path": "gone.ply"}
     with pytest.warns(SceneWarning, match="gone.ply"):
         scene = load_scene(write_transforms(tmp_path, content))
     assert scene.sfm_points is None
 
 
-def test_the_filter_of_mip_splatting_is_applied_row_by_row(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_the_filter_of_mip_splatting_is_applied_row_by_row(field_room, tmp_path):
     rows = field_room.rows()
     widths = np.random.default_rng(0).uniform(0, 0.02, len(rows)).astype(np.float32)
     widths[::7] = 0
@@ -202,13 +186,12 @@ def test_the_filter_of_mip_splatting_is_applied_row_by_row(field_room: FieldRoom
     assert np.array_equal(filtered.means, plain.means)
 
 
-def test_tracks_may_name_points_of_images_that_were_not_written(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_tracks_may_name_points_of_images_that_were_not_written(field_room, tmp_path):
     content = field_room.copy_photographs(tmp_path)
     write_colmap_text(tmp_path, content)
     points = tmp_path / "sparse/0/points3D.txt"
     points.write_text("# Number of points: 2\n1 1 2 3 9 8 7 0.5 1 0 2 4\n2 4 5 6 9 8 7 0.5\n")
     scene = load_scene(tmp_path)
-    assert scene.sfm_points is not None
     assert sorted((scene.sfm_points + scene.origin).tolist()) == [[1, 2, 3], [4, 5, 6]]
     points.write_text(points.read_text().replace(" 9 8 7 0.5 1 0 2 4", ""))
     with pytest.raises(InputError, match="line 2 is not POINT3D_ID"):
@@ -216,7 +199,7 @@ def test_tracks_may_name_points_of_images_that_were_not_written(field_room: Fiel
 
 
 @pytest.mark.parametrize("width", [-0.01, np.nan, np.inf])
-def test_a_filter_that_is_no_width_is_named(field_room: FieldRoom, tmp_path: Path, width: float) -> None:
+def test_a_filter_that_is_no_width_is_named(field_room, tmp_path, width):
     rows = field_room.rows()
     widths = np.zeros(len(rows), np.float32)
     widths[3:5] = width
@@ -225,9 +208,7 @@ def test_a_filter_that_is_no_width_is_named(field_room: FieldRoom, tmp_path: Pat
         load_splat(path)
 
 
-def test_inspect_says_that_the_filter_is_applied_and_lists_other_properties_once(
-    field_room: FieldRoom, tmp_path: Path
-) -> None:
+def test_inspect_says_that_the_filter_is_applied_and_lists_other_properties_once(field_room, tmp_path):
     rows = field_room.rows()
     column = np.full(len(rows), 0.005, np.float32)
     path = write_ply(tmp_path / "filtered.ply", with_fields(rows, filter_3D=column, semantic_0=column, nx=column))
@@ -242,9 +223,7 @@ def test_inspect_says_that_the_filter_is_applied_and_lists_other_properties_once
     assert inspect_splat(read_raw(field_room.splat)).unused == ()
 
 
-def test_inspect_lists_every_key_and_folder_that_was_not_used(
-    field_room: FieldRoom, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_inspect_lists_every_key_and_folder_that_was_not_used(field_room, tmp_path, capsys):
     folder = tmp_path / "room"
     content = field_room.copy_photographs(folder, depth=True)
     assert unused_of(write_transforms(folder, content)) == ()
@@ -268,7 +247,7 @@ def test_inspect_lists_every_key_and_folder_that_was_not_used(
     assert json.loads((out / "summary.json").read_text())["results"]["scenes"][0]["unused"] == list(expected)
 
 
-def test_a_distortion_that_nothing_here_reads_is_refused(field_room: FieldRoom, tmp_path: Path) -> None:
+def test_a_distortion_that_nothing_here_reads_is_refused(field_room, tmp_path):
     content = {**field_room.copy_photographs(tmp_path), "k5": 0.0}
     load_scene(write_transforms(tmp_path, content))
     with pytest.raises(InputError, match="k6 of a perspective camera"):

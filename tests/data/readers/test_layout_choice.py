@@ -6,14 +6,8 @@ import pytest
 from PIL import Image
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.layouts import (
-    COLMAP_FOLDERS,
-    ReadOptions,
-    colmap_model_in,
-    describe_layouts,
-    layout_of,
-    transforms_in,
-)
+from gsencoder.data.readers.layouts import COLMAP_FOLDERS, colmap_model_in, describe_layouts, layout_of, transforms_in
+from gsencoder.data.readers.posed import ReadOptions
 
 
 def model(folder: Path) -> None:
@@ -31,14 +25,13 @@ def photograph(folder: Path) -> None:
 def read_of(folder: Path, **options: str) -> tuple[Path, Path]:
     """The photograph that is read, and the folder of the scene."""
     layout = layout_of(folder)
-    assert layout is not None
     assert layout.name == "COLMAP"
     posed, home = layout.read(folder, ReadOptions(**options))  # type: ignore[arg-type]
     return posed.images[0].image, home
 
 
 @pytest.mark.parametrize("subfolder", COLMAP_FOLDERS)
-def test_a_model_is_found_where_tools_put_it(tmp_path: Path, subfolder: str) -> None:
+def test_a_model_is_found_where_tools_put_it(tmp_path, subfolder):
     model(tmp_path / subfolder)
     photograph(tmp_path / "images")
     assert colmap_model_in(tmp_path) == tmp_path / subfolder
@@ -46,7 +39,7 @@ def test_a_model_is_found_where_tools_put_it(tmp_path: Path, subfolder: str) -> 
 
 
 @pytest.mark.parametrize("above", [1, 2])
-def test_photographs_may_lie_beside_the_folders_above_the_model_itself(tmp_path: Path, above: int) -> None:
+def test_photographs_may_lie_beside_the_folders_above_the_model_itself(tmp_path, above):
     folder = tmp_path / "scene" / "sparse" / "0"
     model(folder)
     home = folder.parents[above - 1]
@@ -54,13 +47,13 @@ def test_photographs_may_lie_beside_the_folders_above_the_model_itself(tmp_path:
     assert read_of(folder) == (home / "images" / "a.png", home)
 
 
-def test_a_model_without_photographs_says_where_they_were_looked_for(tmp_path: Path) -> None:
+def test_a_model_without_photographs_says_where_they_were_looked_for(tmp_path):
     model(tmp_path / "sparse" / "0")
     with pytest.raises(InputError, match=f"looked for {tmp_path}/images; say images=FOLDER"):
         read_of(tmp_path)
 
 
-def test_photographs_are_looked_for_in_the_scene_and_from_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photographs_are_looked_for_in_the_scene_and_from_here(tmp_path, monkeypatch):
     scene = tmp_path / "scene"
     model(scene / "sparse" / "0")
     photograph(scene / "small")
@@ -74,7 +67,7 @@ def test_photographs_are_looked_for_in_the_scene_and_from_here(tmp_path: Path, m
             read_of(scene, images=missing)
 
 
-def test_the_first_of_several_models_is_used_with_a_warning(tmp_path: Path) -> None:
+def test_the_first_of_several_models_is_used_with_a_warning(tmp_path):
     photograph(tmp_path / "images")
     for number in ("0", "1", "2"):
         model(tmp_path / "sparse" / number)
@@ -83,25 +76,24 @@ def test_the_first_of_several_models_is_used_with_a_warning(tmp_path: Path) -> N
         read_of(tmp_path)
 
 
-def test_a_transforms_json_comes_before_a_model_and_says_so_unless_it_was_made_from_it(tmp_path: Path) -> None:
+def test_a_transforms_json_comes_before_a_model_and_says_so_unless_it_was_made_from_it(tmp_path):
     photograph(tmp_path / "images")
     frame = '{"file_path": "images/a.png", "transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}'
     text = f'{{"fl_x": 5, "fl_y": 5, "cx": 4, "cy": 3, "w": 8, "h": 6, "frames": [{frame}]}}'
     (tmp_path / "transforms.json").write_text(text)
     assert transforms_in(tmp_path) == tmp_path / "transforms.json"
     layout = layout_of(tmp_path)
-    assert layout is not None
     assert layout.name == "transforms.json"
     # nerfstudio leaves its model in colmap/.
     model(tmp_path / "colmap" / "sparse" / "0")
-    posed, home = layout.read(tmp_path, ReadOptions(depth_scale=0.5))
+    posed, home = layout.read(tmp_path, ReadOptions())
     assert (posed.images[0].image, home) == (tmp_path / "images" / "a.png", tmp_path)
     model(tmp_path / "sparse" / "0")
     with pytest.warns(SceneWarning, match="transforms.json is used"):
         layout.read(tmp_path, ReadOptions())
 
 
-def test_an_empty_folder_has_no_layout(tmp_path: Path) -> None:
+def test_an_empty_folder_has_no_layout(tmp_path):
     assert layout_of(tmp_path) is None
     assert (transforms_in(tmp_path), colmap_model_in(tmp_path)) == (None, None)
-    assert describe_layouts().count(";") == 6
+    assert describe_layouts().count(";") == 7

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from gsencoder.data.readers.depth_images import register_depth
 
 
-def test_registered_depth_follows_a_turned_and_shifted_sensor_pixel_by_pixel() -> None:
+def test_registered_depth_follows_a_turned_and_shifted_sensor_pixel_by_pixel():
     """The oracle: each depth pixel as a point, projected; a plane that faces no camera has a depth everywhere."""
     height, width = 60, 80
     depth_K = np.array([[70.0, 0, 41], [0, 74, 29], [0, 0, 1]])
@@ -43,7 +43,7 @@ def test_registered_depth_follows_a_turned_and_shifted_sensor_pixel_by_pixel() -
     assert not covered[within < -1.5].any()
 
 
-def test_a_pixel_of_depth_covers_its_own_square_a_tenth_wider() -> None:
+def test_a_pixel_of_depth_covers_its_own_square_a_tenth_wider():
     depth = np.zeros((3, 4), np.float32)
     depth[1, 2] = 2.0
     sensor = np.array([[10.0, 0, 2], [0, 10, 1.5], [0, 0, 1]])
@@ -54,7 +54,7 @@ def test_a_pixel_of_depth_covers_its_own_square_a_tenth_wider() -> None:
 
 
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (0, 3), (2, 0), (2, 3)])
-def test_squares_that_leave_the_picture_are_cut_off(row: int, column: int) -> None:
+def test_squares_that_leave_the_picture_are_cut_off(row, column):
     depth = np.zeros((3, 4), np.float32)
     depth[row, column] = 1.0
     K = np.array([[10.0, 0, 2], [0, 10, 1.5], [0, 0, 1]])

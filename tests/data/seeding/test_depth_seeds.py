@@ -10,11 +10,7 @@ from seed_views import TILTED, K, camera, colors_of, frames, normals_of, plane_d
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.seeding.depth import LAYER, SurfaceGrid, depth_samples, surface_pixels
 from gsencoder.data.seeding.points import flat_gaussians, quats_from_normals
-from gsencoder.data.seeding.seed import (
-    SeedConfig,
-    seed,
-    seed_from_depth,
-)
+from gsencoder.data.seeding.seed import SeedConfig, seed, seed_from_depth
 from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
 
@@ -125,35 +121,6 @@ class TestDepth:
             errors = (surface.depth - clean)[5:-5, 5:-5]
             assert errors.std() < 0.6 * max((noisy - clean)[5:-5, 5:-5].std(), 1e-4)
 
-    def test_surfaces_seen_at_a_slant_are_not_taken(self):
-        view = camera()
-        steep = np.array([1.0, 0.0, 0.02]) / np.linalg.norm([1.0, 0.0, 0.02])
-        depth = plane_depth(view, steep, 1.5 * steep[2])
-        depth[depth > 20] = 0
-        cos = np.abs(rays(view) @ steep) / np.linalg.norm(rays(view), axis=-1)
-        use = surface_pixels(depth, K, min_cos=0.1).use
-        assert not use[cos < 0.095].any()
-
-    def test_a_rigid_motion_of_the_scene_moves_the_seeds(self):
-        scene = make_room(1, views=6, width=120, height=90)
-        views = scene.views
-        still = seed_from_depth(views, voxel=0.04)
-        turn, shift = rotation(0.4, -0.7, 0.2), np.array([3.0, -2.0, 1.0])
-        pose = views.cameras.cam_from_world.astype(np.float64).copy()
-        pose[:, :3, 3] -= np.einsum("vij,j->vi", pose[:, :3, :3] @ turn.T, shift)
-        pose[:, :3, :3] = pose[:, :3, :3] @ turn.T
-        moved = seed_from_depth(
-            replace(views, cameras=replace(views.cameras, cam_from_world=pose.astype(np.float32))), voxel=0.04
-        )
-        assert 0.8 < len(moved) / len(still) < 1.25
-        expected = still.means @ turn.T + shift
-        distance, row = cKDTree(moved.means).query(expected)
-        assert distance.max() < 2 * 0.04
-        assert np.median(distance) < 0.03
-        cos = np.abs((normals_of(moved)[row] * (normals_of(still) @ turn.T)).sum(1))
-        assert np.mean(cos > 0.9) > 0.9
-        assert abs(np.median(moved.scales[:, 0]) / np.median(still.scales[:, 0]) - 1) < 0.1
-
     def test_the_same_views_give_the_same_bits_and_their_order_only_rounding(self):
         views = make_room(2, views=5, width=100, height=75).views
         first = seed_from_depth(views, voxel=0.03)
@@ -175,17 +142,6 @@ class TestDepth:
         big = seed_from_depth(frames((view, (1024 * depth).astype(np.float32))), voxel=0.02 * 1024)
         assert np.abs(big.means / 1024 - g.means).max() < 1e-5
         assert np.abs(big.scales / 1024 - g.scales).max() < 1e-5
-
-    def test_masked_and_far_pixels_are_not_used(self):
-        view = camera()
-        depth = plane_depth(view, (0, 0, 1.0), 1.5)
-        depth[:, 160:] = 3.0
-        mask = np.zeros((240, 320), bool)
-        mask[:, :80] = True
-        masked = seed_from_depth(replace(frames((view, depth)), masks=[mask]), voxel=0.05)
-        assert masked.means[:, 0].max() < -0.4
-        near = seed_from_depth(frames((view, depth)), voxel=0.05, max_depth=2.0)
-        assert near.means[:, 2].max() < 2
 
     def test_a_single_pixel_is_a_single_gaussian(self):
         one = np.array([[100, 0, 0.5], [0, 100, 0.5], [0, 0, 1]], np.float32)
@@ -211,8 +167,6 @@ class TestDepth:
         ):
             with pytest.raises(InputError, match=message):
                 seed_from_depth(replace(views, depths=depths, images=images), voxel=0.02)
-        with pytest.raises(InputError, match="voxel must be a positive length"):
-            seed_from_depth(frames((view, good)), voxel=0.0)
         with pytest.raises(InputError, match="voxels\\) from the cameras"):
             seed_from_depth(frames((view, good * 1000)), voxel=0.001)
 
@@ -248,12 +202,6 @@ class TestDepth:
         np.testing.assert_allclose(rows, sums, rtol=1e-6, atol=1e-6)
 
 
-def rotation(a: float, b: float, c: float) -> np.ndarray:
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_euler("xyz", [a, b, c]).as_matrix()
-
-
 def test_an_empty_grid_gives_no_samples():
     grid = SurfaceGrid(0.1, np.zeros(3))
     grid.add(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
@@ -278,16 +226,7 @@ def test_coincident_points_get_a_finite_size():
     assert (g.scales[:, 0] <= 0.08).all()
 
 
-@pytest.mark.parametrize("depth", [1e-42, 1e-20, 1e20, 3e38])
-def test_depth_that_no_sensor_gives_is_taken_for_a_wrong_scale(depth):
-    view = camera()
-    with pytest.raises(InputError, match="76800 of 76800 depths lie outside .* check the depth scale"):
-        seed_from_depth(frames((view, np.full((240, 320), depth, np.float32))), voxel=0.02)
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"voxel_units": 1e-300}, {"voxel_units": 1e300}, {"voxel": 1e300}, {"voxel": 1e-300}]
-)
+@pytest.mark.parametrize("wrong", [{"voxel": 1e300}, {"voxel": 1e-300}])
 def test_a_voxel_that_float32_cannot_count_in_is_refused(wrong):
     views = frames((camera(), np.ones((240, 320), np.float32)))
     with pytest.raises(InputError, match="is outside 1e-12 to 1e\\+12; check voxel"):

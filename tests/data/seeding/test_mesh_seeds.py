@@ -8,10 +8,7 @@ from scipy.spatial import cKDTree
 from seed_views import camera, colors_of, frames, normals_of, plane_depth, sphere_depth
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.seeding.seed import (
-    seed_from_mesh,
-    seed_from_tsdf,
-)
+from gsencoder.data.seeding.seed import seed_from_mesh, seed_from_tsdf
 
 
 class TestMesh:
@@ -84,7 +81,7 @@ class TestMesh:
 
     def test_a_mesh_in_other_units_than_the_voxel_is_an_error_that_says_so(self, tmp_path):
         self.trimesh.creation.box((5000, 5000, 3000)).export(tmp_path / "mm.ply")
-        with pytest.raises(InputError, match="its unit is not the voxel's"):
+        with pytest.raises(InputError, match="give a larger voxel, or the scene's metres_per_unit"):
             seed_from_mesh(tmp_path / "mm.ply", voxel=0.02)
 
 

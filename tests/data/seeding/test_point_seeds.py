@@ -5,9 +5,7 @@ import pytest
 from seed_views import camera, colors_of, normals_of
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.seeding.seed import (
-    seed_from_points,
-)
+from gsencoder.data.seeding.seed import seed_from_points
 from gsencoder.types import Views
 
 

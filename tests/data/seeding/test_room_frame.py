@@ -28,9 +28,8 @@ def some_transform(number: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("number", range(2))
-def test_seeds_of_a_turned_room_are_its_turned_seeds(number: int) -> None:
+def test_seeds_of_a_turned_room_are_its_turned_seeds(number):
     views = make_room(number, objects=6, views=6, width=96, height=72).views
-    assert views is not None
     config = SeedConfig(voxel=0.04)
     other_from_world = some_transform(number)
     here = seed(Scene(name="room", views=views, metres_per_unit=1.0), config)
@@ -49,11 +48,10 @@ def test_seeds_of_a_turned_room_are_its_turned_seeds(number: int) -> None:
 
 
 @pytest.mark.parametrize("number", range(3))
-def test_the_axes_of_a_box_are_those_of_its_walls_and_the_origin_is_among_the_cameras(number: int) -> None:
+def test_the_axes_of_a_box_are_those_of_its_walls_and_the_origin_is_among_the_cameras(number):
     other_from_world = some_transform(number)
     views = moved(box_views(box_cameras(5, width=96, height=72, focal=67.2)), other_from_world)
     frame = room_frame(views)
-    assert frame is not None
     cosines = np.abs(frame[:3, :3] @ other_from_world[:3, :3])
     np.testing.assert_allclose(np.sort(cosines, axis=1), [[0, 0, 1]] * 3, atol=2e-3)
     np.testing.assert_allclose(frame[:3, :3] @ frame[:3, :3].T, np.eye(3), atol=1e-12)
@@ -62,18 +60,15 @@ def test_the_axes_of_a_box_are_those_of_its_walls_and_the_origin_is_among_the_ca
     np.testing.assert_allclose(frame[:3, :3] @ center + frame[:3, 3], 0, atol=1e-5)
 
 
-def test_larger_depth_images_give_the_same_frame() -> None:
+def test_larger_depth_images_give_the_same_frame():
     small, large = (
         room_frame(box_views(box_cameras(3, width=80 * size, height=60 * size, focal=56.0 * size))) for size in (1, 4)
     )
-    assert small is not None
-    assert large is not None
     np.testing.assert_allclose(np.abs(large[:3, :3] @ small[:3, :3].T).max(axis=0), 1, atol=1e-4)
 
 
-def test_depth_without_surfaces_has_no_frame() -> None:
+def test_depth_without_surfaces_has_no_frame():
     views = box_views(box_cameras(2, width=32, height=24, focal=22.0))
-    assert views.depths is not None
     for value in (0.0, np.nan, np.inf, 1e-30):
         depths = [np.full_like(depth, value) for depth in views.depths]
         frame = room_frame(replace(views, depths=depths))

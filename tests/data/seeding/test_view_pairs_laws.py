@@ -40,7 +40,7 @@ def moved(cameras: Cameras, rotation: np.ndarray, scale: float) -> Cameras:
     return replace(cameras, cam_from_world=poses.astype(np.float32))
 
 
-def test_distances_and_overlaps_do_not_depend_on_the_world() -> None:
+def test_distances_and_overlaps_do_not_depend_on_the_world():
     cameras = arc(6)
     other = moved(cameras, Rotation.random(random_state=0).as_matrix(), 7.0)
     assert typical_distance(other) == pytest.approx(7 * typical_distance(cameras), rel=1e-4)
@@ -50,7 +50,7 @@ def test_distances_and_overlaps_do_not_depend_on_the_world() -> None:
     assert choose_pairs(other, 2) == choose_pairs(cameras, 2)
 
 
-def test_the_overlap_with_a_view_at_the_same_place_is_whole_and_with_a_wider_one_too() -> None:
+def test_the_overlap_with_a_view_at_the_same_place_is_whole_and_with_a_wider_one_too():
     pair = arc(1).select([0, 0])
     assert overlaps(pair, 1.0).tolist() == [[0, 1], [1, 0]]
     wide = replace(pair, Ks=np.stack((pair.Ks[0], pair.Ks[1] * np.array([[0.5], [0.5], [1]], np.float32))))
@@ -59,14 +59,14 @@ def test_the_overlap_with_a_view_at_the_same_place_is_whole_and_with_a_wider_one
     assert overlaps(wide, 1.0).tolist() == [[0, 1], [pytest.approx(9 / 25), 0]]
 
 
-def test_a_view_from_behind_sees_the_points_and_does_not_count() -> None:
+def test_a_view_from_behind_sees_the_points_and_does_not_count():
     """Two cameras that look at each other: what lies between them is seen from opposite sides."""
     centers = np.array([[-2.0, 0, 0], [2.0, 0, 0]])
     face = looking_cameras(centers, -centers / 2, UP, width=64, height=48, focal=60.0)
     assert overlaps(face, 2.0).sum() == 0
 
 
-def test_the_overlap_is_the_share_of_points_that_both_see_from_similar_directions() -> None:
+def test_the_overlap_is_the_share_of_points_that_both_see_from_similar_directions():
     """The oracle: each of the 125 points by itself."""
     cameras = arc(5, 40.0)
     shares = overlaps(cameras, 1.5)
@@ -85,13 +85,13 @@ def test_the_overlap_is_the_share_of_points_that_both_see_from_similar_direction
         assert shares[view, other] == pytest.approx(0 if view == other else count / 125)
 
 
-def test_each_view_is_paired_with_those_that_overlap_most() -> None:
+def test_each_view_is_paired_with_those_that_overlap_most():
     cameras = arc(5, 20.0)
     assert choose_pairs(cameras, 1) == [(0, 1), (1, 2), (2, 3), (3, 4)]
     assert choose_pairs(cameras, 0) == []
 
 
-def test_cameras_that_look_apart_are_taken_to_look_ten_neighbors_away() -> None:
+def test_cameras_that_look_apart_are_taken_to_look_ten_neighbors_away():
     cameras = arc(8, 45.0)
     outward = cameras.cam_from_world.copy()
     outward[:, [0, 2]] *= -1
@@ -103,17 +103,17 @@ def test_cameras_that_look_apart_are_taken_to_look_ten_neighbors_away() -> None:
     assert typical_distance(replace(cameras, cam_from_world=mixed)) == pytest.approx(2, rel=0.05)
 
 
-def test_two_cameras_that_look_at_one_point_are_as_far_from_it_as_they_are() -> None:
+def test_two_cameras_that_look_at_one_point_are_as_far_from_it_as_they_are():
     assert typical_distance(arc(2, 30.0)) == pytest.approx(2, rel=1e-5)
 
 
-def test_distances_between_neighbors_count_each_place_once() -> None:
+def test_distances_between_neighbors_count_each_place_once():
     assert nearest_distances(np.array([[0.0, 0, 0]])).tolist() == []
     centers = np.array([[0.0, 0, 0], [1, 0, 0], [1, 0, 0], [4, 0, 0]])
     assert sorted(nearest_distances(centers).tolist()) == [1, 1, 3]
 
 
-def test_neighbors_of_a_sweep_stand_an_eighth_of_the_distance_apart_if_they_can() -> None:
+def test_neighbors_of_a_sweep_stand_an_eighth_of_the_distance_apart_if_they_can():
     """Along an arc of 1.8° steps, an eighth is 7.2°: the fourth camera to each side comes first, the next one last."""
     cameras = arc(21, 1.8)
     neighbors = _spread_neighbors(cameras, np.ones(21), 10)
@@ -129,7 +129,7 @@ def test_neighbors_of_a_sweep_stand_an_eighth_of_the_distance_apart_if_they_can(
     assert 0 < MIN_COVERAGE < 1
 
 
-def test_the_fundamental_matrix_has_the_epipoles_of_both_cameras() -> None:
+def test_the_fundamental_matrix_has_the_epipoles_of_both_cameras():
     """F e = 0 for the picture of the other camera's center (Hartley and Zisserman, section 9.2.4)."""
     cameras = box_cameras(3)
     matrix = fundamental_matrix(cameras, 0, 2)
@@ -141,7 +141,7 @@ def test_the_fundamental_matrix_has_the_epipoles_of_both_cameras() -> None:
     np.testing.assert_allclose(fundamental_matrix(cameras, 2, 0) / matrix.T, 1, rtol=1e-3)
 
 
-def test_features_are_found_where_the_smaller_picture_and_its_mask_show_something() -> None:
+def test_features_are_found_where_the_smaller_picture_and_its_mask_show_something():
     views = box_views(box_cameras(2, width=320, height=240, focal=224.0).select([0, 0]))
     views = replace(views, names=("a", "b"))
     half = np.zeros((240, 320), bool)
@@ -157,7 +157,7 @@ def test_features_are_found_where_the_smaller_picture_and_its_mask_show_somethin
     assert match_photographs(views, small, [], features=300) == []
 
 
-def test_triangulation_needs_two_photographs() -> None:
+def test_triangulation_needs_two_photographs():
     views = box_views(box_cameras(1, width=32, height=24, focal=22.0))
     for wrong in (views, replace(views, images=None)):
         with pytest.raises(InputError, match="two posed photographs or more, got 1"):

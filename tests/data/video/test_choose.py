@@ -10,13 +10,13 @@ from gsencoder.data.video import BLOCK, Course, choose_frames, follow, laplacian
 
 
 @pytest.mark.parametrize(("right", "down"), [(0, 0), (5, 0), (-7, 11), (20, -3), (0, 25)])
-def test_the_motion_of_a_picture_is_its_shift(right: int, down: int) -> None:
+def test_the_motion_of_a_picture_is_its_shift(right, down):
     before = WALL[200 : 200 + HEIGHT, 200 : 200 + WIDTH]
     after = WALL[200 - down : 200 - down + HEIGHT, 200 - right : 200 - right + WIDTH]
     assert median_motion(before, after) == pytest.approx(np.hypot(right, down), abs=0.5)
 
 
-def test_zooming_in_is_motion_as_well() -> None:
+def test_zooming_in_is_motion_as_well():
     before = WALL[200 : 200 + HEIGHT, 200 : 200 + WIDTH]
     larger = zoom(before, 1.1, order=1)
     rows, columns = ((side - wanted) // 2 for side, wanted in zip(larger.shape, before.shape, strict=True))
@@ -24,7 +24,7 @@ def test_zooming_in_is_motion_as_well() -> None:
     assert 5 < median_motion(before, after) < 20
 
 
-def test_what_cannot_be_followed_counts_as_far_and_what_shows_nothing_as_no_motion() -> None:
+def test_what_cannot_be_followed_counts_as_far_and_what_shows_nothing_as_no_motion():
     other = wallpaper(1).astype(np.float32)
     assert median_motion(WALL[:HEIGHT, :WIDTH], other[:HEIGHT, :WIDTH]) == BLOCK / 2
     grey = np.full((HEIGHT, WIDTH), 128, np.float32)
@@ -33,27 +33,27 @@ def test_what_cannot_be_followed_counts_as_far_and_what_shows_nothing_as_no_moti
 
 
 @pytest.mark.parametrize(("speed", "way"), [(0.2, 80), (1.7, 300), (12.0, 300)])
-def test_slow_and_fast_motion_are_measured_in_full(speed: float, way: int) -> None:
+def test_slow_and_fast_motion_are_measured_in_full(speed, way):
     count = int(way / speed) + 1
     course = follow(looking_at(speed * index) for index in range(count))
     assert course.positions[-1] * WIDTH == pytest.approx(way, rel=0.06)
     assert (np.diff(course.positions) >= 0).all()
 
 
-def test_a_camera_that_trembles_in_one_place_does_not_move() -> None:
+def test_a_camera_that_trembles_in_one_place_does_not_move():
     made = np.random.default_rng(0)
     course = follow(looking_at(300 + made.uniform(-2, 2), 100 + made.integers(-2, 3)) for _ in range(80))
     assert course.positions[-1] * WIDTH < 16
 
 
-def test_sharpness_falls_with_blur_and_is_zero_for_one_color() -> None:
+def test_sharpness_falls_with_blur_and_is_zero_for_one_color():
     sharp = looking_at(300).astype(np.float32)
     values = [laplacian_variance(gaussian_filter(sharp, sigma)) for sigma in (0, 0.5, 1, 2, 4)]
     assert values == sorted(values, reverse=True)
     assert laplacian_variance(np.full((40, 40), 200, np.float32)) == 0
 
 
-def test_frames_are_evenly_apart_although_the_camera_paused_and_the_sharp_ones_are_taken() -> None:
+def test_frames_are_evenly_apart_although_the_camera_paused_and_the_sharp_ones_are_taken():
     lefts = [*np.arange(0, 300, 3.0), *[300.0] * 60, *np.arange(300, 1100, 3.0)]
     sharp = np.arange(len(lefts)) % 4 == 1
     pictures = [
@@ -68,24 +68,24 @@ def test_frames_are_evenly_apart_although_the_camera_paused_and_the_sharp_ones_a
     assert steps.max() < 0.16
 
 
-def test_equally_sharp_frames_are_taken_where_they_were_wanted() -> None:
+def test_equally_sharp_frames_are_taken_where_they_were_wanted():
     course = Course(np.linspace(0, 1, 101), np.full(101, 7.0))
     np.testing.assert_array_equal(choose_frames(course, motion=0.1, most=50, least=3), np.arange(0, 101, 10))
 
 
 @pytest.mark.parametrize(("most", "least", "expected"), [(5, 3, 5), (50, 3, 11), (50, 20, 20), (50, 200, 50)])
-def test_the_number_of_frames_follows_the_motion_between_the_limits(most: int, least: int, expected: int) -> None:
+def test_the_number_of_frames_follows_the_motion_between_the_limits(most, least, expected):
     course = Course(np.linspace(0, 1, 1001), np.ones(1001))
     chosen = choose_frames(course, motion=0.1, most=most, least=least)
     assert len(chosen) == expected
     assert (np.diff(chosen) > 0).all()
 
 
-def test_a_jump_leaves_positions_without_a_frame() -> None:
+def test_a_jump_leaves_positions_without_a_frame():
     course = Course(np.concatenate((np.linspace(0, 0.1, 11), np.linspace(0.9, 1, 11))), np.ones(22))
     np.testing.assert_array_equal(choose_frames(course, motion=0.1, most=50, least=3), [0, 10, 11, 21])
 
 
-def test_a_camera_that_hardly_moves_is_an_error() -> None:
+def test_a_camera_that_hardly_moves_is_an_error():
     with pytest.raises(InputError, match=r"moves by 3% of its width in 9 frames; a reconstruction needs a camera that"):
         choose_frames(Course(np.linspace(0, 0.03, 9), np.ones(9)), motion=0.08, most=50, least=16)
