@@ -11,11 +11,17 @@ from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.transformer import TransformerConfig
 from gsencoder.teachers.base import Teacher
-from gsencoder.train.batch import SamplingConfig
 from gsencoder.train.loop import TrainerConfig
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PrepareConfig, PreparedDataset
-from gsencoder.train.samples import AugmentConfig, SampleDataset, SampleRecipe, TeacherRecipe, TrainingScene
+from gsencoder.train.samples import (
+    Augmentation,
+    SampleDataset,
+    SampleRecipe,
+    SamplingConfig,
+    TeacherRecipe,
+    TrainingScene,
+)
 from gsencoder.train.space import fit_space
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
 
@@ -118,7 +124,7 @@ def samples(dataset: PreparedDataset, names: Sequence[str], **changes: Any) -> S
     recipe = {
         "encoder": SMALL,
         "sampling": SamplingConfig(views=2, gaussians=200),
-        "augmentation": AugmentConfig(turn=10.0),
+        "augmentation": Augmentation(turn=10.0),
         "losses": LOSSES,
         "teachers": (TeacherRecipe(name="sides", class_balance=dataset.load_class_balance()),),
         "seed": 3,

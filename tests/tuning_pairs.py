@@ -17,9 +17,7 @@ ANSWERS = ("red", "green", "2", "yes")
 SPREAD = 10.0
 SHORT = TuneConfig(
     lora=AdapterConfig(rank=4, alpha=8.0, dropout=0.0),
-    train=TrainerConfig(
-        steps=8, batch=2, learning_rate=0.01, warmup=2, weight_decay=0.0, log_every=1, validate_every=0
-    ),
+    train=TrainerConfig(steps=8, batch=2, learning_rate=0.01, warmup=2, log_every=1, validate_every=0),
 )
 
 

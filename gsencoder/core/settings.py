@@ -8,7 +8,7 @@ import operator
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from math import inf
+from math import inf, isfinite
 from typing import Any, Literal, Protocol, TypeVar, get_args, get_origin, runtime_checkable
 
 from gsencoder.core.errors import InputError
@@ -48,7 +48,10 @@ def check_limits(settings: Any) -> None:
         if "one" in item.metadata and len(value) > 1:
             raise InputError(f"{item.name}: expected one {item.metadata['one']}, got {len(value)}")
         numbers = value if isinstance(value, tuple) else () if value is None else (value,)
-        if not all(LIMITS[name][0](number, limit) for number in numbers for name, limit in limits.items()):
+        if limits and not all(
+            isfinite(number) and all(LIMITS[name][0](number, limit) for name, limit in limits.items())
+            for number in numbers
+        ):
             expected = " and ".join(LIMITS[name][1].format(limits[name]) for name in LIMITS if name in limits)
             raise InputError(
                 f"{item.name}: expected {expected}, got {list(value) if isinstance(value, tuple) else value}"

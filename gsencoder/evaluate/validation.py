@@ -104,9 +104,9 @@ def validate_encoder(
         for teacher, codebook in codebooks.items()
     }
     for scene in track(share, "validation"):
-        gaussians = scene.gaussians(np.arange(len(scene)))
+        gaussians = scene.first.gaussians(np.arange(len(scene.first)))
         with about(f"scene {scene.name}"):
-            unit = scene.metres_per_unit or 1.0
+            unit = scene.first.metres_per_unit or 1.0
             encoded = encode_spaces(gaussians, encoder, outputs, config, metres_per_unit=unit)
         for (teacher, tally), part in zip(tallies.items(), scene.parts, strict=True):
             if part is not None:

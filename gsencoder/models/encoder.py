@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.settings import option
 from gsencoder.models.grid import SceneCurves
 from gsencoder.models.neighbors import KernelSize, NeighborConv
 from gsencoder.models.plan import CloudPlan, Plan, join_plans, plan_cloud
@@ -32,21 +33,16 @@ MIN_MERGE_WEIGHT = 1e-3
 class EncoderConfig:
     """Inputs, token grid and network of an encoder."""
 
-    voxel: float = field(default=0.02, metadata={"help": "edge length of the token grid's cells, metres"})
-    inputs: tuple[Attribute, ...] = field(
-        default=("offset", "color", "opacity", "scale", "rotation"),
-        metadata={"help": "Gaussian attributes that the encoder sees"},
+    voxel: float = option(0.02, "edge length of the token grid's cells, metres")
+    inputs: tuple[Attribute, ...] = option(
+        ("offset", "color", "opacity", "scale", "rotation"), "Gaussian attributes that the encoder sees"
     )
-    stem: KernelSize = field(
-        default=3, metadata={"help": "edge of the first convolution's neighborhood in cells: 3, or 5 as in PTv3"}
-    )
+    stem: KernelSize = option(3, "edge of the first convolution's neighborhood in cells: 3, or 5 as in PTv3")
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
-    projector: int = field(
-        default=128,
-        metadata={
-            "help": "hidden channels of the MLP (linear, GELU, linear) that gives the outputs of each teacher; 0 = one "
-            "linear layer for all"
-        },
+    projector: int = option(
+        128,
+        "hidden channels of the MLP (linear, GELU, linear) that gives the outputs of each teacher; 0 = one "
+        "linear layer for all",
     )
 
     def __post_init__(self) -> None:

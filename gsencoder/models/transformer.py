@@ -10,7 +10,7 @@ out.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 import torch
@@ -20,6 +20,7 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.settings import option
 from gsencoder.geometry import rotmats_from_quats
 from gsencoder.models.grid import ALIGN, Order
 from gsencoder.models.neighbors import NeighborConv
@@ -180,42 +181,23 @@ Shuffle = Literal["once", "pooling", "never"]
 class TransformerConfig:
     """Sizes of the network. Tuples have one entry per level, finest first; those of the decoder have one fewer."""
 
-    encoder_depths: tuple[int, ...] = field(
-        default=(1, 1, 2, 2, 1), metadata={"help": "number of encoder blocks of each level, finest first"}
+    encoder_depths: tuple[int, ...] = option((1, 1, 2, 2, 1), "number of encoder blocks of each level, finest first")
+    encoder_channels: tuple[int, ...] = option((32, 64, 96, 128, 128), "encoder channels of each level")
+    decoder_depths: tuple[int, ...] = option((0, 1, 1, 1), "number of decoder blocks of each level but the coarsest")
+    decoder_channels: tuple[int, ...] = option((64, 64, 96, 128), "decoder channels of each level but the coarsest")
+    head_channels: int = option(32, "channels per attention head")
+    patch: int = option(128, "largest number of tokens in a patch, within which attention is computed")
+    orders: tuple[Order, ...] = option(
+        ORDERS, "space-filling curves along which patches are cut; blocks use them in turn"
     )
-    encoder_channels: tuple[int, ...] = field(
-        default=(32, 64, 96, 128, 128), metadata={"help": "encoder channels of each level"}
+    shuffle_orders: Shuffle = option(
+        "once",
+        "in training, permute the orders at random: once for all levels, or again at each pooling, as PTv3 "
+        "does; outside training they are never permuted",
     )
-    decoder_depths: tuple[int, ...] = field(
-        default=(0, 1, 1, 1), metadata={"help": "number of decoder blocks of each level but the coarsest"}
-    )
-    decoder_channels: tuple[int, ...] = field(
-        default=(64, 64, 96, 128), metadata={"help": "decoder channels of each level but the coarsest"}
-    )
-    head_channels: int = field(default=32, metadata={"help": "channels per attention head"})
-    patch: int = field(
-        default=128, metadata={"help": "largest number of tokens in a patch, within which attention is computed"}
-    )
-    orders: tuple[Order, ...] = field(
-        default=ORDERS,
-        metadata={"help": "space-filling curves along which patches are cut; blocks use them in turn"},
-    )
-    shuffle_orders: Shuffle = field(
-        default="once",
-        metadata={
-            "help": "in training, permute the orders at random: once for all levels, or again at each pooling, as PTv3 "
-            "does; outside training they are never permuted"
-        },
-    )
-    mlp_ratio: float = field(
-        default=4.0, metadata={"help": "hidden channels of a block's MLP, as a multiple of its channels"}
-    )
-    drop_path: float = field(
-        default=0.1, metadata={"help": "rate of stochastic depth in training, reached at the last encoder block"}
-    )
-    checkpoint: bool = field(
-        default=False, metadata={"help": "recompute activations of blocks in the backward pass to save memory"}
-    )
+    mlp_ratio: float = option(4.0, "hidden channels of a block's MLP, as a multiple of its channels")
+    drop_path: float = option(0.1, "rate of stochastic depth in training, reached at the last encoder block")
+    checkpoint: bool = option(False, "recompute activations of blocks in the backward pass to save memory")
 
     def __post_init__(self) -> None:
         levels = len(self.encoder_depths)

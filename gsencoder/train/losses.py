@@ -1,104 +1,115 @@
-"""The losses of distillation (SplatDistill Eqs. 3–5), as weighted sums, so that a step divides once by global weights.
+"""The losses of SplatDistill (sec. 3.3), what they compare, and the table of them.
 
-Losses work in the units of the encoder's outputs (`OutputSpace`): by default standard units about the mean of the
-space, since raw CLIP-like vectors are nearly parallel, and the cosine between them hardly distinguishes names.
+    L = Σ_teachers w · Σ_terms λ_term · L_term,   L_term = Σ_i w_i · loss_i / Σ_i w_i
 
-Eq. 4 of the paper is written with the render of G_fused, which has no parameters. It is computed here with the render
-of the predicted features, which can be trained.
-
-The loss of a step: weighted terms, each a sum over the micro-batches of all processes, divided once.
-
-term = Σ total / Σ divisor,     loss = Σ lambda · term
+A new term is a function of this file, its line in `TERMS`, and the field `NAME_weight` of `LossConfig`.
 """
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Float16, Int32, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
 from gsencoder.core.errors import InputError
-from gsencoder.render import Blend
-from gsencoder.train.distributed import STOPPED_ELSEWHERE, sum_over_processes
+from gsencoder.core.settings import check_limits, option
+from gsencoder.render import Blend, BlendConfig
+from gsencoder.render.rays import Lattice
 
 EPS = 1e-12
-MAX_RARITY = 4.0
-"""Limit of the power of class frequencies: with it a Gaussian of a class of 10⁶ already weighs 1e-24."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LossConfig:
     """Weights and parameters of the loss terms."""
 
-    cosine: float = field(default=0.9, metadata={"help": "α: weight of 1 − cosine in the matching loss"})
-    smooth_l1: float = field(default=0.1, metadata={"help": "β: weight of the smooth L1 distance in the matching loss"})
-    confidence: bool = field(
-        default=True,
-        metadata={"help": "weight the cosine of a target near the mean by the target's length; false = Eq. 3 as it is"},
+    cosine: float = option(0.9, "α: weight of 1 − cosine in the matching loss", ge=0)
+    smooth_l1: float = option(0.1, "β: weight of the smooth L1 distance in the matching loss", ge=0)
+    confidence: bool = option(
+        True, "weight the cosine of a target near the mean by the target's length; false = Eq. 3 as it is"
     )
-    field_weight: float = field(default=1.0, metadata={"help": "λ of the loss on Gaussians (L_3D)"})
-    render_weight: float = field(default=0.2, metadata={"help": "λ of the loss on rendered cells (L_render); 0 = off"})
-    contrast_weight: float = field(
-        default=0.0, metadata={"help": "λ of the cross-entropy among target classes (L_contrast); 0 = off"}
+    field_weight: float = option(1.0, "λ of the loss on Gaussians (L_3D)", ge=0)
+    render_weight: float = option(0.2, "λ of the loss on rendered cells (L_render); 0 = off", ge=0)
+    contrast_weight: float = option(0.0, "λ of the cross-entropy among target classes (L_contrast); 0 = off", ge=0)
+    contrast_clusters: bool = option(
+        False, "L_contrast also among clusters of the targets of dense teachers, which have no names"
     )
-    contrast_clusters: bool = field(
-        default=False,
-        metadata={"help": "L_contrast also among clusters of the targets of dense teachers, which have no names"},
+    temperature: float = option(0.1, "temperature of the softmax in L_contrast, in squared typical distances", gt=0)
+    rarity: float = option(
+        0.5,
+        "power p of class weights: targets of a class with n Gaussians are weighted by n^−p; 0 = equally",
+        ge=0,
+        le=4,
     )
-    temperature: float = field(
-        default=0.1, metadata={"help": "temperature of the softmax in L_contrast, in squared typical distances"}
+    divide_by_alpha: bool = option(
+        True, "compare rendered features divided by the cell's opacity; false = as they are composited"
     )
-    rarity: float = field(
-        default=0.5,
-        metadata={
-            "help": "power p of class weights: targets of a class with n Gaussians are weighted by n^−p; 0 = equally"
-        },
+    min_alpha: float = option(0.5, "smallest opacity that a cell must have to enter L_render", gt=0, le=1)
+    min_kept: float = option(
+        0.95, "smallest share of a cell's weight that must be in the crop for the cell to enter L_render", gt=0, le=1
     )
-    divide_by_alpha: bool = field(
-        default=True,
-        metadata={"help": "compare rendered features divided by the cell's opacity; false = as they are composited"},
-    )
-    min_alpha: float = field(default=0.5, metadata={"help": "smallest opacity that a cell must have to enter L_render"})
-    min_kept: float = field(
-        default=0.95,
-        metadata={"help": "smallest share of a cell's weight that must be in the crop for the cell to enter L_render"},
-    )
-    teacher_weights: tuple[float, ...] = field(
-        default=(),
-        metadata={"help": "weights of the losses of several teachers, in their order; empty = all equal 1"},
+    teacher_weights: tuple[float, ...] = option(
+        (), "weights of the losses of several teachers, in their order; empty = all equal 1", ge=0
     )
 
     def __post_init__(self) -> None:
-        for name in ("cosine", "smooth_l1", "field_weight", "render_weight", "contrast_weight", "rarity"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        if self.rarity > MAX_RARITY:
-            raise InputError(
-                f"rarity: expected at most {MAX_RARITY}, got {self.rarity}: only the rarest classes would keep a weight"
-            )
-        if not 0 < self.temperature < float("inf"):
-            raise InputError(f"temperature: expected a positive number, got {self.temperature}")
-        for name in ("min_alpha", "min_kept"):
-            if not 0 < getattr(self, name) <= 1:
-                raise InputError(f"{name}: expected a number in (0, 1], got {getattr(self, name)}")
-        if not all(0 <= weight < float("inf") for weight in self.teacher_weights) or (
-            self.teacher_weights and not sum(self.teacher_weights) > 0
-        ):
-            raise InputError(
-                f"teacher_weights: expected numbers of 0 or more, not all 0, got {list(self.teacher_weights)}"
-            )
+        check_limits(self)
+        if self.teacher_weights and not sum(self.teacher_weights) > 0:
+            raise InputError("teacher_weights: expected one above 0")
         if not (self.cosine + self.smooth_l1 > 0 or self.contrast_weight > 0):
             raise InputError(
                 "cosine and smooth_l1: expected one above 0 unless contrast_weight is; there would be no loss"
             )
-        if not self.field_weight + self.render_weight + self.contrast_weight > 0:
-            raise InputError(
-                "field_weight, render_weight and contrast_weight: expected one above 0; there would be no loss"
-            )
+        if not any(self.lambdas.values()):
+            names = ", ".join(f"{name}_weight" for name in TERMS)
+            raise InputError(f"{names}: expected one above 0; there would be no loss")
+
+    @property
+    def lambdas(self) -> dict[str, float]:
+        """The weight of each term of `TERMS`."""
+        return {name: getattr(self, f"{name}_weight") for name in TERMS}
+
+
+class RenderRows(NamedTuple):
+    """Rows of B for the render loss, over the Gaussians of a sample or a batch.
+
+    Attributes:
+        crow, col, weight: compressed rows, as in `gsencoder.render.Blend`.
+        targets: the teacher's vectors in the cells, standard units.
+        row_weights: weight of each row in the loss.
+    """
+
+    crow: Int64[Tensor, " P_plus_1"]
+    col: Int32[Tensor, " nnz"]
+    weight: Float[Tensor, " nnz"]
+    targets: Float[Tensor, "P C"]
+    row_weights: Float[Tensor, " P"]
+
+    def blend(self, gaussians: int) -> Blend:
+        """The rows as a `Blend`. They are not the pixels of an image, so its lattice is a single column."""
+        lattice = Lattice(height=len(self.crow) - 1, width=1, side=1, x0=0.5, y0=0.5, dx=1.0, dy=1.0)
+        depths = self.weight.new_zeros(gaussians)
+        return Blend(self.crow, self.col, self.weight, depths, lattice, BlendConfig())
+
+
+class TeacherTargets(NamedTuple):
+    """What one teacher says of the Gaussians and views of a sample or a batch.
+
+    Attributes:
+        targets: targets of the Gaussians, standard units; in float16, since samples that are made
+            ahead fill shared memory.
+        codes: class of each Gaussian's target, a row of the teacher's codebook; −1 without a target.
+        loss_weights: weight of each Gaussian in the loss; 0 without a target.
+        rows: rows of the render loss.
+    """
+
+    targets: Float16[Tensor, "N C"]
+    codes: Int64[Tensor, " N"]
+    loss_weights: Float[Tensor, " N"]
+    rows: RenderRows
 
 
 class AdapterHead(nn.Module):
@@ -125,6 +136,10 @@ class AdapterHead(nn.Module):
     def forward(self, features: Float[Tensor, "n D"]) -> Float[Tensor, "n E"]:
         out: Tensor = (self.body(features) - self.mean) / self.unit
         return out
+
+
+Heads = Sequence[tuple[AdapterHead, nn.Module]]
+"""Adapter heads of a teacher, each with a decoder from standard units to its input."""
 
 
 def match_loss(
@@ -169,11 +184,11 @@ def contrast_loss(
     moves the prediction towards the likelier of the two, so that it is also the nearest vector of the codebook.
 
     Args:
-        predicted: predicted features, units of the outputs.
+        predicted: standard units.
         codes: for each Gaussian, the class of its target, which is a row of the codebook.
-        weights: weights in the loss; 0 for Gaussians without a target, whose codes are ignored.
+        weights: 0 for Gaussians without a target, whose codes are ignored.
         codebook: vectors c_k of the target classes, standard units.
-        config: settings, of which the temperature is used.
+        config: gives the temperature.
     """
     rows = torch.nonzero(weights).squeeze(1)
     half = 0.5 * (codebook * codebook).sum(dim=1)
@@ -188,7 +203,7 @@ def render_loss(
     target: Float[Tensor, "P C"],
     weights: Float[Tensor, " P"],
     config: LossConfig,
-    heads: Sequence[tuple[AdapterHead, nn.Module]] = (),
+    heads: Heads = (),
 ) -> Float[Tensor, ""]:
     """L_render (Eq. 4) before division: Σ_p w_p · match((B f)_p / alpha_p, t_p) over cells of the teacher's grid.
 
@@ -199,11 +214,10 @@ def render_loss(
         predicted: predicted features f of the Gaussians of the sample, standard units.
         blend: B over these Gaussians, with one row for each cell.
         target: the teacher's vectors t in the cells, standard units.
-        weights: weights of the cells in the loss.
-        config: settings of the matching loss.
-        heads: adapter heads, each with a decoder from standard units to its input; the loss is summed over the outputs
-            of the heads. Both sides are decoded from the dataset's basis, so what it drops of the teacher's vectors is
-            missing in both. Without heads the features themselves are compared.
+        weights: of the cells.
+        config: of the matching loss.
+        heads: the loss is summed over the outputs of these. Both sides are decoded from the dataset's basis, so what
+            it drops of the teacher's vectors is missing in both. Without heads the features themselves are compared.
     """
     rendered = blend.render(predicted.float())
     if config.divide_by_alpha:
@@ -217,119 +231,58 @@ def render_loss(
     return (losses * weights).sum()
 
 
-NO_WEIGHT = 1e-12
-"""Divisor of a term that nothing in a step has a weight for."""
-
-
-@runtime_checkable
-class TrainingBatch(Protocol):
-    """A batch of samples.
+class LossInputs(NamedTuple):
+    """What a term is computed from: the columns of one teacher.
 
     Attributes:
-        names: of the samples, for messages.
+        predicted: the encoder's outputs, standard units.
+        targets: what the teacher says.
+        codebook: the vectors of the teacher's target classes, standard units.
+        heads: its adapter heads.
+        config: parameters of the terms.
     """
 
-    @property
-    def names(self) -> Sequence[str]: ...
+    predicted: Float[Tensor, "N C"]
+    targets: TeacherTargets
+    codebook: Float[Tensor, "K C"]
+    heads: Heads
+    config: LossConfig
 
-    def to(self, device: torch.device) -> "TrainingBatch": ...
 
-
-@runtime_checkable
-class Objective(Protocol):
-    """The loss of a network as weighted terms. In a step each term is Σ total / Σ divisor, summed over all
-    micro-batches of all processes.
+class Term(NamedTuple):
+    """A term of the loss.
 
     Attributes:
-        network: the network to call, possibly compiled or wrapped for several processes.
-        lambdas: the weights of the terms that are not 0, by name.
-        advice: for the error where no term has a divisor above 0: what the user should check.
+        total: Σ_i w_i · loss_i.
+        weights: the weights w of these sums, which are known before anything is computed.
+        classes: whether it compares classes of targets, which dense teachers lack.
     """
 
-    network: nn.Module
-
-    @property
-    def lambdas(self) -> dict[str, float]: ...
-
-    @property
-    def advice(self) -> str: ...
-
-    def divisors(self, batch: Any) -> dict[str, float]:
-        """The sum of the weights of a batch's rows, for each term."""
-        ...
-
-    def __call__(self, batch: Any) -> dict[str, Tensor]:
-        """The totals of the terms whose weight is not 0."""
-        ...
+    total: Callable[[LossInputs], Float[Tensor, ""]]
+    weights: Callable[[TeacherTargets], Float[Tensor, " n"]]
+    classes: bool = False
 
 
-def sum_divisors(
-    objective: Objective, items: Sequence[TrainingBatch | InputError], device: torch.device
-) -> tuple[list[TrainingBatch], dict[str, float]]:
-    """Separates the batches of a step from errors, and sums the divisors of its loss terms over all processes.
-
-    Args:
-        objective: gives the divisors of a batch.
-        items: micro-batches of this process, or the errors of their samples.
-
-    Returns:
-        The batches, and for each term its divisor, at least `NO_WEIGHT`.
-    """
-    batches = [item for item in items if not isinstance(item, InputError)]
-    lambdas = objective.lambdas
-    batch_divisors = [objective.divisors(batch) for batch in batches]
-    sums = [sum(divisors[name] for divisors in batch_divisors) for name in lambdas]
-    failed = len(items) - len(batches)
-    totals = sum_over_processes(torch.tensor([*sums, failed], dtype=torch.float64, device=device)).tolist()
-    for item in items:
-        if isinstance(item, InputError):
-            raise item
-    if totals[-1]:
-        raise InputError(STOPPED_ELSEWHERE)
-    if not any(totals[:-1]):
-        names = "; ".join(name for batch in batches for name in batch.names)
-        raise InputError(
-            f"training: there is nothing to compare in {names}: no Gaussian has a target with a weight, and no "
-            f"cell of the teacher passes the thresholds; check {objective.advice}, and these scenes"
-        )
-    return batches, {name: max(total, NO_WEIGHT) for name, total in zip(lambdas, totals, strict=False)}
-
-
-def finite_terms(
-    step: int,
-    batches: Sequence[TrainingBatch],
-    names: Sequence[str],
-    micro_terms: Float64[Tensor, "micro terms"],
-    norm: float,
-    *,
-    processes: int,
-) -> dict[str, float]:
-    """The loss terms of a step over all processes, by name.
-
-    Args:
-        step: number of the step, for messages.
-        batches: micro-batches of this process.
-        names: of the terms.
-        micro_terms: what each micro-batch adds to each term.
-        norm: norm of the gradient, which is summed over all processes.
-        processes: their number.
-    """
-    bad_loss = bad_gradient = ""
-    for batch, row in zip(batches, micro_terms.tolist(), strict=True):
-        for name, value in zip(names, row, strict=True):
-            if not math.isfinite(value):
-                bad_loss = bad_loss or f"the {name} loss of {'; '.join(batch.names)}"
-    if not bad_loss and not math.isfinite(norm):
-        # Gradients are already summed over processes, so samples of any of them may be the cause.
-        samples = "; ".join(name for batch in batches for name in batch.names)
-        bad_gradient = f"the gradient of {samples}{' or of samples of other processes' if processes > 1 else ''}"
-    flags = micro_terms.new_tensor([float(bool(bad_loss)), float(bool(bad_gradient))])
-    *totals, bad_losses, bad_gradients = sum_over_processes(torch.cat((micro_terms.sum(dim=0), flags))).tolist()
-    if bad_losses or bad_gradients:
-        # A loss identifies the samples that cause it; the gradient is named only if all losses are finite.
-        where = bad_loss or ("a loss of another process" if bad_losses else bad_gradient)
-        raise InputError(
-            f"training: {where} is not finite at step {step}; parameters were not changed. Use a lower "
-            "learning_rate, or check these scenes (`gsencoder inspect`)"
-        )
-    return dict(zip(names, totals, strict=True))
+TERMS: Mapping[str, Term] = {
+    "field": Term(
+        lambda at: field_loss(at.predicted, at.targets.targets.float(), at.targets.loss_weights, at.config),
+        lambda targets: targets.loss_weights,
+    ),
+    "render": Term(
+        lambda at: render_loss(
+            at.predicted,
+            at.targets.rows.blend(len(at.predicted)),
+            at.targets.rows.targets,
+            at.targets.rows.row_weights,
+            at.config,
+            at.heads,
+        ),
+        lambda targets: targets.rows.row_weights,
+    ),
+    "contrast": Term(
+        lambda at: contrast_loss(at.predicted, at.targets.codes, at.targets.loss_weights, at.codebook, at.config),
+        lambda targets: targets.loss_weights,
+        classes=True,
+    ),
+}
+"""The terms by name; the weight of NAME is `LossConfig.NAME_weight`."""

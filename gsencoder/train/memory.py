@@ -1,15 +1,10 @@
-"""Training of a scene's memory: first queries, the loop, and what comes out (M3 sec. 3.3).
-
-The network of a scene's memory, its samples and its loss: principal queries of Gaussians, rendered through B, attend
-to banks (M3 sec. 3.3).
+"""Training of a scene's memory (M3 sec. 3.3): principal queries of Gaussians, rendered through B, attend to banks.
 
     R̂ = A_gm(B q / alpha),   L = λ_cos · (1 − cos(R̂, R)) + λ_L2 · |R̂ − R|² / C
 
 over rows of B that are drawn at random in each view, and Gaussians, which are rows with one entry, with a weight of
-their own; in standard units about the mean of the space. With the geometry
-frozen this is a regression on sparse rows, without a rasterizer.
-
-Preparation of a scene for the training of its memory: fused features, a bank, and the rows of B of every view.
+their own; in standard units about the mean of the space. With the geometry frozen this is a regression on sparse rows,
+without a rasterizer.
 
 The files of each teacher are in a folder of their own, and appear when they are complete; an interrupted preparation
 continues with the maps and sums of its fusion.
@@ -19,11 +14,11 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -35,7 +30,7 @@ from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files import plain, read_foreign, write_json
 from gsencoder.core.process import ProcessRank, Track, untracked
-from gsencoder.core.settings import first_difference
+from gsencoder.core.settings import check_limits, first_difference, option
 from gsencoder.data.scene_arrays import bank_parts, read_bank
 from gsencoder.data.splats.files import fingerprint
 from gsencoder.fusion.basis import to_coordinates
@@ -45,15 +40,17 @@ from gsencoder.memory.attention import Decoder, MemoryAttention, make_decoder, r
 from gsencoder.memory.bank import BankConfig, MapStream, RawSample, build_bank, draw_sample, principal_queries
 from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
 from gsencoder.teachers.base import Teacher
-from gsencoder.train.batch import RenderRows, gaussian_rows, join_rows, sample_rows
-from gsencoder.train.loop import CHANGEABLE_ON_RESUME, Trainer, TrainerConfig, TrainingState
+from gsencoder.train.loop import Trainer, TrainerConfig, TrainingState
+from gsencoder.train.losses import EPS, RenderRows
 from gsencoder.train.prepare import PrepareConfig, view_rows
 from gsencoder.train.prepared_file import PreparedScene, write_prepared
+from gsencoder.train.samples import join_rows, sample_rows
 from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory, Scene
 from gsencoder.types.features import Scoring
 
 BANK_FILE, SCENE_FILE, MAPS_FOLDER = "bank.safetensors", "scene.safetensors", "maps"
 SAMPLE_FILE, SETTINGS_FILE = "sample.safetensors", "made_with.json"
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -142,7 +139,10 @@ def prepare_memory(
     rows = view_rows(scene, source, outputs, prepare, np.arange(len(scene.views)), device)
     _sample_raw(folder, stream, features.space, sample)
     write_prepared(folder / SCENE_FILE, scene, features, outputs, rows)
-    _write_bank(folder / BANK_FILE, components, outputs, settings)
+    arrays, header = output_space_parts(outputs)
+    of_bank, figures = bank_parts(components)
+    arrays |= {"bank": components.components, **of_bank}
+    write_archive(folder / BANK_FILE, arrays, {**header, **figures, "made_with": settings})
     return open_memory_scene(folder, settings)
 
 
@@ -167,16 +167,12 @@ def _advice(folder: Path) -> AbstractContextManager[None]:
 
 
 def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Writes what a preparation depends on before its first map and its sample, which do not say so themselves."""
+    """Writes what a preparation depends on before its first map and its sample, which do not say so themselves, or
+    compares it with what an interrupted one wrote."""
     path = folder / SETTINGS_FILE
     with _advice(folder):
         if not path.is_file():
-            if any((folder / name).exists() for name in (SAMPLE_FILE, MAPS_FOLDER)):
-                raise InputError(f"{folder}: holds parts of a preparation, and not what they were made with")
-            try:
-                folder.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise InputError(f"{folder}: cannot be made: {error.strerror or error}") from error
+            folder.mkdir(parents=True, exist_ok=True)
             write_json(path, settings)
             return
         try:
@@ -223,13 +219,6 @@ def _map_stream(scene: Scene, teacher: Teacher, folder: Path) -> MapStream:
     return stream
 
 
-def _write_bank(path: Path, bank: MemoryBank, outputs: OutputSpace, settings: Mapping[str, Any]) -> None:
-    arrays, header = output_space_parts(outputs)
-    of_bank, figures = bank_parts(bank)
-    arrays |= {"bank": bank.components, **of_bank}
-    write_archive(path, arrays, {**header, **figures, "made_with": dict(settings)})
-
-
 def _preparation_settings(
     scene: Scene, teacher: Teacher, bank: BankConfig, prepare: PrepareConfig, predicted: GaussianFeatures | None
 ) -> dict[str, Any]:
@@ -259,55 +248,35 @@ def _spread(features: GaussianFeatures) -> float:
     return float(np.sqrt(total / len(seen))) or 1.0
 
 
-EPS = 1e-12
-MAX_CHANNELS = 1024
-"""Channels of a query, at most; 16 to 64 are enough for most teachers."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MemoryConfig:
     """Queries, attention and loss of a memory."""
 
-    channels: int = field(default=16, metadata={"help": "channels s of a Gaussian's query for each teacher"})
-    init: Literal["fused", "random"] = field(
-        default="fused",
-        metadata={
-            "help": "first queries: the principal coordinates of the fused features, with which Gaussians themselves "
-            "keep features; random = as the paper, where only rendered queries do"
-        },
+    channels: int = option(16, "channels s of a Gaussian's query for each teacher", ge=1, le=1024)
+    init: Literal["fused", "random"] = option(
+        "fused",
+        "first queries: the principal coordinates of the fused features, with which Gaussians themselves "
+        "keep features; random = as the paper, where only rendered queries do",
     )
-    scoring: Scoring = field(
-        default="centered",
-        metadata={
-            "help": "queries and components are compared by the cosine about the mean; cosine = as they are, as M3's "
-            "code does; dot = by products, as its equation"
-        },
+    scoring: Scoring = option(
+        "centered",
+        "queries and components are compared by the cosine about the mean; cosine = as they are, as M3's "
+        "code does; dot = by products, as its equation",
     )
-    temperature: float = field(default=0.05, metadata={"help": "temperature of the attention's softmax"})
-    points: int = field(default=2000, metadata={"help": "rows of B that are drawn in each view of a step"})
-    gaussian_weight: float = field(
-        default=0.3,
-        metadata={
-            "help": "weight of Gaussians that are compared with their fused features, half as many as points; without "
-            "them rendered features come nearer to the teacher's, and those of the Gaussians go their own way; 0 = off"
-        },
+    temperature: float = option(0.05, "temperature of the attention's softmax", gt=0)
+    points: int = option(2000, "rows of B that are drawn in each view of a step", ge=1)
+    gaussian_weight: float = option(
+        0.3,
+        "weight of Gaussians that are compared with their fused features, half as many as points; without "
+        "them rendered features come nearer to the teacher's, and those of the Gaussians go their own way; 0 = off",
+        ge=0,
     )
-    min_alpha: float = field(default=0.5, metadata={"help": "smallest opacity of a row"})
-    cosine: float = field(default=1.0, metadata={"help": "weight of 1 − cosine"})
-    l2: float = field(default=1.0, metadata={"help": "weight of the squared distance in standard units"})
+    min_alpha: float = option(0.5, "smallest opacity of a row", gt=0, le=1)
+    cosine: float = option(1.0, "weight of 1 − cosine", ge=0)
+    l2: float = option(1.0, "weight of the squared distance in standard units", ge=0)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.channels <= MAX_CHANNELS:
-            raise InputError(f"channels: expected 1 to {MAX_CHANNELS:,}, got {self.channels:,}")
-        if self.points < 1:
-            raise InputError(f"points: expected 1 or more, got {self.points}")
-        if not 0 < self.temperature < math.inf:
-            raise InputError(f"temperature: expected a positive number, got {self.temperature}")
-        if not 0 < self.min_alpha <= 1:
-            raise InputError(f"min_alpha: expected a number in (0, 1], got {self.min_alpha}")
-        for name in ("cosine", "l2", "gaussian_weight"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        check_limits(self)
         if not self.cosine + self.l2 > 0:
             raise InputError("cosine, l2: expected one above 0; there would be no loss")
 
@@ -348,10 +317,17 @@ class ViewSamples(Dataset[MemoryBatch]):
         rows = sample_rows(scene.view(view), seen, config.min_alpha, config.points, rng)
         if not config.gaussian_weight:
             return rows
-        # A Gaussian is a row of B with one entry.
         of_seen = np.flatnonzero(seen)
         chosen = np.sort(rng.choice(of_seen, min(len(of_seen), -(-config.points // 2)), replace=False))
-        return join_rows([rows, gaussian_rows(chosen, scene.targets(chosen), config.gaussian_weight)], [0, 0])
+        # A Gaussian is a row of B with one entry.
+        gaussians = RenderRows(
+            crow=torch.arange(len(chosen) + 1),
+            col=torch.from_numpy(chosen.astype(np.int32)),
+            weight=torch.ones(len(chosen)),
+            targets=torch.from_numpy(scene.targets(chosen)),
+            row_weights=torch.full((len(chosen),), float(config.gaussian_weight)),
+        )
+        return join_rows([rows, gaussians], [0, 0])
 
 
 def join_views(samples: Sequence[MemoryBatch | InputError]) -> MemoryBatch | InputError:
@@ -387,45 +363,44 @@ class MemoryNetwork(nn.Module):
 class MemoryObjective:
     """The loss of a memory: for each teacher and row w · (λ_cos · (1 − cos) + λ_L2 · |R̂ − R|² / C)."""
 
-    def __init__(self, network: nn.Module, config: MemoryConfig, teachers: Sequence[str]) -> None:
-        self.network, self._config, self._teachers = network, config, tuple(teachers)
+    advice = "memory.min_alpha"
 
-    @property
-    def advice(self) -> str:
-        """Settings that leave nothing to compare."""
-        return "memory.min_alpha"
+    def __init__(self, network: nn.Module, config: MemoryConfig, teachers: Sequence[str]) -> None:
+        self.network, self._teachers = network, tuple(teachers)
+        self._weights = {name: value for name, value in (("cosine", config.cosine), ("l2", config.l2)) if value}
+
+    def _by_term(self, teacher: str, values: Mapping[str, T]) -> dict[str, T]:
+        """Values of the terms whose weight is not 0, by the names of the terms in the log."""
+        return {term if len(self._teachers) == 1 else f"{teacher}/{term}": values[term] for term in self._weights}
 
     @property
     def lambdas(self) -> dict[str, float]:
         """The weights of the terms that are not 0, by name."""
-        weights = {"cosine": self._config.cosine, "l2": self._config.l2}
-        return {self._term(name, term): value for name in self._teachers for term, value in weights.items() if value}
-
-    def _term(self, teacher: str, term: str) -> str:
-        return term if len(self._teachers) == 1 else f"{teacher}/{term}"
+        return {name: weight for each in self._teachers for name, weight in self._by_term(each, self._weights).items()}
 
     def divisors(self, batch: MemoryBatch) -> dict[str, float]:
         """The sum of the weights of the rows, for each term."""
-        sums = {
-            name: float(rows.row_weights.double().sum()) for name, rows in zip(self._teachers, batch.rows, strict=True)
-        }
-        return {self._term(name, term): total for name, total in sums.items() for term in ("cosine", "l2")}
+        divisors: dict[str, float] = {}
+        for name, rows in zip(self._teachers, batch.rows, strict=True):
+            divisors |= self._by_term(name, dict.fromkeys(self._weights, float(rows.row_weights.double().sum())))
+        return divisors
 
     def __call__(self, batch: MemoryBatch) -> dict[str, Tensor]:
         """Totals of the terms whose weight is not 0."""
-        terms = {}
+        totals: dict[str, Tensor] = {}
         for name, predicted, rows in zip(self._teachers, self.network(batch.rows), batch.rows, strict=True):
             predicted, target = predicted.float(), rows.targets
             products = (predicted * target).sum(dim=1)
             lengths = torch.sqrt(((predicted * predicted).sum(dim=1) + EPS) * ((target * target).sum(dim=1) + EPS))
-            terms[self._term(name, "cosine")] = ((1 - products / lengths) * rows.row_weights).sum()
-            terms[self._term(name, "l2")] = ((predicted - target).square().mean(dim=1) * rows.row_weights).sum()
-        return {name: terms[name] for name in self.lambdas}
+            directions = ((1 - products / lengths) * rows.row_weights).sum()
+            distances = ((predicted - target).square().mean(dim=1) * rows.row_weights).sum()
+            totals |= self._by_term(name, {"cosine": directions, "l2": distances})
+        return totals
 
 
 def memory_training() -> TrainerConfig:
     """The training loop's settings for memories."""
-    return TrainerConfig(steps=600, learning_rate=0.04, warmup=50, weight_decay=0.0, validate_every=0, log_every=10)
+    return TrainerConfig(steps=600, learning_rate=0.04, warmup=50, validate_every=0)
 
 
 def first_queries(
@@ -518,13 +493,11 @@ def _train(
         decoders[name] = _decoder_of(scene, config, kind, first, projection, training.seed)
     settings = {
         "memory": plain(config),
-        "train": {name: value for name, value in plain(training).items() if name not in CHANGEABLE_ON_RESUME},
         "decoder": kind or "attention",
         "teachers": list(scenes),
         "spaces": {name: scene.bank.space.describe() for name, scene in scenes.items()},
         "components": {name: len(scene.bank) for name, scene in scenes.items()},
         "digests": {name: fingerprint_of(scene.bank) for name, scene in scenes.items()},
-        "samples_per_step": training.samples_per_step(process.world_size),
     }
     trainer = Trainer(
         MemoryNetwork(queries, decoders),
@@ -536,6 +509,7 @@ def _train(
         settings=settings,
         process=process,
         device=device,
+        weight_decay=0.0,
     )
     state = trainer.run(track)
     assert isinstance(trainer.network, MemoryNetwork)

@@ -25,7 +25,7 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, advised, listed, readable
 from gsencoder.core.files import atomic_file, locked, read_foreign, read_foreign_text
 from gsencoder.core.process import ProcessRank, Track
-from gsencoder.core.settings import first_difference
+from gsencoder.core.settings import first_difference, option
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.checkpoint import CachedTeacher, upright
 from gsencoder.fusion.errors import project_maps
@@ -51,38 +51,22 @@ class PrepareConfig:
     """Settings of targets and of the matrices of the render loss."""
 
     fusion: FuseConfig = field(default_factory=FuseConfig)
-    render_cell: int = field(
-        default=8,
-        metadata={"help": "smallest side of a cell of the render loss, pixels; finer teacher maps are averaged"},
+    render_cell: int = option(8, "smallest side of a cell of the render loss, pixels; finer teacher maps are averaged")
+    render_min_weight: float = option(1e-3, "smallest blending weight in the matrices of the render loss")
+    render_views: int = option(
+        0,
+        "views of a scene, evenly spaced, whose matrices are stored and from which samples draw theirs; "
+        "0 = all. Targets are fused from all views in any case",
     )
-    render_min_weight: float = field(
-        default=1e-3, metadata={"help": "smallest blending weight in the matrices of the render loss"}
-    )
-    render_views: int = field(
-        default=0,
-        metadata={
-            "help": "views of a scene, evenly spaced, whose matrices are stored and from which samples draw theirs; "
-            "0 = all. Targets are fused from all views in any case"
-        },
-    )
-    basis_views: int = field(
-        default=256, metadata={"help": "number of maps from which the basis of a dense teacher is computed"}
-    )
+    basis_views: int = option(256, "number of maps from which the basis of a dense teacher is computed")
 
-    center: bool = field(
-        default=True, metadata={"help": "subtract the teacher's mean from targets; false needs fusion.basis=false"}
-    )
-    scale: bool = field(
-        default=True,
-        metadata={"help": "divide targets by their typical distance from the mean; false = in the teacher's units"},
-    )
+    center: bool = option(True, "subtract the teacher's mean from targets; false needs fusion.basis=false")
+    scale: bool = option(True, "divide targets by their typical distance from the mean; false = in the teacher's units")
 
-    targets: Precision = field(
-        default="float16",
-        metadata={
-            "help": "how targets and the teacher's vectors of the render loss are stored: float16, or int8 with a "
-            "scale for each column, in half the bytes"
-        },
+    targets: Precision = option(
+        "float16",
+        "how targets and the teacher's vectors of the render loss are stored: float16, or int8 with a "
+        "scale for each column, in half the bytes",
     )
 
     def __post_init__(self) -> None:

@@ -17,6 +17,7 @@ from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, SceneWarning, about, listed
 from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, Track, untracked
+from gsencoder.core.settings import option
 from gsencoder.data.labels.files import read_split
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.points import unit_of
@@ -45,17 +46,14 @@ TRAINED = "trained on"
 class SourceConfig:
     """The source of a training's targets: settings of reading, seeding, the teacher and preparation."""
 
-    splat: str = field(
-        default="",
-        metadata={
-            "help": "file of the Gaussians of scenes with views, where {scene} stands for the name of its folder; "
-            f"empty = make seeds. {READABLE}"
-        },
+    splat: str = option(
+        "",
+        "file of the Gaussians of scenes with views, where {scene} stands for the name of its folder; "
+        f"empty = make seeds. {READABLE}",
     )
-    orbits: int = field(default=24, metadata={"help": "largest number of cameras placed in a splat without views"})
-    cameras: CamerasOfSplat = field(
-        default="auto",
-        metadata={"help": "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"},
+    orbits: int = option(24, "largest number of cameras placed in a splat without views")
+    cameras: CamerasOfSplat = option(
+        "auto", "where they stand: around it, inside it, or auto = inside if that shows most of it (a room)"
     )
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import plain
 from gsencoder.core.process import Device, ProcessRank, Track, untracked
+from gsencoder.core.settings import check_limits, option
 from gsencoder.core.threads import threads_of_torch
 from gsencoder.fusion.measured_heads import heads_digest
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
@@ -23,10 +24,8 @@ from gsencoder.teachers.build import words_by_teacher
 from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.train.adapter_heads import dataset_heads, render_heads, required_heads, teacher_of_heads
-from gsencoder.train.batch import Batch, SamplingConfig, TeacherTargets, join_samples
 from gsencoder.train.distributed import check_agreement, cpu_share, digest_of, fail_together, join_processes
 from gsencoder.train.loop import (
-    CHANGEABLE_ON_RESUME,
     TRAINING_CHECKPOINT_FILE,
     Trainer,
     TrainerConfig,
@@ -34,24 +33,31 @@ from gsencoder.train.loop import (
     ValidationResult,
     check_same_teachers,
 )
-from gsencoder.train.losses import AdapterHead, LossConfig, contrast_loss, field_loss, render_loss
+from gsencoder.train.losses import TERMS, Heads, LossConfig, LossInputs
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepare_scenes import SourceConfig, prepare_scenes
 from gsencoder.train.prepared_file import PreparedScene
-from gsencoder.train.samples import AugmentConfig, SampleDataset, SampleRecipe, TeacherRecipe, TrainingScene
-
-Heads = Sequence[tuple[AdapterHead, nn.Module]]
-"""Adapter heads of a teacher, each with a decoder from standard units to its input."""
+from gsencoder.train.samples import (
+    Augmentation,
+    Batch,
+    SampleDataset,
+    SampleRecipe,
+    SamplingConfig,
+    TeacherRecipe,
+    TrainingScene,
+    join_samples,
+)
 
 
 class Distillation:
-    """The loss L = Σ_teachers w · (λ_3D · L_3D + λ_render · L_render + λ_contrast · L_contrast), as totals before
-    division.
+    """The loss L = Σ_teachers w · Σ_terms λ_term · L_term over the terms of `losses.TERMS`, as totals before division.
 
     In a step each term is Σ total / Σ weight over all micro-batches of all processes. The weights are known before
     anything is computed, so each micro-batch divides its totals by the sum of the step's weights, and gradients are
     simply added. A term of one of several teachers is called TEACHER/TERM, such as "labels/field".
     """
+
+    advice = "loss.min_alpha, loss.min_kept and loss.rarity"
 
     def __init__(
         self,
@@ -63,49 +69,35 @@ class Distillation:
         device: torch.device = torch.device("cpu"),
     ) -> None:
         """Args:
-        network: a `GaussianEncoder`, possibly compiled or wrapped for several processes.
+        network: a `GaussianEncoder`, possibly wrapped for several processes.
         config: weights and parameters of the terms.
-        teachers: the teachers, in the order of the encoder's output columns.
+        teachers: in the order of the encoder's output columns.
         heads: adapter heads of teachers, by name.
-        device: the device of the losses.
+        device: of the losses.
         """
         self.network, self.config = network, config
-        self._teachers = list(teachers)
+        self._widths = [teacher.channels for teacher in teachers]
         self._codebooks = [torch.from_numpy(each.class_balance.codebook).to(device) for each in teachers]
-        self._heads = {
-            name: [(head.to(device), decode.to(device)) for head, decode in of_teacher]
-            for name, of_teacher in heads.items()
-        }
+        self._heads = [
+            [(head.to(device), decode.to(device)) for head, decode in heads.get(each.name, ())] for each in teachers
+        ]
+        self._terms = [
+            (name if len(teachers) == 1 else f"{teacher.name}/{name}", weight * teacher.weight, number, TERMS[name])
+            for number, teacher in enumerate(teachers)
+            for name, weight in config.lambdas.items()
+            if weight * teacher.weight and (teacher.classes or not TERMS[name].classes)
+        ]
 
     @property
     def lambdas(self) -> dict[str, float]:
         """The weights of the terms that are not 0, by name."""
-        config = self.config
-        terms = {"field": config.field_weight, "render": config.render_weight, "contrast": config.contrast_weight}
-        return {
-            self._term(teacher, name): weight * teacher.weight
-            for teacher in self._teachers
-            for name, weight in terms.items()
-            if weight * teacher.weight and (teacher.contrast or name != "contrast")
-        }
-
-    def _term(self, teacher: TeacherRecipe, name: str) -> str:
-        return name if len(self._teachers) == 1 else f"{teacher.name}/{name}"
-
-    @property
-    def advice(self) -> str:
-        """Settings that leave nothing to compare."""
-        return "loss.min_alpha, loss.min_kept and loss.rarity"
+        return {name: weight for name, weight, _, _ in self._terms}
 
     def divisors(self, batch: Batch) -> dict[str, float]:
         """The sum of the weights of a batch's Gaussians or rows, for each term."""
-        divisors = {}
-        for teacher, targets in zip(self._teachers, batch.teachers, strict=True):
-            gaussians = float(targets.loss_weights.double().sum())
-            divisors[self._term(teacher, "field")] = gaussians
-            divisors[self._term(teacher, "render")] = float(targets.rows.row_weights.double().sum())
-            divisors[self._term(teacher, "contrast")] = gaussians
-        return divisors
+        return {
+            name: float(term.weights(batch.teachers[number]).double().sum()) for name, _, number, term in self._terms
+        }
 
     def __call__(self, batch: Batch) -> dict[str, Tensor]:
         """Totals of the terms whose weight is not 0, for the encoder's predictions."""
@@ -113,32 +105,13 @@ class Distillation:
 
     def terms(self, predicted: Float[Tensor, "N C"], batch: Batch) -> dict[str, Tensor]:
         """Totals of the terms whose weight is not 0; the terms of a teacher that the batch's scenes lack are 0."""
-        widths = [teacher.channels for teacher in self._teachers]
-        terms: dict[str, Tensor] = {}
         with torch.autocast(predicted.device.type, enabled=False):
-            columns = predicted.split(widths, dim=1)
-            for number, (teacher, targets) in enumerate(zip(self._teachers, batch.teachers, strict=True)):
-                if teacher.weight:
-                    totals = self._teacher_terms(columns[number], targets, number)
-                    terms |= {self._term(teacher, name): total for name, total in totals.items()}
-        return terms
-
-    def _teacher_terms(
-        self, predicted: Float[Tensor, "N C"], targets: TeacherTargets, number: int
-    ) -> dict[str, Tensor]:
-        """The terms of one teacher; the render loss without rows is 0."""
-        config, terms = self.config, dict[str, Tensor]()
-        teacher = self._teachers[number]
-        if config.field_weight:
-            terms["field"] = field_loss(predicted, targets.targets.float(), targets.loss_weights, config)
-        if config.render_weight:
-            rows, heads = targets.rows, self._heads.get(teacher.name, ())
-            b = rows.blend(len(predicted))
-            terms["render"] = render_loss(predicted, b, rows.targets, rows.row_weights, config, heads)
-        if config.contrast_weight and teacher.contrast:
-            codebook = self._codebooks[number]
-            terms["contrast"] = contrast_loss(predicted, targets.codes, targets.loss_weights, codebook, config)
-        return terms
+            columns = predicted.split(self._widths, dim=1)
+            inputs = [
+                LossInputs(*each, self.config)
+                for each in zip(columns, batch.teachers, self._codebooks, self._heads, strict=True)
+            ]
+            return {name: term.total(inputs[number]) for name, _, number, term in self._terms}
 
 
 def encoder_trainer(
@@ -151,15 +124,8 @@ def encoder_trainer(
     device: torch.device = torch.device("cpu"),
     **settings: Any,
 ) -> Trainer:
-    """A trainer that distills the teachers of a dataset into an encoder.
-
-    Args:
-        encoder: the encoder, trained in place and moved to `device`.
-        dataset: the training samples.
-        losses: weights and parameters of the loss terms.
-        heads: adapter heads of teachers, by name.
-        settings: the other arguments of `Trainer`.
-    """
+    """A trainer that distills the teachers of a dataset into an encoder; `settings` are the other arguments of
+    `Trainer`."""
     return Trainer(
         encoder,
         dataset,
@@ -183,32 +149,27 @@ target classes. It is called in all processes, and what it returns in the first 
 class TrainConfig(SourceConfig):
     """Settings of a training run."""
 
-    tensorboard: bool = field(default=True, metadata={"help": "write TensorBoard events in addition to log.csv"})
-    heads: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "names": True,
-            "help": "the teacher's adapter heads on whose outputs L_render is computed, such as siglip,sam.features; "
-            "they are stored beside the weights; empty = L_render compares the features themselves",
-        },
+    tensorboard: bool = option(True, "write TensorBoard events in addition to log.csv")
+    heads: tuple[str, ...] = option(
+        (),
+        "the teacher's adapter heads on whose outputs L_render is computed, such as siglip,sam.features; "
+        "they are stored beside the weights; empty = L_render compares the features themselves",
+        names=True,
     )
     model: EncoderConfig = field(default_factory=EncoderConfig, metadata={"preset": "tiny"})
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    augment: bool = option(True, "turn, mirror, scale, shift, thin and relight samples at random")
     loss: LossConfig = field(default_factory=LossConfig)
     train: TrainerConfig = field(default_factory=TrainerConfig)
-    prepare_threads: int = field(
-        default=0,
-        metadata={
-            "help": "threads of each process while scenes are prepared; 0 = the machine's cores, divided among its "
-            "processes"
-        },
+    prepare_threads: int = option(
+        0,
+        "threads of each process while scenes are prepared; 0 = the machine's cores, divided among its processes",
+        ge=0,
     )
 
     def __post_init__(self) -> None:
         SourceConfig.__post_init__(self)
-        if self.prepare_threads < 0:
-            raise InputError(f"prepare_threads: expected 0 or more, got {self.prepare_threads}")
+        check_limits(self)
         if self.loss.confidence and not (self.prepare.center and self.prepare.scale):
             raise InputError(
                 "loss.confidence: weights by distances from the mean in typical ones; give loss.confidence=false with "
@@ -268,8 +229,13 @@ def train(
         work: folder for the checkpoint and the log; created if it does not exist.
         held_out: scenes on which `validate` scores the encoder.
         prepared: folder of prepared scenes, which runs with the same sources can share; None = a folder in `work`.
-        device: the device on which scenes are prepared and the encoder is trained.
+        device: on which scenes are prepared and the encoder is trained.
         validate: scores the encoder during training, for example `gsencoder.evaluate.validation.validate_names`.
+        track: wraps loops to show progress.
+
+    Raises:
+        InputError: a scene cannot be used; `work` or `prepared` holds a run with other settings; or a loss or gradient
+            is not finite.
     """
     folder = Path(work)
     training, validation = [Path(path) for path in scenes], [Path(path) for path in held_out]
@@ -279,16 +245,14 @@ def train(
         with fail_together():
             if process.is_first:
                 check_same_teachers(folder / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
-        prepared_folder = Path(prepared) if prepared is not None else folder / "prepared"
-        voxel = config.model.voxel
         with threads_of_torch(cpu_share(process, config.prepare_threads)):
             datasets = prepare_scenes(
                 training,
                 validation,
                 words,
                 config,
-                prepared_folder,
-                voxel=voxel,
+                Path(prepared) if prepared is not None else folder / "prepared",
+                voxel=config.model.voxel,
                 heads=required_heads(config.heads, config.teachers_by_name),
                 process=process,
                 device=chosen_device,
@@ -324,39 +288,18 @@ def fit(
     """Trains an encoder on prepared scenes, given by name; the other arguments are those of `train`."""
     # Samples are numbered by scene, so that the order in which scenes are given must not matter to a resumed run.
     training = sorted(training)
-    spaces = {name: dataset.load_space() for name, dataset in datasets.items()}
-    outputs = OutputSpaces(by_teacher={name: space for name, (space, _) in spaces.items()})
+    outputs = OutputSpaces(by_teacher={name: dataset.load_space()[0] for name, dataset in datasets.items()})
     with_heads = teacher_of_heads(config.teachers_by_name, config.heads)
     heads = dataset_heads(datasets[with_heads], config.heads)
     if len(heads.heads) < len(config.heads):
         raise InputError(f"heads: {', '.join(config.heads)} names a head twice; its loss would count twice")
     check_agreement("the heads of L_render", heads_digest(heads))
-    weights = config.loss.teacher_weights or (1.0,) * len(datasets)
-    with_contrast = {name: config.loss.contrast_clusters or space[1] is not None for name, space in spaces.items()}
-    if config.loss.contrast_weight and not any(with_contrast.values()):
-        nothing_else = not config.loss.field_weight + config.loss.render_weight > 0
-        message = (
-            "loss.contrast_weight: the maps of no teacher are codes of a table of names, so L_contrast has no classes; "
-            "loss.contrast_clusters=true takes clusters of targets as classes"
-        )
-        if nothing_else:
-            raise InputError(message)
-        warnings.warn(message, SceneWarning, stacklevel=2)
-    _check_trained(config.loss, weights, with_contrast)
     recipe = SampleRecipe(
         encoder=config.model,
         sampling=config.sampling,
-        augmentation=config.augment,
+        augmentation=Augmentation() if config.augment else None,
         losses=config.loss,
-        teachers=tuple(
-            TeacherRecipe(
-                name=name,
-                class_balance=dataset.load_class_balance(),
-                weight=weight,
-                contrast=with_contrast[name],
-            )
-            for (name, dataset), weight in zip(datasets.items(), weights, strict=True)
-        ),
+        teachers=teacher_recipes(datasets, config.loss),
         seed=config.train.seed,
         step_samples=config.train.samples_per_step(process.world_size),
     )
@@ -369,16 +312,15 @@ def fit(
     if process.world_size > 1:
         digests = [dataset.digest_of_scenes(training) for dataset in datasets.values()]
         check_agreement("the prepared scenes", digest_of(digests))
-    scenes_to_train_on = [TrainingScene(_parts(datasets, name)) for name in training]
     torch.manual_seed(config.train.seed)
     encoder = GaussianEncoder(config.model, outputs.widths)
     trainer = encoder_trainer(
         encoder,
-        SampleDataset(scenes_to_train_on, recipe),
+        SampleDataset([TrainingScene(_parts(datasets, name)) for name in training], recipe),
         config.loss,
         config.train,
         folder=work,
-        settings=resume_settings(config, process, datasets, training),
+        settings=resume_settings(config, datasets, training, heads_digest(heads)),
         heads={with_heads: render_heads(heads, outputs[with_heads])},
         process=process,
         device=device,
@@ -387,33 +329,53 @@ def fit(
     )
     state = trainer.run(track)
     # A run that is resumed after its last step and validation has not validated in this process.
-    if trainer.last_validation is None:
-        trainer.last_validation = score_encoder(encoder)
-    scores = dict(trainer.last_validation.scores) if trainer.last_validation is not None else {}
+    last = trainer.last_validation or score_encoder(encoder)
     tables = {name: _table_of(each, datasets[name]) for name, each in words.items()}
-    return Training(encoder=encoder, outputs=outputs, tables=tables, state=state, scores=scores)
+    return Training(encoder=encoder, outputs=outputs, tables=tables, state=state, scores=dict(last.scores))
 
 
-def _check_trained(losses: LossConfig, weights: Sequence[float], with_contrast: Mapping[str, bool]) -> None:
-    """Warns of teachers on which no loss is computed, since the encoder offers their features all the same."""
-    of_all = losses.field_weight + losses.render_weight > 0
-    untrained = [
-        name
-        for (name, contrast), weight in zip(with_contrast.items(), weights, strict=True)
-        if not weight or not (of_all or (contrast and losses.contrast_weight))
-    ]
-    if not untrained:
-        return
-    option = f"loss.teacher_weights={list(weights)}"
-    if len(untrained) == len(weights):
-        raise InputError(f"loss: the losses of every teacher have the weight 0 ({option}); give one of them a weight")
-    names = f"teacher {untrained[0]}" if len(untrained) == 1 else f"teachers {', '.join(untrained)}"
-    warnings.warn(
-        f"{names}: no loss is computed with a weight above 0 ({option}), so that the encoder gives features that were "
-        "never trained; give a weight above 0, or leave the teacher out",
-        SceneWarning,
-        stacklevel=3,
+def teacher_recipes(datasets: Mapping[str, PreparedDataset], losses: LossConfig) -> tuple[TeacherRecipe, ...]:
+    """The teachers of a training with the weights and classes of their targets.
+
+    Raises:
+        InputError: no loss is computed on any teacher.
+
+    Warns:
+        SceneWarning: none is on some, whose features the encoder offers all the same, or no teacher has classes for
+            L_contrast.
+    """
+    weights = losses.teacher_weights or (1.0,) * len(datasets)
+    teachers = tuple(
+        TeacherRecipe(
+            name=name,
+            class_balance=dataset.load_class_balance(),
+            weight=weight,
+            classes=losses.contrast_clusters or dataset.load_space()[1] is not None,
+        )
+        for (name, dataset), weight in zip(datasets.items(), weights, strict=True)
     )
+    of_all = any(weight and not TERMS[name].classes for name, weight in losses.lambdas.items())
+    if losses.contrast_weight and not any(each.classes for each in teachers):
+        message = (
+            "loss.contrast_weight: the maps of no teacher are codes of a table of names, so L_contrast has no classes; "
+            "loss.contrast_clusters=true takes clusters of targets as classes"
+        )
+        if not of_all:
+            raise InputError(message)
+        warnings.warn(message, SceneWarning, stacklevel=3)
+    untrained = [each.name for each in teachers if not each.weight or not (of_all or each.classes)]
+    option = f"loss.teacher_weights={list(weights)}"
+    if len(untrained) == len(teachers):
+        raise InputError(f"loss: the losses of every teacher have the weight 0 ({option}); give one of them a weight")
+    if untrained:
+        names = f"teacher {untrained[0]}" if len(untrained) == 1 else f"teachers {', '.join(untrained)}"
+        warnings.warn(
+            f"{names}: no loss is computed with a weight above 0 ({option}), so that the encoder gives features that "
+            "were never trained; give a weight above 0, or leave the teacher out",
+            SceneWarning,
+            stacklevel=3,
+        )
+    return teachers
 
 
 def _parts(datasets: Mapping[str, PreparedDataset], name: str) -> list[PreparedScene | None]:
@@ -422,37 +384,23 @@ def _parts(datasets: Mapping[str, PreparedDataset], name: str) -> list[PreparedS
 
 
 def _table_of(words: Words, dataset: PreparedDataset) -> TextTable:
-    """The names that are known without a tower: those of a table, or of a tower's vocabulary and the dataset. It states
-    those trained on, where the dataset has classes with names."""
+    """The names that are known without a tower: those of a table, or of a tower's vocabulary and the dataset, with
+    those trained on marked, where the dataset has classes with names."""
     kinds = dataset.load_kinds()
     return closed_table(words.trained_on(kinds) if kinds else words)
 
 
 def resume_settings(
-    config: TrainConfig, process: ProcessRank, datasets: Mapping[str, PreparedDataset], training: Sequence[str]
+    config: TrainConfig, datasets: Mapping[str, PreparedDataset], training: Sequence[str], heads: str
 ) -> dict[str, Any]:
-    """The settings that a run must share with the one that it resumes, as JSON values.
-
-    The distribution of a step's micro-batches over processes may change.
-    """
-    shared = {name: plain(getattr(config, name)) for name in ("model", "sampling", "augment", "loss", "train")}
-    for name in CHANGEABLE_ON_RESUME:
-        del shared["train"][name]
-    with_heads = teacher_of_heads(config.teachers_by_name, config.heads)
-    digest = heads_digest(dataset_heads(datasets[with_heads], config.heads))
-    heads = f"{','.join(config.heads)} ({digest})" if config.heads else ""
-    spaces = {name: dataset.fingerprint() for name, dataset in datasets.items()}
-    prepared = {name: dataset.settings for name, dataset in datasets.items()}
-    if len(datasets) == 1:
-        (space,), (of_preparation,) = spaces.values(), prepared.values()
-        of_teachers: dict[str, Any] = {"space": space, "prepared": of_preparation}
-    else:
-        # The order, which a mapping does not state when it is compared, is that of the columns.
-        scenes = {name: [each.name for each in dataset.scenes(training)] for name, dataset in datasets.items()}
-        of_teachers = {"teachers": list(datasets), "spaces": spaces, "prepared": prepared, "scenes": scenes}
+    """What a run must share with the one that it resumes besides the settings of the loop, as JSON values; `heads` is
+    the digest of the render loss's heads."""
     return {
-        **shared,
-        **of_teachers,
-        "heads": heads,
-        "samples_per_step": config.train.samples_per_step(process.world_size),
+        **{name: plain(getattr(config, name)) for name in ("model", "sampling", "augment", "loss")},
+        # The order, which a mapping does not have when it is compared, is that of the columns.
+        "teachers": list(datasets),
+        "spaces": {name: dataset.fingerprint() for name, dataset in datasets.items()},
+        "prepared": {name: dataset.settings for name, dataset in datasets.items()},
+        "scenes": {name: [each.name for each in dataset.scenes(training)] for name, dataset in datasets.items()},
+        "heads": f"{','.join(config.heads)} ({heads})" if config.heads else "",
     }

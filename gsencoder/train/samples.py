@@ -7,78 +7,203 @@ through the same samples.
 
 import math
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int32, Int64
 from scipy.spatial.transform import Rotation
-from torch.utils.data import Dataset, Sampler
+from torch import Tensor
+from torch.utils.data import Dataset
 
 from gsencoder.core.errors import InputError, about
+from gsencoder.core.settings import check_limits, option
 from gsencoder.geometry import sh_basis
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
-from gsencoder.train.batch import (
-    Sample,
-    SamplingConfig,
-    TeacherTargets,
-    choose_crop,
-    crop_size,
-    drop_random,
-    empty_rows,
-    join_rows,
-    make_render_rows,
-    no_targets,
-    restrict_rows,
-)
-from gsencoder.train.losses import LossConfig
+from gsencoder.models.plan import CloudPlan, Plan, join_plans
+from gsencoder.train.losses import TERMS, LossConfig, RenderRows, TeacherTargets
 from gsencoder.train.prepare import ClassBalance, nearest_codes
-from gsencoder.train.prepared_file import PreparedScene
+from gsencoder.train.prepared_file import PreparedScene, ViewRows
 from gsencoder.types import SH_C0, Cameras, Gaussians
 from gsencoder.types.checks import perpendicular
+
+_CANDIDATES_PER_GAUSSIAN = 4
+"""Gaussians nearest to the center that are tested against the frusta first, as a multiple of the size of a crop."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SamplingConfig:
+    """Selection of the Gaussians and views of a sample (SplatDistill sec. 3.3, "view-dependent selection")."""
+
+    scope: Literal["frusta", "scene"] = option(
+        "frusta", "candidates: Gaussians in the frusta of the target views, or all of the scene"
+    )
+    views: int = option(4, "number of target views of a sample, in which the render loss is computed", ge=1)
+    gaussians: int = option(
+        30_000, "largest number of Gaussians of a sample, nearest to its center first; 0 = all", ge=0
+    )
+    smallest: int = option(
+        4_000, "smallest size of a crop; sizes are log-uniform up to `gaussians`; 0 = all of that size", ge=0
+    )
+    rare_centers: float = option(
+        0.8, "share of crops whose center is drawn evenly over target classes instead of over Gaussians", ge=0, le=1
+    )
+
+    def __post_init__(self) -> None:
+        check_limits(self)
+
+
+def in_frusta(means: Float32[np.ndarray, "N 3"], cameras: Cameras, *, near: float = 0.01) -> Bool[np.ndarray, " N"]:
+    """True for Gaussians whose center lies in the image of at least one camera and beyond its near plane.
+
+    Args:
+        means: in the cameras' world.
+        cameras: all of them count.
+        near: smallest depth, world units.
+    """
+    inside = np.zeros(len(means), bool)
+    for view in range(len(cameras)):
+        # The rows that are found already need not be looked at again.
+        rows = np.flatnonzero(~inside)
+        inside[rows] = cameras.in_image(*cameras.project(means[rows], view), view, near=near)
+    return inside
+
+
+def seen_by(point: Float32[np.ndarray, "3"], cameras: Cameras, *, near: float = 0.01) -> Bool[np.ndarray, " V"]:
+    """True for cameras in whose image a point lies, beyond the near plane."""
+    return cameras.in_image(*cameras.project(point[None]), near=near)[:, 0]
+
+
+def nearest_rows(
+    means: Float32[np.ndarray, "n 3"], center: Float32[np.ndarray, "3"], count: int
+) -> Int64[np.ndarray, " m"]:
+    """The `count` rows nearest to a point, in ascending order; all rows if there are not more."""
+    if len(means) <= count:
+        return np.arange(len(means))
+    distances = np.square(means - center).sum(axis=1)
+    return np.sort(np.argpartition(distances, count)[:count])
+
+
+def crop_size(config: SamplingConfig, rng: np.random.Generator) -> int:
+    """Draws the largest number of Gaussians of a crop; 0 = no limit.
+
+    Small crops show small objects often; large ones show the context by which a door or a sofa is recognized.
+    """
+    if not 0 < config.smallest < config.gaussians:
+        return config.gaussians
+    return round(config.smallest * (config.gaussians / config.smallest) ** rng.random())
+
+
+def choose_crop(
+    means: Float32[np.ndarray, "N 3"],
+    cameras: Cameras,
+    center_weights: Float32[np.ndarray, " N"],
+    config: SamplingConfig,
+    size: int,
+    rng: np.random.Generator,
+) -> tuple[tuple[int, ...], Int64[np.ndarray, " n"]]:
+    """Chooses target views and the Gaussians of a sample.
+
+    Without a limit of size the views are drawn first and all Gaussians in their frusta are taken, as in the paper. With
+    a limit the center of the crop is drawn first, and the views are drawn from those that see it: other views would
+    show nothing of the sample.
+
+    Args:
+        means: centers of all Gaussians of the scene.
+        center_weights: for each Gaussian, its weight in drawing the center of a crop; 0 for those without a target.
+        config: settings of sampling.
+        size: largest number of Gaussians (`crop_size`); 0 = no limit.
+        rng: source of all random numbers.
+
+    Returns:
+        Distinct views, fewer than `config.views` if no more are suitable, and rows in ascending order.
+    """
+    full_scene = config.scope == "scene"
+    if not 0 < size < len(means):
+        drawn = rng.permutation(len(cameras))
+        views = drawn[: config.views]
+        rows = np.arange(len(means)) if full_scene else np.flatnonzero(in_frusta(means, cameras.select(views)))
+        for view in drawn[config.views :]:
+            if len(rows):
+                break
+            # A view that sees nothing is replaced by another one.
+            views = np.array([view])
+            rows = np.flatnonzero(in_frusta(means, cameras.select(views)))
+    else:
+        center = means[_draw_center(center_weights, config, rng)]
+        seeing = np.flatnonzero(seen_by(center, cameras))
+        views = rng.permutation(seeing if len(seeing) else len(cameras))[: config.views]
+        rows = nearest_rows(means, center, len(means) if full_scene else _CANDIDATES_PER_GAUSSIAN * size)
+        if not full_scene:
+            selected = cameras.select(views)
+            rows = rows[in_frusta(means[rows], selected)]
+            if len(rows) < size:
+                rows = np.flatnonzero(in_frusta(means, selected))
+            if not len(rows):  # No view sees the center, and those drawn see no Gaussian at all: use all views.
+                views = rng.permutation(len(cameras))
+                rows = np.flatnonzero(in_frusta(means, cameras))
+        rows = rows[nearest_rows(means[rows], center, size)]
+    if not len(rows):
+        raise InputError("sample: no Gaussian lies in the frustum of any view; check poses and units")
+    return tuple(int(view) for view in views), rows
+
+
+def _draw_center(center_weights: Float32[np.ndarray, " N"], config: SamplingConfig, rng: np.random.Generator) -> int:
+    """Draws the row of the center of a crop."""
+    weights = center_weights.astype(np.float64)
+    if rng.random() >= config.rare_centers:
+        weights = (weights > 0).astype(np.float64)
+    cumulative = np.cumsum(weights)
+    if not 0 < cumulative[-1] < math.inf:
+        return int(rng.integers(len(center_weights)))
+    return int(min(np.searchsorted(cumulative, rng.random() * cumulative[-1], side="right"), len(center_weights) - 1))
+
+
+def drop_random(rows: Int64[np.ndarray, " n"], max_share: float, rng: np.random.Generator) -> Int64[np.ndarray, " m"]:
+    """Drops each row with one probability that is drawn between 0 and `max_share`; never drops all rows."""
+    if not max_share:
+        return rows
+    remaining = rows[rng.random(len(rows)) >= rng.uniform(0, max_share)]
+    return remaining if len(remaining) else rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Augmentation:
+    """Strengths of the random changes to a training sample; 0 = none.
+
+    Attributes:
+        turn: largest rotation about the up axis in either direction, degrees.
+        tilt: standard deviation of the tilt of the up axis, degrees.
+        mirror: probability of mirroring.
+        scale: largest relative change of size.
+        jitter: standard deviation of the shift of each center, voxels.
+        drop: largest share of Gaussians that is dropped at random.
+        light: largest relative change of brightness.
+        tint: largest relative change of each color channel, and largest shift of black.
+        noise: standard deviation of the noise added to each Gaussian's color; white = 1.
+    """
+
+    turn: float = 180.0
+    tilt: float = 3.0
+    mirror: float = 0.5
+    scale: float = 0.1
+    jitter: float = 0.1
+    drop: float = 0.2
+    light: float = 0.2
+    tint: float = 0.08
+    noise: float = 0.02
+
 
 _DIRECTIONS = 64
 """Directions over which harmonics are turned: more than enough for the 16 coefficients of degree 3."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AugmentConfig:
-    """Strengths of the random changes to a training sample; 0 = none."""
-
-    turn: float = field(
-        default=180.0, metadata={"help": "largest rotation about the up axis in either direction, degrees"}
-    )
-    tilt: float = field(default=3.0, metadata={"help": "standard deviation of the tilt of the up axis, degrees"})
-    mirror: float = field(default=0.5, metadata={"help": "probability of mirroring"})
-    scale: float = field(default=0.1, metadata={"help": "largest relative change of size"})
-    jitter: float = field(default=0.1, metadata={"help": "standard deviation of the shift of each center, voxels"})
-    drop: float = field(default=0.2, metadata={"help": "largest share of Gaussians that is dropped at random"})
-    light: float = field(default=0.2, metadata={"help": "largest relative change of brightness"})
-    tint: float = field(
-        default=0.08, metadata={"help": "largest relative change of each color channel, and largest shift of black"}
-    )
-    noise: float = field(
-        default=0.02, metadata={"help": "standard deviation of the noise added to each Gaussian's color; white = 1"}
-    )
-
-    def __post_init__(self) -> None:
-        for name in ("turn", "tilt", "jitter", "noise"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        for name in ("turn", "tilt"):
-            if getattr(self, name) > 360:
-                raise InputError(f"{name}: expected at most 360 degrees, got {getattr(self, name)}")
-        for name in ("mirror", "drop", "scale", "light", "tint"):
-            if not 0 <= getattr(self, name) <= (1 if name == "mirror" else 0.9):
-                limit = 1 if name == "mirror" else 0.9
-                raise InputError(f"{name}: expected a number from 0 to {limit}, got {getattr(self, name)}")
-
-
 def augment(
     gaussians: Gaussians,
     rng: np.random.Generator,
-    config: AugmentConfig,
+    config: Augmentation,
     *,
     voxel: float,
     up: Float64[np.ndarray, "3"] | None = None,
@@ -151,7 +276,7 @@ def _turn_sh(sh: Float32[np.ndarray, "N K 3"], to_from: np.ndarray) -> Float32[n
 
 
 def _relight(
-    sh: Float32[np.ndarray, "N K 3"], rng: np.random.Generator, config: AugmentConfig
+    sh: Float32[np.ndarray, "N K 3"], rng: np.random.Generator, config: Augmentation
 ) -> Float32[np.ndarray, "N K 3"]:
     """Changes brightness and tint and adds noise; colors are ½ + SH_C0·dc, and all degrees are scaled equally."""
     gain = rng.uniform(1 - config.light, 1 + config.light) * rng.uniform(1 - config.tint, 1 + config.tint, 3)
@@ -161,71 +286,245 @@ def _relight(
     return relit.astype(np.float32)
 
 
+MIN_REMAINING_WEIGHT = 0.5
+"""Smallest share of a row's weight that must remain after Gaussians are dropped at random."""
+
+
+def restrict_rows(
+    view: ViewRows,
+    gaussians: int,
+    selected: Int64[np.ndarray, " s"],
+    remaining: Int64[np.ndarray, " n"],
+    config: LossConfig,
+) -> ViewRows:
+    """Restricts the rows of B of a view to the Gaussians of a sample, and selects the rows to compare.
+
+    A row is selected if the teacher has a vector there, the full scene covers it with an alpha of `min_alpha` or more,
+    and at least the share `min_kept` of its weight is on selected Gaussians. Gaussians that were then dropped at random
+    are left out of the row, of whose weight at least MIN_REMAINING_WEIGHT must remain.
+
+    Args:
+        view: rows over all Gaussians of the scene.
+        selected: the Gaussians of the crop.
+        remaining: those of them that the sample has after dropping some at random; they become columns 0, 1, ….
+        config: the thresholds.
+    """
+    column_of = np.full(gaussians, -1, np.int32)
+    column_of[selected] = -2
+    column_of[remaining] = np.arange(len(remaining), dtype=np.int32)
+    column = column_of[view.col]
+    alpha = _row_sums(view.weight, view.crow)
+    selected_alpha = _row_sums(np.where(column != -1, view.weight, 0), view.crow)
+    remaining_alpha = _row_sums(np.where(column >= 0, view.weight, 0), view.crow)
+    usable = view.valid & (alpha >= config.min_alpha) & (selected_alpha >= config.min_kept * alpha)
+    # Of rows with less than this the weighted mean of the remaining Gaussians would say little.
+    usable &= remaining_alpha >= MIN_REMAINING_WEIGHT * alpha
+    entries = np.repeat(usable, np.diff(view.crow)) & (column >= 0)
+    counts = np.add.reduceat(np.append(entries, False), view.crow[:-1])[usable] if len(entries) else np.zeros(0, int)
+    return ViewRows(
+        crow=np.concatenate(([0], np.cumsum(counts))).astype(np.int64),
+        col=column[entries],
+        weight=view.weight[entries],
+        targets=view.targets[usable],
+        valid=np.ones(int(usable.sum()), bool),
+    )
+
+
+def _row_sums(values: np.ndarray, crow: np.ndarray) -> np.ndarray:
+    """Sums of the entries of each compressed row; 0 for empty rows."""
+    total = np.add.reduceat(np.append(values, np.float32(0)), crow[:-1])
+    return np.where(np.diff(crow) > 0, total, 0)
+
+
+def sample_rows(
+    view: ViewRows,
+    seen: Bool[np.ndarray, " N"],
+    min_alpha: float,
+    count: int = 0,
+    rng: np.random.Generator | None = None,
+) -> RenderRows:
+    """Rows of a view over the Gaussians that were seen, all with the weight 1: those with a vector and an alpha of
+    `min_alpha` or more.
+
+    Args:
+        view: rows over all Gaussians.
+        seen: the Gaussians that take part.
+        min_alpha: smallest sum of the weights of a row.
+        count: number of rows that are drawn at random; 0 = all of them.
+        rng: source of random numbers.
+    """
+    weight = np.where(seen[view.col], view.weight, np.float32(0))
+    chosen = np.flatnonzero(view.valid & (_row_sums(weight, view.crow) >= min_alpha))
+    if rng is not None and 0 < count < len(chosen):
+        chosen = np.sort(rng.choice(chosen, count, replace=False))
+    counts = np.diff(view.crow)[chosen]
+    crow = np.concatenate(([0], np.cumsum(counts))).astype(np.int64)
+    entries = np.arange(crow[-1]) + np.repeat(view.crow[:-1][chosen] - crow[:-1], counts)
+    return RenderRows(
+        crow=torch.from_numpy(crow),
+        col=torch.from_numpy(view.col[entries]),
+        weight=torch.from_numpy(weight[entries]),
+        targets=torch.from_numpy(view.targets[chosen]),
+        row_weights=torch.ones(len(chosen)),
+    )
+
+
+def make_render_rows(view: ViewRows, class_balance: ClassBalance, power: float) -> RenderRows:
+    """Converts rows of one view to tensors; the weight of each in the loss is n^−power of its target's class."""
+    return RenderRows(
+        crow=torch.from_numpy(view.crow),
+        col=torch.from_numpy(view.col),
+        weight=torch.from_numpy(view.weight),
+        targets=torch.from_numpy(view.targets),
+        row_weights=torch.from_numpy(class_balance.target_weights(view.targets, power)),
+    )
+
+
+def empty_rows(channels: int) -> RenderRows:
+    """A matrix without rows."""
+    empty = torch.zeros(0)
+    crow, col = torch.zeros(1, dtype=torch.int64), torch.zeros(0, dtype=torch.int32)
+    return RenderRows(crow=crow, col=col, weight=empty, targets=empty.view(0, channels), row_weights=empty)
+
+
+def join_rows(matrices: Sequence[RenderRows], shifts: Sequence[int]) -> RenderRows:
+    """Concatenates matrices along their rows; `shifts` are added to the column numbers of each."""
+    entries = np.cumsum([0, *(len(matrix.col) for matrix in matrices)]).tolist()
+    crows = [matrix.crow[:-1] + entry for matrix, entry in zip(matrices, entries, strict=False)]
+    return RenderRows(
+        crow=torch.cat([*crows, torch.tensor(entries[-1:])]),
+        col=torch.cat([matrix.col + shift for matrix, shift in zip(matrices, shifts, strict=True)]),
+        weight=torch.cat([matrix.weight for matrix in matrices]),
+        targets=torch.cat([matrix.targets for matrix in matrices]),
+        row_weights=torch.cat([matrix.row_weights for matrix in matrices]),
+    )
+
+
+def no_targets(gaussians: int, channels: int) -> TeacherTargets:
+    """The targets of a teacher that a scene lacks: nothing that has a weight."""
+    return TeacherTargets(
+        targets=torch.zeros(gaussians, channels, dtype=torch.float16),
+        codes=torch.full((gaussians,), -1),
+        loss_weights=torch.zeros(gaussians),
+        rows=empty_rows(channels),
+    )
+
+
+class Sample(NamedTuple):
+    """One sample, as a data worker returns it; attributes as in `Batch`."""
+
+    name: str
+    attributes: Float[Tensor, "N A"]
+    opacities: Float[Tensor, " N"]
+    plan: CloudPlan
+    teachers: tuple[TeacherTargets, ...]
+
+
+class Batch(NamedTuple):
+    """A batch of samples, concatenated along Gaussians, tokens and rows.
+
+    Attributes:
+        names: scene and views of each sample, for messages.
+        attributes, opacities, plan: inputs of the encoder.
+        teachers: targets of each teacher, in the order of the recipe; without weights in scenes that lack the teacher.
+    """
+
+    names: tuple[str, ...]
+    attributes: Float[Tensor, "N A"]
+    opacities: Float[Tensor, " N"]
+    plan: Plan
+    teachers: tuple[TeacherTargets, ...]
+
+    def to(self, device: torch.device) -> "Batch":
+        """The batch with all its tensors on a device."""
+        if self.attributes.device == device:
+            return self
+
+        def move(value: Tensor) -> Tensor:
+            return value.to(device, non_blocking=True)
+
+        return Batch(
+            names=self.names,
+            attributes=move(self.attributes),
+            opacities=move(self.opacities),
+            plan=self.plan.to(device),
+            teachers=tuple(
+                TeacherTargets(
+                    targets=move(each.targets),
+                    codes=move(each.codes),
+                    loss_weights=move(each.loss_weights),
+                    rows=RenderRows(*map(move, each.rows)),
+                )
+                for each in self.teachers
+            ),
+        )
+
+
+def join_samples(results: Sequence[Sample | InputError], patch: int) -> Batch | InputError:
+    """Joins samples to a batch; if one of them is an error, returns the first error instead.
+
+    Args:
+        results: one or more samples or errors.
+        patch: largest number of tokens in a patch of the encoder.
+    """
+    samples = []
+    for result in results:
+        if isinstance(result, InputError):
+            return result
+        samples.append(result)
+    sizes = [len(sample.attributes) for sample in samples]
+    starts = [sum(sizes[:i]) for i in range(len(sizes))]
+    return Batch(
+        names=tuple(sample.name for sample in samples),
+        attributes=torch.cat([sample.attributes for sample in samples]),
+        opacities=torch.cat([sample.opacities for sample in samples]),
+        plan=join_plans([sample.plan for sample in samples], patch),
+        teachers=tuple(
+            TeacherTargets(
+                targets=torch.cat([each.targets for each in of_teacher]),
+                codes=torch.cat([each.codes for each in of_teacher]),
+                loss_weights=torch.cat([each.loss_weights for each in of_teacher]),
+                rows=join_rows([each.rows for each in of_teacher], starts),
+            )
+            for of_teacher in zip(*(sample.teachers for sample in samples), strict=True)
+        ),
+    )
+
+
 class TrainingScene:
-    """The prepared files of one scene. Gaussians and cameras are read from the first of them, and are the same in all.
+    """The prepared files of one scene.
 
     Attributes:
         parts: the prepared scene of each teacher, in the order of the teachers; None for those that the scene lacks.
+        first: the first of them, from which Gaussians and cameras are read; these are the same in all.
         name: of the scene.
     """
 
     def __init__(self, parts: Sequence[PreparedScene | None]) -> None:
-        """Args:
-        parts: see the class.
-        """
         present = [part for part in parts if part is not None]
         if not present:
             raise InputError("training: a scene has no teacher")
-        self.parts, self._first = tuple(parts), present[0]
-        self.name = self._first.name
+        self.parts, self.first, self.name = tuple(parts), present[0], present[0].name
 
     def check_consistent(self) -> None:
         """Checks that all parts were prepared for the same Gaussians and views."""
-        first = self._first
+        first = self.first
         for part in self.parts:
-            same = part is None or (
+            if part is None or (
                 part.view_names == first.view_names
                 and len(part) == len(first)
                 and np.array_equal(part.means, first.means)
+            ):
+                continue
+            raise InputError(
+                f"{part.path}: has other Gaussians or views than {first.path}; remove both to prepare the scene again"
             )
-            if part is not None and not same:
-                raise InputError(
-                    f"{part.path}: has other Gaussians or views than {first.path}; remove both to prepare the scene "
-                    "again"
-                )
 
     def close(self) -> None:
         """Closes the files; the next access opens them again."""
         for part in self.parts:
             if part is not None:
                 part.close()
-
-    def __len__(self) -> int:
-        return len(self._first)
-
-    @property
-    def cameras(self) -> Cameras:
-        return self._first.cameras
-
-    @property
-    def view_names(self) -> tuple[str, ...]:
-        return self._first.view_names
-
-    @property
-    def metres_per_unit(self) -> float | None:
-        return self._first.metres_per_unit
-
-    @property
-    def up(self) -> Float64[np.ndarray, "3"] | None:
-        return self._first.up
-
-    @property
-    def means(self) -> Float32[np.ndarray, "N 3"]:
-        return self._first.means
-
-    def gaussians(self, rows: np.ndarray) -> Gaussians:
-        """Reads Gaussians by row; see `PreparedScene.gaussians`."""
-        return self._first.gaussians(rows)
 
 
 MAX_OPEN_FILES = 256
@@ -242,13 +541,13 @@ class TeacherRecipe:
         class_balance: classes of its targets in the dataset and their frequencies; the columns of the codebook are the
             teacher's columns of the encoder's outputs.
         weight: of its losses.
-        contrast: whether its losses include L_contrast.
+        classes: whether its targets have classes that a term of the loss may compare.
     """
 
     name: str
     class_balance: ClassBalance
     weight: float = 1.0
-    contrast: bool = True
+    classes: bool = True
 
     @property
     def channels(self) -> int:
@@ -274,7 +573,7 @@ class SampleRecipe:
 
     encoder: EncoderConfig
     sampling: SamplingConfig
-    augmentation: AugmentConfig | None
+    augmentation: Augmentation | None
     losses: LossConfig
     teachers: tuple[TeacherRecipe, ...]
     seed: int
@@ -282,10 +581,10 @@ class SampleRecipe:
 
     def uses_classes(self, teacher: TeacherRecipe) -> bool:
         """Whether samples depend on the classes of a teacher's targets: by the centers of crops, by weights of rare
-        classes, or by L_contrast."""
+        classes, or by a term that compares classes."""
         by_center = self.sampling.rare_centers > 0 and self.sampling.gaussians > 0
-        by_contrast = teacher.contrast and teacher.weight > 0 and self.losses.contrast_weight > 0
-        return by_center or by_contrast or self.losses.rarity != 0
+        compared = any(weight > 0 and TERMS[name].classes for name, weight in self.losses.lambdas.items())
+        return by_center or (compared and teacher.classes and teacher.weight > 0) or self.losses.rarity != 0
 
 
 Codes = tuple[Int32[np.ndarray, " N"] | None, ...]
@@ -296,10 +595,6 @@ class SampleDataset(Dataset[Sample]):
     """The samples of a run by number; each epoch goes through the scenes in a new random order."""
 
     def __init__(self, scenes: Sequence[TrainingScene], recipe: SampleRecipe) -> None:
-        """Args:
-        scenes: the scenes to train on.
-        recipe: settings of the samples.
-        """
         if not scenes:
             raise InputError("training: no scenes to train on")
         self.scenes, self.recipe = list(scenes), recipe
@@ -338,34 +633,6 @@ class SampleDataset(Dataset[Sample]):
         return self._codes[scene_index]
 
 
-class StepSampler(Sampler[list[int]]):
-    """The sample numbers of each micro-batch of this process, in order of steps.
-
-    Step s of a run takes samples s·n to (s + 1)·n − 1, where n = batch · accumulate · world. Each micro-batch of each
-    process takes `batch` consecutive ones of them.
-    """
-
-    def __init__(self, first: int, last: int, *, batch: int, accumulate: int, rank: int, world: int) -> None:
-        """Args:
-        first: first step.
-        last: step after the last one.
-        batch: number of samples of a micro-batch.
-        accumulate: number of micro-batches of a process in a step.
-        world: number of processes.
-        """
-        self.steps = range(first, last)
-        self.batch, self.accumulate, self.rank, self.world = batch, accumulate, rank, world
-
-    def __len__(self) -> int:
-        return len(self.steps) * self.accumulate
-
-    def __iter__(self) -> Iterator[list[int]]:
-        for step in self.steps:
-            for micro in range(self.accumulate):
-                start = ((step * self.accumulate + micro) * self.world + self.rank) * self.batch
-                yield list(range(start, start + self.batch))
-
-
 def target_codes(scene: TrainingScene, recipe: SampleRecipe) -> Codes:
     """The class of each Gaussian's target, a row of each teacher's codebook.
 
@@ -402,19 +669,20 @@ def make_sample(
         size: largest number of Gaussians; 0 = all that the views see.
         rng: source of all random numbers.
     """
+    source = scene.first
     # With the power 1 every class is equally often the center of a crop.
     first, first_codes = next((number, each) for number, each in enumerate(codes) if each is not None)
     center_weights = _weights_of(first_codes, recipe.teachers[first].class_balance, 1.0)
-    views, selected = choose_crop(scene.means, scene.cameras, center_weights, recipe.sampling, size, rng)
+    views, selected = choose_crop(source.means, source.cameras, center_weights, recipe.sampling, size, rng)
     augmentation = recipe.augmentation
     remaining = drop_random(selected, augmentation.drop, rng) if augmentation is not None else selected
-    voxel = recipe.encoder.voxel / (scene.metres_per_unit or 1.0)
-    gaussians = scene.gaussians(remaining)
+    voxel = recipe.encoder.voxel / (source.metres_per_unit or 1.0)
+    gaussians = source.gaussians(remaining)
     if augmentation is not None:
-        gaussians = augment(gaussians, rng, augmentation, voxel=voxel, up=scene.up)
+        gaussians = augment(gaussians, rng, augmentation, voxel=voxel, up=source.up)
     attributes, opacities, plan = encoder_inputs(gaussians, recipe.encoder, voxel)
     return Sample(
-        name=f"{scene.name} ({', '.join(scene.view_names[view] for view in views)})",
+        name=f"{scene.name} ({', '.join(source.view_names[view] for view in views)})",
         attributes=attributes,
         opacities=opacities,
         plan=plan,

@@ -1,7 +1,5 @@
 """Low-rank adapters of a vision-language model on rendered features: samples, loss and training.
 
-Questions and answers as the tokens that a vision-language model is trained on.
-
 The prompt goes through the model's processor and chat template, as a server puts it together; the answer follows, and
 the token that ends the model's turn. Labels are the answer's tokens alone, so that the prompt carries no loss.
 """
@@ -27,9 +25,10 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files import check_written, plain
 from gsencoder.core.pretrained import load_pretrained
 from gsencoder.core.process import ProcessRank, Track, untracked
+from gsencoder.core.settings import option
 from gsencoder.data.prompts import PromptStore, StoredPrompt
 from gsencoder.train.distributed import check_agreement
-from gsencoder.train.loop import CHANGEABLE_ON_RESUME, Trainer, TrainerConfig, TrainingState
+from gsencoder.train.loop import Trainer, TrainerConfig, TrainingState
 from gsencoder.train.vlm import (
     SPLIT,
     WHAT,
@@ -320,27 +319,19 @@ PROJECTION_FILE = "projection.safetensors"
 
 def tuning_training() -> TrainerConfig:
     """The training loop's settings for adapters."""
-    return TrainerConfig(
-        steps=1000, accumulate=8, learning_rate=2e-4, final_rate=0.0, warmup=30, weight_decay=0.0, validate_every=0
-    )
+    return TrainerConfig(steps=1000, accumulate=8, learning_rate=2e-4, warmup=30, validate_every=0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TuneConfig:
     """Settings of a tuning."""
 
-    base: Literal["float32", "bfloat16"] = field(
-        default="float32", metadata={"help": "type in which the model's own weights, which stay as they are, are kept"}
+    base: Literal["float32", "bfloat16"] = option(
+        "float32", "type in which the model's own weights, which stay as they are, are kept"
     )
-    recompute: bool = field(
-        default=False, metadata={"help": "recompute activations in the backward pass: less memory, more time"}
-    )
+    recompute: bool = option(False, "recompute activations in the backward pass: less memory, more time")
     lora: AdapterConfig = field(default_factory=AdapterConfig)
     train: TrainerConfig = field(default_factory=tuning_training)
-
-    def __post_init__(self) -> None:
-        if self.train.compile:
-            raise InputError("train.compile: expected false; models of transformers are not compiled here")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -378,7 +369,6 @@ def tune(
     model: Path,
     config: TuneConfig = TuneConfig(),
     *,
-    project: bool | None = None,
     work: Path,
     process: ProcessRank = ProcessRank(),
     device: torch.device = torch.device("cpu"),
@@ -393,9 +383,6 @@ def tune(
         store: of the prompts.
         model: folder of a vision-language model of transformers.
         config: adapters and loop.
-        project: for prompts with rendered features, which replace the output of the model's tower: whether a linear
-            layer that is trained, too, leads from the features to the tower's channels; None = where their numbers
-            differ.
         work: existing folder for the checkpoint and the log.
         tensorboard: whether to write TensorBoard events.
     """
@@ -403,7 +390,8 @@ def tune(
     first = pairs[0].prompt.tokens
     stated, processor, layout = open_processor(model, with_tokens=bool(first))
     channels = store.tokens(first).shape[2] if first else None
-    projected = None if layout is None or channels is None else _projected(channels, layout, project)
+    # Features replace the output of the model's tower; a linear layer leads to its channels where they are others.
+    projected = None if layout is None or channels == layout.channels else channels
     digest = model_digest(model)
     check_agreement("the weights of the model", digest)
     seed = config.train.seed
@@ -417,11 +405,9 @@ def tune(
     settings = {
         "lora": plain(config.lora),
         "base": config.base,
-        "train": {name: value for name, value in plain(config.train).items() if name not in CHANGEABLE_ON_RESUME},
         "model": digest,
         "pairs": pairs_digest(pairs),
         "tokens": {"channels": channels, "projected": projected},
-        "samples_per_step": config.train.samples_per_step(process.world_size),
     }
     trainer = Trainer(
         network,
@@ -433,6 +419,8 @@ def tune(
         settings=settings,
         process=process,
         device=device,
+        weight_decay=0.0,
+        final_rate=0.0,
         tensorboard=tensorboard,
     )
     state = trainer.run(track)
@@ -445,18 +433,6 @@ def recompute_activations(model: Any) -> None:
     # The name before version 5.20 of transformers.
     enable = getattr(model, "activation_checkpointing_enable", None) or model.gradient_checkpointing_enable
     enable({"use_reentrant": False})
-
-
-def _projected(channels: int, layout: TowerLayout, project: bool | None) -> int | None:
-    """The channels of features that are projected; None where they are those of the tower."""
-    if project or (project is None and channels != layout.channels):
-        return channels
-    if channels != layout.channels:
-        raise InputError(
-            f"project=false: the features have {channels} channels and the tower has {layout.channels}; leave project= "
-            "out"
-        )
-    return None
 
 
 def check_pairs(pairs: Sequence[TuningPair]) -> None:

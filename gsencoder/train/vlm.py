@@ -16,7 +16,7 @@ import shutil
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,35 +34,28 @@ from gsencoder.core.pretrained import (
     read_config,
     weight_files,
 )
+from gsencoder.core.settings import check_limits, option
 
 WHAT = "tune"
 SERVED_FOLDER = "served"
-MAX_RANK = 4096
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdapterConfig:
     """Low-rank adapters (LoRA, Hu et al. 2021): a layer's W x becomes W x + (alpha / rank) · B A x."""
 
-    rank: int = field(default=16, metadata={"help": "rank of A and B"})
-    alpha: float = field(default=32.0, metadata={"help": "scale of the adapters, divided by the rank"})
-    dropout: float = field(default=0.05, metadata={"help": "share of an adapter's inputs that is dropped in training"})
-    targets: tuple[str, ...] = field(
-        default=(),
-        metadata={
-            "names": True,
-            "help": "ends of the names of the linear layers that get adapters, such as q_proj,v_proj; layers of the "
-            "vision tower get none; empty = all of the language model",
-        },
+    rank: int = option(16, "rank of A and B", ge=1, le=4096)
+    alpha: float = option(32.0, "scale of the adapters, divided by the rank", gt=0)
+    dropout: float = option(0.05, "share of an adapter's inputs that is dropped in training", ge=0, lt=1)
+    targets: tuple[str, ...] = option(
+        (),
+        "ends of the names of the linear layers that get adapters, such as q_proj,v_proj; layers of the "
+        "vision tower get none; empty = all of the language model",
+        names=True,
     )
 
     def __post_init__(self) -> None:
-        if not 1 <= self.rank <= MAX_RANK:
-            raise InputError(f"rank: expected 1 to {MAX_RANK:,}, got {self.rank}")
-        if not 0 < self.alpha < float("inf"):
-            raise InputError(f"alpha: expected a positive number, got {self.alpha}")
-        if not 0 <= self.dropout < 1:
-            raise InputError(f"dropout: expected a share from 0 to below 1, got {self.dropout}")
+        check_limits(self)
 
 
 def check_peft() -> None:

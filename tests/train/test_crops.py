@@ -10,7 +10,15 @@ from splats import front_camera
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import blend
-from gsencoder.train.batch import SamplingConfig, choose_crop, crop_size, drop_random, in_frusta, nearest_rows, seen_by
+from gsencoder.train.samples import (
+    SamplingConfig,
+    choose_crop,
+    crop_size,
+    drop_random,
+    in_frusta,
+    nearest_rows,
+    seen_by,
+)
 from gsencoder.types import Cameras, Gaussians
 
 RNG = np.random.default_rng

@@ -123,11 +123,11 @@ def test_each_teacher_with_classes_has_a_contrast(
     clusters: bool, expected: list[bool], datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     data, *_ = begin(datasets, ["wall_0"], tmp_path, monkeypatch, contrast_clusters=clusters)
-    assert [teacher.contrast for teacher in data.recipe.teachers] == expected
+    assert [teacher.classes for teacher in data.recipe.teachers] == expected
     # The order of teachers does not matter.
     reversed_order = {name: datasets[name] for name in reversed(datasets)}
     data, *_ = begin(reversed_order, ["wall_0"], tmp_path, monkeypatch, contrast_clusters=clusters)
-    assert [teacher.contrast for teacher in data.recipe.teachers] == expected[::-1]
+    assert [teacher.classes for teacher in data.recipe.teachers] == expected[::-1]
 
 
 def test_scenes_are_numbered_by_name_each_with_its_own_parts_and_others_are_validated(

@@ -16,11 +16,21 @@ from training_scenes import SMALL, DenseSideTeacher, prepared, samples, small_en
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import BlendConfig, blend
-from gsencoder.train.batch import SamplingConfig, choose_crop, join_samples, restrict_rows
+from gsencoder.train.loop import StepSampler
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_file import PreparedScene, ViewRows
-from gsencoder.train.samples import AugmentConfig, SampleDataset, StepSampler, TrainingScene, make_sample, target_codes
+from gsencoder.train.samples import (
+    Augmentation,
+    SampleDataset,
+    SamplingConfig,
+    TrainingScene,
+    choose_crop,
+    join_samples,
+    make_sample,
+    restrict_rows,
+    target_codes,
+)
 from gsencoder.types import Cameras
 
 
@@ -79,8 +89,8 @@ def test_without_changes_a_sample_holds_the_scene_as_it_is(dataset: tuple[Prepar
         if sample.name.startswith(scene.name):
             source = scene
     assert source is not None
-    assert len(sample.attributes) == len(source)
-    everything = np.arange(len(source))
+    assert len(sample.attributes) == len(source.first)
+    everything = np.arange(len(source.first))
     (targets,), (part,) = sample.teachers, source.parts
     assert part is not None
     np.testing.assert_array_equal(targets.targets.numpy(), part.targets(everything))
@@ -93,7 +103,7 @@ def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tupl
     whole = SamplingConfig(scope="scene", gaussians=0, views=1)
     data = samples(*dataset, augmentation=None, sampling=whole, losses=LossConfig(rarity=0.0))
     sample = data[0]
-    scene = next(scene for scene in data.scenes if sample.name.startswith(scene.name))
+    scene = next(each.first for each in data.scenes if sample.name.startswith(each.name))
     view = scene.view_names.index(sample.name.split("(")[1].rstrip(")"))
     config = BlendConfig(rays_per_patch=16)  # One a pixel.
     b = blend(scene.gaussians(np.arange(len(scene))), scene.cameras, view, patch=4, config=config)
@@ -312,7 +322,7 @@ def test_views_that_see_nothing_are_named(dataset: tuple[PreparedDataset, list[s
     (part,) = scene.parts
     assert part is not None
     part._header[0].cam_from_world[:, 2, 3] -= 1000  # Both cameras now stand behind the wall and look away.
-    data = SampleDataset([scene], replace(data.recipe, augmentation=AugmentConfig()))
+    data = SampleDataset([scene], replace(data.recipe, augmentation=Augmentation()))
     with pytest.raises(InputError, match=r"scene wall_0: sample: no Gaussian"):
         data.make(0)
     # From a worker it comes back as a value, and through the batch, so that it can be raised in its own words.

@@ -10,7 +10,6 @@ from joint_training import Datasets, batch_of, joint
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 
 from gsencoder.core.logs import LOG_FILE, read_log
-from gsencoder.core.process import ProcessRank
 from gsencoder.core.settings import first_difference
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.train.run import Distillation, TrainConfig, encoder_trainer, resume_settings
@@ -138,7 +137,7 @@ def test_the_weight_of_a_teacher_multiplies_that_of_each_of_its_terms(datasets: 
 def test_a_teacher_without_contrast_has_no_such_term(datasets: Datasets) -> None:
     data = joint(datasets)
     sides, heights = data.recipe.teachers
-    distillation = Distillation(small_encoder(8), LOSSES, (sides, replace(heights, contrast=False)))
+    distillation = Distillation(small_encoder(8), LOSSES, (sides, replace(heights, classes=False)))
     batch = batch_of(data, range(2))
     terms = distillation.terms(torch.randn(len(batch.attributes), 8), batch)
     assert set(terms) == set(distillation.lambdas)
@@ -153,8 +152,8 @@ def test_a_teacher_of_weight_zero_changes_nothing_but_its_own_columns(datasets: 
     encoder = small_encoder([4, 4])
     own = encoder.head.of_teacher[1]  # type: ignore[index, union-attr]
     before = [parameter.detach().clone() for parameter in own.parameters()]
-    config = replace(SHORT, steps=2, weight_decay=0.0)
-    encoder_trainer(encoder, weightless, LOSSES, config, folder=tmp_path, settings={}).run()
+    config = replace(SHORT, steps=2)
+    encoder_trainer(encoder, weightless, LOSSES, config, folder=tmp_path, settings={}, weight_decay=0.0).run()
     assert all(torch.equal(old, new) for old, new in zip(before, own.parameters(), strict=True))
 
 
@@ -162,10 +161,10 @@ def test_a_run_goes_on_only_with_its_teachers_in_their_order(datasets: Datasets)
     config = TrainConfig(teachers={"sides": PaletteConfig(), "heights": PaletteConfig()})
     opened = {name: dataset for name, (dataset, _) in datasets.items()}
     turned = {name: opened[name] for name in reversed(opened)}
-    first, second = (resume_settings(config, ProcessRank(), each, ["wall_0"]) for each in (opened, turned))
+    first, second = (resume_settings(config, each, ["wall_0"], "") for each in (opened, turned))
     assert first != second
     assert first_difference(first, second).startswith("teachers=['sides', 'heights'], and this run asks teachers=['hei")
-    assert first != resume_settings(config, ProcessRank(), opened, ["wall_0", "wall_1"])
+    assert first != resume_settings(config, opened, ["wall_0", "wall_1"], "")
 
 
 def _stop_at(step: int) -> object:

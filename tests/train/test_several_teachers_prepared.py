@@ -1,5 +1,6 @@
 """Scenes prepared for several teachers: which of them a run takes, and what it reports or refuses."""
 
+import re
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -34,27 +35,15 @@ def test_other_teachers_than_those_of_a_checkpoint_are_refused_before_and_after_
     check_same_teachers(path, ["a", "b", "c"])
     encoder = small_encoder()
     optimizer = torch.optim.AdamW(encoder.parameters())
-    several: dict[str, object] = {"teachers": ["a", "b"], "spaces": {"a": "1", "b": "2"}}
-    state = TrainingState(step=1)
-    for stored, asked, message in (
-        (
-            several,
-            ["a", "b", "c"],
-            r"was made with teachers=\['a', 'b'\], and this run asks teachers=\['a', 'b', 'c'\];",
-        ),
-        (several, ["b", "a"], r"was made with teachers=\['a', 'b'\], and this run asks teachers=\['b', 'a'\];"),
-        (several, ["a"], r"was made with teachers=\['a', 'b'\], and this run asks one teacher;"),
-        ({"space": "1"}, ["a", "b"], r"was made with one teacher, and this run asks teachers=\['a', 'b'\];"),
-    ):
-        save_checkpoint(path, encoder, optimizer, state, stored)
-        check_same_teachers(path, several["teachers"] if "teachers" in stored else ["any"])  # type: ignore[arg-type]
-        settings = {"teachers": asked, "spaces": {}} if len(asked) > 1 else {"space": "1"}
-        for check in (
-            lambda asked=asked: check_same_teachers(path, asked),
-            lambda settings=settings: load_checkpoint(path, encoder, optimizer, settings),
-        ):
-            with pytest.raises(InputError, match=f"{message}.*; give resume=false to begin anew"):
-                check()
+    stored = {"teachers": ["a", "b"], "spaces": {"a": "1", "b": "2"}}
+    save_checkpoint(path, encoder, optimizer, TrainingState(step=1), stored)
+    check_same_teachers(path, ["a", "b"])
+    for asked in (["a", "b", "c"], ["b", "a"], ["a"]):
+        message = re.escape(f"was made with teachers=['a', 'b'], and this run asks teachers={asked};")
+        with pytest.raises(InputError, match=f"{message}.*; give resume=false"):
+            check_same_teachers(path, asked)
+        with pytest.raises(InputError, match=message):
+            load_checkpoint(path, encoder, optimizer, {"teachers": asked, "spaces": {}})
 
 
 def test_a_run_with_another_list_of_teachers_is_refused_before_anything_is_prepared(tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ from pretend_device import pretended_device
 from training_scenes import PREPARE, TABLE, DenseSideTeacher, SideTeacher, prepared, samples, scene
 
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.train.batch import SamplingConfig
 from gsencoder.train.prepare import prepare_scene
 from gsencoder.train.prepared_file import PreparedScene
+from gsencoder.train.samples import SamplingConfig
 from gsencoder.train.space import dataset_space
 from gsencoder.types import FeatureMap, Views
 

@@ -128,7 +128,7 @@ def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, 
     trainer(dataset, tmp_path).run()
     with pytest.raises(InputError, match=r"was made with run=1, and this run asks run=2"):
         encoder_trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 2})
-    for key, message in (("samples_per_step", "a step had None samples, and this run has 4"), ("space", "changed")):
+    for key, message in (("samples_per_step", "a step had 1 samples, and this run has 4"), ("spaces", "changed")):
         with pytest.raises(InputError, match=message):
             encoder_trainer(
                 small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 1, key: 4}

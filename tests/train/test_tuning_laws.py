@@ -13,12 +13,10 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.prompts import StoredPrompt
 from gsencoder.train import tune as run
 from gsencoder.train import vlm
-from gsencoder.train.loop import TrainerConfig
 from gsencoder.train.tune import (
     IGNORED,
     TERM,
     AnswerObjective,
-    TuneConfig,
     TuningBatch,
     TuningPair,
     TuningSample,
@@ -27,7 +25,6 @@ from gsencoder.train.tune import (
     join_pairs,
     open_processor,
     pairs_digest,
-    tuning_training,
 )
 from gsencoder.train.vlm import SPLIT, AdapterConfig, TokenHook, TowerLayout, tower_layout
 
@@ -167,12 +164,6 @@ def test_adapters_have_their_ranges(changes: dict[str, Any], valid: bool) -> Non
         return
     with pytest.raises(InputError, match=f"{next(iter(changes))}: expected"):
         AdapterConfig(**changes)
-
-
-def test_models_of_transformers_are_not_compiled_and_the_rate_falls_to_nothing() -> None:
-    with pytest.raises(InputError, match=r"train\.compile: expected false"):
-        TuneConfig(train=TrainerConfig(compile=True))
-    assert (tuning_training().final_rate, tuning_training().validate_every) == (0.0, 0)
 
 
 @pytest.mark.parametrize(

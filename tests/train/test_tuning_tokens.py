@@ -113,9 +113,3 @@ def test_tokens_are_trained_on_and_projected_where_channels_differ(model: Path, 
         )
         other = again.network(one.inputs, None if one.tokens is None else one.tokens + 1)
         assert not torch.equal(other, again.network(one.inputs, one.tokens))
-
-
-def test_features_of_other_channels_are_refused_without_a_projection(model: Path, tmp_path: Path) -> None:
-    pairs = make_pairs(tmp_path / "prompts", 2, tokens=np.zeros((1, CELLS**2, 7)))
-    with pytest.raises(InputError, match="the features have 7 channels and the tower has 32"):
-        tune(*pairs, model, SHORT, project=False, work=tmp_path)

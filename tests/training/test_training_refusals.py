@@ -136,7 +136,6 @@ def test_folders_that_a_training_did_not_make_are_left_alone(
         "model.transformer.mlp_ratio=1e12",
         "model.transformer.encoder_channels=32,32,32,32,32000000000",
         "model.transformer.encoder_depths=1,1,1,1,300000",
-        "augment.turn=1e308",
         "loss.rarity=1000",
         "loss.cosine=0 loss.smooth_l1=0 loss.contrast_weight=0",
     ],

@@ -27,7 +27,6 @@ from gsencoder.memory.bank import BankConfig, RawSample
 from gsencoder.models.output_space import check_distinct, name_of_space
 from gsencoder.teachers.build import build_teacher, stored_words, words_by_teacher
 from gsencoder.text.table import TextTable
-from gsencoder.train.batch import sample_rows
 from gsencoder.train.distributed import fail_together
 from gsencoder.train.loop import TrainerConfig
 from gsencoder.train.memory import (
@@ -41,6 +40,7 @@ from gsencoder.train.memory import (
     untrained_memory,
 )
 from gsencoder.train.prepare_scenes import SourceConfig
+from gsencoder.train.samples import sample_rows
 from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
 
 DRAWN_FEATURES = 20_000

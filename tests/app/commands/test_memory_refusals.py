@@ -31,7 +31,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_defaults_that_help_shows_are_those_of_the_command() -> None:
     options, training = options_by_key(MemoryCommandConfig), memory_training()
-    for name in ("steps", "learning_rate", "warmup", "weight_decay", "validate_every"):
+    for name in ("steps", "learning_rate", "warmup", "validate_every"):
         assert options[f"train.{name}"].default == getattr(training, name)
 
 
