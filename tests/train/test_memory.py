@@ -332,8 +332,8 @@ def test_a_loss_that_is_not_finite_stops_the_run(prepared: MemoryScene, tmp_path
     [
         ({"channels": 0}, "channels: expected 1 to 1,024, got 0"),
         ({"points": 0}, "points: expected 1 or more"),
-        ({"temperature": 0.0}, "temperature: expected a number above 0"),
-        ({"min_alpha": 0.0}, "min_alpha: expected a number above 0 and at most 1"),
+        ({"temperature": 0.0}, "temperature: expected above 0"),
+        ({"min_alpha": 0.0}, "min_alpha: expected above 0 and at most 1"),
         ({"cosine": -1.0}, "cosine: expected 0 or more"),
         ({"gaussian_weight": -1.0}, "gaussian_weight: expected 0 or more"),
         ({"cosine": 0.0, "l2": 0.0}, "there would be no loss"),

@@ -268,7 +268,6 @@ class TuneCommandConfig(TuneConfig, AskingConfig):
 
     def __post_init__(self) -> None:
         AskingConfig.__post_init__(self)
-        TuneConfig.__post_init__(self)
         VlmConfig(image_side=self.image_side)
 
 

@@ -42,7 +42,7 @@ def test_rows_that_nothing_covers_and_queries_of_any_width_are_refused(
     assert "memory.min_alpha: no cell of 2 views of teacher palette is covered to 1" in refusal(
         capsys, *words, "memory.min_alpha=1"
     )
-    assert "memory.channels: expected 1 to 1,024, got 100,000" in refusal(capsys, *words, "memory.channels=100000")
+    assert "memory.channels: expected 1 to 1,024, got 100000" in refusal(capsys, *words, "memory.channels=100000")
     assert not (tmp_path / "out").exists()
 
 
