@@ -52,16 +52,11 @@ def check_limits(settings: Any) -> None:
             isfinite(number) and all(LIMITS[name][0](number, limit) for name, limit in limits.items())
             for number in numbers
         ):
-<<<<<<< HEAD
-            expected = " and ".join(LIMITS[name][1].format(limits[name]) for name in LIMITS if name in limits)
+            expected = " and ".join(LIMITS[name][1].format(f"{limits[name]:,}") for name in LIMITS if name in limits)
+            expected = expected.replace(" or more and at most ", " to ")
             raise InputError(
                 f"{item.name}: expected {expected}, got {list(value) if isinstance(value, tuple) else value}"
             )
-=======
-            expected = " and ".join(LIMITS[name][1].format(f"{limits[name]:,}") for name in LIMITS if name in limits)
-            expected = expected.replace(" or more and at most ", " to ")
-            raise InputError(f"{item.name}: expected {expected}, got {value}")
->>>>>>> 344d0c0b (core: the range of a number reads 1 to 4,096; infinite numbers are within no limits)
 
 
 Settings = TypeVar("Settings")
