@@ -48,7 +48,7 @@ from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.relevancy import ThresholdConfig
 from gsencoder.teachers.build import text_table_of
 from gsencoder.teachers.labels import LabelsConfig
-from gsencoder.text.vocabulary import Words, stating_trained
+from gsencoder.text.vocabulary import Words, with_training_names
 from gsencoder.types import Scene
 
 RIM = 2
@@ -277,7 +277,7 @@ def main() -> None:
             parser.error(f"--space {arguments.space}: the encoder has the spaces {listed(list(encoder.spaces))}")
         source = encoder_source(encoder, space=arguments.space)
         words = encoder.tables.get(arguments.space or "", words)
-        words = stating_trained(words, table_beside(encoder, arguments.space))
+        words = with_training_names(words, table_beside(encoder, arguments.space))
     score(rooms, arguments.rooms, source, words, kinds)
 
 

@@ -4,12 +4,11 @@ import numpy as np
 import torch
 from torch import nn
 
-from gsencoder.fusion.measured_heads import HeadFit, MeasuredHead
-from gsencoder.teachers.adapter_heads import Head, Residual
+from gsencoder.fusion.measured_heads import MeasuredHead
+from gsencoder.teachers.radio import Head, Residual
 from gsencoder.types import FeatureSpace
 
 SPACE = FeatureSpace(name="radio", channels=6, teacher="radio", weights="abcd", preprocessing="resized")
-FIT = HeadFit(cells=3, cosine=0.5, worst=0.25)
 
 
 def body(channels: int = 4) -> nn.Sequential:
@@ -23,4 +22,5 @@ def body(channels: int = 4) -> nn.Sequential:
 
 def measured(name: str = "siglip.summary", channels: int = 4, text: str = "siglip") -> MeasuredHead:
     mean = np.arange(channels, dtype=np.float32)
-    return MeasuredHead(head=Head(name=name, body=body(channels), text=text, model="M"), mean=mean, scale=2.0, fit=FIT)
+    head = Head(name=name, body=body(channels), text=text, model="M")
+    return MeasuredHead(head=head, mean=mean, scale=2.0, cells=3, cosine=0.5, worst=0.25)

@@ -31,13 +31,13 @@ from gsencoder.fusion.folder import (
     save_features,
     save_memories,
 )
-from gsencoder.fusion.measured_heads import HeadFit, HeadSet, MeasuredHead, load_heads, save_heads
+from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, load_heads, save_heads
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_package, save_package
 from gsencoder.memory.index import index_features
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights
 from gsencoder.reconstruct.parameters import RowAdam, State, anchor_at, load_state, parameters_from, save_state
-from gsencoder.teachers.adapter_heads import Head
+from gsencoder.teachers.radio import Head
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.loop import TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE
@@ -106,8 +106,7 @@ def encoder(folder: Path) -> Made:
 
 def heads(folder: Path) -> Made:
     head = Head(name="clip.summary", body=torch.nn.Sequential(torch.nn.Linear(4, 3)), text="clip", model="ViT-H")
-    fit = HeadFit(cells=3, cosine=0.5, worst=0.25)
-    one = MeasuredHead(head=head, mean=np.ones(3, np.float32), scale=2.0, fit=fit)
+    one = MeasuredHead(head=head, mean=np.ones(3, np.float32), scale=2.0, cells=3, cosine=0.5, worst=0.25)
     save_heads(folder / "h", HeadSet(space=an_output_space()["s"].space, heads=(one,)))
 
     def read() -> Any:

@@ -3,13 +3,12 @@
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.folder import HEADS_FILE
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, find_head, head_features, load_heads
 from gsencoder.infer.localize import select_features
-from gsencoder.teachers.adapter_heads import TEXT_KINDS, Head, text_kind
+from gsencoder.teachers.radio import TEXT_KINDS, Head, text_kind
 from gsencoder.text.models import TransformersTower
 from gsencoder.text.table import TextTable, TextTower, load_text_table
 from gsencoder.text.vocabulary import (
@@ -38,11 +37,7 @@ def queried_through_head(
 def packed_through_head(
     scene: Scene, folder: Path, head: str, text: TextConfig, *, space: str = ""
 ) -> tuple[Scene, TextTable | None]:
-    """A scene with the outputs of a head as its only features, and the words to store beside them, if a tower is given.
-
-    Raises:
-        InputError: see `queried_through_head`.
-    """
+    """A scene with the outputs of a head as its only features, and the words to store with them, of a given tower."""
     heads = heads_of_folder(folder, head)
     measured_head = find_head(heads, head)
     if isinstance(text, TableTextConfig):
@@ -52,16 +47,7 @@ def packed_through_head(
 
 
 def heads_of_folder(folder: Path, name: str, option: str = "head") -> HeadSet:
-    """The adapter heads beside the features or the weights in a folder.
-
-    Args:
-        folder: of the features or the weights.
-        name: of the head that is asked for, for the error.
-        option: of the command, for the error.
-
-    Raises:
-        InputError: there are none, or the file is damaged.
-    """
+    """The adapter heads in a folder of features or weights; `option=name` asks for one, for the error."""
     path = folder / HEADS_FILE
     if not path.is_file():
         raise InputError(
@@ -74,22 +60,14 @@ def heads_of_folder(folder: Path, name: str, option: str = "head") -> HeadSet:
 def scene_through_head(
     scene: Scene, heads: HeadSet, head: MeasuredHead, *, space: str = "", text_encoder: str = ""
 ) -> Scene:
-    """The scene with the outputs of a head as its only features.
-
-    Raises:
-        InputError: the features are of another backbone than the head's.
-    """
+    """The scene with the outputs of a head as its only features."""
     features = features_for_heads(scene, heads, space)
     outputs = head_features(features, head, heads.space, text_encoder=text_encoder)
     return replace(scene, features={outputs.space.name: outputs})
 
 
 def features_for_heads(scene: Scene, heads: HeadSet, space: str = "") -> GaussianFeatures:
-    """The features that heads take: those of `space`, or of several teachers' those of the heads' backbone.
-
-    Raises:
-        InputError: there are no such features.
-    """
+    """The features that heads take: those of `space`, or of several teachers' those of the heads' backbone."""
     if not space and len(scene.features) > 1:
         of_backbone = [features for features in scene.features.values() if features.space == heads.space]
         if of_backbone:
@@ -104,10 +82,6 @@ def words_of_head(head: Head, words_file: str, text: TextConfig) -> Words:
         head: a summary head, whose outputs lie in the space of a model with a text side.
         words_file: a file of words; empty = the vocabulary of `text`.
         text: the text tower of that model.
-
-    Raises:
-        InputError: the head leads to no model with a text side, or is no summary head; no words are given, or they are
-            of another model.
     """
     if not head.text:
         raise InputError(
@@ -136,19 +110,8 @@ def words_of_head(head: Head, words_file: str, text: TextConfig) -> Words:
 
 
 def check_head_words(head: Head, words: Words, tower: TextTower | None) -> None:
-    """Checks that words fit a head: its channels, and the kind of its model where both are known.
-
-    Args:
-        head: a summary head.
-        words: compared with its outputs.
-        tower: of the words, where it was given.
-
-    Raises:
-        InputError: they do not; both are named.
-
-    Warns:
-        SceneWarning: phrases of a SigLIP2 head are embedded as they are written.
-    """
+    """Checks that words fit a summary head: its channels, and the kind of its model where it and the tower of the words
+    are known."""
     name = f"head {head.describe()}"
     described = f"the words of {tower.name!r}" if tower is not None else f"the words of {words.space.text_encoder!r}"
     if words.space.channels != head.channels:
@@ -172,18 +135,3 @@ def check_head_words(head: Head, words: Words, tower: TextTower | None) -> None:
             SceneWarning,
             stacklevel=2,
         )
-
-
-def head_figures(heads: HeadSet) -> dict[str, Any]:
-    """For each head by name: channels and scale of its outputs; mean and worst 5 % of the cosine, about the mean, of
-    its outputs for vectors in the basis with those for the teacher's full vectors; number of the cells compared."""
-    return {head.name: head.figures() for head in heads.heads}
-
-
-def describe_heads(heads: HeadSet) -> list[str]:
-    """One line for each head."""
-    return [
-        f"head {head.head.describe()}: {head.channels} channels; behind the basis its outputs keep "
-        f"{head.fit.describe()}"
-        for head in heads.heads
-    ]

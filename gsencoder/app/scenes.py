@@ -18,8 +18,8 @@ from gsencoder.text.vocabulary import (
     TableTextConfig,
     TextConfig,
     Words,
-    stating_trained,
     vocabulary_of,
+    with_training_names,
     words_of_table,
 )
 from gsencoder.types import FeatureSpace, QueryMemory, Scene
@@ -108,7 +108,7 @@ def load_words(folder: Path, space: FeatureSpace, words_file: str, text: TextCon
     """
     if words_file:
         words = words_of_table(load_text_table(find_file(words_file, "words")), text)
-        return stating_trained(words, _table_beside(folder, space))
+        return with_training_names(words, _table_beside(folder, space))
     if not isinstance(text, TableTextConfig):
         table = _table_beside(folder, space)
         return vocabulary_of(text) if table is None else words_of_table(table, text)

@@ -32,8 +32,8 @@ from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.load import Encoder
 from gsencoder.infer.relevancy import relevancy
 from gsencoder.render import blend
-from gsencoder.teachers.adapter_heads import Head
 from gsencoder.teachers.build import TeacherConfig, build_teacher
+from gsencoder.teachers.radio import Head
 from gsencoder.text.table import TextEncoder, TextTable, check_space
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, MeshLabels, Scene

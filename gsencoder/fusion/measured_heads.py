@@ -1,15 +1,9 @@
 """Adapter heads on features (SplatDistill secs. 3.2 and 3.4): measured, applied and stored.
 
-Features and rendered tokens in the space of an adapter head (SplatDistill secs. 3.2 and 3.4).
-
-The backbone's features are distilled and stored; a head is applied to them when its space is asked for. Features in the
-coordinates of a basis are decoded first.
-
-Mean and scale of an adapter head's outputs over cells of a teacher's maps, and what a basis costs the head.
-
-Centered cosines remove the mean, and the render loss divides by the scale. Features are stored in the coordinates of a
-basis that keeps the energy of the backbone's vectors. What it drops may be small for the backbone and large for a head,
-so the outputs for the projected vectors are compared with those for the full ones.
+The backbone's features are distilled and stored; a head is applied to them when its space is asked for. Centered
+cosines remove the mean of its outputs, and the render loss divides by their scale; both are measured over cells of the
+teacher's maps. Features are stored in the coordinates of a basis, and what that drops may be small for the backbone and
+large for a head, so the outputs for the projected vectors are compared with those for the full ones.
 """
 
 import copy
@@ -22,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, Float64, Int64
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsencoder.core.archive import Archive, open_archive, write_archive
 from gsencoder.core.device import choose_device
@@ -30,13 +24,12 @@ from gsencoder.core.errors import InputError, about
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.errors import WORST, CellSample
 from gsencoder.fusion.folder import check_heads_space, read_heads_space
-from gsencoder.teachers.adapter_heads import (
+from gsencoder.teachers.radio import (
     PARTS,
     TEXT_KINDS,
     Head,
+    Residual,
     default_part,
-    describe_layers,
-    read_layers,
     split_name,
 )
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
@@ -45,40 +38,25 @@ CHUNK = 4096
 """Vectors that a head is given at a time."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class HeadFit:
-    """How well a head's outputs for vectors in a basis agree with those for the full vectors.
-
-    Attributes:
-        cells: number of the vectors; mean and scale of the head are theirs, too.
-        cosine: mean cosine of the outputs, about their mean.
-        worst: the cosine below which the worst 5 % of the vectors are.
-    """
-
-    cells: int
-    cosine: float
-    worst: float
-
-    def describe(self) -> str:
-        """The figures in a phrase."""
-        return f"cosine {self.cosine:.3f}, worst 5 % below {self.worst:.3f} in {self.cells:,} cells"
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MeasuredHead:
-    """An adapter head with the statistics of its outputs over a data set.
+    """An adapter head with the statistics of its outputs over a data set, and what the basis of the features costs it.
 
     Attributes:
         head: its layers and its name.
         mean: of the outputs.
         scale: root mean square distance of the outputs from their mean.
-        fit: what the basis of the features costs it.
+        cells: number of the vectors that were measured.
+        cosine: mean cosine, about the mean, of its outputs for vectors in the basis with those for the full vectors.
+        worst: the cosine below which the worst 5 % of the vectors are.
     """
 
     head: Head
     mean: Float32[np.ndarray, " E"]
     scale: float
-    fit: HeadFit
+    cells: int
+    cosine: float
+    worst: float
 
     @property
     def name(self) -> str:
@@ -90,23 +68,23 @@ class MeasuredHead:
 
     def figures(self) -> dict[str, int | float]:
         """For summaries: channels, scale, and what the basis costs."""
-        return {
-            "channels": self.channels,
-            "scale": self.scale,
-            "cells": self.fit.cells,
-            "cosine": self.fit.cosine,
-            "worst": self.fit.worst,
-        }
+        return {"channels": self.channels, **{name: getattr(self, name) for name in FIGURES}}
+
+    def describe(self) -> str:
+        """The figures in a line."""
+        return (
+            f"head {self.head.describe()}: {self.channels} channels; behind the basis its outputs keep cosine "
+            f"{self.cosine:.3f}, worst 5 % below {self.worst:.3f} in {self.cells:,} cells"
+        )
+
+
+FIGURES = {"scale": float, "cells": int, "cosine": float, "worst": float}
+"""What is measured of a head beside the mean of its outputs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class HeadSet:
-    """Measured heads of one backbone.
-
-    Attributes:
-        space: of the features that the heads take.
-        heads: no name twice.
-    """
+    """Measured heads, of different names, of the backbone whose features have this space."""
 
     space: FeatureSpace
     heads: tuple[MeasuredHead, ...] = field(default=())
@@ -115,21 +93,19 @@ class HeadSet:
     def names(self) -> tuple[str, ...]:
         return tuple(head.name for head in self.heads)
 
+    def figures(self) -> dict[str, dict[str, int | float]]:
+        """For summaries: the figures of each head by its name."""
+        return {head.name: head.figures() for head in self.heads}
+
+    def describe(self) -> list[str]:
+        """One line for each head."""
+        return [head.describe() for head in self.heads]
+
 
 def measure_heads(
     heads: Sequence[Head], sample: CellSample, space: FeatureSpace, basis: FeatureBasis | None
 ) -> HeadSet:
-    """Computes mean and scale of each head's outputs, and what a basis costs it.
-
-    Args:
-        heads: of the backbone of `space`.
-        sample: cells of the teacher's maps.
-        space: of the maps.
-        basis: in which features are stored; None = all channels are.
-
-    Raises:
-        InputError: no cells, or outputs that are not finite, or all equal.
-    """
+    """Computes mean and scale of each head's outputs for cells of the teacher's maps, and what a basis costs it."""
     vectors = sample.vectors()
     projected = vectors
     if basis is not None:
@@ -144,16 +120,18 @@ def _measure(head: Head, vectors: Float32[np.ndarray, "n D"], projected: Float32
     if not scale > 0:
         raise InputError(f"heads: {head.name} gives the same vector for all {len(vectors):,} cells; check the pictures")
     cosines = np.ones(len(full)) if projected is vectors else _cosines(full, head_outputs(head, projected), mean)
-    fit = HeadFit(cells=len(full), cosine=float(cosines.mean()), worst=float(np.quantile(cosines, WORST)))
-    return MeasuredHead(head=head, mean=mean, scale=scale, fit=fit)
+    return MeasuredHead(
+        head=head,
+        mean=mean,
+        scale=scale,
+        cells=len(full),
+        cosine=float(cosines.mean()),
+        worst=float(np.quantile(cosines, WORST)),
+    )
 
 
 def head_outputs(head: Head, vectors: Float32[np.ndarray, "n D"]) -> Float32[np.ndarray, "n E"]:
-    """The outputs of a head, computed by chunks in float32, on a GPU if there is one.
-
-    Raises:
-        InputError: outputs that are not finite.
-    """
+    """The outputs of a head, computed by chunks in float32, on a GPU if there is one; InputError if not finite."""
     device = choose_device("auto")
     body = head.body if device.type == "cpu" else copy.deepcopy(head.body).to(device)
     with torch.inference_mode():
@@ -175,13 +153,7 @@ def _cosines(
 
 
 def head_space(backbone: FeatureSpace, head: MeasuredHead, text_encoder: str = "") -> FeatureSpace:
-    """The space of a head's outputs: it names backbone, head and the digest of the weights, which holds for both.
-
-    Args:
-        backbone: space of the features that the head takes.
-        head: which.
-        text_encoder: what turns words into its space; empty if nothing does.
-    """
+    """The space of a head's outputs: it names backbone, head and the digest of the weights, which holds for both."""
     return replace(
         backbone,
         name=f"{backbone.name}/{head.name}",
@@ -200,16 +172,13 @@ def head_features(
     4 · E bytes a Gaussian.
 
     Args:
-        features: of the backbone, in a basis or not.
+        features: of the space `backbone`, in a basis or not.
         head: which.
         backbone: the space whose features the head takes.
         text_encoder: what turns words into the head's space.
 
     Returns:
         Features of all E channels with the weights of the given ones; their mean is the head's.
-
-    Raises:
-        InputError: features of another backbone, or outputs that are not finite.
     """
     with about(head.name):
         check_heads_space(backbone, features.space)
@@ -234,27 +203,14 @@ def head_features(
 def equal_rows(
     values: Float32[np.ndarray, "n channels"],
 ) -> tuple[Int64[np.ndarray, " distinct"], Int64[np.ndarray, " n"]]:
-    """Groups rows of equal bits.
+    """Groups rows of equal bits: one row number of each group, and for each row the number of its group.
 
-    Returns:
-        One row number of each group, and for each row the number of its group: `values[first][inverse]` equals
-        `values`.
+    `values[first][inverse]` equals `values`.
     """
-    bits = np.ascontiguousarray(values).view(np.uint32)
-    # Rows are compared by a sum with random odd factors modulo 2⁶⁴, which is much faster than by all their columns.
-    random = np.random.default_rng(0).integers(0, 1 << 63, bits.shape[1], dtype=np.uint64)
-    factors = np.bitwise_or(random, np.uint64(1))
-    keys = np.zeros(len(bits), np.uint64)
-    for column, factor in enumerate(factors):
-        keys += bits[:, column].astype(np.uint64) * factor
-    _, first, inverse = np.unique(keys, return_index=True, return_inverse=True)
-    first, inverse = first.astype(np.int64), inverse.astype(np.int64).reshape(-1)
-    for start in range(0, len(bits), CHUNK):
-        part = slice(start, start + CHUNK)
-        if not np.array_equal(bits[first[inverse[part]]], bits[part]):
-            everything = np.arange(len(bits))
-            return everything, everything
-    return first, inverse
+    rows = np.ascontiguousarray(values)
+    bits = rows.view(np.dtype((np.void, rows.shape[1] * rows.itemsize))).reshape(-1)
+    _, first, inverse = np.unique(bits, return_index=True, return_inverse=True)
+    return first.astype(np.int64), inverse.astype(np.int64).reshape(-1)
 
 
 def head_tokens(tokens: Float[Tensor, "V tokens D"], head: MeasuredHead) -> Float[Tensor, "V tokens E"]:
@@ -262,20 +218,70 @@ def head_tokens(tokens: Float[Tensor, "V tokens D"], head: MeasuredHead) -> Floa
 
     A vision-language model was trained on the head's outputs for one patch, as in SplatDistill's sec. 3.4; heads are
     not linear, so rendering the outputs of the Gaussians' vectors would give others.
-
-    Raises:
-        InputError: outputs that are not finite.
     """
     outputs = head_outputs(head.head, tokens.reshape(-1, tokens.shape[-1]).float().numpy())
     return torch.from_numpy(outputs).reshape(*tokens.shape[:-1], head.channels)
 
 
-def save_heads(path: Path, heads: HeadSet) -> None:
-    """Writes adapter heads to a file.
+LAYER_TYPES: dict[str, tuple[type[nn.Module], tuple[str, ...]]] = {
+    "linear": (nn.Linear, ("weight", "bias")),
+    "layernorm": (nn.LayerNorm, ("weight", "bias")),
+    "gelu": (nn.GELU, ()),
+    "relu": (nn.ReLU, ()),
+}
+"""The layer types that a head may have, with the names of their parameters."""
 
-    Raises:
-        InputError: a layer of a type that a file cannot hold, or the disk is full.
-    """
+
+def describe_layers(layers: nn.Sequential, name: str, arrays: dict[str, np.ndarray]) -> list[Any]:
+    """The names of the layers' types, residual blocks as nested lists; parameters are added to `arrays` as
+    NAME.NUMBER.PARAMETER."""
+    layer_types: list[Any] = []
+    for number, layer in enumerate(layers):
+        key = f"{name}.{number}"
+        if isinstance(layer, Residual):
+            layer_types.append(describe_layers(layer, key, arrays))
+            continue
+        layer_type = next(layer_type for layer_type, (cls, _) in LAYER_TYPES.items() if type(layer) is cls)
+        layer_types.append(layer_type)
+        for parameter in LAYER_TYPES[layer_type][1]:
+            arrays[f"{key}.{parameter}"] = getattr(layer, parameter).detach().float().numpy()
+    return layer_types
+
+
+def read_layers(file: Archive, layer_types: Sequence[Any], name: str, width: int) -> tuple[nn.Sequential, int]:
+    """Layers that `describe_layers` described, whose input has `width` channels, and the channels of their outputs."""
+    layers: list[nn.Module] = []
+    for number, layer_type in enumerate(layer_types):
+        key = f"{name}.{number}"
+        if isinstance(layer_type, list):
+            inner, out = read_layers(file, layer_type, key, width)
+            if out != width:
+                raise InputError(f"{key}: expected a residual block with {width} output channels, got {out}")
+            layers.append(Residual(*inner))
+        elif layer_type == "linear":
+            weight = file.array(f"{key}.weight", "float32", (key, width))
+            linear = nn.Linear(width, len(weight))
+            width = len(weight)
+            bias = file.array(f"{key}.bias", "float32", (width,))
+            linear.weight.data, linear.bias.data = torch.from_numpy(weight.copy()), torch.from_numpy(bias.copy())
+            layers.append(linear)
+        elif layer_type == "layernorm":
+            norm = nn.LayerNorm(width)
+            for parameter in LAYER_TYPES[layer_type][1]:
+                value = file.array(f"{key}.{parameter}", "float32", (width,))
+                getattr(norm, parameter).data = torch.from_numpy(value.copy())
+            layers.append(norm)
+        elif isinstance(layer_type, str) and layer_type in LAYER_TYPES:
+            layers.append(LAYER_TYPES[layer_type][0]())
+        else:
+            raise InputError(
+                f"{key}: expected {', '.join(LAYER_TYPES)} or a list of these, got {str(layer_type)[:20]!r}"
+            )
+    return nn.Sequential(*layers), width
+
+
+def save_heads(path: Path, heads: HeadSet) -> None:
+    """Writes adapter heads to a file."""
     arrays: dict[str, np.ndarray] = {}
     entries = [_describe(head, arrays) for head in heads.heads]
     space = {name: getattr(heads.space, name) for name in heads.space.__dataclass_fields__}
@@ -284,26 +290,19 @@ def save_heads(path: Path, heads: HeadSet) -> None:
 
 def _describe(measured: MeasuredHead, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
     """The header's entry of a head, whose arrays are added to `arrays`."""
-    head, fit = measured.head, measured.fit
+    head = measured.head
     arrays[f"{head.name}.mean"] = measured.mean
     return {
         "name": head.name,
         "text": head.text,
         "model": head.model,
         "layers": describe_layers(head.body, head.name, arrays),
-        "scale": float(measured.scale),
-        "cells": fit.cells,
-        "cosine": fit.cosine,
-        "worst": fit.worst,
+        **{name: getattr(measured, name) for name in FIGURES},
     }
 
 
 def load_heads(path: Path) -> HeadSet:
-    """Loads the adapter heads of a file.
-
-    Raises:
-        InputError: the file is missing or damaged, or holds no heads.
-    """
+    """Loads the adapter heads of a file."""
     with open_archive(path) as file:
         space = read_heads_space(file)
         heads = tuple(_read(file, entry, space.channels) for entry in file.value("heads", list))
@@ -313,8 +312,7 @@ def load_heads(path: Path) -> HeadSet:
 
 
 def _read(file: Archive, entry: Any, channels: int) -> MeasuredHead:
-    kinds = {"name": str, "text": str, "model": str, "layers": list, "scale": float, "cells": int}
-    kinds |= {"cosine": float, "worst": float}
+    kinds = {"name": str, "text": str, "model": str, "layers": list, **FIGURES}
     good = isinstance(entry, dict) and all(type(entry.get(key)) is kind for key, kind in kinds.items())
     if not good or not entry["layers"] or not 0 < entry["scale"] < float("inf"):
         raise InputError(f"expected heads with {', '.join(kinds)}, got {str(entry)[:80]}")
@@ -323,26 +321,14 @@ def _read(file: Archive, entry: Any, channels: int) -> MeasuredHead:
         raise InputError(f"expected a head called NAME.summary or NAME.features, got {str(entry)[:80]}")
     body, width = read_layers(file, entry["layers"], name, channels)
     return MeasuredHead(
-        head=Head(
-            name=name, body=body.requires_grad_(False).eval(), text=str(entry["text"]), model=str(entry["model"])
-        ),
+        head=Head(name=name, body=body.requires_grad_(False).eval(), text=entry["text"], model=entry["model"]),
         mean=file.array(f"{name}.mean", "float32", (width,)),
-        scale=entry["scale"],
-        fit=HeadFit(cells=entry["cells"], cosine=entry["cosine"], worst=entry["worst"]),
+        **{figure: entry[figure] for figure in FIGURES},
     )
 
 
 def find_head(heads: HeadSet, name: str, option: str = "head") -> MeasuredHead:
-    """The head that a name stands for: NAME.summary, NAME.features, or NAME for the one that is meant most often.
-
-    Args:
-        heads: to choose from.
-        name: of the head.
-        option: of the command, for the error.
-
-    Raises:
-        InputError: it is not among them.
-    """
+    """The head that a name stands for: NAME.summary, NAME.features, or NAME for the one that is meant most often."""
     by_name, full = {head.name: head for head in heads.heads}, _full_name(heads, name)
     if full not in by_name:
         meant = f" ({full})" if full and full != name else ""
@@ -366,11 +352,7 @@ def _full_name(heads: HeadSet, name: str) -> str:
 
 
 def choose_heads(heads: HeadSet, names: Sequence[str], option: str = "heads") -> HeadSet:
-    """The heads of some names, in their order, each once.
-
-    Raises:
-        InputError: one is not there.
-    """
+    """The heads of some names, in their order, each once."""
     chosen = {(head := find_head(heads, name, option)).name: head for name in names}
     return replace(heads, heads=tuple(chosen.values()))
 

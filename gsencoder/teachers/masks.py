@@ -122,12 +122,7 @@ class FileMasks:
 
 
 def scene_path(scene: Scene, name: str, option: str) -> Path:
-    """A file or folder of a scene: in the scene's folder, else at the path itself.
-
-    Raises:
-        MissingInput: there is none, and the name is relative, so that other scenes may have one.
-        InputError: there is none at an absolute path, or the name stands for both.
-    """
+    """A file or folder of a scene: in the scene's folder, else at the path itself."""
     inside = scene.folder / name if scene.folder is not None and not Path(name).is_absolute() else None
     existing = [path for path in (inside, Path(name)) if path is not None and path.exists()]
     if not existing:

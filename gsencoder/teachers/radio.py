@@ -1,24 +1,39 @@
-"""The `radio` teacher: RADIO's backbone features through transformers, which SplatDistill distils (sec. 3.2)."""
+"""The `radio` teacher: RADIO's backbone features through transformers, and its adapter heads (SplatDistill sec. 3.2).
 
-from collections.abc import Sequence
+An adapter NAME has a summary head and a feature head: NAME.summary and NAME.features say which. NAME alone is the head
+that is meant most often: the summary head of adapters whose model has a text side (CLIP, SigLIP, SigLIP2), since its
+outputs are compared with words, else the feature head.
+
+transformers loads the backbone alone. The heads lie in the same files, under `radio_model.adaptors.NAME.head_mlp`
+(summary) and `.feat_mlp` (features); `config.json` states their sizes in `adaptor_configs` and their form in
+`args.mlp_version` and `args.spatial_mlp_version`.
+"""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from gsencoder.core.device import choose_device
-from gsencoder.core.errors import InputError
-from gsencoder.core.pretrained import digest_files, find_file, load_pretrained, read_config
+from gsencoder.core.errors import InputError, about, listed
+from gsencoder.core.files import read_foreign_text
+from gsencoder.core.pretrained import check_fetched, digest_files, find_file, load_pretrained, read_config, weight_files
 from gsencoder.core.process import Device
 from gsencoder.core.settings import option
-from gsencoder.teachers.adapter_heads import ADAPTERS, WHAT, Head, read_radio_heads
 from gsencoder.teachers.base import Teacher, TeacherSettings, check_channels, text_encoder_of
 from gsencoder.teachers.pictures import Preprocessing, TorchTeacher
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import FeatureSpace, Scene
 
+WHAT = "teacher radio"
+ADAPTERS = "radio_model.adaptors."
+"""The prefix of the keys of adapter heads in files of weights."""
 PICKLED = (".tar", ".pth", ".pt", ".bin", ".ckpt")
 """Endings of files that are opened by unpickling them."""
 
@@ -50,7 +65,7 @@ class RadioConfig(TeacherSettings):
     def stored_heads(self) -> tuple[str, ...]:
         return self.heads
 
-    def read_heads(self, names: Sequence[str]) -> list[Head]:
+    def read_heads(self, names: Sequence[str]) -> "list[Head]":
         folder = radio_folder(self)
         return read_radio_heads(folder, names, check_radio(folder))
 
@@ -123,3 +138,271 @@ def check_radio(folder: Path) -> int:
     if stated.model_type != "radio":
         raise InputError(f"{WHAT}: {folder} holds a {stated.model_type} model, expected radio")
     return int(stated.hidden_size)
+
+
+Part = Literal["summary", "features"]
+PARTS: tuple[Part, Part] = ("summary", "features")
+TEXT_KINDS = ("siglip2", "siglip", "clip")
+"""Kinds of models with a text side, the more special ones first."""
+
+
+def text_kind(*descriptions: str) -> str:
+    """The kind of model with a text side that a description names, such as "open_clip ViT-SO400M-14-SigLIP-384"; empty
+    if none does. The first description that names one decides."""
+    for description in descriptions:
+        for kind in TEXT_KINDS:
+            if kind in description.lower():
+                return kind
+    return ""
+
+
+def split_name(name: str, adapters: Iterable[str]) -> tuple[str, Part | None]:
+    """The adapter that a head's name stands for, and its part if the name says which. The name of an adapter may itself
+    end in a part's name."""
+    adapter, _, last = name.rpartition(".")
+    for part in PARTS:
+        if last == part and adapter and name not in adapters:
+            return adapter, part
+    return name, None
+
+
+def default_part(kind: str) -> Part:
+    """The part that an adapter's name alone stands for, by the kind of its model with a text side."""
+    return "summary" if kind else "features"
+
+
+NORMALIZER = "radio_model.feature_normalizer."
+MODULES: Mapping[Part, str] = {"summary": "head_mlp", "features": "feat_mlp"}
+SECTIONS: Mapping[Part, str] = {"summary": "summary", "features": "feature"}
+"""Names of a head's part in the keys of the weights, and in the configuration."""
+SIZES = ("input_dim", "hidden_dim", "output_dim", "num_inner")
+VERSIONS = ("v1", "v2")
+MAX_SIZE = 1 << 16
+
+
+class Residual(nn.Sequential):
+    """A residual block: x + f(x), where f applies the layers in sequence."""
+
+    def forward(self, x: Float[Tensor, "n C"]) -> Float[Tensor, "n C"]:
+        out: Tensor = x + super().forward(x)
+        return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Head:
+    """An adapter head.
+
+    Attributes:
+        name: ADAPTER.summary or ADAPTER.features.
+        body: its layers, from features [n, D] of the backbone to vectors [n, E].
+        text: the kind of model with a text side to whose space the adapter leads (clip, siglip, siglip2); else empty.
+        model: the model to whose space it leads, as the configuration states it; else empty.
+    """
+
+    name: str
+    body: nn.Sequential
+    text: str = ""
+    model: str = ""
+
+    @property
+    def part(self) -> str:
+        """The part of the adapter: summary or features."""
+        return self.name.rpartition(".")[2]
+
+    @property
+    def channels(self) -> int:
+        """E: the number of channels of its outputs."""
+        return next(layer.out_features for layer in reversed(self.body) if isinstance(layer, nn.Linear))
+
+    def describe(self) -> str:
+        """The head and the model to whose space it leads, for messages."""
+        kind = self.model or self.text
+        return f"{self.name} ({kind})" if kind else self.name
+
+
+def read_radio_heads(folder: Path, names: Sequence[str], channels: int) -> list[Head]:
+    """Reads adapter heads of a RADIO model, each once; no code of the folder is run.
+
+    Args:
+        folder: with config.json and safetensors.
+        names: of heads: NAME, NAME.summary or NAME.features.
+        channels: D of the backbone.
+    """
+    files = weight_files(folder, WHAT)
+    with about(f"heads of {folder}"):
+        config = _read_config(folder)
+        heads: dict[str, Head] = {}
+        with _open_weights(files) as weights:
+            for name in names:
+                head = _read_head(weights, config, name, channels)
+                heads[head.name] = head
+        return list(heads.values())
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    try:
+        config = json.loads(read_foreign_text(folder / "config.json"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"config.json cannot be read: {error}") from error
+    if not isinstance(config, dict) or not isinstance(config.get("adaptor_configs"), dict):
+        raise InputError("config.json has no adaptor_configs: the folder was written without adapter heads")
+    return config
+
+
+@contextmanager
+def _open_weights(paths: Sequence[Path]) -> Iterator[dict[str, Any]]:
+    """For each key of weights the open safetensors file that holds it."""
+    from safetensors import SafetensorError, safe_open
+
+    with ExitStack() as stack:
+        files: dict[str, Any] = {}
+        for path in paths:
+            check_fetched(path)
+            try:
+                file = stack.enter_context(safe_open(path, framework="pt"))
+            except (SafetensorError, OSError) as error:
+                raise InputError(f"{path.name}: no safetensors file: {' '.join(str(error).split())[:160]}") from error
+            for key in file.keys():  # noqa: SIM118 - not a mapping
+                if key in files:
+                    raise InputError(f"{key} is in two files; expected the files of one model")
+                files[key] = file
+        yield files
+
+
+def _read_head(weights: Mapping[str, Any], config: Mapping[str, Any], name: str, channels: int) -> Head:
+    adapters: dict[str, Any] = config["adaptor_configs"]
+    adapter, part = split_name(name, adapters)
+    if adapter not in adapters:
+        raise InputError(f"{name}: there is no such adapter; config.json has {listed(sorted(adapters)) or 'none'}")
+    if any(key.startswith(NORMALIZER) for key in weights):
+        raise InputError(
+            f"{name}: the folder has a feature normalizer, which transformers does not apply; heads would be given "
+            "other features than they were trained on"
+        )
+    args = config.get("args")
+    args = args if isinstance(args, dict) else {}
+    teacher = _teacher_of(args, adapters[adapter], adapter)
+    stated = " ".join(str(teacher.get(key, "")) for key in ("type", "model")).strip()
+    kind = text_kind(stated, adapter)
+    part = part or default_part(kind)
+    full = f"{adapter}.{part}"
+    with about(full):
+        version = _version(args, part)
+        sizes = _sizes(adapters[adapter], part)
+        if sizes["input_dim"] != channels:
+            raise InputError(
+                f"takes {sizes['input_dim']} channels and the backbone has {channels}: a head of another backbone"
+            )
+        prefix = f"{ADAPTERS}{adapter}.{MODULES[part]}."
+        body = _read_body(weights, prefix, version, sizes)
+    return Head(name=full, body=body.requires_grad_(False).eval(), text=kind, model=str(teacher.get("model", "")))
+
+
+def _teacher_of(args: Mapping[str, Any], adapter: Any, name: str) -> Mapping[str, Any]:
+    """What `args.teachers` states of the model to whose space an adapter leads: the entry of its `head_idx`, or the one
+    of its name; empty where nothing is stated."""
+    teachers = args.get("teachers")
+    entries = [entry for entry in teachers if isinstance(entry, dict)] if isinstance(teachers, list) else []
+    for entry in entries:
+        if entry.get("name") == name:
+            return entry
+    index = adapter.get("head_idx") if isinstance(adapter, dict) else None
+    if type(index) is int and 0 <= index < len(entries) and "name" not in entries[index]:
+        return entries[index]
+    return {}
+
+
+def _version(args: Mapping[str, Any], part: Part) -> str:
+    """The form of a head: v1 or v2."""
+    option = "mlp_version"
+    if part == "features" and args.get("spatial_mlp_version"):
+        option = "spatial_mlp_version"
+    version = args.get(option)
+    if version == "attn":
+        raise InputError(f"is an attention head (args.{option}=attn), which is not supported; expected v1 or v2")
+    if version not in VERSIONS:
+        raise InputError(f"is a head of an unknown form (args.{option}={str(version)[:20]}); expected v1 or v2")
+    return str(version)
+
+
+def _sizes(adapter: Any, part: Part) -> dict[str, int]:
+    """The sizes of a head, as the configuration states them."""
+    section = adapter.get(SECTIONS[part]) if isinstance(adapter, dict) else None
+    section = section if isinstance(section, dict) else {}
+    sizes = {name: section.get(name) for name in SIZES}
+    for name, value in sizes.items():
+        if type(value) is not int or not (name == "num_inner" or value) or not 0 <= value <= MAX_SIZE:
+            raise InputError(f"config.json: expected {SECTIONS[part]}.{name} of adaptor_configs, got {str(value)[:20]}")
+    factor = section.get("upsample_factor")
+    if factor not in (None, 1):
+        raise InputError(f"is an upsampling head (upsample_factor={str(factor)[:20]}), which is not supported")
+    return {name: int(value) for name, value in sizes.items() if value is not None}
+
+
+def _read_body(weights: Mapping[str, Any], prefix: str, version: str, sizes: Mapping[str, int]) -> nn.Sequential:
+    """Builds the layers of a head and reads their parameters: exactly those of its form."""
+    stored = {
+        key.removeprefix(prefix): tuple(file.get_slice(key).get_shape())
+        for key, file in weights.items()
+        if key.startswith(prefix)
+    }
+    if any("parametrizations" in key for key in stored):
+        raise InputError(
+            "its weights are in spectral reparametrization, which is not supported; expected plain ones (fc1.weight)"
+        )
+    if not stored:
+        raise InputError(f"config.json states it, but no weights begin with {prefix}")
+    body, modules = _build(version, sizes, pre_norm="pre_norm.0.weight" in stored)
+    expected = {
+        f"{key}.{name}": tuple(value.shape)
+        for key, module in modules.items()
+        for name, value in module.named_parameters()
+    }
+    for names, problem in (
+        (sorted(set(expected) - set(stored)), "missing"),
+        (sorted(set(stored) - set(expected)), f"not part of a head of form {version}"),
+    ):
+        if names:
+            keys = [f"{prefix}{name}" for name in names]
+            raise InputError(f"{len(names)} of its weights are {problem}: {listed(keys, 3)}")
+    for name, shape in expected.items():
+        if stored[name] != shape:
+            raise InputError(
+                f"{prefix}{name} is {list(stored[name])}, and config.json states {list(shape)}; expected both of one "
+                "model"
+            )
+    for key, module in modules.items():
+        for name, _ in list(module.named_parameters()):
+            full = f"{prefix}{key}.{name}"
+            value = weights[full].get_tensor(full).float()
+            if not torch.isfinite(value).all():
+                raise InputError(f"{full} has values that are not finite; fetch the file again")
+            setattr(module, name, nn.Parameter(value))
+    return body
+
+
+def _build(version: str, sizes: Mapping[str, int], *, pre_norm: bool) -> tuple[nn.Sequential, dict[str, nn.Module]]:
+    """The layers of a head without parameters, and those that have some by their key."""
+    modules: dict[str, nn.Module] = {}
+    width, hidden, outputs, inner = (sizes[name] for name in SIZES)
+
+    def linear(key: str, inputs: int, out: int) -> nn.Module:
+        return modules.setdefault(key, nn.Linear(inputs, out))
+
+    def norm(key: str, channels: int) -> nn.Module:
+        return modules.setdefault(key, nn.LayerNorm(channels))
+
+    with torch.device("meta"):
+        if version == "v1":
+            layers = [linear("fc1", width, hidden), norm("norm", hidden), nn.ReLU()]
+            for number in range(inner):
+                first = 3 * number
+                layers += [linear(f"inner.{first}", hidden, hidden), norm(f"inner.{first + 1}", hidden), nn.ReLU()]
+            return nn.Sequential(*layers, linear("fc2", hidden, outputs)), modules
+        layers = [norm("pre_norm.0", width), nn.GELU()] if pre_norm else []
+        layers.append(linear("fc1", width, hidden))
+        for number in range(inner):
+            key = f"blocks.{number}"
+            layers.append(Residual(norm(f"{key}.0", hidden), nn.GELU(), linear(f"{key}.2", hidden, hidden)))
+        layers += [norm("final.0", hidden), nn.GELU(), linear("final.2", hidden, outputs)]
+    return nn.Sequential(*layers), modules

@@ -43,11 +43,13 @@ from gsencoder.teachers.onnx import DenseOnnxOptions, OnnxConfig
 from gsencoder.teachers.pictures import LARGEST_SIDE, OnnxNetwork
 from gsencoder.teachers.radio import RadioConfig
 from gsencoder.teachers.tower import TransformersConfig
-from gsencoder.text.table import MAX_NAME, MAX_SHOWN
+from gsencoder.text.table import MAX_NAME
 from gsencoder.text.vocabulary import Words
-from gsencoder.types import FeatureMap, FeatureSpace, Scene, SceneObject, Views
+from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 
 CAPTIONS_FILE = "captions.json"
+Captions = Mapping[str, Mapping[int, str]]
+"""Captions by label, for each view that has some by its name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,18 +130,19 @@ class RegionsConfig(TeacherSettings):
                 "vector: captions belong to labels that are known, and masks=sam numbers its masks itself; give "
                 "vector=map or vector=crop, or label images (masks=files)"
             )
-        has_captions = self.vector == "captions"
+        captions, other = self.vector == "captions", "vector=map and vector=crop"
+        defaults = {item.name: item.default for item in fields(self)} | {"onnx": OnnxRegionOptions()}
         for name, used, owner in (
             ("folder", self.masks == "files", "masks=files"),
             ("sam", self.masks == "sam", "masks=sam"),
-            ("model", not has_captions, "vector=map and vector=crop"),
-            ("joint", not has_captions, "vector=map and vector=crop"),
-            ("onnx", not has_captions, "vector=map and vector=crop"),
-            ("captions", has_captions, "vector=captions"),
-            ("rest", has_captions, "vector=captions"),
+            ("model", not captions, other),
+            ("joint", not captions, other),
+            ("onnx", not captions, other),
+            ("captions", captions, "vector=captions"),
+            ("rest", captions, "vector=captions"),
             ("around", self.vector == "crop", "vector=crop"),
         ):
-            if not used and getattr(self, name) != _DEFAULTS[name]:
+            if not used and getattr(self, name) != defaults[name]:
                 raise InputError(f"{name}: is an option of {owner}, and masks is {self.masks}, vector {self.vector}")
 
     def build(self, scene: Scene, words: Words | None) -> Teacher:
@@ -152,8 +155,8 @@ class RegionsConfig(TeacherSettings):
         if scene.views is None:
             raise InputError(f"{WHAT}: the scene has no views")
         if words is not None and self.vector == "captions":
-            captions = self._captions(scene, scene.views, masks)
-            return CaptionedRegions(scene.views, masks, captions, words, rest=self.rest == "mean")
+            captions, source = self._captions(scene, scene.views, masks)
+            return CaptionedRegions(scene.views, masks, captions, words, rest=self.rest == "mean", source=source)
         vectors = self._vectors(scene, words)
         check_channels(vectors.space, words)
         return PicturedRegions(scene.views, masks, vectors, min_area=self.min_area)
@@ -174,18 +177,26 @@ class RegionsConfig(TeacherSettings):
         options = SamOptions(**{item.name: getattr(self, item.name) for item in fields(SamOptions)})
         return SamMasks(self.sam, options, self.device)
 
-    def _captions(self, scene: Scene, views: Views, masks: RegionMasks) -> "Captions":
+    def _captions(self, scene: Scene, views: Views, masks: RegionMasks) -> tuple[Captions, str]:
+        """Captions, and where they are from."""
         if self.captions:
-            return read_captions(scene_path(scene, self.captions, "teacher.captions"), views.names)
-        if not isinstance(masks, FileMasks):
-            return captions_of_objects(scene.objects)
-        path = masks.folder / CAPTIONS_FILE
+            path = scene_path(scene, self.captions, "teacher.captions")
+        elif isinstance(masks, FileMasks):
+            path = masks.folder / CAPTIONS_FILE
+        else:
+            names = {item.id: item.name for item in scene.objects if item.name is not None}
+            if not names:
+                raise InputError(
+                    f"{WHAT}: masks=instances: no object of the scene has a name (objects.json); give "
+                    "a JSON file of captions, teacher.captions="
+                )
+            return dict.fromkeys(views.names, names), OBJECTS
         if not path.is_file():
             raise InputError(
                 f"{WHAT}: {path}: no such file; vector=captions needs captions of the labels: give "
                 "teacher.captions=, or vector=map or vector=crop"
             )
-        return read_captions(path, views.names)
+        return read_captions(path, views.names), str(path)
 
     def _vectors(self, scene: Scene, words: Words | None) -> "MapVectors | CropVectors":
         """What makes vectors of regions from the picture."""
@@ -204,19 +215,6 @@ class RegionsConfig(TeacherSettings):
         return CropVectors(tower, text_encoder=text_encoder_of(words), around=self.around)
 
 
-_DEFAULTS = {
-    "folder": "",
-    "sam": "",
-    "model": "",
-    "joint": False,
-    "onnx": OnnxRegionOptions(),
-    "captions": "",
-    "rest": "mean",
-    "around": "picture",
-}
-"""Options that belong to one kind of masks or vectors, at their defaults."""
-
-
 def dense_settings(config: RegionsConfig) -> TeacherSettings:
     """The settings of the teacher whose maps are averaged over regions."""
     if config.model.lower().endswith(".onnx"):
@@ -232,85 +230,50 @@ OBJECTS = "objects.json"
 FORMS = '{"label": "caption"} for all views, or {"view": {"label": "caption"}}'
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Captions:
-    """Captions by label: `shared` by all views, or `by_view`, by the view's whole name without its ending."""
-
-    shared: Mapping[int, str] | None = None
-    by_view: Mapping[str, Mapping[int, str]] | None = None
-    source: str = ""
-
-    def of_view(self, name: str) -> Mapping[int, str]:
-        """The captions of the labels of a view."""
-        if self.shared is not None:
-            return self.shared
-        assert self.by_view is not None
-        return self.by_view.get(str(view_stem(name)), {})
-
-
-def captions_of_objects(objects: Sequence[SceneObject]) -> Captions:
-    """The names of a scene's objects as captions of its instance maps."""
-    names = {item.id: item.name for item in objects if item.name is not None}
-    if not names:
-        raise InputError(
-            f"{WHAT}: masks=instances: no object of the scene has a name (objects.json); give "
-            "a JSON file of captions, teacher.captions="
-        )
-    return Captions(shared=names, source=OBJECTS)
-
-
 def read_captions(path: Path, view_names: Sequence[str]) -> Captions:
     """Captions of a JSON file: {"label": "caption"} for all views, or {"view": {"label": "caption"}}.
 
     Views are called by their names, with or without the ending, or by the last part of the name where that is unique.
     """
     data = read_json(path, unique_keys=True)
-    if not isinstance(data, dict) or not data:
-        got = "an empty object" if isinstance(data, dict) else type(data).__name__
-        raise InputError(f"{path}: expected captions of regions, {FORMS}; got {got}")
-    nested = {isinstance(value, dict) for value in data.values()}
-    if nested == {False}:
-        return Captions(shared=_labels(data, path, ""), source=str(path))
-    if nested != {True}:
-        odd = next(key for key, value in data.items() if not isinstance(value, dict))
-        raise InputError(f"{path}: expected captions of regions, {FORMS}; got a mixture of both, see {odd[:40]!r}")
-    by_view = {str(view_stem(view)): _labels(data[view], path, f" view {view[:40]!r}:") for view in data}
-    if len(by_view) < len(data):
-        raise InputError(f"{path}: a view is listed twice, with and without the ending of its picture")
-    stems = [view_stem(name) for name in view_names]
-    ends = [stem.name for stem in stems]
-    double = sorted({end for end in ends if ends.count(end) > 1 and end in by_view} - {str(stem) for stem in stems})
-    if double:
-        raise InputError(f"{path}: {double[0]!r} stands for {ends.count(double[0])} views; write their whole names")
-    unique = {stem.name: str(stem) for stem in stems if ends.count(stem.name) == 1}
-    both = sorted(
-        end for end, full_name in unique.items() if end != full_name and end in by_view and full_name in by_view
-    )
-    if both:
-        raise InputError(f"{path}: {both[0]!r} and {unique[both[0]]!r} are one view, which is listed twice")
-    by_view = {unique.get(view, view): captions for view, captions in by_view.items()}
-    if not any(str(stem) in by_view for stem in stems):
+    kinds = {isinstance(value, dict) for value in data.values()} if isinstance(data, dict) else set()
+    if len(kinds) != 1:
+        raise InputError(f"{path}: expected captions of regions, {FORMS}")
+    if kinds == {False}:
+        return dict.fromkeys(view_names, _labels(data, str(path)))
+    by_stem, by_end = dict[str, list[str]](), dict[str, list[str]]()
+    for name in view_names:
+        by_stem.setdefault(str(view_stem(name)), []).append(name)
+        by_end.setdefault(view_stem(name).name, []).append(name)
+    captions: dict[str, Mapping[int, str]] = {}
+    for view, texts in data.items():
+        stem, labels = str(view_stem(view)), _labels(texts, f"{path}: view {view[:40]!r}")
+        names = by_stem.get(stem) or by_end.get(stem, [])
+        if len(names) > 1 and stem not in by_stem:
+            raise InputError(f"{path}: {stem!r} stands for {len(names)} views; write their whole names")
+        for name in names:
+            if name in captions:
+                raise InputError(f"{path}: view {name!r} is listed twice")
+            captions[name] = labels
+    if not captions:
         raise InputError(
-            f"{path}: none of its {len(by_view)} views is one of the scene, first {next(iter(data))[:40]!r}; the "
+            f"{path}: none of its {len(data)} views is one of the scene, first {next(iter(data))[:40]!r}; the "
             f"scene's are {view_names[0]!r}, …"
         )
-    return Captions(by_view=by_view, source=str(path))
+    return captions
 
 
-def _labels(data: Mapping[str, Any], path: Path, where: str) -> dict[int, str]:
+def _labels(data: Mapping[str, Any], where: str) -> dict[int, str]:
     captions: dict[int, str] = {}
     for key, text in data.items():
         if not (key.isascii() and key.isdigit()) or not 1 <= int(key[:12]) < 2**31:
-            raise InputError(f"{path}:{where} expected labels as numbers from 1, got {key[:40]!r} ({FORMS})")
-        if not isinstance(text, str) or not text.strip():
-            raise InputError(f"{path}:{where} label {key}: expected a caption as text, got {str(text)[:40]!r}")
-        if len(text) > MAX_NAME:
+            raise InputError(f"{where}: expected labels as numbers from 1, got {key[:40]!r} ({FORMS})")
+        if not isinstance(text, str) or not text.strip() or len(text) > MAX_NAME:
             raise InputError(
-                f"{path}:{where} label {key}: caption {text[:MAX_SHOWN]!r}… has {len(text):,} characters, expected at "
-                f"most {MAX_NAME:,}"
+                f"{where}: label {key}: expected a caption of 1 to {MAX_NAME:,} characters, got {str(text)[:40]!r}"
             )
         if int(key) in captions:
-            raise InputError(f"{path}:{where} label {int(key)} has two captions")
+            raise InputError(f"{where}: label {int(key)} has two captions")
         captions[int(key)] = text.strip()
     return captions
 
@@ -329,7 +292,9 @@ class CaptionedRegions:
 
     cheap = True
 
-    def __init__(self, views: Views, masks: RegionMasks, captions: Captions, words: Words, *, rest: bool) -> None:
+    def __init__(
+        self, views: Views, masks: RegionMasks, captions: Captions, words: Words, *, rest: bool, source: str
+    ) -> None:
         """Embeds the captions, and looks at the labels of all views once; warns of regions without a caption, and of
         captions of labels that no view has.
 
@@ -339,8 +304,9 @@ class CaptionedRegions:
             captions: of their labels.
             words: turns captions into vectors.
             rest: whether the rest of a picture is something else; otherwise nothing is known of it.
+            source: of the captions, for messages.
         """
-        self._masks, self._captions, self._rest = masks, captions, rest
+        self._masks, self._captions, self._rest, self._source = masks, captions, rest, source
         self.needs_images = masks.needs_images
         used = self._check_labels(views)
         self.kinds = tuple(sorted(used))
@@ -364,43 +330,37 @@ class CaptionedRegions:
 
     def _check_labels(self, views: Views) -> set[str]:
         """The captions that occur."""
-        used, bare, everywhere, regions, lost = set[str](), list[int](), set[int](), 0, list[str]()
+        used, bare, everywhere, regions = set[str](), set[int](), set[int](), [0, 0]
         for view, name in enumerate(views.names):
             labels = regions_of(self._masks.labels(views, view))[0].tolist()
-            captions = self._captions.of_view(name)
-            regions += len(labels)
+            captions = self._captions.get(name, {})
             everywhere.update(labels)
             used |= {captions[label] for label in labels if label in captions}
-            bare += [label for label in labels if label not in captions]
-            if self._captions.by_view is not None:
-                lost += [f"{name}: {label}" for label in sorted(set(captions) - set(labels))]
-        source = f"{WHAT}: {self._captions.source}"
-        if not regions:
+            without = [label for label in labels if label not in captions]
+            bare.update(without)
+            regions = [regions[0] + len(labels), regions[1] + len(without)]
+        if not everywhere:
             raise InputError(f"{WHAT}: the masks of all {len(views)} views are empty: they have no label above 0")
         if not used:
             raise InputError(
-                f"{source}: none of its captions belongs to one of the {regions:,} regions, whose labels are "
-                f"{_numbers(everywhere)}"
+                f"{WHAT}: {self._source}: none of its captions belongs to one of the {regions[0]:,} regions, whose "
+                f"labels are {_numbers(everywhere)}"
             )
         if bare:
             _warn(
-                f"{WHAT}: {len(bare):,} of {regions:,} regions in {len(views)} views have no caption and "
+                f"{WHAT}: {regions[1]:,} of {regions[0]:,} regions in {len(views)} views have no caption and "
                 f"{'count as something else' if self._rest else 'no feature'}; their labels are {_numbers(bare)}"
             )
-        if lost:
-            # Small regions may be lost where pictures are made smaller.
-            _warn(f"{source}: {len(lost)} labels are in no pixel of the masks of their views: {listed(lost, 5)}")
-        shared = self._captions.shared or {}
-        unused = set(shared) - everywhere
+        unused = {label for captions in self._captions.values() for label in captions} - everywhere
         # Objects of a scene may be hidden in all views; a file of captions was written for its masks.
-        if unused and self._captions.source != OBJECTS:
-            _warn(f"{source}: {len(unused)} of {len(shared)} labels occur in no mask: {_numbers(unused)}")
+        if unused and self._source != OBJECTS:
+            _warn(f"{WHAT}: {self._source}: {len(unused)} labels occur in no mask: {_numbers(unused)}")
         return used
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         """Codes at the resolution of the picture."""
         labels = self._masks.labels(views, view)
-        captions = self._captions.of_view(views.names[view])
+        captions = self._captions.get(views.names[view], {})
         rows = {label: self._row_of[text] for label, text in captions.items() if text in self._row_of}
         codes = codes_of(labels, rows)
         if self._rest:
@@ -408,8 +368,7 @@ class CaptionedRegions:
         return FeatureMap(codes=codes, table=self.table, grid_from_image=IDENTITY, space=self.space)
 
     def settings(self) -> dict[str, Any]:
-        captions = self._captions.shared or self._captions.by_view
-        digest = hashlib.sha256(self.table.tobytes() + repr(captions).encode("utf-8", "backslashreplace"))
+        digest = hashlib.sha256(self.table.tobytes() + repr(self._captions).encode("utf-8", "backslashreplace"))
         return {"name": "regions", "captions": digest.hexdigest()[:16], "rest": self._rest, **self._masks.settings()}
 
 
@@ -420,7 +379,7 @@ def regions_of(labels: Int32[np.ndarray, "H W"]) -> tuple[np.ndarray, np.ndarray
 
 
 def _numbers(labels: Iterable[int]) -> str:
-    return listed([str(label) for label in sorted(set(labels))])
+    return listed([str(label) for label in sorted(labels)])
 
 
 def _warn(message: str) -> None:

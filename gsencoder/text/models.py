@@ -68,14 +68,7 @@ class OnnxTower:
     lower = False
 
     def __init__(self, config: OnnxTextConfig) -> None:
-        """Reads the folder, and runs the tokenizer's last token through the graph.
-
-        Args:
-            config: which folder, and how.
-
-        Raises:
-            InputError: no such folder, files that cannot be read or do not fit each other, or an unknown pooling.
-        """
+        """Reads the folder, and runs the tokenizer's last token through the graph."""
         if not config.model:
             raise InputError("text.model= is missing: the folder of a text tower (model.onnx and tokenizer.json)")
         folder = find_file(config.model, "text.model", folder=True)
@@ -103,11 +96,7 @@ class OnnxTower:
         self.channels = len(self._probe())
 
     def embed(self, phrases: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
-        """A unit vector for each phrase.
-
-        Raises:
-            InputError: a phrase of which the tokenizer knows nothing, or more tokens than the model takes.
-        """
+        """A unit vector for each phrase."""
         return unit(np.stack([self._pool(*self._run(self._tokens(phrase))) for phrase in phrases]))
 
     def _tokens(self, phrase: str) -> Int64[np.ndarray, " T"]:
@@ -158,7 +147,7 @@ class OnnxTower:
             return output[0, :count].mean(axis=0, dtype=np.float64).astype(np.float32)
         return output[0, 0 if self.pooling == "cls" else count - 1].astype(np.float32)
 
-    def _choose_pooling(self, requested: str) -> tuple[Pooling, str]:
+    def _choose_pooling(self, requested: str) -> tuple[str, str]:
         """The pooling, and the output that it takes."""
         outputs = [tensor.name for tensor in self._session.get_outputs()]
         pooled = next((name for name in POOLED_OUTPUTS if name in outputs), None)
@@ -169,7 +158,7 @@ class OnnxTower:
         if pooling == "output":
             return "output", pooled or outputs[0]
         if pooling in ("mean", "cls", "eos"):
-            return pooling, tokens  # type: ignore[return-value]
+            return pooling, tokens
         raise InputError(
             f"{self._folder}: no file says how token vectors become one (1_Pooling/config.json, or an output "
             f"{' or '.join(POOLED_OUTPUTS)}); give text.pooling=mean, cls or eos as the model's card says"
@@ -223,11 +212,7 @@ def _load_tokenizer(path: Path) -> Any:
 
 
 def stated_pooling(folder: Path) -> str:
-    """The pooling that sentence-transformers' files state, or nothing.
-
-    Raises:
-        InputError: they state one that is not supported, or a layer behind it.
-    """
+    """The pooling that sentence-transformers' files state, or nothing."""
     for module in _read_json(folder / "modules.json", list):
         kind = str(module.get("type", "")).rpartition(".")[2] if isinstance(module, dict) else ""
         if kind not in ("Transformer", "Pooling", "Normalize"):
@@ -255,11 +240,7 @@ def _unknown_token(tokenizer: Any) -> int | None:
 
 
 def _read_json(path: Path, kind: type = dict) -> Any:
-    """A JSON file of the folder; empty where there is none.
-
-    Raises:
-        InputError: it is no JSON of that kind.
-    """
+    """A JSON file of the folder; empty where there is none."""
     if not path.is_file():
         return kind()
     try:
@@ -340,14 +321,7 @@ class TransformersTower:
     """
 
     def __init__(self, config: TransformersTextConfig) -> None:
-        """Loads model and tokenizer; nothing is fetched from anywhere.
-
-        Args:
-            config: which folder, and how.
-
-        Raises:
-            InputError: no such folder, files that cannot be read or do not fit each other, or an unknown pooling.
-        """
+        """Loads model and tokenizer; nothing is fetched from anywhere."""
         if not config.model:
             raise InputError("text.model= is missing: the folder of a text tower")
         folder = find_file(config.model, "text.model", folder=True)
@@ -383,11 +357,7 @@ class TransformersTower:
         self.channels = len(self._pooled({"input_ids": last, "attention_mask": torch.ones_like(last)}))
 
     def embed(self, phrases: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
-        """A unit vector for each phrase.
-
-        Raises:
-            InputError: a phrase of which nothing is left, or with more tokens than the model takes.
-        """
+        """A unit vector for each phrase."""
         return unit(np.stack([self._vector(phrase) for phrase in phrases]))
 
     def _vector(self, phrase: str) -> Float32[np.ndarray, " D"]:

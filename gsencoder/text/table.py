@@ -1,9 +1,7 @@
-"""Text tables: closed vocabularies of names with their embeddings, their files, and what makes them.
+"""Text tables: closed vocabularies of names with embeddings, what makes them, their files, and a cache of vectors.
 
-A cache of phrases and their vectors on disk, one file for each tower and set of templates.
-
-Loading a tower takes longer than embedding a word, and a vocabulary of thousands takes seconds. The file is an archive
-with checksums. It holds nothing that cannot be computed again, so a damaged one is replaced, with a warning.
+The cache is one file for each tower and set of templates, since loading a tower takes longer than embedding a word. It
+holds nothing that cannot be computed again, so a damaged one is replaced, with a warning.
 """
 
 import difflib
@@ -46,20 +44,11 @@ class TextTower(Protocol):
         channels: D.
     """
 
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def identity(self) -> str: ...
-
-    @property
-    def pooling(self) -> str: ...
-
-    @property
-    def lower(self) -> bool: ...
-
-    @property
-    def channels(self) -> int: ...
+    name: str
+    identity: str
+    pooling: str
+    lower: bool
+    channels: int
 
     def embed(self, phrases: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
         """A unit vector for each phrase; InputError for a phrase that the tower cannot read completely."""
@@ -86,7 +75,7 @@ class TowerRecord:
     lower: bool = False
 
     def __post_init__(self) -> None:
-        texts = (self.kind, self.name, self.identity, self.pooling)
+        texts = (self.name, self.identity, self.pooling)
         if not all(isinstance(text, str) and 0 < len(text) <= MAX_PHRASE for text in texts) or self.kind not in KINDS:
             raise InputError(f"text tower: expected a kind among {', '.join(KINDS)}, a name, an identity and a pooling")
         check_templates(self.templates)
@@ -97,11 +86,7 @@ class TowerRecord:
 
 
 def check_templates(templates: Sequence[str]) -> None:
-    """Checks that each template has one slot for a phrase.
-
-    Raises:
-        InputError: none or too many templates, or one without its slot.
-    """
+    """Checks that each template has one slot for a phrase."""
     if not 1 <= len(templates) <= MAX_TEMPLATES:
         raise InputError(f"templates: expected 1 to {MAX_TEMPLATES} sentences, got {len(templates)}")
     for template in templates:
@@ -113,11 +98,7 @@ def check_templates(templates: Sequence[str]) -> None:
 
 
 def check_phrase(phrase: str) -> str:
-    """The phrase with single blanks between its words, which no tokenizer reads otherwise.
-
-    Raises:
-        InputError: it is empty, too long, or holds no letter and no digit.
-    """
+    """The phrase with single blanks between its words, which no tokenizer reads otherwise."""
     if len(phrase) > MAX_PHRASE:
         raise InputError(f"query {phrase[:40]!r}…: has {len(phrase):,} characters; expected at most {MAX_PHRASE:,}")
     text = re.sub(r"\s+", " ", phrase).strip()
@@ -129,16 +110,8 @@ def check_phrase(phrase: str) -> str:
 
 
 def check_known(phrase: str, tokens: Sequence[int], unknown: int | None) -> None:
-    """Checks that a tokenizer knows all of a phrase; with a part of it unknown another phrase would be embedded.
-
-    Args:
-        phrase: for the message.
-        tokens: of the phrase, without special ones at its ends.
-        unknown: the token for what is not known; None where there is none.
-
-    Raises:
-        InputError: nothing, or not all of it, is known.
-    """
+    """Checks that a tokenizer knows all of a phrase, whose tokens are given without special ones at its ends; with a
+    part of it unknown another phrase would be embedded."""
     if not tokens or all(token == unknown for token in tokens):
         raise InputError(f"query {phrase[:60]!r}: holds no word that its tokenizer knows")
     if unknown in tokens:
@@ -151,16 +124,7 @@ def check_known(phrase: str, tokens: Sequence[int], unknown: int | None) -> None
 def embed_in_templates(
     tower: TextTower, phrases: Sequence[str], templates: Sequence[str]
 ) -> Float32[np.ndarray, "Q D"]:
-    """The mean of a phrase's vectors over templates, of unit length.
-
-    Args:
-        tower: to embed with.
-        phrases: words or descriptions.
-        templates: sentences with a slot.
-
-    Raises:
-        InputError: a phrase is empty, too long, or not readable for the tower; or vectors are not finite.
-    """
+    """The mean of a phrase's vectors over templates, of unit length."""
     total = np.zeros((len(phrases), tower.channels))
     for template in templates:
         with about(f"text tower {tower.name}"):
@@ -172,11 +136,7 @@ def embed_in_templates(
 
 
 def unit(vectors: np.ndarray) -> Float32[np.ndarray, "Q D"]:
-    """Rows of unit length, computed in float64.
-
-    Raises:
-        InputError: a row has no direction.
-    """
+    """Rows of unit length, computed in float64."""
     values = np.asarray(vectors, np.float64)
     norms = np.sqrt((values**2).sum(axis=1, keepdims=True))
     if not (norms > 1e-12).all():
@@ -238,20 +198,16 @@ class TextTable:
 
     def __post_init__(self) -> None:
         table = self.embeddings
-        long = next((row for row, name in enumerate(self.names) if len(name) > MAX_NAME), None)
+        long = next((name for name in self.names if len(name) > MAX_NAME), None)
         if long is not None:
             raise InputError(
-                f"TextTable: name {self.names[long][:MAX_SHOWN]!r}… in row {long} has {len(self.names[long]):,} "
-                f"characters, expected at most {MAX_NAME:,}"
+                f"TextTable: name {long[:MAX_SHOWN]!r}… has {len(long):,} characters, expected at most {MAX_NAME:,}"
             )
-        if not self.names or table.ndim != 2 or len(table) != len(self.names):
+        channels = self.space.channels
+        if not self.names or table.shape != (len(self.names), channels) or self.mean.shape != (channels,):
             raise InputError(
-                f"TextTable: expected one embedding for each name, got {len(self.names)} names and {table.shape}"
-            )
-        if table.shape[1] != self.space.channels or self.mean.shape != (self.space.channels,):
-            raise InputError(
-                f"TextTable: expected {self.space.channels} channels ({self.space.name}), got embeddings of "
-                f"{table.shape[1]} and a mean of {self.mean.shape}"
+                f"TextTable: expected embeddings of {len(self.names)} names and a mean of {channels} channels "
+                f"({self.space.name}), got {table.shape} and {self.mean.shape}"
             )
         if self.tower is not None and self.tower.identity != self.space.text_encoder:
             raise InputError(
@@ -307,11 +263,7 @@ class TextTable:
         return tuple(self.names[row_of[name]] for name in list(near_names)[:count])
 
     def encode(self, words: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
-        """The embeddings of words; case, blanks, `_`, `-`, a leading article and simple plurals are ignored.
-
-        Raises:
-            InputError: words that are not in the table; the message suggests similar names.
-        """
+        """The embeddings of words; case, blanks, `_`, `-`, a leading article and simple plurals are ignored."""
         rows = [self.find(word) for word in words]
         unknown = [word for word, row in zip(words, rows, strict=True) if row is None]
         if unknown:
@@ -332,9 +284,6 @@ def make_text_table(names: Iterable[str], embeddings: np.ndarray, encoder: str) 
     """Makes a table from names and their unit vectors of any float type, which the text encoder `encoder` made.
 
     Rows are normalized in float32, which removes the rounding of a float16 file.
-
-    Raises:
-        InputError: repeated or empty names, rows that are not finite unit vectors, sizes that differ.
     """
     table = np.ascontiguousarray(embeddings, dtype=np.float32)
     if table.ndim != 2 or 0 in table.shape:
@@ -359,9 +308,6 @@ def load_text_table(path: str | Path, *, encoder: str = "") -> TextTable:
         path: the file.
         encoder: name of the text encoder. If empty, it is the entry `encoder` of the file, else the name of the file
             without a trailing "_names".
-
-    Raises:
-        InputError: missing, damaged or hostile, or not a text table.
     """
     file = Path(path)
     if not file.is_file():
@@ -380,9 +326,6 @@ def save_text_table(path: str | Path, table: TextTable, *, dtype: Literal["float
         path: the file.
         table: to store.
         dtype: of the embeddings; float16 halves the file.
-
-    Raises:
-        InputError: the file cannot be written; an earlier file stays.
     """
     space = {item.name: getattr(table.space, item.name) for item in fields(table.space)}
     arrays = {"embeddings": table.embeddings.astype(dtype), "mean": table.mean}
@@ -400,11 +343,7 @@ def tower_to_json(tower: TowerRecord) -> dict[str, Any]:
 
 
 def tower_from_json(values: Any) -> TowerRecord:
-    """The record that JSON values hold.
-
-    Raises:
-        InputError: they hold none.
-    """
+    """The record that JSON values hold."""
     if not isinstance(values, dict) or values.keys() != {item.name for item in fields(TowerRecord)}:
         raise InputError(f"expected the record of a text tower, got {str(values)[:60]!r}")
     if not isinstance(values["templates"], list):
@@ -415,11 +354,7 @@ def tower_from_json(values: Any) -> TowerRecord:
 
 
 def trained_from_json(values: Any) -> tuple[str, ...]:
-    """The names trained on that JSON values hold.
-
-    Raises:
-        InputError: they hold none.
-    """
+    """The names trained on that JSON values hold."""
     if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
         raise InputError(f"expected a list of the names trained on, got {str(values)[:60]!r}")
     return tuple(values)
@@ -430,41 +365,19 @@ def _read_archive(file: Path) -> TextTable:
         dtype = archive.value("dtype", str)
         if dtype not in ("float32", "float16"):
             raise InputError(f"{file}: expected embeddings of float32 or float16, got {dtype[:20]!r}")
-        arrays = {
-            "embeddings": archive.array("embeddings", dtype, ("C", "D")),
-            "mean": archive.array("mean", "float32", ("D",)),
-        }
-        tower = tower_from_json(archive.value("tower", dict)) if "tower" in archive else None
-        trained = trained_from_json(archive.value("trained", list)) if "trained" in archive else None
-        return _table(file, archive.value("names", list), archive.value("space", dict), arrays, tower, trained)
-
-
-def _table(
-    file: Path,
-    names: Any,
-    space: Any,
-    arrays: dict[str, np.ndarray],
-    tower: TowerRecord | None = None,
-    trained: tuple[str, ...] | None = None,
-) -> TextTable:
-    """A table of what a file holds.
-
-    Raises:
-        InputError: other types, shapes or values than a table has.
-    """
-    shapes = arrays["embeddings"].ndim == 2 and arrays["mean"].ndim == 1
-    types = arrays["embeddings"].dtype in (np.float32, np.float16) and arrays["mean"].dtype == np.float32
-    texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    texts &= isinstance(space, dict) and set(space) <= {item.name for item in fields(FeatureSpace)}
-    texts = texts and all(isinstance(value, int if key == "channels" else str) for key, value in space.items())
-    if not texts or not {"name", "channels"} <= set(space) or not shapes or not types:
-        raise InputError(
-            f"{file}: expected embeddings [C, D] of float32 or float16, a float32 mean [D], names and a space of text"
+        embeddings = archive.array("embeddings", dtype, ("C", "D"))
+        names, space = archive.value("names", list), archive.value("space", dict)
+        texts = all(isinstance(name, str) for name in names) and {"name", "channels"} <= set(space)
+        if not texts or not set(space) <= {item.name for item in fields(FeatureSpace)}:
+            raise InputError(f"{file}: expected names, and a space with a name and channels")
+        return TextTable(
+            names=tuple(names),
+            embeddings=unrounded(embeddings.astype(np.float32)) if dtype == "float16" else embeddings,
+            space=FeatureSpace(**space),
+            mean=archive.array("mean", "float32", ("D",)),
+            tower=tower_from_json(archive.value("tower", dict)) if "tower" in archive else None,
+            trained=trained_from_json(archive.value("trained", list)) if "trained" in archive else None,
         )
-    if arrays["embeddings"].dtype == np.float16:
-        arrays["embeddings"] = unrounded(arrays["embeddings"].astype(np.float32))
-    with about(file):
-        return TextTable(names=tuple(names), space=FeatureSpace(**space), tower=tower, trained=trained, **arrays)
 
 
 def _read_npz(file: Path, encoder: str) -> TextTable:
@@ -498,11 +411,7 @@ class TextEncoder(Protocol):
 
 
 def check_space(features: FeatureSpace, text: FeatureSpace) -> None:
-    """Checks that words and features have the same text encoder.
-
-    Raises:
-        InputError: the features have no text encoder, or another encoder or width; both spaces are named.
-    """
+    """Checks that words and features have the same text encoder."""
     if not features.text_encoder:
         raise InputError(
             f"features of space ({features.describe()}) cannot be queried with words: it has no text encoder; "
@@ -546,9 +455,6 @@ def cached_vectors(
         templates: that phrases are put into.
         phrases: to be embedded.
         compute: embeds those that the cache does not have; called only if there are such.
-
-    Warns:
-        SceneWarning: the file of the cache is damaged, or cannot be written.
     """
     path = _file_of(identity, templates)
     cached = _read(path) if path is not None else {}
@@ -596,38 +502,5 @@ def _write(path: Path, cached: dict[str, Float32[np.ndarray, " D"]]) -> None:
         )
 
 
-_LIST = """
-air conditioner, airplane, alarm clock, animal, apple, armchair, backpack, bag, ball, balloon, banana, basin,
-basket, bathtub, battery, bean bag, bear, bed, bedside table, bell, belt, bench, bicycle, bin, bird, blanket,
-blender, blinds, board, boat, book, bookshelf, boot, bottle, bowl, box, bread, brick, bridge, broom, brush, bucket,
-building, bulletin board, bus, bush, cabinet, cable, cake, calculator, calendar, camera, can, candle, cap, car,
-card, cardboard box, carpet, cat, ceiling, ceiling fan, ceiling lamp, cereal box, chair, chandelier, chest of
-drawers, chopping board, clock, cloth, clothes, coat, coat rack, coffee machine, coffee table, column, computer,
-computer mouse, container, cooker, cookie, counter, cow, cracker, cradle, crib, cucumber, cup, cupboard, curtain,
-cushion, cutting board, desk, desk lamp, dish, dishwasher, display, dog, doll, door, door frame, doorknob, doormat,
-drawer, dress, dresser, drill, dryer, duck, dumbbell, egg, elevator, envelope, eraser, extinguisher, fan, faucet,
-fence, field, file cabinet, fireplace, fish, flag, flashlight, floor, floor lamp, flower, flower pot, folder, food,
-football, footstool, fork, fountain, frame, fridge, fruit, frying pan, garage, garden, gate, glass, glasses, glove,
-grapes, grass, grill, ground, guitar, hair dryer, hairbrush, hammer, handbag, handle, handrail, hanger, hat,
-headphones, heater, helmet, hill, hook, horse, hose, house, iron, jacket, jar, jeans, jug, juice, kettle, key,
-keyboard, kitchen island, knife, ladder, lake, lamp, lamp shade, laptop, laundry basket, leaf, lego brick, lemon,
-letter, light, light bulb, light switch, lock, lunch box, machine, magazine, magnet, mailbox, map, marker, mat,
-mattress, meat, medal, microphone, microwave, milk, mirror, monitor, mop, motorcycle, mountain, mouse pad, mug,
-nail, napkin, newspaper, nightstand, notebook, nut, office chair, onion, orange, ottoman, oven, package, paddle,
-padlock, painting, pan, paper, paper towel, parasol, park, path, peach, pear, pen, pencil, pencil case, pepper,
-person, phone, piano, picture, pillow, pipe, pitcher, pizza, plant, plastic bag, plate, pliers, plug, plum, pole,
-poster, pot, potato, power drill, power strip, printer, projector, pump, purse, puzzle, quilt, rack, radiator,
-radio, railing, refrigerator, remote control, rice cooker, river, road, robot, rock, roof, rope, rug, ruler, salt
-shaker, sand, sandwich, scale, scarf, scissors, screen, screw, screwdriver, sculpture, sea, seat, sheet, shelf,
-ship, shirt, shoe, shoe rack, shopping bag, shower, shower curtain, sidewalk, sign, sink, skateboard, skirt, sky,
-slipper, snow, soap, soap dispenser, soccer ball, sock, socket, sofa, soup can, spatula, speaker, sponge, spoon,
-spray bottle, stairs, stapler, statue, stick, stone, stool, stove, strawberry, street light, string, suitcase, sun,
-sunglasses, sweater, swimming pool, switch, table, table lamp, tablecloth, tape, teapot, teddy bear, telephone,
-television, tennis ball, tennis racket, tent, tie, tile, tire, tissue box, toaster, toilet, toilet brush, toilet
-paper, tomato, tool, toolbox, toothbrush, toothpaste, towel, towel rack, toy, toy car, train, trash can, tray, tree,
-trophy, trousers, truck, tube, umbrella, vacuum cleaner, van, vase, vegetable, vent, wall, wallet, wardrobe, washing
-machine, watch, water, water bottle, watermelon, wheel, wheelchair, whiteboard, window, window sill, wine bottle,
-wine glass, wood, wrench, wristwatch, yoga mat
-"""
-
-REFERENCE_NOUNS = tuple(" ".join(noun.split()) for noun in _LIST.split(","))
+REFERENCE_NOUNS = tuple(Path(__file__).with_name("nouns.txt").read_text(encoding="utf-8").splitlines())
+"""Everyday nouns; the mean of the vectors of these alone is that of a tower."""

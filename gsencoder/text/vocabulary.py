@@ -39,13 +39,6 @@ class OpenVocabulary:
     """
 
     def __init__(self, table: TextTable, open_tower: OpenTower) -> None:
-        """Args:
-        table: with the record of a tower.
-        open_tower: loads that tower; called when a phrase needs it, once.
-
-        Raises:
-            InputError: no tower made the table.
-        """
         if table.tower is None:
             raise InputError(f"words of {table.space.text_encoder}: a closed table; no text tower belongs to it")
         self.table, self.record, self._open = table, table.tower, open_tower
@@ -60,11 +53,7 @@ class OpenVocabulary:
 
     @cached_property
     def tower(self) -> TextTower:
-        """The tower, loaded when this is first read.
-
-        Raises:
-            InputError: it cannot be had, or is another than the table's.
-        """
+        """The tower, loaded when this is first read."""
         tower = self._open()
         if tower.identity != self.record.identity:
             raise InputError(
@@ -74,11 +63,7 @@ class OpenVocabulary:
         return tower
 
     def encode(self, words: Sequence[str]) -> Float32[np.ndarray, "Q D"]:
-        """Unit vectors: of names from the table, of other phrases from the tower.
-
-        Raises:
-            InputError: a phrase is empty, too long, or cannot be tokenized; or the tower is needed and cannot be had.
-        """
+        """Unit vectors: of names from the table, of other phrases from the tower."""
         rows = [self.table.find(check_phrase(word)) for word in words]
         unknown = [word for word, row in zip(words, rows, strict=True) if row is None]
         vectors = np.zeros((len(words), self.space.channels), np.float32)
@@ -141,9 +126,6 @@ def make_vocabulary(
         kind: of the tower.
         names: that are known beside the reference nouns.
         templates: sentences that names are put into.
-
-    Raises:
-        InputError: a name cannot be embedded.
     """
     record = TowerRecord(
         kind=kind,
@@ -182,30 +164,18 @@ def closed_table(words: Words) -> TextTable:
 
 
 def check_known(words: Words, names: Sequence[str]) -> None:
-    """Checks that words know names, before there is work with them; with a tower they know all.
-
-    Raises:
-        InputError: names that are not in a table without a tower.
-    """
+    """Checks that words know names, before there is work with them; with a tower they know all."""
     if not isinstance(words, OpenVocabulary):
         words.encode(names)
 
 
 def load_tower(config: TowerConfig) -> TextTower:
-    """The tower of a folder.
-
-    Raises:
-        InputError: the folder holds none that can be used.
-    """
+    """The tower of a folder."""
     return OnnxTower(config) if isinstance(config, OnnxTextConfig) else TransformersTower(config)
 
 
 def vocabulary_of(config: TowerConfig, names: Sequence[str] = ()) -> OpenVocabulary:
-    """The vocabulary of a tower, with some names in its table beside the reference nouns.
-
-    Raises:
-        InputError: the tower cannot be used, or a name cannot be embedded.
-    """
+    """The vocabulary of a tower, with some names in its table beside the reference nouns."""
     return make_vocabulary(load_tower(config), config.name, names, templates=config.templates)
 
 
@@ -216,9 +186,6 @@ def words_of_table(table: TextTable, config: TextConfig = TableTextConfig()) -> 
         table: from a folder of features, or a file.
         config: a tower that is given; it must be the one that made the table. Without one the folder of models is
             searched for it, once a phrase needs it.
-
-    Raises:
-        InputError: a tower is given, and the table was not made by it.
     """
     if isinstance(config, TableTextConfig):
         record = table.tower
@@ -233,24 +200,20 @@ def words_of_table(table: TextTable, config: TextConfig = TableTextConfig()) -> 
     return OpenVocabulary(table, lambda: tower)
 
 
-def stating_trained(words: Words, beside: TextTable | None) -> Words:
+def with_training_names(words: Words, stored: TextTable | None) -> Words:
     """Words that state the names on which an encoder was trained, where the table beside its features does.
 
     Args:
         words: that are asked. Names that they state themselves stay; a closed table states those that it has.
-        beside: the table that was written with the encoder or its features.
+        stored: the table that was written with the encoder or its features.
     """
-    if beside is None or beside.trained is None or closed_table(words).trained is not None:
+    if stored is None or stored.trained is None or closed_table(words).trained is not None:
         return words
-    return words.trained_on(beside.trained)
+    return words.trained_on(stored.trained)
 
 
 def find_tower(record: TowerRecord) -> TextTower:
-    """Looks for a tower in the folder of models and among those installed, first in folders of its name.
-
-    Raises:
-        TowerMissing: it is in none of them.
-    """
+    """Looks for a tower in the folder of models and among those installed, first in folders of its name."""
     models = os.environ.get(MODELS_VARIABLE, "")
     try:
         folders = sorted(path for path in Path(models).iterdir() if path.is_dir()) if models else []

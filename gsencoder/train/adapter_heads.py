@@ -25,8 +25,8 @@ from gsencoder.fusion.measured_heads import (
     save_heads,
 )
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.teachers.adapter_heads import Head
 from gsencoder.teachers.build import TeacherConfig, load_teacher_heads
+from gsencoder.teachers.radio import Head
 from gsencoder.train.losses import AdapterHead
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.space import OpenScene, sampled_maps
@@ -51,11 +51,7 @@ class FeatureDecoder(nn.Module):
 
 
 def render_heads(heads: HeadSet, outputs: OutputSpace) -> list[tuple[AdapterHead, nn.Module]]:
-    """Heads as the render loss takes them, each with a decoder from standard units to its input.
-
-    Raises:
-        InputError: they are of another backbone than the outputs.
-    """
+    """Heads as the render loss takes them, each with a decoder from standard units to its input."""
     if not heads.heads:
         return []
     check_heads_space(heads.space, outputs.space)
@@ -64,11 +60,7 @@ def render_heads(heads: HeadSet, outputs: OutputSpace) -> list[tuple[AdapterHead
 
 
 def teacher_of_heads(teachers: Mapping[str, TeacherConfig], heads: Sequence[str]) -> str:
-    """The name of the teacher that adapter heads belong to; the first teacher where none has heads.
-
-    Raises:
-        InputError: heads are named, and several teachers have some.
-    """
+    """The name of the teacher that adapter heads belong to; the first teacher where none has heads."""
     with_heads = [name for name, config in teachers.items() if config.has_heads]
     if heads and len(with_heads) > 1:
         raise InputError(
@@ -85,11 +77,7 @@ def required_heads(loss_heads: Sequence[str], teachers: Mapping[str, TeacherConf
 
 
 def missing_heads(dataset: PreparedDataset, names: Sequence[str], teacher: TeacherConfig) -> list[Head]:
-    """The teacher's heads of some names that are not stored in a prepared dataset yet.
-
-    Raises:
-        InputError: the teacher has no such heads, or the dataset's file of heads is damaged.
-    """
+    """The teacher's heads of some names that are not stored in a prepared dataset yet."""
     path = dataset.folder / HEADS_FILE
     stored = load_heads(path) if path.is_file() else None
     if stored is not None and all(has_head(stored, name) for name in names):
@@ -116,9 +104,6 @@ def measure_dataset_heads(
         open_scene: reads a scene without making Gaussians, and builds its teacher.
         views: number of maps.
         optional: leave out scenes that lack what the teacher needs.
-
-    Raises:
-        InputError: the teacher's weights are not those of the dataset, or see `measure_heads`.
     """
     if not heads:
         return
@@ -134,11 +119,7 @@ def measure_dataset_heads(
 
 
 def dataset_heads(dataset: PreparedDataset, names: Sequence[str]) -> HeadSet:
-    """Heads of a prepared dataset, by name; none for no names.
-
-    Raises:
-        InputError: one is not stored, or the file is damaged.
-    """
+    """Heads of a prepared dataset, by name; none for no names."""
     if not names:
         return HeadSet(space=dataset.load_space()[0].space)
     return choose_heads(load_heads(dataset.folder / HEADS_FILE), names)

@@ -14,7 +14,7 @@ from gsencoder.app.main import main
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, space_of_words
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
-from gsencoder.text.vocabulary import stating_trained
+from gsencoder.text.vocabulary import with_training_names
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, Scene
 
 WORDS = {name: make_text_table(("mug", "cup"), np.eye(2, dtype=np.float32), f"{name}-words") for name in "abc"}
@@ -89,12 +89,12 @@ def test_two_spaces_of_one_text_encoder_are_told_apart_by_their_name_alone(monke
 
 
 def test_words_state_the_names_trained_on_where_the_table_beside_them_does() -> None:
-    assert stating_trained(WORDS["a"], TRAINED["a"]).trained == ("cup",)  # type: ignore[union-attr]
+    assert with_training_names(WORDS["a"], TRAINED["a"]).trained == ("cup",)  # type: ignore[union-attr]
     other = replace(TRAINED["b"], trained=("mug",))
     # Words that state them themselves stay as they are.
-    assert stating_trained(other, TRAINED["a"]).trained == ("mug",)  # type: ignore[union-attr]
+    assert with_training_names(other, TRAINED["a"]).trained == ("mug",)  # type: ignore[union-attr]
     for table in (WORDS["a"], None):
-        assert stating_trained(WORDS["a"], table).trained is None  # type: ignore[union-attr]
+        assert with_training_names(WORDS["a"], table).trained is None  # type: ignore[union-attr]
 
 
 def test_a_space_without_weights_and_features_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -14,10 +14,9 @@ from splats import front_camera
 from torch.nn import functional
 
 from gsencoder.core.errors import InputError
-from gsencoder.teachers.adapter_heads import Head, read_radio_heads, text_kind
 from gsencoder.teachers.build import load_teacher_heads
 from gsencoder.teachers.labels import PaletteConfig
-from gsencoder.teachers.radio import RadioConfig, RadioTeacher
+from gsencoder.teachers.radio import Head, RadioConfig, RadioTeacher, read_radio_heads, text_kind
 from gsencoder.types import Views
 
 pytest.importorskip("transformers")

@@ -46,8 +46,8 @@ def test_fusing_leaves_measured_heads_and_says_what_the_basis_costs_each(fused: 
     assert list(results["heads"]) == list(heads.names)
     for head in heads.heads:
         assert results["heads"][head.name] == head.figures()
-        assert -1 <= head.fit.worst < head.fit.cosine < 1
-        assert head.fit.cells == 3 * 4 * 6
+        assert -1 <= head.worst < head.cosine < 1
+        assert head.cells == 3 * 4 * 6
 
 
 def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(

@@ -151,7 +151,7 @@ def test_a_half_precision_file_gives_unit_rows_and_the_encoder_of_its_name(table
         ({"names": np.array(["a1"])}, "embeddings is missing"),
         ({"names": np.array([1.0]), "embeddings": np.eye(1)}, "names: expected 1 axis"),
         ({"names": np.array(["a1"]), "embeddings": np.ones(3)}, "embeddings: expected 2 axes"),
-        ({"names": np.array(["a1", "b1"]), "embeddings": np.eye(3)}, "one embedding for each name"),
+        ({"names": np.array(["a1", "b1"]), "embeddings": np.eye(3)}, "expected embeddings of"),
         ({"names": np.array(["x", "X "]), "embeddings": np.eye(2)}, "'X ' in row 1 is repeated"),
         ({"names": np.array(["x", ""]), "embeddings": np.eye(2)}, "row 1 is empty"),
         ({"names": np.array(["x", "y"]), "embeddings": np.eye(2) * 3}, "'x' has norm 3"),

@@ -13,12 +13,11 @@ from torch import nn
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.errors import CellSample
 from gsencoder.fusion.folder import HEADS_FILE
-from gsencoder.fusion.measured_heads import HeadFit, HeadSet, MeasuredHead, load_heads, save_heads
+from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, load_heads, save_heads
 from gsencoder.models.output_space import OutputSpace
-from gsencoder.teachers.adapter_heads import Head
 from gsencoder.teachers.base import MissingInput
 from gsencoder.teachers.labels import PaletteConfig
-from gsencoder.teachers.radio import RadioConfig
+from gsencoder.teachers.radio import Head, RadioConfig
 from gsencoder.train.adapter_heads import (
     FeatureDecoder,
     dataset_heads,
@@ -47,8 +46,7 @@ def measured(name: str, channels: int, scale: float = 2.0, inputs: int = 6) -> M
     torch.manual_seed(channels)
     body = nn.Sequential(nn.Linear(inputs, 8), nn.GELU(), nn.Linear(8, channels))
     mean = np.arange(channels, dtype=np.float32)
-    fit = HeadFit(cells=5, cosine=0.9, worst=0.5)
-    return MeasuredHead(head=Head(name=name, body=body), mean=mean, scale=scale, fit=fit)
+    return MeasuredHead(head=Head(name=name, body=body), mean=mean, scale=scale, cells=5, cosine=0.9, worst=0.5)
 
 
 @pytest.mark.parametrize("rank", [0, 3])
@@ -187,8 +185,8 @@ def test_a_head_is_measured_once_over_the_maps_of_the_output_space(tmp_path: Pat
     full = head.head.body(torch.from_numpy(vectors)).detach().numpy()
     np.testing.assert_allclose(head.mean, full.mean(axis=0), atol=1e-5)
     assert head.scale == pytest.approx(np.sqrt(((full - full.mean(axis=0)) ** 2).sum(axis=1).mean()), rel=1e-5)
-    assert head.fit.cells == len(vectors)
-    assert -1 <= head.fit.worst < head.fit.cosine < 1
+    assert head.cells == len(vectors)
+    assert -1 <= head.worst < head.cosine < 1
     MapTeacher.asked = 0
     measure("clip.summary")
     assert MapTeacher.asked == 0

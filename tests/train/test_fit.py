@@ -16,11 +16,10 @@ from training_scenes import LOSSES, SMALL, SideTeacher, prepared
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import ProcessRank
 from gsencoder.fusion.folder import HEADS_FILE
-from gsencoder.fusion.measured_heads import HeadFit, HeadSet, MeasuredHead, save_heads
+from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, save_heads
 from gsencoder.models.output_space import OutputSpaces
-from gsencoder.teachers.adapter_heads import Head
 from gsencoder.teachers.labels import PaletteConfig
-from gsencoder.teachers.radio import RadioConfig
+from gsencoder.teachers.radio import Head, RadioConfig
 from gsencoder.train import run
 from gsencoder.train.loop import ValidationResult
 from gsencoder.train.prepare import PreparedDataset
@@ -147,8 +146,7 @@ def test_the_heads_of_the_render_loss_go_to_the_teacher_that_has_them(
 ) -> None:
     assert begin(datasets, ["wall_0"], tmp_path, monkeypatch)[2] == {"dense": []}
     head = Head(name="siglip.summary", body=torch.nn.Sequential(torch.nn.Linear(4, 3)))
-    fit_of_head = HeadFit(cells=5, cosine=0.9, worst=0.5)
-    measured = MeasuredHead(head=head, mean=np.arange(3, dtype=np.float32), scale=2.0, fit=fit_of_head)
+    measured = MeasuredHead(head=head, mean=np.arange(3, dtype=np.float32), scale=2.0, cells=5, cosine=0.9, worst=0.5)
     path = datasets["dense"].folder / HEADS_FILE
     save_heads(path, HeadSet(space=DenseTeacher.space, heads=(measured,)))
     *_, heads = begin(datasets, ["wall_0"], tmp_path, monkeypatch, heads=("siglip.summary",))

@@ -42,7 +42,7 @@ from gsencoder.infer.load import file_of_encoder, load_encoder
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.teachers.build import TeacherConfig, load_teacher_heads, words_of
 from gsencoder.teachers.labels import LabelsConfig
-from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, stating_trained, words_of_table
+from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, with_training_names, words_of_table
 from gsencoder.train.distributed import fail_together, value_of_first, values_of_all
 from gsencoder.types import QueryMemory, Scene
 
@@ -154,7 +154,7 @@ def teacher_or_encoder(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     else:
         words = _given_words(config)
     space = config.space or space_of_words(encoder, words)
-    words = stating_trained(words, table_beside(encoder, space))
+    words = with_training_names(words, table_beside(encoder, space))
     return encoder_source(encoder, config.encode, space), words
 
 

@@ -9,7 +9,6 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from gsencoder.app.heads import describe_heads, head_figures
 from gsencoder.app.inputs import load_fusable
 from gsencoder.app.options import SharedScenesConfig, settings
 from gsencoder.app.output import Summary
@@ -30,7 +29,6 @@ from gsencoder.fusion.folder import FEATURES_FILE, HEADS_FILE, WORDS_FILE, save_
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.measured_heads import measure_heads, save_heads
 from gsencoder.models.output_space import OutputSpaces, name_of_space
-from gsencoder.teachers.adapter_heads import Head
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import (
     AutoConfig,
@@ -41,6 +39,7 @@ from gsencoder.teachers.build import (
     stored_words,
     words_of,
 )
+from gsencoder.teachers.radio import Head
 from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
@@ -280,5 +279,5 @@ def write_heads(folder: Path, heads: Sequence[Head], scene: Scene, fusion: Fusio
         sample = sample_cells(fusion.teacher, scene.views, fusion.views)
         measured = measure_heads(heads, sample, fusion.features.space, fusion.features.basis)
         save_heads(folder / HEADS_FILE, measured)
-    summary.results.update(heads=head_figures(measured))
-    return describe_heads(measured)
+    summary.results.update(heads=measured.figures())
+    return measured.describe()

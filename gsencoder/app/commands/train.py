@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from gsencoder.app.heads import describe_heads, head_figures
 from gsencoder.app.options import CommonConfig, settings
 from gsencoder.app.output import prepared_folder
 from gsencoder.app.run import Run
@@ -95,7 +94,7 @@ def run(config: TrainCommandConfig, run: Run) -> None:
             heads = dataset_heads(datasets[teacher_of_heads(config.teachers_by_name, heads_asked)], heads_asked)
         if config.prepare_only:
             run.print(f"{prepared}: {len(training)} scenes to train on, {len(held_out)} for validation")
-            run.print(*(f"{prepared}: {line}" for line in describe_heads(heads)))
+            run.print(*(f"{prepared}: {line}" for line in heads.describe()))
             return
         with fail_together():
             group.take(resume=config.resume)
@@ -125,7 +124,7 @@ def run(config: TrainCommandConfig, run: Run) -> None:
     for name, of_teacher in figures.items():
         of = f" for {name}" if len(figures) > 1 else ""
         run.print(f"{out}: basis{of}: {describe_basis(of_teacher, 'held-out scenes')}")
-    run.print(*(f"{out}: {line}" for line in describe_heads(heads)))
+    run.print(*(f"{out}: {line}" for line in heads.describe()))
 
 
 def names(paths: Sequence[Path]) -> list[str]:
@@ -169,7 +168,7 @@ def write_results(
         parameters=sum(value.numel() for value in result.encoder.parameters()),
         validation=result.scores,
         basis=provenance["basis"],
-        heads=head_figures(heads),
+        heads=heads.figures(),
         weights=WEIGHTS_FILE,
         log=LOG_FILE,
     )
