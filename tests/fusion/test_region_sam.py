@@ -273,7 +273,7 @@ def test_a_teacher_with_masks_of_sam_gives_each_region_a_vector(saved: Any, tmp_
     np.testing.assert_array_equal(made.codes >= 0, np.isin(labels, large))
     assert teacher.settings()["masks"] == "sam"
     empty = build_teacher(replace(config, min_iou=1.0), scene, None)
-    with pytest.raises(InputError, match="no view has any cell with features"):
+    with pytest.raises(InputError, match="none of 2 views"):
         fuse(scene, empty)
     bare = region_scene(images=None).views
     assert bare is not None
