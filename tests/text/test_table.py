@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.text.table import TextTable, load_text_table, make_text_table, save_text_table
+from gsencoder.text.table import TextTable, check_space, load_text_table, make_text_table, save_text_table
+from gsencoder.types import FeatureSpace
 
 NAMES = (
     "mug",
@@ -312,3 +313,24 @@ def test_no_error_of_a_table_repeats_a_long_name(length: int, wrong: str, no_jax
     with pytest.raises(InputError) as caught:
         make_text_table(names, rows, "toy" * length).encode(["x" * (length - 1)])
     assert len(str(caught.value)) < 1000
+
+
+def space(encoder: str, channels: int = 4, teacher: str = "") -> FeatureSpace:
+    return FeatureSpace(name=f"space-{encoder}", channels=channels, teacher=teacher, text_encoder=encoder)
+
+
+def test_features_of_any_teacher_may_be_asked_with_words_of_their_encoder() -> None:
+    assert check_space(space("clip", teacher="labels"), space("clip")) is None
+
+
+@pytest.mark.parametrize("text", [space("siglip"), space("clip", channels=5), space("")])
+def test_words_of_another_space_are_an_error_that_names_both(text: FeatureSpace) -> None:
+    with pytest.raises(InputError) as caught:
+        check_space(space("clip", teacher="labels"), text)
+    assert "space-clip · 4 channels · labels · clip" in str(caught.value)
+    assert text.describe() in str(caught.value)
+
+
+def test_features_that_no_words_lead_into_cannot_be_asked() -> None:
+    with pytest.raises(InputError, match="it has no text encoder"):
+        check_space(space(""), space(""))

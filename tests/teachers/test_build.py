@@ -1,17 +1,36 @@
-"""The teacher where none is named: labels of a scene that has some, else what is installed."""
+"""The teacher where none is named, and which words lead into the space of which teacher."""
 
 from copy import copy
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
+import onnx
 import pytest
 from field_scenes import FieldRoom
+from onnx import TensorProto, helper
+from text_towers import save_graph, save_tokenizer
 
 from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.compose import compose
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.scenes import load_scene
-from gsencoder.teachers.build import SEGMENTER, SENTENCES, AutoConfig, TeacherConfig, choose_teacher, text_table_of
+from gsencoder.teachers.build import (
+    SEGMENTER,
+    SENTENCES,
+    AutoConfig,
+    TeacherConfig,
+    build_teacher,
+    choose_teacher,
+    text_table_of,
+    words_of,
+)
 from gsencoder.teachers.labels import LabelsConfig, PaletteConfig
+from gsencoder.teachers.onnx import OnnxConfig
+from gsencoder.teachers.radio import RadioConfig
+from gsencoder.teachers.segmenter import SegmenterConfig, synonyms_of_classes
 from gsencoder.text.models import OnnxTextConfig
+from gsencoder.text.table import REFERENCE_NOUNS
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words
 from gsencoder.types import Scene
 
@@ -25,13 +44,13 @@ def room(field_room: FieldRoom) -> Scene:
     return load_scene(field_room.room)
 
 
-def words_of(teacher: TeacherConfig, text: TextConfig) -> Words | None:
+def installed(teacher: TeacherConfig, text: TextConfig) -> Words | None:
     """The installed table, whatever is asked: loading towers is tested elsewhere."""
     return TABLE
 
 
 def chosen(scene: Scene, config: AutoConfig | TeacherConfig = AutoConfig(), text: TextConfig = NO_TOWER):
-    return choose_teacher(config, text, scene, words_of)
+    return choose_teacher(config, text, scene, installed)
 
 
 def renamed(scene: Scene, *names: str | None) -> Scene:
@@ -79,13 +98,13 @@ def test_names_that_no_table_needs_to_know_are_those_of_the_tower_that_is_given(
 def test_the_words_are_those_of_the_teacher_and_the_tower_that_were_chosen(room: Scene) -> None:
     words = dict[tuple[TeacherConfig, TextConfig], Words]()
 
-    def words_of(teacher: TeacherConfig, text: TextConfig) -> Words | None:
+    def read(teacher: TeacherConfig, text: TextConfig) -> Words | None:
         return words.setdefault((teacher, text), copy(TABLE))
 
     for scene in (room, renamed(room, "table", "a thing with legs"), replace(room, objects=())):
         for config in (AutoConfig(), AutoConfig(words="own.npz"), SEGMENTER):
             for text in (NO_TOWER, OTHER):
-                taken = choose_teacher(config, text, scene, words_of)
+                taken = choose_teacher(config, text, scene, read)
                 assert taken.words is words[taken.teacher, taken.text]
 
 
@@ -94,3 +113,49 @@ def test_a_table_that_is_given_means_labels_and_a_teacher_that_is_given_is_taken
     assert chosen(bare, AutoConfig(words="own.npz")).teacher == LabelsConfig(words="own.npz")
     for scene in (room, bare):
         assert (chosen(scene, PaletteConfig()).teacher, chosen(scene, PaletteConfig()).reason) == (PaletteConfig(), "")
+
+
+TOWER = OnnxTextConfig(model="nowhere")
+
+
+@pytest.mark.parametrize(
+    ("teacher", "problem"),
+    [
+        (PaletteConfig(), "has the words of its eleven colors"),
+        (RadioConfig(), "no text tower speaks for the features of RADIO's backbone"),
+        (OnnxConfig(classes="c.npz"), "have vectors of their own"),
+        (OnnxConfig(), "if teacher.joint=true says that both belong to one joint model"),
+        (OnnxConfig(joint=True, words="w.npz"), "both say what words are"),
+        (SegmenterConfig(words="w.npz"), "both say what words are"),
+    ],
+)
+def test_a_tower_is_refused_for_features_that_it_does_not_speak_for(teacher: TeacherConfig, problem: str) -> None:
+    with pytest.raises(InputError, match=problem):
+        words_of(teacher, TOWER)
+
+
+def test_a_joint_model_needs_a_tower_of_its_width(tmp_path: Path) -> None:
+    words = sorted(set(" ".join(REFERENCE_NOUNS).split()))
+    save_tokenizer(tmp_path / "tokenizer.json", ("[PAD]", "[UNK]", "[CLS]", "[SEP]", *words))
+    save_graph(tmp_path / "model.onnx", rows=1000)
+    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 3, "h", "w"])
+    features = helper.make_tensor_value_info("features", TensorProto.FLOAT, [1, 3, "h", "w"])
+    graph = helper.make_graph([helper.make_node("Identity", ["image"], ["features"])], "net", [image], [features])
+    onnx.save(
+        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=10), tmp_path / "net.onnx"
+    )
+    config = OnnxConfig(model=str(tmp_path / "net.onnx"), layout="grid", patch=1, joint=True)
+    vocabulary = words_of(config, OnnxTextConfig(model=str(tmp_path), pooling="mean"))
+    with pytest.raises(InputError, match="its features have 3 channels and its words 6"):
+        build_teacher(config, Scene(name="s"), vocabulary)
+
+
+def test_classes_without_a_name_are_refused_and_doubled_ones_counted() -> None:
+    with pytest.raises(InputError, match="class ', ,' has no name"):
+        synonyms_of_classes(["wall", ", ,"], ["other"])
+    with pytest.warns(SceneWarning, match="1 names stand for several classes: wall"):
+        assert synonyms_of_classes(["wall", "wall", "other"], ["other"]) == [["wall"], ["wall"], []]
+
+
+def test_reference_nouns_are_distinct() -> None:
+    assert len(set(REFERENCE_NOUNS)) == len(REFERENCE_NOUNS) == len(np.unique(REFERENCE_NOUNS))
