@@ -79,7 +79,7 @@ class MeasuredHead:
 
 
 FIGURES = {"scale": float, "cells": int, "cosine": float, "worst": float}
-"""What is measured of a head beside the mean of its outputs."""
+"""What is measured of a head, apart from the mean of its outputs."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

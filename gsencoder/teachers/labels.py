@@ -99,7 +99,7 @@ class LabelsTeacher:
         """
         if not objects:
             raise MissingInput(
-                "teacher labels: the scene lists no objects; it needs an objects.json beside its views, or the "
+                "teacher labels: the scene lists no objects; it needs an objects.json in its folder, or the "
                 "label files of ScanNet or ScanNet++; teacher=mosaic text=minilm looks at pictures instead"
             )
         row_of = {name: row for row, name in enumerate(names)}

@@ -55,7 +55,7 @@ class RegionMasks(Protocol):
         ...
 
     def settings(self) -> dict[str, Any]:
-        """All that the masks depend on beside the views, as JSON values."""
+        """All but the views that the masks depend on, as JSON values."""
         ...
 
 

@@ -382,7 +382,7 @@ def _read_body(weights: Mapping[str, Any], prefix: str, version: str, sizes: Map
 
 
 def _build(version: str, sizes: Mapping[str, int], *, pre_norm: bool) -> tuple[nn.Sequential, dict[str, nn.Module]]:
-    """The layers of a head without parameters, and those that have some by their key."""
+    """The layers of a head without parameters, and by their keys the layers that have some."""
     modules: dict[str, nn.Module] = {}
     width, hidden, outputs, inner = (sizes[name] for name in SIZES)
 

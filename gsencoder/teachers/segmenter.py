@@ -248,7 +248,7 @@ class SegmenterConfig(TeacherSettings):
     classes: str = option(
         "",
         "names of its classes in their order: a .json list or a text file with one a line; empty = those "
-        "of the model's folder, or the .json beside the .onnx file",
+        "of the model's folder, or the .json of the same name as the .onnx file",
     )
     nothing: tuple[str, ...] = option(
         ("other", "others", "background", "unlabeled", "unlabelled", "unknown", "void", "nothing"),

@@ -248,10 +248,7 @@ class VisionTower(nn.Module):
       connection and the MLP of that layer are left out, as in F3RM (Shen et al. 2023).
 
     Attributes:
-        patch: pixels along a patch.
         native: pixels along the pictures that the model was trained on.
-        channels: of its vectors.
-        digest: of configuration and weights.
         dense: what the vectors are; "auto" is decided.
         joint: whether they lie in the space of a text tower.
     """
@@ -261,7 +258,7 @@ class VisionTower(nn.Module):
 
         Args:
             folder: of the model.
-            tower: what its configuration says.
+            tower: its configuration.
             dense: what the vectors are; auto = in the joint space if there is one: values of CLIP, summary of SigLIP.
             layer: tokens are hidden states of a layer, as transformers counts them: 0 = what goes into the first layer,
                 −1 = what comes from the last one, without the final norm. None = after the final norm.

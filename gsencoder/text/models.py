@@ -55,7 +55,7 @@ class OnnxTextConfig:
 
 class OnnxTower:
     """A tokenizer and an ONNX graph. Phrases run one at a time and without padding: a graph with dynamic int8 scales
-    gives a phrase another vector beside others, or with padding behind it.
+    gives a phrase another vector in a batch, or with padding behind it.
 
     Attributes:
         name: of the folder.

@@ -428,7 +428,7 @@ CACHE_VARIABLE = "GSENCODER_CACHE"
 """A folder; "off" = no cache; not set = gsencoder in the user's folder of caches."""
 OFF = "off"
 MAX_PHRASES = 20_000
-"""A file that would grow beyond is begun anew."""
+"""A file that would grow beyond starts again."""
 
 
 def cache_folder() -> Path | None:
@@ -452,9 +452,9 @@ def cached_vectors(
 
     Args:
         identity: of the tower.
-        templates: that phrases are put into.
+        templates: sentences that phrases are put into.
         phrases: to be embedded.
-        compute: embeds those that the cache does not have; called only if there are such.
+        compute: embeds phrases that the cache does not have.
     """
     path = _file_of(identity, templates)
     cached = _read(path) if path is not None else {}

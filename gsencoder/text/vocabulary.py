@@ -100,11 +100,11 @@ class OpenVocabulary:
                 lambda missing: embed_in_templates(self.tower, missing, self.record.templates),
             )
         except TowerMissing as error:
-            shown = ", ".join(repr(phrase[:MAX_SHOWN]) for phrase in phrases[:3])
+            first = ", ".join(repr(phrase[:MAX_SHOWN]) for phrase in phrases[:3])
             near = [name for phrase in phrases[:3] for name in self.table.near(phrase[:MAX_SHOWN], 3)]
             among = f"; known without it: {', '.join(near or self.table.names[:5])}, …"
             raise InputError(
-                f"{shown}: not among the {len(self.table)} words stored with these features, and the text tower that "
+                f"{first}: not among the {len(self.table)} words stored with these features, and the text tower that "
                 f"made them is missing: {self.record.describe()}; put its folder into GSENCODER_MODELS or give "
                 f"text={self.record.kind} text.model=FOLDER ({error}){among}"
             ) from error
@@ -120,12 +120,6 @@ def make_vocabulary(
     """The vocabulary of a tower: the reference nouns, and further names.
 
     The mean is that of the reference nouns alone, so that it is the same whatever the other names are.
-
-    Args:
-        tower: embeds the names.
-        kind: of the tower.
-        names: that are known beside the reference nouns.
-        templates: sentences that names are put into.
     """
     record = TowerRecord(
         kind=kind,
@@ -175,7 +169,7 @@ def load_tower(config: TowerConfig) -> TextTower:
 
 
 def vocabulary_of(config: TowerConfig, names: Sequence[str] = ()) -> OpenVocabulary:
-    """The vocabulary of a tower, with some names in its table beside the reference nouns."""
+    """The vocabulary of a tower, with some names in its table, and the reference nouns."""
     return make_vocabulary(load_tower(config), config.name, names, templates=config.templates)
 
 
@@ -201,10 +195,10 @@ def words_of_table(table: TextTable, config: TextConfig = TableTextConfig()) -> 
 
 
 def with_training_names(words: Words, stored: TextTable | None) -> Words:
-    """Words that state the names on which an encoder was trained, where the table beside its features does.
+    """Words that state the names on which an encoder was trained, where the table stored with its features does.
 
     Args:
-        words: that are asked. Names that they state themselves stay; a closed table states those that it has.
+        words: that are asked. Names that they state themselves stay; a closed table states the names that it has.
         stored: the table that was written with the encoder or its features.
     """
     if stored is None or stored.trained is None or closed_table(words).trained is not None:

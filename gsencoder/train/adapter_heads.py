@@ -70,8 +70,7 @@ def teacher_of_heads(teachers: Mapping[str, TeacherConfig], heads: Sequence[str]
 
 
 def required_heads(loss_heads: Sequence[str], teachers: Mapping[str, TeacherConfig]) -> tuple[str, ...]:
-    """The names of the heads that a training needs: those of the render loss, and those that are stored beside the
-    weights besides."""
+    """The names of the heads that a training needs: of the render loss, and stored with the weights."""
     stored = [name for config in teachers.values() for name in config.stored_heads]
     return tuple(dict.fromkeys([*loss_heads, *stored]))
 
