@@ -281,7 +281,7 @@ def load_tokenizer(folder: Path, subject: str, **options: Any) -> Any:
     # Without any vocabulary transformers makes a tokenizer that knows nothing.
     if not any(path for pattern in VOCABULARIES for path in folder.glob(pattern)):
         raise InputError(
-            f"{subject}: {folder}: the tokenizer is missing; expected tokenizer.json in the folder of the model"
+            f"{subject}: {folder}: the tokenizer is missing; expected tokenizer.json in it"
         )
     from transformers import AutoTokenizer
 

@@ -190,7 +190,7 @@ def test_a_model_without_its_tokenizer_is_named(saved: Any) -> None:
     folder, _ = saved(bert)
     for path in folder.glob("tokenizer*"):
         path.unlink()
-    with pytest.raises(InputError, match="the tokenizer is missing; expected tokenizer.json beside the model"):
+    with pytest.raises(InputError, match="the tokenizer is missing; expected tokenizer.json in it"):
         TransformersTower(TransformersTextConfig(model=str(folder), pooling="mean"))
 
 
