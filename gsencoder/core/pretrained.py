@@ -280,9 +280,7 @@ def load_tokenizer(folder: Path, subject: str, **options: Any) -> Any:
     """The tokenizer of a folder; arguments are those of `load_companion`."""
     # Without any vocabulary transformers makes a tokenizer that knows nothing.
     if not any(path for pattern in VOCABULARIES for path in folder.glob(pattern)):
-        raise InputError(
-            f"{subject}: {folder}: the tokenizer is missing; expected tokenizer.json in it"
-        )
+        raise InputError(f"{subject}: {folder}: the tokenizer is missing; expected tokenizer.json in it")
     from transformers import AutoTokenizer
 
     return load_companion(AutoTokenizer, folder, subject, "tokenizer", **options)
