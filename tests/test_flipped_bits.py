@@ -112,7 +112,7 @@ def heads(folder: Path) -> Made:
     def read() -> Any:
         made = load_heads(folder / "h")
         return made.space, [
-            (each.name, each.head.text, each.head.model, each.head.body.state_dict(), each.mean, each.scale, each.fit)
+            (each.name, each.head.text, each.head.model, each.head.body.state_dict(), each.mean, each.figures())
             for each in made.heads
         ]
 
