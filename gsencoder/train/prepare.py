@@ -1,9 +1,8 @@
-"""Preparation of a scene for training: everything that does not depend on the encoder is computed once and stored.
+"""Preparation of scenes for training: everything that does not depend on the encoder is computed once and stored.
 
-Class balance of targets: loss weights by class frequency, since a floor has 10⁵ Gaussians and a spoon has forty.
-
-The class of a target is the nearest vector of a codebook: the vectors of a coded teacher's table, or cluster centers of
-a dense teacher's features. A Gaussian of a class with n Gaussians in the dataset is weighted by n^−power.
+Loss weights are by class frequency, since a floor has 10⁵ Gaussians and a spoon has forty. The class of a target is the
+nearest vector of a codebook: the vectors of a coded teacher's table, or cluster centers of a dense teacher's features.
+A Gaussian of a class with n Gaussians in the dataset is weighted by n^−power.
 """
 
 import hashlib
@@ -25,7 +24,7 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, advised, listed, readable
 from gsencoder.core.files import atomic_file, locked, read_foreign, read_foreign_text
 from gsencoder.core.process import ProcessRank, Track
-from gsencoder.core.settings import first_difference, option
+from gsencoder.core.settings import check_limits, first_difference, option
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.checkpoint import CachedTeacher, upright
 from gsencoder.fusion.errors import project_maps
@@ -51,14 +50,17 @@ class PrepareConfig:
     """Settings of targets and of the matrices of the render loss."""
 
     fusion: FuseConfig = field(default_factory=FuseConfig)
-    render_cell: int = option(8, "smallest side of a cell of the render loss, pixels; finer teacher maps are averaged")
-    render_min_weight: float = option(1e-3, "smallest blending weight in the matrices of the render loss")
+    render_cell: int = option(
+        8, "smallest side of a cell of the render loss, pixels; finer teacher maps are averaged", ge=1
+    )
+    render_min_weight: float = option(1e-3, "smallest blending weight in the matrices of the render loss", ge=0, lt=1)
     render_views: int = option(
         0,
         "views of a scene, evenly spaced, whose matrices are stored and from which samples draw theirs; "
         "0 = all. Targets are fused from all views in any case",
+        ge=0,
     )
-    basis_views: int = option(256, "number of maps from which the basis of a dense teacher is computed")
+    basis_views: int = option(256, "number of maps from which the basis of a dense teacher is computed", ge=1)
 
     center: bool = option(True, "subtract the teacher's mean from targets; false needs fusion.basis=false")
     scale: bool = option(True, "divide targets by their typical distance from the mean; false = in the teacher's units")
@@ -70,17 +72,11 @@ class PrepareConfig:
     )
 
     def __post_init__(self) -> None:
+        check_limits(self)
         if not self.center and self.fusion.basis:
             raise InputError(
                 "center: expected fusion.basis=false with center=false; coordinates in a basis are about the mean"
             )
-        for name in ("render_cell", "basis_views"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name}: expected 1 or more, got {getattr(self, name)}")
-        if self.render_views < 0:
-            raise InputError(f"render_views: expected 0 (all) or more, got {self.render_views}")
-        if not 0 <= self.render_min_weight < 1:
-            raise InputError(f"render_min_weight: expected a number in [0, 1), got {self.render_min_weight}")
 
 
 def prepare_scene(
@@ -285,31 +281,28 @@ class PreparedDataset:
         settings: everything that the preparation depends on, compared with the settings stored in the folder. None =
             open an existing dataset with any settings.
         """
-        self.folder = folder
-        path = folder / DATASET_SETTINGS_FILE
-        try:
-            if settings is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-            stored: Any = json.loads(read_foreign_text(path)) if path.is_file() else None
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"{path}: cannot be used: {error}; give another folder as prepared=") from error
-        if path.is_file() and not isinstance(stored, dict):
-            raise InputError(f"{path}: expected settings, got {str(stored)[:40]}; give another folder as prepared=")
-        if stored is None and settings is None:
-            raise InputError(f"{folder}: expected prepared scenes, found no {DATASET_SETTINGS_FILE}")
-        if stored is None and any(not entry.name.startswith(".") for entry in folder.iterdir()):
-            raise InputError(
-                f"{folder}: holds something else than prepared scenes (no {DATASET_SETTINGS_FILE}); "
-                "give another folder as prepared="
+        self.folder, path = folder, folder / DATASET_SETTINGS_FILE
+        with advised("give another folder as prepared="):
+            try:
+                if settings is not None:
+                    folder.mkdir(parents=True, exist_ok=True)
+                stored: Any = json.loads(read_foreign_text(path)) if path.is_file() else None
+            except (OSError, ValueError, RecursionError) as error:
+                raise InputError(f"{path}: cannot be used: {error}") from error
+            if path.is_file() and not isinstance(stored, dict):
+                raise InputError(f"{path}: expected settings, got {str(stored)[:40]}")
+            if stored is None and settings is None:
+                raise InputError(f"{folder}: expected prepared scenes, found no {DATASET_SETTINGS_FILE}")
+            if stored is None and any(not entry.name.startswith(".") for entry in folder.iterdir()):
+                raise InputError(f"{folder}: holds something else than prepared scenes (no {DATASET_SETTINGS_FILE})")
+            self.settings: dict[str, Any] = (
+                stored if settings is None else json.loads(json.dumps(settings, default=str))
             )
-        expected: dict[str, Any] = stored if settings is None else json.loads(json.dumps(settings, default=str))
-        self.settings = expected
-        if stored is not None and stored != expected:
-            difference = first_difference(stored, expected)
-            raise InputError(f"{folder}: was prepared with {difference}; give another folder as prepared=")
+            if stored is not None and stored != self.settings:
+                raise InputError(f"{folder}: was prepared with {first_difference(stored, self.settings)}")
         if stored is None:
             with atomic_file(path) as stream:
-                stream.write(json.dumps(expected, indent=1).encode())
+                stream.write(json.dumps(self.settings, indent=1).encode())
 
     def fingerprint(self) -> str:
         """A hash of the output space, by which a resumed training checks that its targets are the same."""
@@ -325,15 +318,13 @@ class PreparedDataset:
             path = self.scene_path(name)
             if path.is_file():
                 with open_archive(path) as file:
-                    digest.update(f"{name} {file.value('digest', str) if 'digest' in file else ''}".encode())
+                    digest.update(f"{name} {file.value('digest', str)}".encode())
         return digest.hexdigest()[:16]
 
     def load_kinds(self) -> tuple[str, ...]:
-        """Loads the names of the things that the teacher tells apart; none for a teacher without names, and of datasets
-        of earlier versions.
-        """
+        """Loads the names of the things that the teacher tells apart; none for a teacher without names."""
         with advised("give another folder as prepared="), open_archive(self.folder / SPACE_FILE) as file:
-            kinds = file.value("kinds", list) if "kinds" in file else []
+            kinds = file.value("kinds", list)
             if not all(isinstance(kind, str) for kind in kinds):
                 raise InputError("expected names as the kinds in the header")
         return tuple(kinds)
@@ -365,7 +356,7 @@ class PreparedDataset:
             return False
         with advised("remove the file to prepare the scene again"), open_archive(path) as file:
             stored_source = file.value("source", str)
-            files = file.value("source_files", str) if "source_files" in file else ""
+            files = file.value("source_files", str)
             if (got := stored_precision(file)) != self.precision:
                 raise InputError(f"expected targets of {self.precision}, as the settings of its folder say, got {got}")
         # A data set that was moved, or is mounted elsewhere on another machine, holds the same files.
@@ -459,22 +450,16 @@ class PreparedDataset:
 
     def _classes_to_count(self, names: Sequence[str]) -> Float32[np.ndarray, "C channels"] | None:
         """The codebook of the classes; None if the targets of these scenes have been counted."""
-        scenes, counted = self.scenes(names), self._counted_scenes()
-        if counted is None or (counted and {scene.name for scene in scenes} <= set(counted)):
-            return None
+        scenes, path = self.scenes(names), self.folder / CLASS_BALANCE_FILE
+        if path.is_file():
+            with advised("remove the file to count targets again"), open_archive(path) as file:
+                if {scene.name for scene in scenes} <= set(file.value("scenes", list)):
+                    return None
         _, codebook = self.load_space()
         if codebook is None:
             scene_share = max(1, CLUSTERED_TARGETS // len(scenes))
             codebook = cluster_targets(np.concatenate([_seen_targets(scene, scene_share) for scene in scenes]))
         return codebook
-
-    def _counted_scenes(self) -> list[str] | None:
-        """The scenes whose targets were counted, none at first; None for a file of earlier versions."""
-        path = self.folder / CLASS_BALANCE_FILE
-        if not path.is_file():
-            return []
-        with advised("remove the file to count targets again"), open_archive(path) as file:
-            return [str(name) for name in file.value("scenes", list)] if "scenes" in file else None
 
     def load_class_balance(self) -> ClassBalance:
         """Loads the target classes and their frequencies, as stored by `count_classes`."""

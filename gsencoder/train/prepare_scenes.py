@@ -97,22 +97,23 @@ class SceneReader:
     """Reads scenes and builds teachers for them."""
 
     def __init__(self, config: SourceConfig, words: Mapping[str, Words], voxel: float) -> None:
-        """Args:
-        config: settings of reading, seeding and the teachers.
-        words: the words of teachers that have any, by teacher.
-        voxel: see `prepare_scenes`.
-        """
         self.config, self.words, self.voxel = config, words, voxel
         self._shared: dict[str, Teacher] = {}
 
     def teacher(self, name: str, scene: Scene) -> Teacher:
-        """The teacher of a scene. Objects and masks belong to a scene; any other teacher is built once for all."""
+        """The teacher of a scene: its own, or one that is built once for all scenes.
+
+        Raises:
+            MissingInput: the scene lacks what the teacher needs.
+        """
         config = self.config.teachers_by_name[name]
-        if config.per_scene:
-            return build_teacher(config, scene, self.words.get(name))
-        if name not in self._shared:
-            self._shared[name] = build_teacher(config, scene, self.words.get(name))
-        return self._shared[name]
+        teacher = None if config.per_scene else self._shared.get(name)
+        if teacher is None:
+            teacher = self._shared[name] = build_teacher(config, scene, self.words.get(name))
+        # Known before Gaussians are made, which takes minutes where they come from photographs.
+        if teacher.needs_images and scene.views is not None and scene.views.images is None:
+            raise MissingInput(f"teacher {name}: the scene has no pictures")
+        return teacher
 
     def with_views(self, name: str, path: Path) -> tuple[Scene, Teacher]:
         """A scene with views, which is enough for maps, and the teacher of this name."""
@@ -323,11 +324,7 @@ def _prepare_scene(
         for name in names:
             try:
                 with config.typed_options(name):
-                    teacher = reader.teacher(name, scene)
-                # Known before Gaussians are made, which takes minutes where they come from photographs.
-                if teacher.needs_images and scene.views is not None and scene.views.images is None:
-                    raise MissingInput(f"teacher {name}: the scene has no pictures")
-                teachers[name] = teacher
+                    teachers[name] = reader.teacher(name, scene)
             except MissingInput:
                 if not optional:
                     raise

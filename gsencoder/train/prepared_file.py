@@ -1,10 +1,7 @@
 """The file of a prepared scene: Gaussians, their targets, and the rows of the render loss of every view.
 
-Targets and the teacher's vectors in the rows are float16, or integers of eight bits and a scale for each column.
-
-Prepared scenes, read from their files as samples need them.
-
-The file is memory-mapped: a sample reads only its Gaussians and views, and data workers on one machine share the page
+Targets and the teacher's vectors in the rows are float16, or integers of eight bits and a scale for each column. The
+file is memory-mapped: a sample reads only its Gaussians and views, and data workers on one machine share the page
 cache. Data is verified against checksums when it is first read.
 """
 
@@ -248,8 +245,7 @@ class PreparedScene:
             yield
 
     def projections(self) -> ProjectionSums | None:
-        """How well the basis represents the teacher's vectors in this scene; None without a basis, or if the scene was
-        prepared before this was computed."""
+        """How well the basis represents the teacher's vectors in this scene; None without a basis."""
         with self._error_context(), open_archive(self.path) as file:
             if "sums_of_projections" not in file:
                 return None
