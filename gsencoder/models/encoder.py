@@ -1,6 +1,5 @@
 """The Gaussian encoder: a network from raw Gaussian attributes to one feature per Gaussian (SplatDistill sec. 3.3)."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -11,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import option
+from gsencoder.core.settings import check_limits, option
 from gsencoder.models.grid import SceneCurves
 from gsencoder.models.neighbors import KernelSize, NeighborConv
 from gsencoder.models.plan import CloudPlan, Plan, join_plans, plan_cloud
@@ -33,7 +32,7 @@ MIN_MERGE_WEIGHT = 1e-3
 class EncoderConfig:
     """Inputs, token grid and network of an encoder."""
 
-    voxel: float = option(0.02, "edge length of the token grid's cells, metres")
+    voxel: float = option(0.02, "edge length of the token grid's cells, metres", gt=0)
     inputs: tuple[Attribute, ...] = option(
         ("offset", "color", "opacity", "scale", "rotation"), "Gaussian attributes that the encoder sees"
     )
@@ -43,15 +42,14 @@ class EncoderConfig:
         128,
         "hidden channels of the MLP (linear, GELU, linear) that gives the outputs of each teacher; 0 = one "
         "linear layer for all",
+        ge=0,
+        le=1 << 16,
     )
 
     def __post_init__(self) -> None:
-        if not 0 < self.voxel < math.inf:
-            raise InputError(f"voxel: expected a positive length in metres, got {self.voxel}")
+        check_limits(self)
         if self.stem not in (3, 5):
             raise InputError(f"stem: expected 3 or 5 cells, got {self.stem}")
-        if not 0 <= self.projector <= 1 << 16:
-            raise InputError(f"projector: expected 0 to 65,536 channels, got {self.projector}")
         unknown = [name for name in self.inputs if name not in ATTRIBUTE_CHANNELS]
         if not self.inputs or unknown or len(set(self.inputs)) < len(self.inputs):
             raise InputError(

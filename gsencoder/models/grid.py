@@ -1,6 +1,4 @@
-"""Grid coordinates and the space-filling curves through them, for numpy arrays and torch tensors.
-
-Space-filling orders of grid cells: Morton and Hilbert codes and their transposed forms (PTv3, Wu et al. 2024).
+"""Space-filling orders of grid cells: Morton and Hilbert codes and their transposed forms (PTv3, Wu et al. 2024).
 
 A code is an int64, and cells sorted by code follow a curve on which neighbors are close in space. Codes are
 hierarchical: `code >> 3` is the code of the parent cell, so one set of codes serves every level of pooling.

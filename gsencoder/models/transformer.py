@@ -1,12 +1,10 @@
 """The point transformer (PTv3, Wu et al. 2024): input channels, attention in patches, pooling and unpooling.
 
-Input channels of the encoder, computed from Gaussian attributes.
-
-The channels do not depend on where the scene lies, nor on the sign and the axis order that a file chose. A quaternion
-and three scales describe the same ellipsoid in 48 ways, and a network would have to learn that they are equal. The
-logarithm of the covariance has one value for each ellipsoid, is linear in log-scales, and stays within a few units for
-scales from 1e-9 to 1e4. `rotation` is its trace-free part and `scale` the sorted log-scales, so that either can be left
-out.
+The input channels do not depend on where the scene lies, nor on the sign and the axis order that a file chose. A
+quaternion and three scales describe the same ellipsoid in 48 ways, and a network would have to learn that they are
+equal. The logarithm of the covariance has one value for each ellipsoid, is linear in log-scales, and stays within a few
+units for scales from 1e-9 to 1e4. `rotation` is its trace-free part and `scale` the sorted log-scales, so that either
+can be left out.
 """
 
 import math
@@ -20,7 +18,7 @@ from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import option
+from gsencoder.core.settings import check_limits, option
 from gsencoder.geometry import rotmats_from_quats
 from gsencoder.models.grid import ALIGN, Order
 from gsencoder.models.neighbors import NeighborConv
@@ -181,12 +179,20 @@ Shuffle = Literal["once", "pooling", "never"]
 class TransformerConfig:
     """Sizes of the network. Tuples have one entry per level, finest first; those of the decoder have one fewer."""
 
-    encoder_depths: tuple[int, ...] = option((1, 1, 2, 2, 1), "number of encoder blocks of each level, finest first")
-    encoder_channels: tuple[int, ...] = option((32, 64, 96, 128, 128), "encoder channels of each level")
-    decoder_depths: tuple[int, ...] = option((0, 1, 1, 1), "number of decoder blocks of each level but the coarsest")
-    decoder_channels: tuple[int, ...] = option((64, 64, 96, 128), "decoder channels of each level but the coarsest")
-    head_channels: int = option(32, "channels per attention head")
-    patch: int = option(128, "largest number of tokens in a patch, within which attention is computed")
+    encoder_depths: tuple[int, ...] = option(
+        (1, 1, 2, 2, 1), "number of encoder blocks of each level, finest first", ge=0, le=MAX_BLOCKS
+    )
+    encoder_channels: tuple[int, ...] = option(
+        (32, 64, 96, 128, 128), "encoder channels of each level", ge=1, le=MAX_CHANNELS
+    )
+    decoder_depths: tuple[int, ...] = option(
+        (0, 1, 1, 1), "number of decoder blocks of each level but the coarsest", ge=0, le=MAX_BLOCKS
+    )
+    decoder_channels: tuple[int, ...] = option(
+        (64, 64, 96, 128), "decoder channels of each level but the coarsest", ge=1, le=MAX_CHANNELS
+    )
+    head_channels: int = option(32, "channels per attention head", ge=1)
+    patch: int = option(128, "largest number of tokens in a patch, within which attention is computed", ge=1)
     orders: tuple[Order, ...] = option(
         ORDERS, "space-filling curves along which patches are cut; blocks use them in turn"
     )
@@ -195,11 +201,16 @@ class TransformerConfig:
         "in training, permute the orders at random: once for all levels, or again at each pooling, as PTv3 "
         "does; outside training they are never permuted",
     )
-    mlp_ratio: float = option(4.0, "hidden channels of a block's MLP, as a multiple of its channels")
-    drop_path: float = option(0.1, "rate of stochastic depth in training, reached at the last encoder block")
+    mlp_ratio: float = option(
+        4.0, "hidden channels of a block's MLP, as a multiple of its channels", gt=0, le=MAX_MLP_RATIO
+    )
+    drop_path: float = option(
+        0.1, "rate of stochastic depth in training, reached at the last encoder block", ge=0, lt=1
+    )
     checkpoint: bool = option(False, "recompute activations of blocks in the backward pass to save memory")
 
     def __post_init__(self) -> None:
+        check_limits(self)
         levels = len(self.encoder_depths)
         # With more levels a part of a scene would be pooled differently from the full scene.
         max_levels = ALIGN.bit_length()
@@ -207,8 +218,6 @@ class TransformerConfig:
             raise InputError(
                 f"encoder_depths: expected one entry per level and 1 to {max_levels} levels, got {levels} entries"
             )
-        if self.head_channels < 1 or self.patch < 1:
-            raise InputError(f"head_channels and patch: expected 1 or more, got {self.head_channels} and {self.patch}")
         if len(self.encoder_channels) != levels:
             raise InputError(
                 f"encoder_channels: expected one entry per level as in encoder_depths ({levels}), "
@@ -220,10 +229,8 @@ class TransformerConfig:
                     f"{name}: expected {levels - 1} entries, one fewer than encoder_depths, got "
                     f"{len(getattr(self, name))}"
                 )
-        if min((*self.encoder_depths, *self.decoder_depths)) < 0:
-            raise InputError("encoder_depths and decoder_depths: expected 0 or more blocks at every level")
         for channels in (*self.encoder_channels, *self.decoder_channels):
-            if channels < 1 or channels % self.head_channels:
+            if channels % self.head_channels:
                 raise InputError(
                     f"encoder_channels and decoder_channels: expected multiples of head_channels "
                     f"({self.head_channels}), got {channels}"
@@ -232,14 +239,6 @@ class TransformerConfig:
             raise InputError("orders: expected at least one of z, z-trans, hilbert, hilbert-trans")
         if self.shuffle_orders not in get_args(Shuffle):
             raise InputError(f"shuffle_orders: expected once, pooling or never, got {self.shuffle_orders!r}")
-        if not 0 <= self.drop_path < 1:
-            raise InputError(f"drop_path: expected a number in [0, 1), got {self.drop_path}")
-        if not 0 < self.mlp_ratio <= MAX_MLP_RATIO:
-            raise InputError(f"mlp_ratio: expected a number above 0 and at most {MAX_MLP_RATIO}, got {self.mlp_ratio}")
-        for kind, limit in (("channels", MAX_CHANNELS), ("depths", MAX_BLOCKS)):
-            for name in (f"encoder_{kind}", f"decoder_{kind}"):
-                if max(getattr(self, name), default=0) > limit:
-                    raise InputError(f"{name}: expected at most {limit} per level, got {max(getattr(self, name))}")
 
     @property
     def levels(self) -> int:

@@ -1,6 +1,4 @@
-"""Distributed training with torch.distributed: the process group, and sums over processes.
-
-Which processes of a training are there: where they meet, and which of them still run.
+"""Distributed training with torch.distributed: the process group, sums over processes, and which of them still run.
 
 A thread of each process counts up its entry of a store in the first process (torchrun's: in its agent) and reads those
 of the others. A process that computes for hours counts on; one that has ended, or whose machine is gone, does not.

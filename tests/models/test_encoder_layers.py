@@ -137,7 +137,7 @@ def test_thousands_of_coincident_gaussians_are_one_token() -> None:
         ({"encoder_depths": (1, -1, 1)}, "encoder_depths"),
         ({"encoder_depths": ()}, "encoder_depths: expected one entry per level"),
         ({"encoder_depths": (1,) * 8}, "1 to 7 levels, got 8"),
-        ({"head_channels": 0}, "head_channels and patch"),
+        ({"head_channels": 0}, "head_channels"),
     ],
 )
 def test_a_shape_that_cannot_be_is_refused(change: dict, message: str, no_jaxtyping: None) -> None:
