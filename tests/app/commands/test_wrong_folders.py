@@ -70,7 +70,7 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         (tmp_path / command / "summary.json").write_text(json.dumps({"command": command}))
         for file in files:
             (tmp_path / command / file).write_text("x")
-    WorkFolder(tmp_path / "unfinished").take(anew=False)
+    WorkFolder(tmp_path / "unfinished").take(resume=True)
     write_box(tmp_path / "scene", box_views(box_cameras(2, width=32, height=24, focal=22.0)))
     (tmp_path / "several" / "room").mkdir(parents=True)
     (tmp_path / "several" / "room" / SCENE_FILE).write_text("x")

@@ -187,7 +187,7 @@ def test_files_are_videos_by_their_suffix_and_folders_are_none(video, tmp_path):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"frames": 2}, "at least 3"),
+        ({"frames": 2}, "3 or more"),
         ({"motion": 0.0}, "0.001 to 1"),
         ({"motion": 1.5}, "0.001"),
         ({"pixels": 32}, "64"),
