@@ -36,9 +36,9 @@ def test_a_scene_without_pictures_is_refused(models: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"size": -1}, "size: expected 0 or more and at most 8192"),
-        ({"overlap": 1.0}, "overlap: expected 0 or more and at most 0.9"),
-        ({"overlap": -0.1}, "overlap: expected 0 or more and at most 0.9"),
+        ({"size": -1}, "size: expected 0 to 8,192"),
+        ({"overlap": 1.0}, "overlap: expected 0 to 0.9"),
+        ({"overlap": -0.1}, "overlap: expected 0 to 0.9"),
         ({"dense": "values", "layer": -2}, "layer: hidden states of a layer are dense=tokens"),
     ],
 )

@@ -200,7 +200,7 @@ def test_presets_state_what_a_kind_gives(tmp_path: Path, preset: str, kind: str,
         (["teacher.model=nowhere"], "teacher.model: no folder at nowhere"),
         (["teacher.model=nowhere", "teacher.layer=-2", "text=transformers", "text.model=a"], "no words lead into"),
         (["teacher.large=tiles"], "teacher.large: expected one of interpolate, windows"),
-        (["teacher.size=-3"], "teacher.size: expected 0 or more"),
+        (["teacher.size=-3"], "teacher.size: expected 0 to 8,192"),
     ],
 )
 def test_a_fusion_that_cannot_be_is_refused_in_one_line(

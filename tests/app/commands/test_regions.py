@@ -96,7 +96,7 @@ def test_scenes_are_prepared_for_training_from_regions(room: Path, tmp_path: Pat
         (["teacher.masks=instances"], "captions need words: give a text tower"),
         (["teacher.folder=nowhere", "teacher.words=words.safetensors"], "teacher.folder: nothing at"),
         (["teacher.masks=instances", "teacher.folder=masks"], "teacher.folder: is an option of masks=files"),
-        (["teacher.onnx.size=-3"], "teacher.onnx.size: expected 0 or more"),
+        (["teacher.onnx.size=-3"], "teacher.onnx.size: expected 0 to 8,192"),
         (["teacher.vector=map", "teacher.folder=masks"], "teacher.model= is missing: the image tower of vector=map"),
     ],
 )
