@@ -21,8 +21,8 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.errors import field_error, judge
-from gsencoder.infer.chunks import EncodeBudget, EncodeConfig
-from gsencoder.infer.encode_budget import encode_within
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode_budget import EncodeBudget, encode_within
 from gsencoder.infer.load import load_encoder
 
 
@@ -60,9 +60,10 @@ def main() -> None:
                     "scene": scene.name,
                     "gaussians": len(gaussians),
                     "promise": error,
-                    **{name: made.setting.knobs.get(name, "") for name in ("precision", "halo")},
-                    "predicted": made.setting.error,
-                    "bound": made.setting.bound,
+                    "precision": made.choice.setting.precision,
+                    "halo": made.choice.setting.halo,
+                    "predicted": made.choice.estimate.error,
+                    "bound": made.choice.estimate.bound,
                     "realised": max(judge(made.features[name], exact[name]).total for name in exact),
                     "over_all": max(field_error(made.features[name], exact[name], sample=0).total for name in exact),
                     "cpu_choosing": made.choosing,

@@ -22,7 +22,7 @@ from gsencoder.app.scenes import queried_scene
 from gsencoder.core.errors import SceneWarning
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, localize
-from gsencoder.infer.views.budget import fewest_views, measured_errors
+from gsencoder.infer.views.budget import ViewsBudget, fewest_views, measured_errors
 from gsencoder.infer.views.candidates import FreeSpace
 from gsencoder.infer.views.choose import CoverageObjective, judge_candidates
 from gsencoder.infer.views.targets import ViewsConfig, targets_of
@@ -59,10 +59,10 @@ def main() -> None:
             cameras = judgment.candidates.cameras
             blend = replace(BlendConfig(), near=min(BlendConfig().near, judgment.blend.near))
             usual, _ = CoverageObjective(cameras, [target], judgment.scores, config).greedy(config.count)
-            fewest = [fewest_views(judgment.scores, error) for error in errors]
+            fewest = [fewest_views(judgment.scores, ViewsBudget(error=error)) for error in errors]
             choices = [usual, *(picked.order for picked, _ in fewest)]
             usual_error, *realised = measured_errors(gaussians, [target], cameras, choices, config=blend)
-            for error, (picked, predicted), measured in zip(errors, fewest, realised, strict=True):
+            for error, (picked, choice), measured in zip(errors, fewest, realised, strict=True):
                 lines.append(
                     {
                         "scene": scene.name,
@@ -71,7 +71,7 @@ def main() -> None:
                         "candidates": len(cameras),
                         "promise": error,
                         "views": len(picked.order),
-                        "predicted": predicted,
+                        "predicted": choice.estimate.error,
                         "realised": measured,
                         "usual_views": len(usual),
                         "usual_realised": usual_error,

@@ -1,68 +1,57 @@
 """The report of a budget, and the figures of a basis."""
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gsencoder.app.output import Summary
 from gsencoder.app.run import console
+from gsencoder.core.budget import Budget
 from gsencoder.core.errors import SceneWarning
-from gsencoder.core.settings import Budget, describe_values, shown_value
+from gsencoder.core.settings import describe_values, shown_value
 from gsencoder.types import FeatureBasis
 
 
 def report_choice(
     summary: Summary,
     scene: str,
-    knobs: Mapping[str, Any],
+    chosen: Mapping[str, Any],
     *,
-    predicted: Mapping[str, float | None],
+    predicted: Mapping[str, float],
     notes: Sequence[str],
     quiet: bool,
-    of: str = "",
     **more: Any,
 ) -> None:
-    """Prints a setting that a budget chose, warns of what it does not keep, and adds both to the summary.
+    """Prints the setting that a budget chose, warns of what it does not keep, and adds both to the summary.
 
     Args:
-        predicted: of the setting, by promise; None = not predicted.
-        notes: what budgets in conflict do not keep.
-        of: what the values are of, on the screen.
+        predicted: by limit.
+        notes: limits that are expected to be broken.
+        more: further entries of `results.budget`.
     """
-    summary.results["budget"] = {
-        "chosen": dict(knobs),
-        "predicted": {name: value for name, value in predicted.items() if value is not None},
-        "notes": list(notes),
-        **more,
-    }
-    console(quiet).print(f"{scene}: budget: {describe_values(knobs)}{of}")
+    known = {name: value for name, value in predicted.items() if math.isfinite(value)}
+    summary.results["budget"] = {"chosen": dict(chosen), "predicted": known, "notes": list(notes), **more}
+    console(quiet).print(f"{scene}: budget: {describe_values(chosen)}")
     for note in notes:
         warnings.warn(note, SceneWarning, stacklevel=3)
 
 
-def report_promises(summary: Summary, budget: Budget, realised: Mapping[str, float]) -> list[str]:
-    """A line for each promise that is not broken; warns of those that are, and adds what became of all to the summary.
-
-    Args:
-        realised: what was measured, by promise; one that is missing was not.
-    """
-    promised = {name: budget.promise(name) for name in budget.promised}
-    summary.results["budget"].update(promised=promised, realised=dict(realised))
-    predicted = summary.results["budget"]["predicted"]
+def report_budget(summary: Summary, budget: Budget, measured: Mapping[str, float]) -> list[str]:
+    """A line for each limit that is kept; warns of those that are broken, and adds both numbers to the summary, after
+    `report_choice`. A limit that is not in `measured` was not measured."""
+    limits = {name: budget.limit(name) for name in budget.limits}
+    measured = {name: measured[name] for name in limits if name in measured}
+    summary.results["budget"].update(limits=limits, measured=measured)
     lines = []
-    for name, promise in promised.items():
-        if name not in realised:
-            lines.append(f"budget.{name}: promised {shown_value(promise)}, not measured (budget.check=false)")
-            continue
-        if realised[name] <= promise:
-            lines.append(f"budget.{name}: promised {shown_value(promise)}, realised {realised[name]:.4g}")
+    for name, limit in limits.items():
+        if name not in measured:
+            lines.append(f"budget.{name}: limit {shown_value(limit)}, not measured (budget.check=false)")
+        elif measured[name] <= limit:
+            lines.append(f"budget.{name}: limit {shown_value(limit)}, measured {measured[name]:.4g}")
         else:
-            more = "; the summary says what was predicted" if name in predicted else ""
-            warnings.warn(
-                f"budget.{name}: promised {shown_value(promise)}, and it became {realised[name]:.4g}{more}",
-                SceneWarning,
-                stacklevel=3,
-            )
+            text = f"budget.{name}: the limit is {shown_value(limit)}, and it became {measured[name]:.4g}"
+            warnings.warn(text, SceneWarning, stacklevel=3)
     return lines
 
 

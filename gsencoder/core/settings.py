@@ -1,15 +1,15 @@
-"""Settings: options with their limits, knobs that trade cost for accuracy, budgets, and differences between settings.
+"""Settings: options with their limits, knobs that trade cost for accuracy, and differences between settings.
 
-Stages list their knobs (`gsencoder.fusion.package`, `gsencoder.evaluate.tradeoff.stages`); a sweep or a budget needs no
-more than such a list to choose settings.
+Stages list their knobs (`gsencoder.fusion.package`, `gsencoder.evaluate.tradeoff.stages`); a sweep needs no more than
+such a list.
 """
 
 import operator
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from math import inf, isfinite
-from typing import Any, Literal, Protocol, TypeVar, get_args, get_origin, runtime_checkable
+from math import isfinite
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from gsencoder.core.errors import InputError
 
@@ -178,132 +178,6 @@ def read_value(settings: object, knob: Knob, text: str) -> Any:
     names = {int: "a whole number", float: "a number", bool: "true or false"}
     expected = " or ".join(names.get(kind, str(kind)) for kind in kinds)
     raise InputError(f"{knob.name}: expected {expected}, got {text!r}")
-
-
-PROMISES = {"error": "", "seconds": " s", "megabytes": " MB"}
-"""What can be promised, with its unit. Where promises conflict, the one that stands first wins."""
-MEGABYTE = 1_000_000
-PLANNED = 0.85
-"""Share of promised seconds that is planned with, since times vary."""
-
-
-class Budget:
-    """Promises: a frozen dataclass with fields `error`, `seconds` or `megabytes`, None where nothing is promised.
-
-    A field `seed`, where there is one, is of what the choice draws.
-    """
-
-    __slots__ = ()
-
-    def __post_init__(self) -> None:
-        for name in self.promised:
-            value = self.promise(name)
-            if name == "error" and not 0 < value < 1:
-                raise InputError(f"error: expected a number between 0 and 1, got {value}")
-            if not 0 < value < inf:
-                raise InputError(f"{name}: expected a number above 0, got {value}")
-        if (seed := getattr(self, "seed", 0)) < 0:
-            raise InputError(f"seed: expected 0 or more, got {seed}")
-
-    @property
-    def promised(self) -> tuple[str, ...]:
-        """The promises that are made, the one that wins first."""
-        return tuple(name for name in PROMISES if getattr(self, name, None) is not None)
-
-    def promise(self, name: str) -> float:
-        """The value of a promise that is made."""
-        return float(getattr(self, name))
-
-    @property
-    def names(self) -> str:
-        """The options of the promises that are made, for messages."""
-        return " and ".join(f"budget.{name}" for name in self.promised)
-
-    def shown(self, name: str) -> str:
-        """A promise as it is written on the command line."""
-        return f"budget.{name}={shown_value(self.promise(name))}"
-
-    def conflict(self, first: str, other: str, needed: float) -> str:
-        """What is said where a promise cannot be kept beside one that comes before it."""
-        return (
-            f"{self.shown(first)} takes about {needed:.3g}{PROMISES[other]}, more than {self.shown(other)}; "
-            f"budget.{first} comes first"
-        )
-
-
-def check_governed(budget: Budget, settings: object, default: object, keys: Iterable[str], section: str) -> None:
-    """Refuses options that a budget chooses where they are set by hand.
-
-    Args:
-        default: such settings with every option at its default.
-        keys: of the options, with dots between sections.
-        section: that the settings are on the command line.
-    """
-    if not budget.promised:
-        return
-    for key in keys:
-        if (value := value_at(settings, key)) != value_at(default, key):
-            raise InputError(
-                f"{section}.{key}={shown_value(value)}: is chosen by {budget.names}; leave it (or the preset that sets "
-                "it) out, or the budget"
-            )
-
-
-@runtime_checkable
-class PredictedSetting(Protocol):
-    """A setting with what is predicted of it.
-
-    Attributes:
-        error: predicted.
-        bound: what the error stays below in all likelihood.
-        cost: in units that all settings of a choice share.
-    """
-
-    @property
-    def error(self) -> float: ...
-
-    @property
-    def bound(self) -> float: ...
-
-    @property
-    def cost(self) -> float: ...
-
-
-Setting = TypeVar("Setting", bound=PredictedSetting)
-
-
-def best_setting(settings: Sequence[Setting], error: float | None = None) -> Setting:
-    """The cheapest setting that keeps a promised error, of equal ones the most exact; where no error is promised, the
-    most exact setting, of equal ones the cheapest."""
-    if error is None:
-        return min(settings, key=lambda setting: (setting.error, setting.cost))
-    return min(
-        (setting for setting in settings if setting.bound <= error), key=lambda setting: (setting.cost, setting.error)
-    )
-
-
-def within_seconds(
-    settings: Sequence[Setting], best: Setting, budget: Budget, seconds: Callable[[Setting], float]
-) -> tuple[Setting, tuple[str, ...]]:
-    """The best setting that keeps promised seconds; the fastest where none does. A promised error comes first.
-
-    Args:
-        seconds: that a setting takes, from the beginning of the choice.
-
-    Returns:
-        The setting, and notes about a promise that is not kept.
-    """
-    limit = budget.promise("seconds")
-    if "error" in budget.promised:
-        needed = seconds(best)
-        return best, (budget.conflict("error", "seconds", needed),) if needed > limit else ()
-    fast_enough = [setting for setting in settings if seconds(setting) <= PLANNED * limit]
-    if fast_enough:
-        return best_setting(fast_enough), ()
-    fastest = min(settings, key=lambda setting: (seconds(setting), setting.error))
-    return fastest, (
-        f"{budget.shown('seconds')}: the fastest setting takes about {seconds(fastest):.3g} s; it is used",
-    )
 
 
 def first_difference(saved: Mapping[str, Any], current: Mapping[str, Any], prefix: str = "") -> str:

@@ -1,282 +1,137 @@
-"""A fusion within a budget: the setting is chosen on a sample of the scene, used, and measured."""
+"""A fusion within a budget: how many views, and how many coordinates are written.
+
+The error of leaving out views has two parts. What they do not show is counted on a few rays of the views. What they
+show is a mean Σ w·f / Σ w over fewer views; like any mean of n of V samples it differs from that over all by
+τ (1/n − 1/V), and τ is measured by leaving out maps that were made.
+"""
 
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float, Float64
+from scipy.sparse import csr_array
 
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.budget import (
+    Budget,
+    Choice,
+    Estimate,
+    check_any_limit,
+    choose,
+    error_bound,
+    reject_options_set_by_budget,
+)
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Device, Track, untracked
-from gsencoder.core.settings import best_setting, within_seconds
-from gsencoder.fusion.basis import Moments, distinct_rows
+from gsencoder.core.threads import parallel
+from gsencoder.fusion.basis import distinct_rows
 from gsencoder.fusion.checkpoint import CachedTeacher, WrappedTeacher, open_checkpoint, upright
-from gsencoder.fusion.cost_model import (
-    UNKNOWN_SCATTER,
-    BudgetConfig,
-    Measure,
-    Pace,
-    Predicted,
-    RankErrors,
-    Setting,
-    all_settings,
-    check_budget,
-    exact_config,
-    measure_drift,
-    measure_scatter,
-    rank_errors,
-    sample_features,
-    setting_weights,
-    with_rank,
-    within_megabytes,
-)
-from gsencoder.fusion.errors import FieldError, judge
+from gsencoder.fusion.coordinates import reduce_to_fit
+from gsencoder.fusion.errors import FieldError, judge, row_cosines
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse, validate_scene
-from gsencoder.fusion.lift import FeatureSums, limit_rays, resolve, view_matrix
-from gsencoder.fusion.view_coverage import LatticeOf, Sight, trace_sight, view_order
-from gsencoder.render.rays import Lattice, grid_lattice
+from gsencoder.fusion.lift import VisibilityConfig, resolve
+from gsencoder.fusion.view_coverage import SAMPLE, coverage_order, sample_view
+from gsencoder.render import BlendConfig
+from gsencoder.render.rays import Lattice
 from gsencoder.teachers.base import Teacher
-from gsencoder.types import FeatureMap, FeatureSpace, Gaussians, Scene, Views
+from gsencoder.types import FeatureMap, Gaussians, Scene, Views
 
-FIRST_MAPS, MAPS_SHARE = 4, 8
-"""The scatter of the teacher's vectors is first measured on so many views, or on one of so many if that is more."""
-SAFETY = 1.5
-"""Factor by which ρ is multiplied, since views are not independent of each other."""
-MINIMAL_SCATTER = 1e-4
-"""Lower bound of ρ: vectors that agree in a few views may differ in others."""
+OPTIONS_SET_BY_BUDGET = (
+    "views",
+    "view_share",
+    "view_choice",
+    "basis",
+    "max_rank",
+    "energy",
+    "table_energy",
+    "blend.rays_per_patch",
+    "blend.stop_transmittance",
+    "blend.min_weight",
+)
+ALL_VIEWS, VIEWS_SHARE = 24, 2
+"""Up to so many views are all looked at on a few rays; of more, one of so many if that is more."""
+FIRST_MAPS, MAPS_SHARE = 4, 4
+"""A costly teacher's maps of so many views are made to choose by, or of one of so many if that is more; all of them are
+lifted."""
+CHEAP_MAPS = 8
+"""The same of a cheap teacher, whose maps are made again."""
+DIRECTIONS = 1024
+"""Gaussians on which means over maps are compared."""
+LEFT_OUT = 4
+"""Maps that are left out one at a time."""
+UNKNOWN_TURN = 1.0
+"""τ where no Gaussian of the sample is seen twice: whatever is not measured counts in full."""
+PARTS = 16
+"""Parts of the sample, by neighborhoods, whose scatter says how far an error is known."""
+SAFETY = 2.0
+"""Factor of a predicted error, since views are not independent of each other."""
+BASIS_SHARE = 0.25
+"""Share of the limit of error that is left to the basis of a dense teacher."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Choice:
-    """A setting that was chosen.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FusionBudget(Budget):
+    """What a fusion may cost, or must reach. Where they conflict, the one that stands first here wins.
 
-    Attributes:
-        config: of the fusion.
-        rows: numbers of its views, ascending.
-        order: all views, those that are used first.
-        knobs: values that were chosen, by name.
-        predicted: its error.
-        cost: of the fusion, in views that are blended at the exact rays.
-        seconds: that are predicted; None without a budget of seconds.
-        bytes: of the file of features that are predicted; None without a budget of megabytes.
-        scatter: ρ of the teacher.
-        drift: of the mean of its vectors.
-        maps: that were made on the way, by view.
-        followed: rays that were followed on the way.
-        all_rays: rays of the fusion at its exact settings.
-        notes: what budgets in conflict do not keep.
+    A budget of error alone takes the cheapest setting that keeps it; budgets of seconds and megabytes without one take
+    the most exact setting that keeps them.
     """
 
-    config: FuseConfig
-    rows: tuple[int, ...]
-    order: tuple[int, ...]
-    knobs: Mapping[str, int | float]
-    predicted: Predicted
-    cost: float
-    seconds: float | None
-    bytes: int | None
-    scatter: float
-    drift: float
-    maps: Mapping[int, FeatureMap]
-    followed: int
-    all_rays: int
-    notes: tuple[str, ...]
-
-
-@dataclass(slots=True, kw_only=True)
-class _ProbedTeacher:
-    """The maps of a teacher that were made for the choice, and what they say about it.
-
-    Attributes:
-        maps: by view.
-        scatter: ρ, see `gsencoder.fusion.cost_model`.
-        drift: of the mean of its vectors.
-        ranks: what ranks leave out.
-    """
-
-    maps: dict[int, FeatureMap] = field(default_factory=dict)
-    scatter: float = UNKNOWN_SCATTER
-    drift: float = 0.0
-    ranks: RankErrors = field(default_factory=RankErrors)
-
-
-def choose(
-    gaussians: Gaussians,
-    views: Views,
-    teacher: Teacher,
-    base: FuseConfig,
-    budget: BudgetConfig,
-    *,
-    map_of: Callable[[int], FeatureMap],
-    measure: Measure,
-    elapsed: Callable[[], float],
-) -> Choice:
-    """Chooses views, rays, their ends and a rank.
-
-    Args:
-        gaussians: the splat.
-        views: all that there are.
-        teacher: what will be lifted.
-        base: options of the fusion that no budget changes.
-        budget: at least one promise.
-        map_of: the teacher's map of a view.
-        measure: seconds of one view, asked for with a budget of seconds alone.
-        elapsed: seconds since the choice began.
-    """
-    exact = exact_config(base)
-    # Maps of a costly teacher are all used: the first one, whose cells tell where rays are, is of a view of the middle.
-    spread = spread_out(len(views))
-    probe = spread[0]
-    probed = _ProbedTeacher(maps={probe: map_of(probe)})
-    lattice_of = _lattices(views, probed.maps[probe], exact)
-    visibility = resolve(base.visibility, views, base.lift)
-    sight = trace_sight(gaussians, views, lattice_of, visibility, exact.blend, seed=budget.seed)
-    choosing, judging = sight.halves()
-    map_count = min(max(FIRST_MAPS, math.ceil(len(views) / MAPS_SHARE)), len(views))
-    while True:
-        for view in spread[:map_count]:
-            if view not in probed.maps:
-                probed.maps[view] = map_of(view)
-        _measure_teacher(probed, sight, teacher, base, budget)
-        first = () if teacher.cheap else spread[:map_count]
-        order = view_order(choosing.weights, choosing.singles, probed.scatter, first)
-        settings = all_settings(
-            judging,
-            order,
-            probed.ranks,
-            scatter=SAFETY * probed.scatter,
-            drift=SAFETY * probed.drift,
-            exact_stop=exact.blend.stop_transmittance,
-            cheap=teacher.cheap,
-            coded=teacher.table is not None,
-            least=max(len(first), 1) if budget.seconds is None else 1,
-        )
-        chosen = best_setting(settings, budget.error)
-        # More maps are made until they are half of what is needed, and never one that is not.
-        if teacher.cheap or budget.error is None or chosen.views <= 2 * map_count or map_count == len(views):
-            break
-        map_count = min(2 * map_count, len(views))
-    notes: list[str] = []
-    seconds = size = None
-    if budget.seconds is not None:
-        of_map, lift = measure(int(order[0]))
-        passes = 2 if teacher.cheap and probed.ranks.fitted else 1
-        pace = Pace(map=of_map, lift=lift, passes=passes, cached=len(probed.maps), spent=elapsed())
-        chosen, broken = within_seconds(settings, chosen, budget, pace.seconds)
-        seconds = pace.seconds(chosen)
-        notes += broken
-    if budget.megabytes is not None:
-        weights = setting_weights(sight, chosen.stop, exact.blend.stop_transmittance)
-        basis = base.basis and teacher.space.channels > base.narrow
-        chosen, size, broken = within_megabytes(
-            chosen,
-            _seen_share(weights[order[: chosen.views]]),
-            sight,
-            probed.ranks,
-            teacher.space.channels,
-            budget,
-            basis=basis,
-        )
-        notes += broken
-    return _choice(chosen, base, teacher, probed, sight, order, seconds, size, notes)
-
-
-def _choice(
-    chosen: Setting,
-    base: FuseConfig,
-    teacher: Teacher,
-    probed: _ProbedTeacher,
-    sight: Sight,
-    order: np.ndarray,
-    seconds: float | None,
-    size: int | None,
-    notes: list[str],
-) -> Choice:
-    rays = exact_config(base).blend.rays_per_patch
-    blend = replace(base.blend, stop_transmittance=chosen.stop, rays_per_patch=rays)
-    config = with_rank(replace(base, blend=blend), chosen.rank, probed.ranks, teacher)
-    knobs: dict[str, int | float] = {"views": chosen.views, "stop_transmittance": chosen.stop}
-    if chosen.rank or probed.ranks.fitted:
-        knobs["rank"] = chosen.rank or probed.ranks.full
-    return Choice(
-        config=config,
-        rows=tuple(sorted(order[: chosen.views].tolist())),
-        order=tuple(order.tolist()),
-        knobs=knobs,
-        predicted=Predicted(error=chosen.error, deviation=chosen.deviation),
-        cost=chosen.cost,
-        seconds=seconds,
-        bytes=size,
-        scatter=probed.scatter,
-        drift=probed.drift,
-        maps=probed.maps,
-        followed=sight.followed,
-        all_rays=sight.all_rays,
-        notes=tuple(notes),
+    error: float | None = field(
+        default=None,
+        metadata={
+            "help": "largest mean of 1 − centered cosine to the features of preset=exact, over all Gaussians that it "
+            "sees; one that only it sees counts as 1"
+        },
+    )
+    seconds: float | None = field(
+        default=None, metadata={"help": "largest time from the choice of the setting to the features"}
+    )
+    megabytes: float | None = field(
+        default=None, metadata={"help": "largest size of the file of features, in units of 1,000,000 bytes"}
+    )
+    check: bool = field(
+        default=True,
+        metadata={"help": "measure the error afterwards, which fuses at preset=exact; false = leave it unmeasured"},
     )
 
 
-def spread_out(count: int) -> tuple[int, ...]:
-    """Numbers of views, the first so many of which are spread over all of them however many that are: the middle one,
-    those at a quarter and three quarters, and so on."""
-    order, parts = dict.fromkeys([count // 2]), 2
-    while parts < 2 * count:
-        parts *= 2
-        order.update(dict.fromkeys(part * count // parts for part in range(1, parts, 2)))
-    return tuple({**order, **dict.fromkeys(range(count))})
+def check_budget(budget: FusionBudget, config: FuseConfig, *, basis: bool = False) -> None:
+    """Refuses what a budget cannot be combined with.
 
-
-def _lattices(views: Views, probe: FeatureMap, exact: FuseConfig) -> LatticeOf:
-    """The rays of the exact settings in each view, by the map of one."""
-    rays = limit_rays(exact.blend, probe).rays_per_patch
-    lattice = grid_lattice(probe.grid_from_image, probe.width, probe.height, rays)
-    cell_x, cell_y = lattice.dx * lattice.side, lattice.dy * lattice.side
-
-    def of(view: int) -> Lattice:
-        width, height = int(views.cameras.widths[view]), int(views.cameras.heights[view])
-        columns, lines = width / cell_x, height / cell_y
-        if abs(columns - lattice.width) < 1 and abs(lines - lattice.height) < 1:
-            return lattice
-        # A picture of another size: cells of as many pixels.
-        return replace(lattice, width=max(1, round(columns)), height=max(1, round(lines)))
-
-    return of
-
-
-def _measure_teacher(
-    probed: _ProbedTeacher, sight: Sight, teacher: Teacher, base: FuseConfig, budget: BudgetConfig
-) -> None:
-    """Measures ρ, and what ranks leave out, on the maps that were made."""
-    fits = teacher.table is None and (budget.megabytes is not None or teacher.space.channels > base.narrow)
-    moments = Moments(teacher.space.channels, second=fits)
-    means = []
-    for _, feature_map in sorted(probed.maps.items()):
-        rows = distinct_rows(feature_map)
-        moments.add(rows)
-        if len(rows):
-            means.append(rows.mean(axis=0, dtype=np.float64))
-    if moments.count == 0:
+    Args:
+        basis: whether features are fused in a basis that was given.
+    """
+    if not budget.limits:
         return
-    features = sample_features(sight, probed.maps)
-    stated_mean = teacher.table.mean(axis=0) if teacher.mean is None and teacher.table is not None else teacher.mean
-    mean = np.asarray(moments.mean if stated_mean is None else stated_mean, np.float64)
-    probed.scatter = max(measure_scatter(features, mean), MINIMAL_SCATTER)
-    probed.drift = measure_drift(features, np.stack(means)) if stated_mean is None else 0.0
-    probed.ranks = rank_errors(teacher, moments, features, mean, base, needed=budget.megabytes is not None)
+    reject_options_set_by_budget(budget, config, FuseConfig(), OPTIONS_SET_BY_BUDGET, "fusion")
+    if config.lift != "blend":
+        raise InputError(
+            f"fusion.lift={config.lift}: {budget.options} is for lift=blend alone; leave one of the two out"
+        )
+    if "rendered" in config.visibility.against:
+        raise InputError(
+            f"fusion.visibility.against=rendered: {budget.options} knows sensor depth alone; test against sensor or "
+            "nothing, or leave the budget out"
+        )
+    if basis:
+        raise InputError(
+            f"basis=: {budget.options} chooses a rank, and a basis that is given has one; leave one of the two out"
+        )
 
 
-def _seen_share(weights: np.ndarray) -> float:
-    """Share of the sample that has any weight."""
-    return float((weights > 0).any(axis=0).mean()) if weights.size else 1.0
-
-
-DEPTH_CACHE_BYTES = 1 << 28
-"""Depth maps that the choice reads stay in memory up to this size, for the fusion."""
+def exact_config(config: FuseConfig) -> FuseConfig:
+    """The fusion that errors are measured against: the values of `preset=exact`."""
+    blend = replace(config.blend, rays_per_patch=196, stop_transmittance=1e-6, min_weight=0.0)
+    return replace(config, blend=blend, energy=1.0, table_energy=1.0, max_rank=0, basis=True, views=0, view_share=1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -284,28 +139,31 @@ class BudgetFusion:
     """A fusion within a budget.
 
     Attributes:
-        fusion: the features.
-        choice: the setting, and what was predicted of it.
+        fusion: the features, with as few coordinates as a limit of megabytes asks for.
+        choice: the number of views.
+        predicted: by limit.
         choosing: seconds of the choice.
         seconds: from its beginning to the features.
-        scene: with the views that the fusion read, some of whose depth maps are in memory.
-        teacher: whose maps of some views are, too.
+        teacher: with the maps of a costly one that the choice made.
+        notes: warnings about limits that are expected to be broken.
     """
 
     fusion: Fusion
-    choice: Choice
+    choice: Choice[int]
+    predicted: Mapping[str, float]
     choosing: float
     seconds: float
-    scene: Scene
-    teacher: Teacher
+    teacher: "KeptMaps"
+    notes: tuple[str, ...]
 
 
 def fuse_within(
     scene: Scene,
     teacher: Teacher,
     config: FuseConfig,
-    budget: BudgetConfig,
+    budget: FusionBudget,
     *,
+    header: Mapping[str, Any] = {},
     work: Path | None = None,
     device: Device | torch.device = "auto",
     track: Track = untracked,
@@ -314,119 +172,248 @@ def fuse_within(
     """Lifts a teacher's maps by the setting that keeps a budget.
 
     Args:
-        scene: with Gaussians and views.
-        teacher: whose maps are lifted.
         config: options that the budget does not choose.
-        budget: at least one promise.
+        header: the settings that are written with the features, which take bytes.
         work: folder for the maps of a costly teacher, which are then made once, in interrupted runs too.
-        device: see `fuse`.
-        track: see `fuse`.
-        clock: seconds.
-
-    Raises:
-        InputError: no budget, one that cannot be combined with the options, megabytes into which not even one
-            coordinate of each Gaussian fits, or what `fuse` refuses.
     """
-    if not budget.promised:
-        raise InputError("budget: expected budget.error=, budget.seconds= or budget.megabytes=, got none of them")
+    check_any_limit(budget)
     check_budget(budget, config)
     start, teacher = clock(), upright(teacher)
     gaussians, views = validate_scene(scene)
-    if views.depths is not None:
-        views = replace(views, depths=_CachedDepths(views.depths))
+    visibility, exact = resolve(config.visibility, views, config.lift), exact_config(config)
     if work is not None and not teacher.cheap:
         settings = {"budget": "maps", "lift": config.lift}
         teacher = open_checkpoint(work, settings, teacher, gaussians, views, range(len(views)), None).cached(teacher)
-    maps: dict[int, FeatureMap] = {}
+    maps, count = KeptMaps(teacher), len(views)
+    order, sampled = bisection_order(count), None
+    if budget.error is not None:
+        sampled = sample_views(gaussians, views, maps, visibility, exact.blend)
+        order = sampled.order
 
-    def map_of(view: int) -> FeatureMap:
-        maps[view] = teacher.feature_map(views, view)
-        return maps[view]
-
-    def measure(view: int) -> tuple[float, float]:
-        visibility = resolve(config.visibility, views, config.lift)
-        blend = exact_config(config).blend
+    @cache
+    def seconds_of_view() -> float:
+        """Seconds of fusing one view alone."""
         begun = clock()
-        # The time of a map is measured even where it is in memory.
-        maker = teacher.teacher if isinstance(teacher, CachedTeacher) else teacher
-        feature_map = maker.feature_map(views, view) if view in maps else map_of(view)
-        between = clock()
-        matrix = view_matrix(gaussians, views, view, feature_map, lift=config.lift, visibility=visibility, config=blend)
-        ones = _one_channel(feature_map)
-        FeatureSums(len(gaussians), ones.space, None, None).add(matrix, ones, None)
-        return between - begun, clock() - between
+        uncached = teacher.teacher if isinstance(teacher, CachedTeacher) else teacher
+        with suppress(InputError):  # It sees nothing, which is known at the end.
+            fuse(scene, uncached, exact, rows=order[:1], device=device)
+        return clock() - begun
 
-    choice = choose(
-        gaussians,
-        views,
-        teacher,
-        config,
-        budget,
-        map_of=map_of,
-        measure=measure,
-        elapsed=lambda: clock() - start,
-    )
-    choice_end = clock()
-    scene = replace(scene, views=views)
-    cached = _CachedMaps(teacher, maps)
-    fusion = fuse(scene, cached, choice.config, rows=choice.rows, device=device, track=track)
+    def measure(number: int) -> Estimate:
+        error, bound = (math.nan, math.nan) if sampled is None else sampled.error(number)
+        seconds = math.nan
+        if budget.seconds is not None:
+            # Of views whose maps are kept it is on the safe side.
+            seconds = seconds_of_view() * number + clock() - start
+        return Estimate(error=error, bound=bound + BASIS_SHARE * (budget.error or 0), seconds=seconds)
+
+    of_views = replace(budget, megabytes=None)
+    choice = Choice(setting=count, estimate=Estimate())
+    if of_views.limits:
+        # All maps of a costly teacher that were made are used.
+        least = 1 if sampled is None or teacher.cheap else sampled.maps
+        choice = choose(range(least, count + 1), measure, of_views)
+    choosing = clock() - start
+    chosen, rows = exact, sorted(order[: choice.setting])
+    if budget.error is not None and choice.setting < count:
+        # What is kept of the energy of vectors about their mean is about 1 − 2 (1 − cosine).
+        chosen = replace(exact, energy=1 - BASIS_SHARE * budget.error)
+    fusion = fuse(scene, maps, chosen, rows=rows, device=device, track=track)
+    predicted = {"error": choice.estimate.error, "seconds": choice.estimate.seconds}
+    notes = choice.notes
+    if budget.megabytes is not None:
+        name, spare = fusion.features.space.name, (budget.error or 0.0) - choice.estimate.bound
+        reduced = reduce_to_fit({name: fusion.features}, budget, header, error=max(spare, 0.0))
+        fusion = replace(fusion, features=reduced.features[name])
+        predicted |= {"megabytes": reduced.megabytes, "error": choice.estimate.error + reduced.error}
+        if reduced.megabytes > budget.megabytes:
+            notes += (budget.conflict("megabytes", reduced.megabytes),)
     return BudgetFusion(
         fusion=fusion,
         choice=choice,
-        choosing=choice_end - start,
+        predicted={name: value for name, value in predicted.items() if math.isfinite(value)},
+        choosing=choosing,
         seconds=clock() - start,
-        scene=scene,
-        teacher=cached,
+        teacher=maps,
+        notes=notes,
     )
 
 
-def _one_channel(feature_map: FeatureMap) -> FeatureMap:
-    """A map of the same grid with one channel."""
-    space = FeatureSpace(name="ones", channels=1)
-    ones = np.ones((feature_map.height, feature_map.width, 1), np.float32)
-    return FeatureMap(features=ones, grid_from_image=feature_map.grid_from_image, space=space)
+class KeptMaps(WrappedTeacher):
+    """A teacher whose maps are kept in memory where it is costly, while a setting is chosen."""
+
+    def __init__(self, teacher: Teacher) -> None:
+        super().__init__(teacher)
+        self.kept = dict[int, FeatureMap]()
+
+    def keep(self, views: Views, view: int) -> FeatureMap:
+        """The map of a view, which is not made again."""
+        feature_map = self.feature_map(views, view)
+        if not self.cheap:
+            self.kept[view] = feature_map
+        return feature_map
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        return self.kept[view] if view in self.kept else self.teacher.feature_map(views, view)
+
+
+def bisection_order(count: int) -> tuple[int, ...]:
+    """Numbers of views, the first of which are spread over all of them however many are taken: the middle one, those at
+    a quarter and three quarters, and so on."""
+    order, parts = dict.fromkeys([count // 2]), 2
+    while parts < 2 * count:
+        parts *= 2
+        order.update(dict.fromkeys(part * count // parts for part in range(1, parts, 2)))
+    return tuple({**order, **dict.fromkeys(range(count))})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SampledViews:
+    """What views show on a few rays, and the error of leaving some of them out.
+
+    Attributes:
+        order: of all views, those that are used first.
+        maps: how many maps of a costly teacher were made, of the views that the order begins with.
+        errors: of Gaussians of the sample with the first 1, 2, … of the views that were looked at; 1 where these do
+            not show one.
+        views: number of all views.
+    """
+
+    order: tuple[int, ...]
+    maps: int
+    errors: Float64[np.ndarray, "S n"]
+    beyond: float
+    views: int
+
+    def error(self, number: int) -> tuple[float, float]:
+        """The error with the first `number` views of the order, and what it stays below."""
+        if number == self.views or not self.errors.size:
+            return 0.0, 0.0
+        share = number / self.views
+        errors = self.errors[max(int(share * len(self.errors)), 1) - 1]
+        parts = [float(part.mean()) for part in np.array_split(errors, PARTS) if len(part)]
+        beyond = self.beyond * (1 - share)
+        return float(errors.mean()) + beyond, error_bound(parts, SAFETY) + SAFETY * beyond
+
+
+def sample_views(
+    gaussians: Gaussians, views: Views, teacher: KeptMaps, visibility: VisibilityConfig, config: BlendConfig
+) -> SampledViews:
+    """Looks at views on a few rays, and makes some maps.
+
+    Args:
+        visibility: resolved; against sensor depth, or nothing.
+        config: of the exact settings.
+    """
+    count, spread = len(views), bisection_order(len(views))
+    looked_at = spread[: max(ALL_VIEWS, math.ceil(count / VIEWS_SHARE))]
+    maps = min(CHEAP_MAPS if teacher.cheap else max(FIRST_MAPS, math.ceil(count / MAPS_SHARE)), len(looked_at))
+    sample, compared = even_indices(len(gaussians), SAMPLE), even_indices(len(gaussians), DIRECTIONS)
+
+    def look(number: int) -> tuple[np.ndarray, ...]:
+        """Which Gaussians of the sample a view shows; of maps also sums and weights of vectors, and their mean."""
+        view = looked_at[number]
+        b = sample_view(gaussians, views, view, visibility, config)
+        crow, columns, weight = b.crow.numpy(), b.col.numpy(), b.weight.numpy()
+        of_map: tuple[np.ndarray, ...] = ()
+        if teacher.cheap or number < maps:
+            feature_map = teacher.keep(views, view)
+            at_rays = map_at_rays(feature_map, b.lattice)
+            has_vector = at_rays.has_vector.ravel()
+            weight = weight * np.repeat(has_vector, np.diff(crow))
+            if number < maps:
+                vectors = np.where(has_vector[:, None], at_rays.rows(), np.float32(0))
+                matrix = csr_array((weight, columns, crow), shape=(b.rows, b.gaussians))[:, compared].T
+                distinct = distinct_rows(feature_map)
+                mean = distinct.mean(axis=0) if len(distinct) else np.zeros(vectors.shape[1])
+                of_map = matrix @ vectors, matrix.sum(axis=1), mean
+        return (np.bincount(columns, weight, len(gaussians))[sample] > 0, *of_map)
+
+    # A costly teacher has threads of its own.
+    numbers = range(len(looked_at))
+    looks = parallel(look, numbers) if teacher.cheap else [look(number) for number in numbers]
+    sums, weights, means = (np.stack([each[kind] for each in looks[:maps]]) for kind in (1, 2, 3))
+    stated = teacher.table.mean(axis=0) if teacher.mean is None and teacher.table is not None else teacher.mean
+    turn = mean_turn(sums, weights, means if stated is None else np.stack([stated] * maps), looked_at)
+    # Views that are chosen by a sample show more of it than of the scene: they are judged by another one.
+    by_view = np.stack([each[0] for each in looks])
+    choosing, judging = (by_view[:, ::2], by_view[:, 1::2]) if by_view.shape[1] > 2 * PARTS else (by_view, by_view)
+    order = coverage_order(choosing, () if teacher.cheap else range(maps))
+    counts = judging[order][:, judging.any(axis=0)].cumsum(axis=0)
+    turned = turn * (1 / np.maximum(counts, 1) - 1 / counts[-1]) * len(looked_at) / count
+    others = [view for view in spread if view not in looked_at]
+    # Views that were not looked at come evenly between those that were.
+    places = {view: (place + 1) / len(looked_at) for place, view in enumerate(np.array(looked_at)[order].tolist())}
+    places |= {view: (place + 1) / len(others) for place, view in enumerate(others)}
+    return SampledViews(
+        order=tuple(sorted(places, key=lambda view: places[view])),
+        maps=maps,
+        errors=np.where(counts > 0, np.minimum(turned, 1), 1.0),
+        beyond=float((counts[-1] == 1).mean()) * len(others) / len(looked_at) if counts.size else 0.0,
+        views=count,
+    )
+
+
+def mean_turn(
+    sums: Float[np.ndarray, "M n D"],
+    weights: Float[np.ndarray, "M n"],
+    means: Float[np.ndarray, "M D"],
+    views: Sequence[int],
+) -> float:
+    """τ: how far centered means over k of K views turn from those over all, 1 − cosine, per 1/k − 1/K. The larger of
+    two counts: single views are left out, and each half of a recording, since neighbors are alike.
+
+    Args:
+        sums: weighted sums of the vectors that each map shows at each Gaussian.
+        means: of the vectors of each map.
+        views: numbers of the maps' views.
+    """
+    maps, all_counts, all_weights = len(sums), (weights > 0).sum(axis=0), weights.sum(axis=0)
+    total = sums.sum(axis=0, dtype=np.float64)
+    rank = np.argsort(np.argsort(views[:maps]))
+    halves, singles = [rank < maps // 2, rank >= maps // 2], [rank != left for left in even_indices(maps, LEFT_OUT)]
+    turns = []
+    for subsets in (halves, singles):
+        turned = change = 0.0
+        for subset in subsets:
+            counts, part = (weights[subset] > 0).sum(axis=0), weights[subset].sum(axis=0)
+            rows = np.flatnonzero((counts > 0) & (counts < all_counts))
+            if len(rows):
+                some = sums[subset][:, rows].sum(axis=0, dtype=np.float64) / part[rows, None] - means[subset].mean(
+                    axis=0
+                )
+                every = total[rows] / all_weights[rows, None] - means.mean(axis=0)
+                turned += float((1 - row_cosines(some, every)).sum())
+                change += float((1 / counts[rows] - 1 / all_counts[rows]).sum())
+        turns.append(turned / change if change else UNKNOWN_TURN)
+    return max(turns)
+
+
+def map_at_rays(feature_map: FeatureMap, lattice: Lattice) -> FeatureMap:
+    """What a map shows where single rays meet it; nothing outside."""
+    affine = feature_map.grid_from_image
+    x = affine[0, 0] * (lattice.x0 + lattice.dx * np.arange(lattice.width)) + affine[0, 2]
+    y = affine[1, 1] * (lattice.y0 + lattice.dy * np.arange(lattice.height)) + affine[1, 2]
+    column, line = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    height, width = feature_map.height, feature_map.width
+    outside = ((line < 0) | (line >= height))[:, None] | (column < 0) | (column >= width)
+    cells = np.ix_(line.clip(0, height - 1), column.clip(0, width - 1))
+    nothing = {"features": np.nan, "codes": -1, "shares": 0}
+    forms = {name: getattr(feature_map, name)[cells] for name in nothing if getattr(feature_map, name) is not None}
+    for name, values in forms.items():
+        values[outside] = nothing[name]
+    return replace(feature_map, **forms)
 
 
 def realised_error(
     fused: BudgetFusion,
+    scene: Scene,
     config: FuseConfig,
     *,
-    seed: int = 0,
     device: Device | torch.device = "auto",
     track: Track = untracked,
 ) -> FieldError:
     """The error of the features against those of the exact settings, on a tenth of the Gaussians that these see, drawn
     now. Maps of views that the setting left out are made for it."""
-    exact = fuse(fused.scene, fused.teacher, exact_config(config), device=device, track=track).features
-    return judge(fused.fusion.features, exact, seed=seed)
-
-
-class _CachedDepths(Sequence[Float32[np.ndarray, "_ _"]]):
-    """Depth maps that are read once, up to a limit of memory."""
-
-    def __init__(self, depths: Sequence[Float32[np.ndarray, "_ _"]]) -> None:
-        self._depths, self._read, self._bytes = depths, dict[int, np.ndarray](), 0
-
-    def __len__(self) -> int:
-        return len(self._depths)
-
-    def __getitem__(self, index: Any) -> Any:
-        if index in self._read:
-            return self._read[index]
-        depth = self._depths[index]
-        if self._bytes + depth.nbytes <= DEPTH_CACHE_BYTES:
-            self._read[index] = depth
-            self._bytes += depth.nbytes
-        return depth
-
-
-class _CachedMaps(WrappedTeacher):
-    """A teacher some of whose maps are in memory."""
-
-    def __init__(self, teacher: Teacher, maps: dict[int, FeatureMap]) -> None:
-        super().__init__(teacher)
-        self._maps = maps
-
-    def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The map of a view, from memory where the choice made it."""
-        return self._maps[view] if view in self._maps else self.teacher.feature_map(views, view)
+    exact = fuse(scene, fused.teacher, exact_config(config), device=device, track=track).features
+    return judge(fused.fusion.features, exact)

@@ -24,9 +24,10 @@ from gsencoder.core.archive import (
     shape_only,
     write_archive,
 )
+from gsencoder.core.budget import Budget
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file
-from gsencoder.core.settings import MEGABYTE, Budget, Knob
+from gsencoder.core.settings import Knob
 from gsencoder.data.scene_arrays import check_splat, read_scene, read_space, scaled_halves, scene_parts, space_parts
 from gsencoder.data.splats.files import FINGERPRINT_DIGITS, fingerprint, load_splat, save_splat
 from gsencoder.fusion.quantize import CompactFeatures, compact, compact_within
@@ -158,8 +159,8 @@ def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, erro
     return _save_compact(folder, scene, compact(features, error=error))
 
 
-def save_package_within(folder: Path, scene: Scene, features: GaussianFeatures, *, megabytes: float) -> CompactFeatures:
-    """Writes the most exact package whose file of features has at most so many megabytes, as `save_package` does.
+def save_package_within(folder: Path, scene: Scene, features: GaussianFeatures, budget: Budget) -> CompactFeatures:
+    """Writes the most exact package whose file of features keeps a limit of megabytes, as `save_package` does.
 
     Raises:
         InputError: no Gaussians, or nothing is so small.
@@ -178,7 +179,7 @@ def save_package_within(folder: Path, scene: Scene, features: GaussianFeatures, 
         numbers, unknown = dict.fromkeys(NUMBERS, LONGEST_NUMBER), "0" * FINGERPRINT_DIGITS
         return archive_bytes(*_contents(scene, features.seen, basis, coded, numbers, fingerprint=unknown))
 
-    return _save_compact(folder, scene, compact_within(features, megabytes * MEGABYTE, bytes_of))
+    return _save_compact(folder, scene, compact_within(features, budget, bytes_of))
 
 
 def _save_compact(folder: Path, scene: Scene, compacted: CompactFeatures) -> CompactFeatures:
@@ -389,7 +390,7 @@ PACKAGE_KNOBS = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PackBudget(Budget):
-    """What a package may lose, or how large it may be. Where both are promised and conflict, the error wins.
+    """What a package may lose, or how large it may be. Where both limits conflict, the error wins.
 
     With a budget of error the smallest package that keeps it is made; with one of megabytes alone, the most exact one.
     """

@@ -8,7 +8,6 @@ Kinds of features count alike, however many Gaussians they have: what is asked f
 and a mean over Gaussians is all ceiling.
 """
 
-import math
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
@@ -18,8 +17,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.core.arrays import even_indices, rise_within
+from gsencoder.core.budget import MEGABYTE, Budget
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import MEGABYTE, shown_value
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 MAX_BITS = 8
@@ -262,29 +261,25 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
 
 
 def compact_within(
-    features: GaussianFeatures, largest: float, bytes_of: Callable[[Int64[np.ndarray, " R"]], int]
+    features: GaussianFeatures, budget: Budget, bytes_of: Callable[[Int64[np.ndarray, " R"]], int]
 ) -> CompactFeatures:
-    """The most exact codes of at most so many bytes; no more exact than `EXACT_ERROR`.
+    """The most exact codes that keep a limit of megabytes; no more exact than `EXACT_ERROR`.
 
     Args:
         features: fused or encoded.
-        largest: number of bytes.
         bytes_of: what a package takes, given the bits of each of its coordinates.
 
     Raises:
-        InputError: nothing is so small; the message says what is. Nothing seen.
+        InputError: nothing is so small, or nothing was seen.
     """
 
     def most_exact(allocation: BitAllocation, encode: _Encode) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
         while not allocation.bits.any() or (allocation.can_grow and max(allocation.errors()) > EXACT_ERROR):
             more = allocation.copy()
             more.add_bits(STEP_BITS)
-            if (size := bytes_of(more.bits[more.bits > 0])) > largest:
+            if (size := bytes_of(more.bits[more.bits > 0]) / MEGABYTE) > budget.limit("megabytes"):
                 if not allocation.bits.any():
-                    raise InputError(
-                        f"budget.megabytes={shown_value(largest / MEGABYTE)}: the smallest package of these features "
-                        f"takes {math.ceil(size / 10) / 1e5:.6g} MB; give more, or another form"
-                    )
+                    raise budget.too_small(size)
                 break
             allocation = more
         return encode(allocation)

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float, Float32, Int64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Device, Precision, Track, untracked
-from gsencoder.core.settings import Budget, check_governed
 from gsencoder.core.threads import ahead
 from gsencoder.models.grid import SceneCurves
 from gsencoder.types import Gaussians
@@ -280,45 +279,3 @@ def _smallest(values: Float[np.ndarray, " n"], count: int) -> tuple[Bool[np.ndar
     smallest = values < following
     smallest[np.flatnonzero(values == following)[: count - np.count_nonzero(smallest)]] = True
     return smallest, float(following)
-
-
-GOVERNED = ("halo", "precision")
-"""The options of encoding that a budget sets; `chunk` remains a limit of memory."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EncodeBudget(Budget):
-    """What an encoding may cost, or must reach. Where they conflict, the one that stands first here wins.
-
-    A budget of error alone takes the cheapest setting that keeps it; budgets of seconds and megabytes without one take
-    the most exact setting that keeps them.
-    """
-
-    error: float | None = field(
-        default=None,
-        metadata={
-            "help": "largest mean of 1 − centered cosine to the features of preset=exact, over all Gaussians; of "
-            "several teachers that of the worst"
-        },
-    )
-    seconds: float | None = field(
-        default=None, metadata={"help": "largest time from the choice of the setting to the features"}
-    )
-    megabytes: float | None = field(
-        default=None, metadata={"help": "largest size of the files of features, in units of 1,000,000 bytes"}
-    )
-    check: bool = field(
-        default=True,
-        metadata={"help": "measure the error afterwards, which encodes at preset=exact; false = leave it unmeasured"},
-    )
-    seed: int = field(default=0, metadata={"help": "of the parts of the scene on which the setting is chosen"})
-
-
-def check_encode_budget(budget: EncodeBudget, config: EncodeConfig) -> None:
-    """Refuses options that a budget chooses where they are set."""
-    check_governed(budget, config, EncodeConfig(), GOVERNED, "encode")
-
-
-def exact_encoding(config: EncodeConfig) -> EncodeConfig:
-    """The encoding that errors are measured against: the values of `preset=exact`."""
-    return replace(config, precision="float32", halo=1.28)

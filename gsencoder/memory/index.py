@@ -6,6 +6,7 @@ LightSplat (CVPR 2026) and LangSplatV2 (2025) have per-scene codebooks that are 
 requires, and the cosine with what it stands for is measured.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -13,8 +14,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
 
 from gsencoder.core.arrays import even_indices
+from gsencoder.core.budget import MEGABYTE, Estimate, choose
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import MEGABYTE
 from gsencoder.fusion.errors import row_cosines
 from gsencoder.fusion.package import PackBudget
 from gsencoder.fusion.quantize import FIT_SAMPLE, rarity_of
@@ -194,29 +195,54 @@ SAMPLE = 16_384
 def index_within(
     features: GaussianFeatures, budget: PackBudget, bytes_of: Callable[[int], int]
 ) -> tuple[IndexMemory, float]:
-    """The smallest table that keeps a budget of error; without one, the largest whose file keeps one of megabytes.
+    """The smallest table that keeps a limit of error; without one, the largest whose file keeps one of megabytes.
 
     Thresholds come from a fixed list. What a sample says of one is too good: its table has fewer rows than that of all
     Gaussians, and is nearer to them. All Gaussians then decide, from there on towards what is safe.
 
+    Args:
+        bytes_of: of a package with a table of so many rows.
+
     Returns:
         The table, and its error: 1 − mean centered cosine over Gaussians, or over their kinds where that is larger.
+
+    Raises:
+        InputError: no features, or no table keeps the budget; the message says how near one comes.
     """
     seen = features.seen.nonzero()[0]
     if not len(seen):
         raise InputError("index: no Gaussian has features")
-    chosen = seen[even_indices(len(seen), SAMPLE)]
-    sample = replace(
-        features,
-        features=features.stored(chosen),
-        weights=features.weights[chosen],
-        index=None,
+    rows = seen[even_indices(len(seen), SAMPLE)]
+    sample = replace(features, features=features.stored(rows), weights=features.weights[rows], index=None)
+    error_of_sample, error_of_all = _KindsError(sample), _KindsError(features)
+
+    def megabytes(indexed: IndexMemory) -> float:
+        return bytes_of(len(indexed.features.features)) / MEGABYTE
+
+    def measure(number: int) -> Estimate:
+        indexed = _indexed(sample, number)
+        error = error_of_sample(indexed)
+        return Estimate(error=error, bound=error, megabytes=megabytes(indexed))
+
+    numbers = range(len(THRESHOLDS))
+    first = choose(numbers, measure, budget).setting
+    reached, size = "does not reach it", math.nan
+    for number in numbers[first:] if budget.error is not None else numbers[first::-1]:
+        try:
+            indexed = _indexed(features, number, MAX_ROWS)
+        except TooManyRowsError:
+            if budget.error is not None:
+                break
+            continue
+        error, size = error_of_all(indexed), megabytes(indexed)
+        if error <= budget.error if budget.error is not None else size <= budget.limit("megabytes"):
+            return indexed, error
+        reached = f"reaches {error:.2g}"
+    if budget.error is None:
+        raise budget.too_small(size)
+    raise InputError(
+        f"{budget.option('error')}: a table of up to {MAX_ROWS:,} rows {reached}; give a larger budget, or form=compact"
     )
-    if budget.error is not None:
-        return _smallest(features, sample, budget.error)
-    assert budget.megabytes is not None
-    indexed = _largest(features, sample, budget.megabytes, bytes_of)
-    return indexed, _KindsError(features)(indexed)
 
 
 class _KindsError:
@@ -240,55 +266,6 @@ class _KindsError:
     def _about_mean(features: GaussianFeatures, rows: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n R"]:
         values = features.stored(rows).astype(np.float64)
         return values if features.basis is not None else values - features.mean
-
-
-def _smallest(features: GaussianFeatures, sample: GaussianFeatures, error: float) -> tuple[IndexMemory, float]:
-    of_sample, of_all = _KindsError(sample), _KindsError(features)
-    first = 0
-    while first < len(THRESHOLDS) - 1 and of_sample(_indexed(sample, first)) > error:
-        first += 1
-    reached: float | None = None
-    for number in range(first, len(THRESHOLDS)):
-        try:
-            indexed = _indexed(features, number, MAX_ROWS)
-        except TooManyRowsError:
-            break
-        reached = of_all(indexed)
-        if reached <= error:
-            return indexed, reached
-    least = "does not reach it" if reached is None else f"reaches {reached:.2g}"
-    raise InputError(
-        f"budget.error={error:g}: a table of up to {MAX_ROWS:,} rows {least}; give a larger budget, or form=compact"
-    )
-
-
-def _largest(
-    features: GaussianFeatures, sample: GaussianFeatures, megabytes: float, bytes_of: Callable[[int], int]
-) -> IndexMemory:
-    largest = megabytes * MEGABYTE
-    rows = _rows_within(largest, bytes_of)
-    first = 0
-    while first < len(THRESHOLDS) - 1 and rows and len(_indexed(sample, first + 1).features.features) <= rows:
-        first += 1
-    for number in range(first if rows else -1, -1, -1):
-        try:
-            return _indexed(features, number, rows)
-        except TooManyRowsError:
-            continue
-    needed = bytes_of(len(_indexed(features, 0).features.features))
-    raise InputError(
-        f"budget.megabytes={megabytes:g}: the smallest table of these features takes {needed / MEGABYTE + 5e-6:.5f} MB"
-        "; give more"
-    )
-
-
-def _rows_within(largest: float, bytes_of: Callable[[int], int]) -> int:
-    """The largest number of rows whose file has at most so many bytes; 0 where there is none."""
-    low, high = 0, MAX_ROWS
-    while low < high:
-        middle = (low + high + 1) // 2
-        low, high = (middle, high) if bytes_of(middle) <= largest else (low, middle - 1)
-    return low
 
 
 def _indexed(features: GaussianFeatures, number: int, most: int | None = None) -> IndexMemory:

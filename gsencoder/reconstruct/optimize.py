@@ -4,7 +4,6 @@ densification.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field, fields
 from typing import NamedTuple
 
@@ -494,12 +493,6 @@ class Optimizer:
         """
         views = ((view, self.photographs.at_scale(view, 2)) for view in self.training)
         return rows_to_keep(self.parameters, self.photographs.cameras, views, self.pruning, self.raster, most=self.most)
-
-    def restricted(self, rows: Int64[Tensor, " n"]) -> "Optimizer":
-        """A copy for trials that has these rows of the parameters alone."""
-        other = copy(self)
-        other.adam = RowAdam({name: value[rows] for name, value in self.parameters.items()})
-        return other
 
     def prune(self) -> None:
         """Removes the Gaussians that contribute nothing."""

@@ -1,14 +1,9 @@
-"""The plan of a reconstruction: how many steps, colors of which degree, and how many Gaussians keep its budget.
-
-Sizes are counted on a trial pruning of the seeds, and seconds are those of trial steps on the scene; where seconds are
-promised, the clock changes the number of steps while they are done. How many steps an error takes is not predicted: the
-plan begins with few, and is extended until held-out photographs show that error.
-
-What a reconstruction may take: how large photographs are looked at, and for how many steps.
+"""The plan of a reconstruction: how large photographs are, how many steps, colors of which degree, how many Gaussians.
 
 A step costs about C₀ + C₁ · pixels + C₂ · Gaussians in view. For an aim in minutes, sizes and steps follow from this
-formula alone, so that the same command on the same machine gives the same splat; the time that is announced is
-measured. What is promised (`error`, `seconds`, `megabytes`) is planned in `gsencoder.reconstruct.plan`.
+formula alone, so that the same command on the same machine gives the same splat. Limits are kept by measurement: sizes
+are counted on a trial pruning of the seeds; for a limit of seconds a few steps are timed on the scene, and the clock
+changes the number of steps while they are done.
 """
 
 import math
@@ -17,18 +12,18 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from gsencoder.core.arrays import even_indices
+from gsencoder.core.budget import MEGABYTE, PLANNED, Budget
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import MEGABYTE, PLANNED, Budget
 from gsencoder.data.splats.ply import inria_row_bytes
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
 from gsencoder.reconstruct.parameters import PLANNED_DEGREE, RowAdam
-from gsencoder.reconstruct.score import MAX_COMPARISONS, LogRow, score
+from gsencoder.reconstruct.score import MAX_COMPARISONS, score
 from gsencoder.types import Cameras
 
 FIXED_SECONDS, PIXEL_SECONDS, GAUSSIAN_SECONDS = 0.03, 7e-7, 1.25e-6
@@ -44,35 +39,37 @@ CUDA_GAIN = 30.0
 SEED_SHARE = 0.2
 """Share of the time that reading and seeding may take."""
 DEFAULT_MINUTES = 10.0
-PROMISED_STEPS = 400
-"""For promised seconds photographs are made smaller only where there is no time for so many steps: of the same time,
+STEPS_IN_SECONDS = 400
+"""For a limit of seconds photographs are made smaller only where there is no time for so many steps: of the same time,
 fewer steps cost less than smaller photographs (docs/measurements.md, Trade-off)."""
-LEAST_STEPS = 200
+LEAST_STEPS, MOST_STEPS = 200, 3000
+"""The fewest of an aim in minutes; the most of any budget, which are those of preset=exact."""
+FEW_STEPS = 50
+"""A limit of seconds that has time for fewer steps is said to have little."""
 SMALLEST_REDUCTION = 0.95
 """Photographs are not resized by less than this."""
-TRIAL_VIEWS = 4
+SEEN_VIEWS, TRIAL_VIEWS = 4, 2
+"""Views that stand for all where Gaussians are counted, and where steps are timed."""
+AIMED = 0.98
+"""Share of a limit of seconds that the clock steers to."""
+LATE = 1.5
+"""A time that is so many times the aim in minutes is said."""
+HEADER_BYTES = 2048
+"""Of a .ply file, at most."""
+PLAN = "plan"
+"""The fact of a checkpoint that holds the rest of the plan."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BudgetConfig(Budget):
-    """What a reconstruction may take, or must reach. A promised size is kept in any case; error comes before seconds.
-
-    A promised error takes the fewest steps that reach it; seconds and megabytes without one take the most steps, the
-    highest degree of colors and the most Gaussians that they allow.
-    """
+class ReconstructBudget(Budget):
+    """What a reconstruction may take: the most steps, the highest degree of colors and the most Gaussians that the
+    limits allow."""
 
     minutes: float = field(
         default=DEFAULT_MINUTES,
         metadata={
             "help": "aim at so many minutes: photographs are made smaller and the default optimize.steps fewer or "
-            "more; 0 = neither. No promise, and not used beside budget.seconds"
-        },
-    )
-    error: float | None = field(
-        default=None,
-        metadata={
-            "help": "largest mean of 1 − SSIM on held-out photographs, at the size that photographs are looked at; "
-            "of measured surfaces, where a fitted photograph shows them"
+            "more; 0 = neither. No limit, and not used beside budget.seconds"
         },
     )
     seconds: float | None = field(
@@ -91,22 +88,9 @@ class BudgetConfig(Budget):
         if not 0 <= self.minutes < math.inf:
             raise InputError(f"minutes: expected 0 (no budget) or more, got {self.minutes}")
 
-    @property
-    def option_of_steps(self) -> str:
-        """The option that chooses the number of steps."""
-        return next((f"budget.{name}" for name in ("error", "seconds") if name in self.promised), "budget.minutes")
-
-    @property
-    def clock(self) -> float | None:
-        """Promised seconds that the clock keeps; a promised error comes before them."""
-        return self.seconds if self.error is None else None
-
     def minutes_left(self, spent: float = 0.0) -> float:
-        """The minutes that sizes and steps are chosen for; 0 = all that they want.
-
-        Args:
-            spent: seconds that reading has taken, which count to a promise of seconds.
-        """
+        """The minutes that sizes and steps are chosen for, after `spent` seconds of reading, which count to a limit of
+        seconds; 0 = all that they want."""
         if self.seconds is None:
             return self.minutes
         return max(PLANNED * self.seconds - spent, 1.0) / 60
@@ -118,8 +102,6 @@ def step_seconds(pixels: float, gaussians: float, device: torch.device, config: 
     Args:
         pixels: of a photograph at its full size.
         gaussians: in view.
-        device: where it is computed.
-        config: the stages.
     """
     seen = sum(share * pixels / shrink**2 for share, shrink in zip(config.shares, config.shrinks, strict=True))
     seconds = OVERHEAD * (FIXED_SECONDS + PIXEL_SECONDS * seen + GAUSSIAN_SECONDS * gaussians)
@@ -147,15 +129,12 @@ def _step_costs(device: torch.device, config: OptimizeConfig) -> tuple[float, fl
 
 
 def choose_scale(
-    cameras: Cameras, budget: BudgetConfig, device: torch.device, config: OptimizeConfig, *, spent: float = 0.0
+    cameras: Cameras, budget: ReconstructBudget, device: torch.device, config: OptimizeConfig, *, spent: float = 0.0
 ) -> float:
     """The factor by which photographs are made smaller, 1 = not at all.
 
     Args:
         cameras: of the photographs at their full size.
-        budget: the aim in minutes, or promised seconds.
-        device: where it is computed.
-        config: the stages.
         spent: seconds that reading has taken.
     """
     pixels = float(np.median(cameras.widths.astype(np.float64) * cameras.heights))
@@ -163,7 +142,7 @@ def choose_scale(
     if not minutes:
         return 1.0
     none, pixel = _step_costs(device, config)
-    steps = steps_for_minutes(minutes, config) if budget.seconds is None else PROMISED_STEPS
+    steps = steps_for_minutes(minutes, config) if budget.seconds is None else STEPS_IN_SECONDS
     seconds = (1 - SEED_SHARE) * 60 * minutes / steps
     affordable = max(least_pixels(device, config), (seconds - none) / pixel)
     scale = math.sqrt(affordable / pixels)
@@ -176,7 +155,7 @@ def affordable_steps(optimizer: Optimizer, minutes: float) -> int:
     config = optimizer.config
     if not minutes or config.steps != OptimizeConfig().steps or config.earlier:
         return config.steps
-    views = trial_views(optimizer.training)
+    views = spread_views(optimizer.training, SEEN_VIEWS)
     gaussians = float(np.mean([optimizer.rows_seen(view) for view in views]))
     pixels = float(np.mean([optimizer.photographs.at_scale(view).image[..., 0].numel() for view in views]))
     seconds = step_seconds(pixels, gaussians, optimizer.device, config)
@@ -184,18 +163,13 @@ def affordable_steps(optimizer: Optimizer, minutes: float) -> int:
     return int(min(max(LEAST_STEPS, affordable), steps_for_minutes(minutes, config)))
 
 
-def trial_views(training: Sequence[int]) -> list[int]:
+def spread_views(views: Sequence[int], count: int) -> list[int]:
     """Some views, evenly spaced, that stand for all."""
-    return [training[index] for index in np.linspace(0, len(training) - 1, min(TRIAL_VIEWS, len(training))).astype(int)]
+    return [views[index] for index in even_indices(len(views), count)]
 
 
 class ExpectedSeconds(NamedTuple):
-    """Seconds that a part of a reconstruction will take.
-
-    Attributes:
-        steps: all steps.
-        other: prunings and validations.
-    """
+    """Seconds that a part of a reconstruction will take: of its steps, and of prunings and validations."""
 
     steps: float
     other: float
@@ -203,19 +177,17 @@ class ExpectedSeconds(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Costs:
-    """Seconds of each kind of work, measured between two steps.
+    """Seconds of each kind of work.
 
     Attributes:
-        step: number of steps that were done.
-        steps: of a step, by the factor that makes photographs smaller and whether the next pruning was before it.
-        prunings: of the next pruning, and of each after it.
+        steps: of a step, by the factor that makes photographs smaller.
+        pruning: of one.
         validation: of one.
-        picture: of a render beside a held-out photograph.
+        picture: of a render of a held-out view.
     """
 
-    step: int
-    steps: Mapping[tuple[int, bool], float]
-    prunings: tuple[float, float]
+    steps: Mapping[int, float]
+    pruning: float
     validation: float
     picture: float
 
@@ -223,41 +195,44 @@ class Costs:
         self, config: OptimizeConfig, prune: PruneConfig, start: int, stop: int, validations: int
     ) -> ExpectedSeconds:
         """Seconds that the steps from `start` to `stop` take, with their prunings and so many validations."""
-        stepping, other, pruned = 0.0, validations * self.validation, False
-        for step in range(self.step, stop):
-            if step >= start:
-                stepping += self.steps.get((config.shrink_at(step), pruned), max(self.steps.values()))
-            if prune.due(step + 1, config):
-                other += self.prunings[pruned] if step >= start else 0
-                pruned = True
-        return ExpectedSeconds(stepping, other)
+        numbers = range(start, stop)
+        prunings = sum(prune.due(step + 1, config) for step in numbers)
+        slowest = max(self.steps.values(), default=0.0)
+        return ExpectedSeconds(
+            sum(self.steps.get(config.shrink_at(step), slowest) for step in numbers),
+            prunings * self.pruning + validations * self.validation,
+        )
 
 
-def measured_costs(optimizer: Optimizer, held_out: Sequence[int], limit: float = inf) -> Costs:
-    """What the remaining work costs; nothing changes.
+def measured_costs(optimizer: Optimizer, held_out: Sequence[int]) -> Costs:
+    """What the remaining work costs by a few trial steps, which change nothing."""
+    views = spread_views(optimizer.training, TRIAL_VIEWS)
+    shrinks = dict.fromkeys(optimizer.config.shrink_at(step) for step in range(optimizer.step, optimizer.config.steps))
+    steps = {shrink: _mean_seconds(views, partial(_trial_step, optimizer, shrink)) for shrink in shrinks}
+    picture = 0.0
+    if held_out:
+        picture = _mean_seconds(spread_views(held_out, TRIAL_VIEWS), lambda view: score(optimizer, [view]))
+    # A pruning renders each fitted photograph at half its size, with gradients.
+    pruning = len(optimizer.training) * min(steps.values(), default=0.0)
+    return Costs(steps=steps, pruning=pruning, validation=len(held_out) * picture, picture=picture)
 
-    Gaussians that contribute nothing now will not contribute later either, and the first pruning takes them out. So it
-    is done once for trial, and the steps after it are timed with what it leaves.
 
-    Args:
-        optimizer: as it is now.
-        held_out: views that are validated on.
-        limit: seconds that go into each kind of work, which is done twice at least.
-    """
-    config, state, prunings, pruned = optimizer.config, optimizer, (0.0, 0.0), False
-    steps: dict[tuple[int, bool], float] = {}
-    for step in range(optimizer.step, config.steps):
-        kind = (config.shrink_at(step), pruned)
-        if kind not in steps:
-            steps[kind] = _mean_seconds(trial_views(optimizer.training), partial(_step, state, kind[0]), limit)
-        if not pruned and optimizer.pruning.due(step + 1, config):
-            began, pruned = time.perf_counter(), True
-            state = _pruned(optimizer)
-            seconds = time.perf_counter() - began
-            prunings = (seconds, seconds * len(state.parameters["means"]) / len(optimizer.parameters["means"]))
-    picture = _mean_seconds(trial_views(held_out), lambda view: score(optimizer, [view]), limit) if held_out else 0.0
-    validation = len(held_out) * picture
-    return Costs(step=optimizer.step, steps=steps, prunings=prunings, validation=validation, picture=picture)
+def _trial_step(optimizer: Optimizer, shrink: int, view: int) -> None:
+    """What a step does, on a copy of the rows that it changes."""
+    _, rows, grads, _ = optimizer.gradients(view, shrink)
+    if len(rows):
+        seen = RowAdam({name: value[rows] for name, value in optimizer.parameters.items()})
+        seen.step(torch.arange(len(rows), device=rows.device), grads, dict.fromkeys(grads, 0.0))
+
+
+def _mean_seconds(views: Sequence[int], work: Callable[[int], object]) -> float:
+    """Of looks at some views; a first one compiles and warms caches, and is not counted."""
+    seconds: list[float] = []
+    for view in (views[0], *views):
+        began = time.perf_counter()
+        work(view)
+        seconds.append(time.perf_counter() - began)
+    return float(np.mean(seconds[1:]))
 
 
 class Pace:
@@ -266,16 +241,16 @@ class Pace:
 
     LOOKS, CHANGE = 0.25, 0.02
 
-    def __init__(self, costs: Costs, until: float, elapsed: Callable[[], float]) -> None:
+    def __init__(self, costs: Costs, step: int, until: float, elapsed: Callable[[], float]) -> None:
         """Args:
-        costs: measured at the step where the run begins or goes on.
+        step: where the run begins or goes on.
         until: seconds that may have gone after the last step.
         elapsed: seconds that have gone.
         """
         self.costs, self.until, self.elapsed = costs, until, elapsed
-        self._looked = (costs.step, elapsed())
+        self._looked = (step, elapsed())
 
-    def steps(self, optimizer: Optimizer, validates: Callable[[int, int], bool], most: int) -> int:
+    def steps(self, optimizer: Optimizer, validates: Callable[[int, int], bool]) -> int:
         """The number of all steps; that of the plan where the clock is not looked at, or where it is about right.
 
         What was done since the last look took so many times longer than expected, and so will the rest.
@@ -283,7 +258,6 @@ class Pace:
         Args:
             optimizer: between two steps.
             validates: whether is validated after a step of so many.
-            most: number of steps.
         """
         now, (last, then) = self.elapsed(), self._looked
         config, step = optimizer.config, optimizer.step
@@ -298,62 +272,8 @@ class Pace:
         )
         slowness = (now - then) / max(sum(done), 1e-9)
         left = (self.until - now) / max(slowness, 1e-9) - rest.other
-        steps = min(step + max(1, int(left * (config.steps - step) / rest.steps)), most)
+        steps = min(step + max(1, int(left * (config.steps - step) / rest.steps)), MOST_STEPS)
         return steps if abs(steps - config.steps) >= max(1, self.CHANGE * (config.steps - step)) else config.steps
-
-
-def _pruned(optimizer: Optimizer) -> Optimizer:
-    try:
-        return optimizer.restricted(optimizer.contributing())
-    except InputError:
-        # Nothing would be left now; the steps until then may change that.
-        return optimizer
-
-
-def _step(optimizer: Optimizer, shrink: int, view: int) -> None:
-    """What a step does, on a copy of the rows that it changes."""
-    _, rows, grads, _ = optimizer.gradients(view, shrink)
-    if len(rows):
-        seen = RowAdam({name: value[rows] for name, value in optimizer.parameters.items()})
-        seen.step(torch.arange(len(rows), device=rows.device), grads, dict.fromkeys(grads, 0.0))
-
-
-def _mean_seconds(views: Sequence[int], work: Callable[[int], object], limit: float) -> float:
-    """Of looks at some views, as many as the limit allows and one at least; a first one compiles and warms caches, and
-    is not counted."""
-    seconds: list[float] = []
-    for view in (views[0], *views):
-        began = time.perf_counter()
-        work(view)
-        seconds.append(time.perf_counter() - began)
-        if sum(seconds[1:]) > max(limit, 0.0):
-            break
-    return float(np.mean(seconds[1:]))
-
-
-STEPS = (50, 100, 150, 200, 300, 400, 600, 800, 1100, 1500, 2100, 3000)
-"""Steps after which a promised error is looked at. The last are those of preset=exact; no promise takes more of them,
-or fewer than the first."""
-PATIENCE = 2
-"""A promised error is given up once it was looked at so many times without becoming smaller than before: more steps
-then fit the photographs that are fitted, and no others."""
-AIMED = 0.98
-"""Share of promised seconds that the clock steers to."""
-FEW_STEPS = STEPS[1]
-"""Where promised seconds have no time for so many steps, photographs are made smaller once more."""
-SMALLEST_SHARE = 0.2
-"""Of the pixels, which smaller photographs keep at least."""
-LATE = 1.5
-"""So many times the aim in minutes is said."""
-HEADER_BYTES = 2048
-"""Of a .ply file, at most."""
-PLAN = "plan"
-"""The fact of a checkpoint that holds the rest of the plan."""
-
-
-class PhotographsTooLargeError(Exception):
-    """Promised seconds have no time for steps of photographs of this size, and enough is left to begin anew with
-    photographs that are so many times as large, `args[0]`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -361,14 +281,14 @@ class Plan:
     """What a reconstruction is about to do.
 
     Attributes:
-        steps: of the optimization; of a promised error the next at which it is looked at.
+        steps: of the optimization.
         sh_degree: of colors.
         earlier: what was planned before, see `OptimizeConfig`.
         most: Gaussians that pruning leaves at most; None = no limit.
         spent: seconds before the first step.
-        seconds: expected in all; None without a promise of them.
-        megabytes: expected size of the splat; None without a promise of it.
-        notes: what is known not to be kept.
+        seconds: expected in all; None without a limit of them.
+        megabytes: expected size of the splat; None without a limit of it.
+        notes: limits that are expected to be broken.
     """
 
     steps: int
@@ -390,60 +310,46 @@ class Plan:
         }
 
     @classmethod
-    def of(cls, facts: Mapping[str, Any], *, steps: int, sh_degree: int) -> "Plan":
-        """The plan in the facts of a checkpoint.
-
-        Args:
-            facts: of the checkpoint.
-            steps: where there are none, as in checkpoints of earlier versions.
-            sh_degree: likewise.
-        """
-        rest = dict(facts.get(PLAN, {}))
-        notes, earlier = (tuple(rest.pop(name, ())) for name in ("notes", "earlier"))
-        steps = int(facts.get("steps_planned", steps))
-        return cls(
-            steps=steps, sh_degree=int(facts.get(PLANNED_DEGREE, sh_degree)), notes=notes, earlier=earlier, **rest
-        )
+    def of(cls, facts: Mapping[str, Any]) -> "Plan":
+        """The plan in the facts of a checkpoint."""
+        rest = dict(facts[PLAN])
+        notes, earlier = (tuple(rest.pop(name)) for name in ("notes", "earlier"))
+        steps, degree = int(facts["steps_planned"]), int(facts[PLANNED_DEGREE])
+        return cls(steps=steps, sh_degree=degree, notes=notes, earlier=earlier, **rest)
 
 
 def make_plan(
     optimizer: Optimizer,
-    budget: BudgetConfig,
+    budget: ReconstructBudget,
     costs: Callable[[], Costs],
     validations: Callable[[int], int],
     *,
     double_means: bool,
     spent: Callable[[], float],
-    may_shrink: bool = False,
 ) -> Plan:
-    """Plans a reconstruction that has not begun; `follow` carries the plan out.
+    """Plans a reconstruction that has not begun; `apply_plan` carries the plan out.
 
     Args:
         optimizer: with the seeds.
-        budget: what is promised, and the aim in minutes.
         costs: measures the work, with the colors of the plan.
         validations: how many there are in so many steps.
         double_means: whether the splat's positions are written as doubles.
         spent: seconds until now.
-        may_shrink: whether photographs may be made smaller.
 
     Raises:
         InputError: megabytes into which not one Gaussian fits, or seconds that are over.
-        PhotographsTooLargeError: seconds ask for smaller ones.
     """
     config = optimizer.config
     plan = Plan(steps=config.steps, sh_degree=config.sh_degree, earlier=config.earlier)
     if budget.megabytes is not None:
-        plan = _within_megabytes(optimizer, budget, budget.megabytes, plan, double_means)
-    if budget.error is not None:
-        return replace(plan, steps=STEPS[0], spent=spent())
+        plan = _within_megabytes(optimizer, budget, plan, double_means)
     if budget.seconds is None:
         return replace(plan, steps=affordable_steps(optimizer, budget.minutes), spent=spent())
-    follow(optimizer, plan)
-    return _within_seconds(optimizer, budget, budget.seconds, plan, costs, validations, spent, may_shrink)
+    apply_plan(optimizer, plan)
+    return _within_seconds(optimizer, budget, budget.seconds, plan, costs, validations, spent)
 
 
-def follow(optimizer: Optimizer, plan: Plan) -> None:
+def apply_plan(optimizer: Optimizer, plan: Plan) -> None:
     """Sets steps, colors and the limit of Gaussians; coefficients of colors above the planned degree are taken out."""
     optimizer.config = replace(optimizer.config, steps=plan.steps, sh_degree=plan.sh_degree, earlier=plan.earlier)
     optimizer.most = plan.most
@@ -458,67 +364,34 @@ def follow(optimizer: Optimizer, plan: Plan) -> None:
         )
 
 
-def extended(plan: Plan, budget: BudgetConfig, rows: Sequence[LogRow]) -> Plan:
-    """The plan with more steps, where a promised error was not reached and more may reach it; otherwise the same, with
-    a note where more would not.
-
-    Args:
-        plan: that was followed to its end.
-        budget: what is promised.
-        rows: of the log.
-    """
-    if budget.error is None or error_of(rows[-1]) <= budget.error:
-        return plan
-    errors = {int(row["step"]): error_of(row) for row in rows if row["step"] in STEPS}
-    best = min(errors, key=lambda step: errors[step])
-    if len([step for step in errors if step > best]) >= PATIENCE:
-        lowest = f"step {best} ({errors[best]:.4f})"
-        note = f"{budget.shown('error')}: it has not fallen since {lowest}, so no more steps are done"
-        # A run that was cut off here finds the note in its checkpoint.
-        return replace(plan, notes=tuple(dict.fromkeys((*plan.notes, note))))
-    return replace(plan, steps=next((steps for steps in STEPS if steps > plan.steps), plan.steps))
-
-
-def error_of(row: LogRow) -> float:
-    """1 − SSIM of a validation: of surfaces that a fitted photograph shows, where a sensor says which these are."""
-    return 1 - row.get("seen_ssim", row["ssim"])
-
-
-def _within_megabytes(
-    optimizer: Optimizer, budget: BudgetConfig, megabytes: float, plan: Plan, double_means: bool
-) -> Plan:
+def _within_megabytes(optimizer: Optimizer, budget: ReconstructBudget, plan: Plan, double_means: bool) -> Plan:
     """The highest degree of colors with which the Gaussians that contribute now fit, or degree 0 and as many as fit."""
     try:
         contributing = len(optimizer.contributing())
     except InputError:
         # Nothing would be left now; the steps until the first pruning may change that.
         contributing = len(optimizer.parameters["means"])
-    limit = megabytes * MEGABYTE - HEADER_BYTES
+    limit = budget.limit("megabytes") * MEGABYTE - HEADER_BYTES
     sizes = {d: inria_row_bytes(d, double_means=double_means) for d in range(plan.sh_degree, -1, -1)}
     degree = next((d for d, row in sizes.items() if contributing * row <= limit), 0)
     most = int(limit // sizes[degree])
     if most < 1:
-        raise InputError(
-            f"{budget.shown('megabytes')}: not one Gaussian fits; a splat of one takes "
-            f"{(HEADER_BYTES + sizes[0]) / MEGABYTE:.4g}"
-        )
+        raise budget.too_small((HEADER_BYTES + sizes[0]) / MEGABYTE)
     expected = (HEADER_BYTES + min(contributing, most) * sizes[degree]) / MEGABYTE
     return replace(plan, sh_degree=degree, most=most, megabytes=expected)
 
 
 def _within_seconds(
     optimizer: Optimizer,
-    budget: BudgetConfig,
+    budget: ReconstructBudget,
     seconds: float,
     plan: Plan,
     measure: Callable[[], Costs],
     validations: Callable[[int], int],
     spent: Callable[[], float],
-    may_shrink: bool,
 ) -> Plan:
     """As many steps as there is time for, by trial steps of each kind."""
-    begun = spent()
-    refuse_late(budget, begun, "reading photographs and seeding")
+    refuse_late(budget, spent(), "reading photographs and seeding")
     costs, steps = measure(), plan.steps
     before = spent()
     expected = costs.expected(optimizer.config, optimizer.pruning, 0, steps, 0)
@@ -526,32 +399,27 @@ def _within_seconds(
     for _ in range(2):
         # How often is validated depends on the steps.
         other = expected.other + costs.validation * validations(max(steps, 1)) + MAX_COMPARISONS * costs.picture
-        steps = min(math.floor((AIMED * seconds - before - other) / each), STEPS[-1])
-    cameras, shares = optimizer.photographs.cameras, (SMALLEST_SHARE, steps / (2 * FEW_STEPS))
-    least = least_pixels(optimizer.device, optimizer.config) / float(np.median(cameras.widths * cameras.heights))
-    factor = math.sqrt(max(*shares, least))
-    if may_shrink and steps < FEW_STEPS and factor < SMALLEST_REDUCTION and before + factor * begun < seconds / 2:
-        raise PhotographsTooLargeError(factor)
-    needed = math.ceil((before + other + STEPS[0] * each) / AIMED)
-    few = f"{budget.shown('seconds')}: has time for {max(steps, 0)} steps; budget.seconds={needed} has for {STEPS[0]}"
+        steps = min(math.floor((AIMED * seconds - before - other) / each), MOST_STEPS)
+    needed = math.ceil((before + other + FEW_STEPS * each) / AIMED)
+    few = f"{budget.option('seconds')}: has time for {max(steps, 0)} steps; budget.seconds={needed} has for {FEW_STEPS}"
     if steps < 1:
         raise InputError(few)
     total = before + other + steps * each
-    return replace(plan, steps=steps, spent=before, seconds=total, notes=(few,) if steps < STEPS[0] else ())
+    return replace(plan, steps=steps, spent=before, seconds=total, notes=(few,) if steps < FEW_STEPS else ())
 
 
-def refuse_late(budget: BudgetConfig, spent: float, subject: str, advice: str = "") -> None:
-    """Raises InputError where promised seconds are over before the first step; `subject` says with what."""
-    if budget.clock is not None and spent >= AIMED * budget.clock:
+def refuse_late(budget: ReconstructBudget, spent: float, subject: str, advice: str = "") -> None:
+    """Raises InputError where a limit of seconds is over before the first step; `subject` says with what."""
+    if budget.seconds is not None and spent >= AIMED * budget.seconds:
         raise InputError(
-            f"{budget.shown('seconds')}: is over before the first step: {spent:.0f} s went into {subject}; "
+            f"{budget.option('seconds')}: is over before the first step: {spent:.0f} s went into {subject}; "
             f"give {advice or 'more seconds, a smaller data.image_scale, or fewer photographs (data.max_views)'}"
         )
 
 
-def late_notes(budget: BudgetConfig, seconds: float) -> tuple[str, ...]:
+def late_notes(budget: ReconstructBudget, seconds: float) -> tuple[str, ...]:
     """What is said where so many seconds in all are far more than the aim in minutes, which no clock keeps."""
     note = (
         f"budget.minutes={budget.minutes:g} aims at less; budget.seconds={60 * budget.minutes:g} is kept by the clock"
     )
-    return (note,) if not budget.promised and 0 < 60 * LATE * budget.minutes < seconds else ()
+    return (note,) if not budget.limits and 0 < 60 * LATE * budget.minutes < seconds else ()

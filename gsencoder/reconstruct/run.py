@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cache
-from math import inf
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,12 +15,12 @@ import numpy as np
 import torch
 from jaxtyping import Float32
 
+from gsencoder.core.budget import reject_options_set_by_budget
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, SceneWarning, advised
 from gsencoder.core.files import plain
 from gsencoder.core.logs import LOG_FILE, Log, read_log
 from gsencoder.core.process import Clock, Device, Track, untracked
-from gsencoder.core.settings import check_governed
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.from_photographs import (
     MAX_DENSE_SPACING,
@@ -45,14 +44,13 @@ from gsencoder.reconstruct.parameters import (
 )
 from gsencoder.reconstruct.plan import (
     AIMED,
+    MOST_STEPS,
     PLAN,
-    STEPS,
-    BudgetConfig,
     Costs,
     Pace,
     Plan,
-    extended,
-    follow,
+    ReconstructBudget,
+    apply_plan,
     late_notes,
     make_plan,
     measured_costs,
@@ -91,7 +89,7 @@ class ReconstructConfig:
     seeds: SeedConfig = field(default_factory=SeedConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
     optimize: OptimizeConfig = field(default_factory=OptimizeConfig)
-    budget: BudgetConfig = field(default_factory=BudgetConfig)
+    budget: ReconstructBudget = field(default_factory=ReconstructBudget)
     prune: PruneConfig = field(default_factory=PruneConfig)
     raster: RasterConfig = field(default_factory=RasterConfig)
 
@@ -101,14 +99,8 @@ class ReconstructConfig:
         for name in ("validate_every", "checkpoint_every"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        if self.budget.error is not None or self.budget.seconds is not None:
-            of_steps = replace(self.budget, megabytes=None)
-            check_governed(of_steps, self.optimize, OptimizeConfig(), ("steps", "earlier"), "optimize")
-        if self.budget.error is not None and not self.holdout:
-            raise InputError(
-                "budget.error: is measured on held-out photographs, and holdout=0 holds out none; leave one of the two "
-                "out"
-            )
+        of_steps = replace(self.budget, megabytes=None)
+        reject_options_set_by_budget(of_steps, self.optimize, OptimizeConfig(), ("steps", "earlier"), "optimize")
         if self.budget.megabytes is not None and not (self.prune.at and self.optimize.steps):
             never = "optimize.steps=0" if self.prune.at else "prune.at=[]"
             raise InputError(
@@ -202,7 +194,7 @@ class Fitted:
 
     Attributes:
         rows: of the log, oldest first.
-        plan: as it was extended, or changed by the clock.
+        plan: as the clock changed it.
     """
 
     rows: list[LogRow]
@@ -223,8 +215,8 @@ def fit(
     pace: Pace | None = None,
     now: Callable[[], float] = time.monotonic,
 ) -> Fitted:
-    """All remaining steps of a plan, which is extended while a promised error is not reached, and changed where a clock
-    sets the pace. Whatever stops the run between two steps leaves a checkpoint."""
+    """All remaining steps of a plan, which is changed where a clock sets the pace. Whatever stops the run between two
+    steps leaves a checkpoint."""
     with advised(START_AGAIN):
         log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
         rows = read_rows(work / LOG_FILE)
@@ -265,7 +257,7 @@ def fit(
                 optimizer.advance()
                 validate()
                 if pace is not None and optimizer.step < plan.steps:
-                    steps = pace.steps(optimizer, config.validates_at, STEPS[-1])
+                    steps = pace.steps(optimizer, config.validates_at)
                     if steps != plan.steps:
                         plan = replace(plan, steps=steps, earlier=(*plan.earlier, plan.steps, optimizer.step))
                         break
@@ -273,10 +265,8 @@ def fit(
                     save()
                     saved_at, saved_step = now(), optimizer.step
             else:
-                plan = extended(plan, config.budget, rows)
-            if plan.steps == optimizer.step:
                 break
-            follow(optimizer, plan)
+            apply_plan(optimizer, plan)
     finally:
         # Also after the last step: writing the results may be interrupted as well.
         if optimizer.is_consistent and optimizer.step > saved_step:
@@ -294,10 +284,6 @@ def read_rows(path: Path) -> list[LogRow]:
         return [{name: float(cell) for name, cell in row.items()} for row in read_log(path)]
     except ValueError as error:
         raise InputError(f"{path}: damaged: {error}") from error
-
-
-TRIAL_SHARE = 1 / 30
-"""Of promised seconds that are left, what goes into trials of each kind of work."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -345,7 +331,6 @@ def reconstruct(
     work: Path | None = None,
     made_from: Mapping[str, Any] = {},
     spent: float = 0.0,
-    may_shrink: bool = False,
     now: Callable[[], float] = time.monotonic,
     track: Track = untracked,
     report: Report = lambda line: None,  # noqa: ARG005
@@ -363,16 +348,14 @@ def reconstruct(
             checkpoint in it, with the same result; None = a temporary folder.
         made_from: what else a run must share with the run that it continues, as JSON values, such as the path and the
             reading options of the scene.
-        spent: seconds that reading the scene took, which count to a promise of seconds.
-        may_shrink: whether the caller begins anew with smaller photographs where promised seconds ask for it.
+        spent: seconds that reading the scene took, which count to a limit of seconds.
         now: the clock.
         track: progress of long loops.
         report: receives a line after seeding and after each validation.
 
     Raises:
         InputError: no photographs, too few of them, nothing to seed from, no Gaussian in view, a loss or gradient that
-            is not finite, a promise that cannot be kept, or a checkpoint of another run.
-        PhotographsTooLargeError: only with `may_shrink`.
+            is not finite, a limit that cannot be kept, or a checkpoint of another run.
 
     Warns:
         SceneWarning: photographs that are masked all over, or plane sweeps that found no surface.
@@ -400,10 +383,8 @@ def reconstruct(
         held_out = drop_masked_views(photographs, held_out, "held-out photographs")
         identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
         chosen_device = choose_device(device)
-        if config.budget.error is not None and not held_out:
-            raise InputError("budget.error: is measured on held-out photographs, and there are none; leave it out")
         if continued:
-            most = max(config.optimize.steps, steps_for_minutes(config.budget.minutes, config.optimize), STEPS[-1])
+            most = max(config.optimize.steps, steps_for_minutes(config.budget.minutes, config.optimize), MOST_STEPS)
             shape = {"steps": most, "sh_degree": config.optimize.sh_degree}
             state = load_state(checkpoint, identity, **shape, device=chosen_device)
         else:
@@ -426,23 +407,15 @@ def reconstruct(
 
         @cache
         def costs() -> Costs:
-            limit = config.budget.clock
-            return measured_costs(optimizer, held_out, inf if limit is None else (limit - elapsed()) * TRIAL_SHARE)
+            return measured_costs(optimizer, held_out)
 
         with clock("trial"):
             if continued:
-                plan = Plan.of(state.facts, steps=config.optimize.steps, sh_degree=config.optimize.sh_degree)
+                plan = Plan.of(state.facts)
             else:
-                plan = make_plan(
-                    optimizer,
-                    config.budget,
-                    costs,
-                    validations,
-                    double_means=bool(scene.origin.any()),
-                    spent=elapsed,
-                    may_shrink=may_shrink,
-                )
-            follow(optimizer, plan)
+                double_means = bool(scene.origin.any())
+                plan = make_plan(optimizer, config.budget, costs, validations, double_means=double_means, spent=elapsed)
+            apply_plan(optimizer, plan)
             saved_from = now()
             if not continued:
                 state = replace(state, adam=optimizer.adam)
@@ -450,16 +423,18 @@ def reconstruct(
             saving = now() - saved_from
             left = optimizer.step, plan.steps, validations(plan.steps)
             seconds = sum(costs().expected(optimizer.config, config.prune, *left))
-            report(describe_plan(optimizer, config.optimize.steps, seconds, config.budget.option_of_steps, STEPS[-1]))
+            option = "budget.minutes" if config.budget.seconds is None else "budget.seconds"
+            report(describe_plan(optimizer, config.optimize.steps, seconds, option))
             for note in (*plan.notes, *late_notes(config.budget, elapsed() + seconds)):
                 report(note)
         if continued:
             # What is repeated does not count.
             first = now() - plan.spent - state.seconds
         pace = None
-        if (limit := config.budget.clock) is not None:
+        if (limit := config.budget.seconds) is not None:
             # The last checkpoint and the splat, and pictures beside it.
-            pace = Pace(costs(), AIMED * limit - 2 * saving - MAX_COMPARISONS * costs().picture, elapsed)
+            until = AIMED * limit - 2 * saving - MAX_COMPARISONS * costs().picture
+            pace = Pace(costs(), optimizer.step, until, elapsed)
         with clock("optimise"):
             fitted = fit(optimizer, state, plan, held_out, config, folder, identity, track, report, pace=pace, now=now)
         exposure = differing = source = None

@@ -187,22 +187,19 @@ class Comparison:
     render: UInt8[np.ndarray, "H W 3"]
 
 
-def describe_plan(optimizer: Optimizer, usual: int, seconds: float, option: str, most: int) -> str:
+def describe_plan(optimizer: Optimizer, usual: int, seconds: float, option: str) -> str:
     """What is about to happen, and how long it should take.
 
     Args:
         optimizer: before its first step, or where it goes on.
         usual: number of steps by default.
         seconds: expected.
-        option: that changes this number; with budget.error more follow until it is reached.
-        most: number of steps that may be done for it.
+        option: that changes the number of steps.
     """
     widths, heights = optimizer.photographs.cameras.widths, optimizer.photographs.cameras.heights
     steps = optimizer.config.steps
     number = f"{steps - optimizer.step:,} more of {steps:,} steps" if optimizer.step else f"{steps:,} steps"
-    if option == "budget.error":
-        number += f", and up to {most:,} until {option} is reached"
-    elif steps != usual:
+    if steps != usual:
         number += f" instead of {usual:,} ({option})"
     expected = f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} s"
     return (

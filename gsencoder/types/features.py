@@ -100,6 +100,13 @@ class FeatureMap:
         grid = next(form for form in (self.features, self.codes, self.shares) if form is not None)
         return np.asarray(grid)
 
+    @property
+    def has_vector(self) -> Bool[np.ndarray, "h w"]:
+        """Which cells have a feature."""
+        if self.codes is not None:
+            return self.codes >= 0
+        return np.asarray(self._grid.any(axis=2) if self.features is None else np.isfinite(self.features[..., 0]))
+
     def rows(self) -> Float32[np.ndarray, "P D"]:
         """The vectors of all cells, row by row of the grid; NaN in cells without a feature."""
         if self.features is not None:

@@ -21,9 +21,10 @@ from gsencoder.app.options import (
 )
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import value_at
-from gsencoder.fusion.cost_model import exact_config
+from gsencoder.fusion.budget import exact_config
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.infer.chunks import EncodeConfig, exact_encoding
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode_budget import exact_encoding
 
 
 def composed(*words: str) -> FuseCommandConfig:

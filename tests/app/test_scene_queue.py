@@ -15,7 +15,7 @@ from gsencoder.app.commands import fuse
 from gsencoder.app.options import SharedScenesConfig
 from gsencoder.app.output import Summary, output_folder
 from gsencoder.app.run import Run
-from gsencoder.app.summary import report_choice, report_promises
+from gsencoder.app.summary import report_budget, report_choice
 from gsencoder.core.errors import BusyError, InputError
 from gsencoder.data.scenes import find_scenes, listed_paths
 from gsencoder.reconstruct.sfm import find_photographed
@@ -90,13 +90,13 @@ def test_each_of_several_scenes_has_its_own_warnings_in_its_summary(tmp_path: Pa
     assert given[-1].warnings == ["weights: old", texts["c"]]
 
 
-def test_a_broken_promise_of_one_of_several_scenes_names_it_on_the_screen_and_stands_in_its_summary_alone(
+def test_a_broken_limit_of_one_of_several_scenes_names_it_on_the_screen_and_stands_in_its_summary_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def run_one(path: Path, out: Path, one: Summary) -> None:
         with output_folder(out, summary=one):
             report_choice(one, path.name, {}, predicted={}, notes=[], quiet=True)
-            report_promises(one, fuse.BudgetConfig(seconds=1.0), {"seconds": 1.5 if path.name == "one" else 2.5})
+            report_budget(one, fuse.FusionBudget(seconds=1.0), {"seconds": 1.5 if path.name == "one" else 2.5})
 
     def run(config: fuse.FuseCommandConfig, run: Run) -> None:
         run.scenes([*map(Path, config.paths)], "features", run_one)
@@ -104,7 +104,7 @@ def test_a_broken_promise_of_one_of_several_scenes_names_it_on_the_screen_and_st
     monkeypatch.setattr(fuse, "run", run)
     out = tmp_path / "out"
     assert cli.main(["fuse", str(tmp_path / "one"), str(tmp_path / "two"), "teacher=palette", f"out={out}"]) == 0
-    broken = "budget.seconds: promised 1, and it became"
+    broken = "budget.seconds: the limit is 1, and it became"
     assert capsys.readouterr().err == f"warning: one: {broken} 1.5\nwarning: two: {broken} 2.5\n"
     for name, seconds in (("one", 1.5), ("two", 2.5)):
         assert json.loads((out / name / "summary.json").read_text())["warnings"] == [f"{broken} {seconds}"]

@@ -1,58 +1,60 @@
-"""What views see of a sample, against B; and the choice of views by what they show."""
+"""What views show by a few rays, against B; and the order of views by what they show."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from fixed_teachers import EXACT, FixedTeacher, make_scene
+from scipy.sparse import csr_array
 
+from gsencoder.fusion import view_coverage
+from gsencoder.fusion.budget import bisection_order, map_at_rays, mean_turn
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.lift import VisibilityConfig, keep_visible
-from gsencoder.fusion.view_coverage import (
-    count_rays,
-    covering_views,
-    list_rays,
-    near_rays,
-    pixels_of,
-    trace_sight,
-    view_order,
-)
+from gsencoder.fusion.view_coverage import coverage_order, covering_views, sample_view
 from gsencoder.render import BlendConfig, blend
+from gsencoder.render.rays import strided_lattice
 
 OPEN = VisibilityConfig(against=())
 
 
 @pytest.mark.parametrize("depth", [False, True])
-def test_rays_that_are_followed_have_the_weights_of_b(depth: bool, rng: np.random.Generator) -> None:
-    depths = [rng.uniform(1.5, 3.0, (24, 32)).astype(np.float32) for _ in range(5)]
-    scene = make_scene(n=400, **({"depths": depths} if depth else {}))
+def test_sampled_rays_have_the_weights_of_b_at_their_pixels(
+    depth: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view_coverage, "RAYS", 100)
+    depths = [rng.uniform(1.5, 3.0, (24, 33)).astype(np.float32) for _ in range(5)]
+    masks = [rng.uniform(size=(24, 33)) > 0.3 for _ in range(5)]
+    scene = make_scene(n=400, masks=masks, **({"depths": depths} if depth else {}))
     assert scene.gaussians is not None
     assert scene.views is not None
     config = BlendConfig(stop_transmittance=1e-6)
     visibility = VisibilityConfig(against=("sensor",), relative=0.2) if depth else OPEN
-    sight = trace_sight(scene.gaussians, scene.views, pixels_of(scene.views), visibility, config)
-    assert sight.followed > 50
-    for view, rays in enumerate(sight.rays):
-        b = blend(scene.gaussians, scene.views.cameras, view, config=config)
-        b = keep_visible(b, depths[view], visibility) if depth else b
-        dense = np.zeros((b.rows, b.gaussians), np.float32)
-        dense[np.repeat(np.arange(b.rows), b.crow.diff().numpy()), b.col.numpy()] = b.weight.numpy()
-        owners = sight.sample[sight.singles :][rays.owners]
-        np.testing.assert_allclose(rays.weights, dense[rays.rows, owners], rtol=1e-4, atol=1e-6)
+    sampled = sample_view(scene.gaussians, scene.views, 2, visibility, config)
+    b = blend(scene.gaussians, scene.views.cameras, 2, config=config)
+    b = keep_visible(b, depths[2][:, :32], visibility) if depth else b
+    assert sampled.shape == (8, 10)
+    assert len(sampled.col) > 50
+    full, part = (
+        csr_array((each.weight.numpy(), each.col.numpy(), each.crow.numpy()), (each.rows, each.gaussians)).toarray()
+        for each in (b, sampled)
+    )
+    pixels = full.reshape(24, 32, -1)[1:24:3, 1:30:3].reshape(80, -1)
+    share = masks[2][1:24:3, 1:30:3].reshape(80, 1)
+    np.testing.assert_allclose(part, pixels * share, rtol=1e-4, atol=1e-6)
 
 
 def test_the_first_views_cover_most_and_one_that_adds_nothing_comes_last() -> None:
-    weights = np.array([[1, 1, 0, 0, 0], [0, 0, 0, 0, 0], [1, 1, 1, 0, 0], [0, 0, 0, 1, 1]], np.float32)
-    order = view_order(weights, 5, 0.05)
-    assert order[0] == 2
-    assert order[1] == 3
-    assert order[-1] == 1
+    seen = np.array([[1, 1, 0, 0, 0], [0, 0, 0, 0, 0], [1, 1, 1, 0, 0], [0, 0, 0, 1, 1]], bool)
+    # Once all are seen, the first view shows two of them a second time.
+    assert coverage_order(seen).tolist() == [2, 3, 0, 1]
+    assert coverage_order(seen, first=(1,)).tolist() == [1, 2, 3, 0]
+    assert coverage_order(np.zeros((3, 4), bool)).tolist() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("weight", [0.01, 0.5, 1.0, 3.0])
-def test_a_view_of_the_same_gaussians_comes_after_one_that_shows_another(weight: float) -> None:
-    weights = weight * np.array([[1, 1, 1, 0], [1, 1, 1, 0], [0, 0, 0, 1]], np.float32)
-    assert view_order(weights, 4, 0.05).tolist() == [0, 2, 1]
+def test_a_view_of_the_same_gaussians_comes_after_one_that_shows_another() -> None:
+    seen = np.array([[1, 1, 1, 0], [1, 1, 1, 0], [0, 0, 0, 1]], bool)
+    assert coverage_order(seen).tolist() == [0, 2, 1]
 
 
 def test_views_by_coverage_see_more_than_evenly_spaced_ones() -> None:
@@ -82,101 +84,42 @@ def test_all_views_need_no_choice_and_rows_are_those_that_are_given() -> None:
     np.testing.assert_array_equal(of_rows.features.features, even.features.features)
 
 
-def test_views_are_judged_by_gaussians_that_they_were_not_chosen_by() -> None:
-    scene = make_scene(n=400)
-    splat, views = scene.gaussians, scene.views
-    assert splat is not None
-    assert views is not None
-    sight = trace_sight(splat, views, pixels_of(views), OPEN, BlendConfig(), size=100)
-    choosing, judging = sight.halves()
-    first, second = (set(each.sample[: each.singles].tolist()) for each in (choosing, judging))
-    assert (len(first), len(second), first & second) == (50, 50, set())
-    assert first | second == set(sight.sample[:100].tolist())
-    for each in (choosing, judging):
-        np.testing.assert_array_equal(each.sample[each.singles :], sight.sample[100:])
-        columns = [sight.sample[:100].tolist().index(row) for row in each.sample[: each.singles]]
-        np.testing.assert_array_equal(each.weights[:, : each.singles], sight.weights[:, columns])
-        np.testing.assert_array_equal(each.areas[:, each.singles :], sight.areas[:, 100:])
-    whole = trace_sight(splat, views, pixels_of(views), OPEN, BlendConfig())
-    assert whole.complete
-    assert whole.halves() == (whole, whole)
+def test_views_in_the_order_of_bisection_are_spread_however_many_are_taken() -> None:
+    for count in (1, 2, 7, 24, 97):
+        order = bisection_order(count)
+        assert sorted(order) == list(range(count))
+        for taken in range(1, count + 1):
+            gaps = np.diff([-1, *sorted(order[:taken]), count])
+            assert gaps.max() <= 2 * count / taken + 2
 
 
-def test_rays_of_slanted_ellipses_are_those_within_them() -> None:
-    """Counted against the inequality itself, at every pixel, of an ellipse whose axes are not the picture's."""
-    a, b, c, r2, u, v = 0.3, 0.14, 0.2, 3.0, 20.3, 15.6
-    projected = np.array([[u, v, 8.0, 8.0, a, b, c, r2]])
-    side, width, height = 4, 10, 8
-    index, depths = np.zeros(1, np.int64), np.array([2.0])
-    least, most = np.zeros(width * height), np.full(width * height, 9.0)
-    counts = np.zeros(1, np.int64)
-    shape = (height, width, side)
-    count_rays(projected, index, depths, least, most, shape, counts)
-    y, x = np.mgrid[0 : height * side, 0 : width * side]
-    dx, dy = x - u, y - v
-    inside = (a * dx * dx + 2 * b * dx * dy + c * dy * dy <= r2) & (abs(dx) <= 8) & (abs(dy) <= 8)
-    assert counts[0] == inside.sum() > 30
-    rays, owners = np.zeros(999, np.int64), np.zeros(999, np.int64)
-    total = list_rays(projected, index, depths, least, most, shape, counts, 999, rays, owners)
-    assert set(rays[:total].tolist()) == set((y * width * side + x)[inside].tolist())
-    # A sample is evenly spread over the list.
-    some = np.zeros(999, np.int64)
-    assert list_rays(projected, index, depths, least, most, shape, counts, 5, some, owners) == 5
-    ranks = [rays[:total].tolist().index(each) for each in some[:5].tolist()]
-    assert ranks == [(2 * k + 1) * total // 10 for k in range(5)]
+def test_what_a_map_shows_at_rays_is_the_cell_that_each_ray_meets_and_nothing_outside() -> None:
+    teacher = FixedTeacher([np.arange(6 * 8 * 6, dtype=np.float32).reshape(6, 8, 6)], stride=4)
+    scene = make_scene()
+    assert scene.views is not None
+    feature_map = teacher.feature_map(scene.views, 0)
+    lattice = strided_lattice(40, 24, 3)  # The map ends after 32 pixels.
+    at_rays = map_at_rays(feature_map, lattice)
+    assert (at_rays.height, at_rays.width) == (lattice.height, lattice.width)
+    for line in range(lattice.height):
+        for column in range(lattice.width):
+            x, y = int(lattice.x0 + 3 * column) // 4, int(lattice.y0 + 3 * line) // 4
+            assert at_rays.has_vector[line, column] == (x < 8)
+            if x < 8:
+                np.testing.assert_array_equal(at_rays.features[line, column], feature_map.features[y, x])
 
 
-def test_balls_that_a_ray_meets_are_near_it_in_pictures_of_unequal_steps() -> None:
-    centers = np.array([[0.0, 0.0, 2.0], [0.0, 0.62, 2.0], [0.62, 0.0, 2.0], [0.0, 0.0, -1.0]])
-    reaches = np.array([0.05, 0.05, 0.05, 0.05])
-    K = np.array([[40.0, 0, 32.0], [0, 40.0, 32.0], [0, 0, 1]])
-    for dx, dy in ((1.0, 1.0), (2.0, 4.0), (4.0, 2.0)):
-        shape = (int(64 / dx / 8), int(64 / dy / 8))
-        for number, (x, y, z) in enumerate(centers[:3]):
-            ends = np.zeros(shape[0] * shape[1])
-            column, row = (40 * x / z + 32) / dx, (40 * y / z + 32) / dy
-            ends[int(row) // 8 * shape[0] + int(column) // 8] = 9.0
-            out = np.zeros(4, np.int64)
-            parts = np.array([[0, 4]])
-            lattice = (0.0, 0.0, dx, dy)
-            count = near_rays(centers, reaches, 1.0, parts, np.eye(4), K, 0.01, lattice, ends, shape, out)
-            assert number in out[:count].tolist()
-            assert 3 not in out[:count].tolist()
-
-
-def test_balls_are_near_every_square_that_they_touch_and_few_others(rng: np.random.Generator) -> None:
-    """Against points on their surfaces, at slants of up to 60 degrees and depths on both sides of 1."""
-    count = 60
-    depths = rng.uniform(0.3, 4, count)
-    centers = np.column_stack((*(rng.uniform(-1.2, 1.2, (2, count)) * depths), depths))
-    reaches = rng.uniform(0.02, 0.1, count) * depths
-    directions = rng.normal(size=(2000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    K, side = np.array([[200.0, 0, 256], [0, 300, 256], [0, 0, 1]]), 64
-    for number in range(count):
-        points = centers[number] + reaches[number] * directions
-        columns, rows = np.floor((points[:, :2] / points[:, 2:] * (200, 300) + 256) / 8).astype(int).T
-        inside = (columns >= 0) & (columns < side) & (rows >= 0) & (rows < side)
-        touched = set(zip(columns[inside].tolist(), rows[inside].tolist(), strict=True))
-        middle = (columns.min() + columns.max()) // 2, (rows.min() + rows.max()) // 2
-        width, height = columns.max() - columns.min() + 1, rows.max() - rows.min() + 1
-        apart = {(middle[0] + 2 * width + 3, middle[1]), (middle[0], middle[1] - 2 * height - 3)}
-        for square, found in [(each, True) for each in touched] + [(each, False) for each in apart]:
-            if not (0 <= square[0] < side and 0 <= square[1] < side):
-                continue
-            ends, out = np.zeros(side * side), np.zeros(1, np.int64)
-            ends[square[1] * side + square[0]] = 9.0
-            ball = centers[number : number + 1], reaches[number : number + 1]
-            lattice, shape, one = (0.0, 0.0, 1.0, 1.0), (side, side), np.array([[0, 1]])
-            assert bool(near_rays(*ball, 1.0, one, np.eye(4), K, 0.01, lattice, ends, shape, out)) == found
-
-
-def test_groups_count_as_much_as_single_gaussians() -> None:
-    """Two views: one sees all groups, one all single Gaussians; of the latter there are more."""
-    weights = np.zeros((2, 6), np.float32)
-    weights[0, 4:], weights[1, :4] = 1, 1
-    weights[1, 4] = 0.5
-    assert view_order(weights, 4, 0.05).tolist() == [1, 0]
-    # Weights below nothing and of nothing gain nothing, whatever their order.
-    assert view_order(np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.float32), 1, 0.05)[0] == 3
-    assert view_order(np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.float32), 1, 0.05, first=(1,))[0] == 1
+def test_the_turn_of_means_is_that_of_independent_vectors(rng: np.random.Generator) -> None:
+    """Vectors of length 1 with noise of variance s² in D dimensions: 1 − cosine is about D s² / 2 (1/k − 1/K)."""
+    maps, count, channels, noise = 8, 4000, 12, 0.05
+    common = rng.normal(size=(count, channels))
+    common /= np.linalg.norm(common, axis=1, keepdims=True)
+    sums = common + noise * rng.normal(size=(maps, count, channels))
+    weights, means = np.ones((maps, count)), np.zeros((maps, channels))
+    # Perpendicular to the vector, the noise has one dimension less.
+    expected = (channels - 1) * noise**2 / 2
+    assert mean_turn(sums, weights, means, range(maps)) == pytest.approx(expected, rel=0.05)
+    # Halves of a recording that differ count, though neighbors are alike.
+    drifting = sums + np.linspace(-0.4, 0.4, maps)[:, None, None] * rng.normal(size=(count, channels))
+    assert mean_turn(drifting, weights, means, range(maps)) > 10 * expected
+    assert mean_turn(sums[:1], weights[:1], means[:1], [0]) == 1

@@ -1,4 +1,4 @@
-"""Budgets of packages: promises hold, wider ones never cost more, and what cannot be is refused with what can."""
+"""Budgets of packages: limits are kept, wider ones never cost more, and what cannot be is refused with what can."""
 
 import json
 import re
@@ -62,13 +62,13 @@ def pack(folder: Path, tmp_path: Path) -> Pack:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_a_promised_error_is_kept_and_a_looser_one_takes_no_more_bytes(pack: Pack, form: str) -> None:
+def test_a_limit_of_error_is_kept_and_a_looser_one_takes_no_more_bytes(pack: Pack, form: str) -> None:
     sizes = []
     for error in (0.003, 0.02, 0.1):
         made = pack(f"form={form}", f"budget.error={error}")
         assert made["measured"] <= error + 1e-5
-        assert made["budget"]["promised"] == {"error": error}
-        assert made["measured"] <= made["budget"]["realised"]["error"] + 1e-5
+        assert made["budget"]["limits"] == {"error": error}
+        assert made["measured"] <= made["budget"]["measured"]["error"] + 1e-5
         assert made["warnings"] == []
         sizes.append(made["size"])
     assert sizes == sorted(sizes, reverse=True)
@@ -76,24 +76,24 @@ def test_a_promised_error_is_kept_and_a_looser_one_takes_no_more_bytes(pack: Pac
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_promised_megabytes_are_kept_and_more_of_them_are_no_less_exact(pack: Pack, form: str) -> None:
+def test_megabytes_are_kept_and_more_of_them_are_no_less_exact(pack: Pack, form: str) -> None:
     errors, sizes = [], (0.0102, 0.014, 0.03, 1.0)
     for size in sizes:
         made = pack(f"form={form}", f"budget.megabytes={size}")
         assert made["size"] <= size
-        assert made["budget"]["realised"] == {"megabytes": made["size"]}
+        assert made["budget"]["measured"] == {"megabytes": made["size"]}
         errors.append(made["measured"])
     assert errors == sorted(errors, reverse=True)
     assert errors[-1] < errors[0]
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_of_two_promises_in_conflict_the_error_is_kept_and_the_size_is_a_warning(pack: Pack, form: str) -> None:
+def test_of_two_limits_in_conflict_the_error_is_kept_and_the_size_is_a_warning(pack: Pack, form: str) -> None:
     made = pack(f"form={form}", "budget.error=0.01", "budget.megabytes=0.009")
     assert made["measured"] <= 0.01
     conflict, broken = made["warnings"]
     assert conflict.endswith("more than budget.megabytes=0.009; budget.error comes first")
-    assert broken.startswith("budget.megabytes: promised 0.009, and it became 0.0")
+    assert broken.startswith("budget.megabytes: the limit is 0.009, and it became 0.0")
     alone = pack(f"form={form}", "budget.error=0.01")
     assert made["size"] == alone["size"]
 
@@ -133,7 +133,7 @@ def test_a_budget_is_refused_beside_what_it_chooses_and_where_nothing_can_be_cho
 
 
 def test_an_error_by_its_short_name_is_the_budget(pack: Pack) -> None:
-    assert pack("error=0.02")["budget"]["promised"] == {"error": 0.02}
+    assert pack("error=0.02")["budget"]["limits"] == {"error": 0.02}
     assert "budget" not in pack()
     assert pack()["error"] <= 0.01
 

@@ -1,4 +1,4 @@
-"""Budgets of encoding: promises hold, wider ones never cost more, and what cannot be is refused with what can."""
+"""Budgets of encoding: limits are kept, wider ones never cost more, and what cannot be is refused with what can."""
 
 import json
 from dataclasses import replace
@@ -12,13 +12,21 @@ from splats import random_gaussians
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat
+from gsencoder.fusion.coordinates import principal_axes
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import features_bytes, load_features, save_features
 from gsencoder.infer import chunks
 from gsencoder.infer import encode_budget as encode_within_module
-from gsencoder.infer.chunks import EncodeBudget, EncodeConfig, check_encode_budget, cut, exact_encoding
+from gsencoder.infer.chunks import EncodeConfig, cut
 from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.encode_budget import BudgetEncoding, all_settings, encode_within, principal_axes
+from gsencoder.infer.encode_budget import (
+    BudgetEncoding,
+    EncodeBudget,
+    SampledEncoding,
+    check_encode_budget,
+    encode_within,
+    exact_encoding,
+)
 from gsencoder.types import Gaussians, Scene
 
 IN_CHUNKS = EncodeConfig(chunk=700)
@@ -41,9 +49,9 @@ def encoder(weights: Path, monkeypatch: pytest.MonkeyPatch) -> TorchEncoder:
 
 
 def within(
-    gaussians: Gaussians, encoder: TorchEncoder, config: EncodeConfig = IN_CHUNKS, **promises: Any
+    gaussians: Gaussians, encoder: TorchEncoder, config: EncodeConfig = IN_CHUNKS, **limits: Any
 ) -> BudgetEncoding:
-    return encode_within(gaussians, encoder, TEACHERS, config, EncodeBudget(**promises))
+    return encode_within(gaussians, encoder, TEACHERS, config, EncodeBudget(**limits))
 
 
 def measured(made: BudgetEncoding, gaussians: Gaussians, encoder: TorchEncoder) -> float:
@@ -52,19 +60,20 @@ def measured(made: BudgetEncoding, gaussians: Gaussians, encoder: TorchEncoder) 
 
 
 @pytest.mark.parametrize("config", [IN_CHUNKS, EncodeConfig()], ids=["chunks", "whole"])
-def test_a_promised_error_is_kept_and_a_looser_one_never_costs_more(
+def test_a_limit_of_error_is_kept_and_a_looser_one_never_costs_more(
     gaussians: Gaussians, encoder: TorchEncoder, config: EncodeConfig
 ) -> None:
-    costs = []
+    sample = SampledEncoding(gaussians, encoder, exact_encoding(config), 1.0)
+    chosen = []
     for error in (1e-7, 1e-3, 0.02, 0.5):
         made = within(gaussians, encoder, config, error=error)
         assert measured(made, gaussians, encoder) <= error
-        costs.append(made.setting.cost)
-    assert costs == sorted(costs, reverse=True)
-    assert costs[-1] < costs[0]
+        chosen.append(sample.settings.index(made.choice.setting))
+    assert chosen == sorted(chosen, reverse=True)
+    assert chosen[-1] == 0 < chosen[0]
 
 
-def test_promised_megabytes_are_kept_and_more_of_them_are_no_less_exact(
+def test_megabytes_are_kept_and_more_of_them_are_no_less_exact(
     gaussians: Gaussians, encoder: TorchEncoder, tmp_path: Path
 ) -> None:
     full = features_bytes(encoder.spaces["labels"], len(gaussians), 4) / 1e6
@@ -75,7 +84,7 @@ def test_promised_megabytes_are_kept_and_more_of_them_are_no_less_exact(
         assert (tmp_path / "f" / "features.safetensors").stat().st_size <= size * 1e6
         errors.append(measured(made, gaussians, encoder))
         ranks.append(made.ranks["labels"])
-        assert made.predicted == pytest.approx(errors[-1], abs=0.01)
+        assert made.predicted["error"] == pytest.approx(errors[-1], abs=0.01)
     assert ranks == sorted(ranks)
     assert 1 <= ranks[0] < ranks[1] < ranks[2] == 4
     assert errors == sorted(errors, reverse=True)
@@ -85,7 +94,7 @@ def test_promised_megabytes_are_kept_and_more_of_them_are_no_less_exact(
 def test_megabytes_that_nothing_fits_into_are_refused_with_those_that_something_does(
     gaussians: Gaussians, encoder: TorchEncoder
 ) -> None:
-    with pytest.raises(InputError, match="^budget.megabytes=0.005: one coordinate of each Gaussian takes ") as refused:
+    with pytest.raises(InputError, match="^budget.megabytes=0.005: the smallest result takes ") as refused:
         within(gaussians, encoder, megabytes=0.005)
     smallest = float(str(refused.value).split("takes ")[1].split(" MB;")[0])
     assert within(gaussians, encoder, megabytes=smallest).ranks == {"labels": 1}
@@ -108,18 +117,12 @@ def test_rooms_that_are_far_apart_are_chosen_for_as_they_are_encoded_and_each_as
     far = replace(gaussians, means=gaussians.means + np.float32([1000, 0, 0]))
     both = Gaussians(**{name: np.concatenate((getattr(gaussians, name), getattr(far, name))) for name in names})
     made = within(both, encoder, EncodeConfig(chunk=len(gaussians)), error=1e-7)
-    assert "halo" not in made.setting.knobs
+    assert made.choice.setting.halo == made.exact.halo
     alone = encoder.encode_spaces(gaussians, made.exact)["labels"].features
     np.testing.assert_array_equal(made.features["labels"].features[: len(gaussians)], alone)
-    exact = replace(made.exact, chunk=1500)
-    both_settings, alone_settings = (
-        all_settings(splat, encoder, exact, EncodeBudget(error=1e-7), metres_per_unit=1.0)[0]
-        for splat in (both, gaussians)
-    )
-    assert [each.knobs for each in both_settings] == [each.knobs for each in alone_settings]
-    assert "halo" in both_settings[0].knobs
-    costs = [2 * each.cost for each in alone_settings]
-    assert [each.cost for each in both_settings] == pytest.approx(costs)
+    samples = [SampledEncoding(splat, encoder, replace(made.exact, chunk=1500), 1.0) for splat in (both, gaussians)]
+    assert [each.is_cut for each in samples] == [True, True]
+    assert samples[0].settings == samples[1].settings
 
 
 class Clock:
@@ -139,7 +142,7 @@ class Clock:
         return self.now
 
 
-def test_promised_seconds_are_kept_and_more_of_them_are_no_less_exact(
+def test_seconds_are_kept_and_more_of_them_are_no_less_exact(
     gaussians: Gaussians, encoder: TorchEncoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock, errors = Clock(encoder, monkeypatch), []
@@ -148,18 +151,20 @@ def test_promised_seconds_are_kept_and_more_of_them_are_no_less_exact(
         made = encode_within(gaussians, encoder, TEACHERS, IN_CHUNKS, budget, clock=clock)
         assert made.seconds <= seconds
         assert made.notes == ()
-        errors.append(made.setting.error)
+        errors.append(made.choice.estimate.error)
     assert errors == sorted(errors, reverse=True)
     assert errors[0] > errors[-1] == 0
     made = encode_within(gaussians, encoder, TEACHERS, IN_CHUNKS, EncodeBudget(seconds=1e-3), clock=clock)
-    assert made.setting.knobs == {"precision": "bfloat16", "halo": 0.0}
+    assert (made.choice.setting.precision, made.choice.setting.halo) == ("bfloat16", 0.0)
     assert "the fastest setting takes about" in made.notes[0]
 
 
-def test_the_same_seed_makes_the_same_choice_and_the_same_features(gaussians: Gaussians, encoder: TorchEncoder) -> None:
-    one, other = (within(gaussians, encoder, error=0.02, seed=3) for _ in range(2))
-    assert one.setting.config == other.setting.config
-    assert one.setting.error == other.setting.error
+def test_the_same_scene_makes_the_same_choice_and_the_same_features(
+    gaussians: Gaussians, encoder: TorchEncoder
+) -> None:
+    one, other = (within(gaussians, encoder, error=0.02) for _ in range(2))
+    assert one.choice.setting == other.choice.setting
+    assert one.choice.estimate.error == other.choice.estimate.error
     np.testing.assert_array_equal(one.features["labels"].features, other.features["labels"].features)
 
 
@@ -168,9 +173,9 @@ def test_what_axes_leave_out_is_what_is_measured(gaussians: Gaussians, encoder: 
     axes = principal_axes(features)
     for rank in (1, 2, 4):
         error = field_error(axes.reduced(features, rank), features, sample=0).total
-        assert error == pytest.approx(axes.left_out(rank), abs=2e-6)
-        assert axes.rank_within(axes.left_out(rank) + 1e-9) == rank
-    assert axes.left_out(4) < 1e-6
+        assert error == pytest.approx(axes.errors[rank - 1], abs=2e-6)
+        assert axes.rank_within(axes.errors[rank - 1] + 1e-9) == rank
+    assert axes.errors[3] < 1e-6
 
 
 def test_a_small_scene_is_encoded_exactly_without_a_choice(
@@ -178,7 +183,7 @@ def test_a_small_scene_is_encoded_exactly_without_a_choice(
 ) -> None:
     monkeypatch.setattr(encode_within_module, "SMALL_SCENE", len(gaussians) + 1)
     made = within(gaussians, encoder, EncodeConfig(), error=0.5)
-    assert (made.sampled, made.setting.config) == (0, made.exact)
+    assert made.choice.setting == made.exact
 
 
 @pytest.mark.parametrize("change", [{"halo": 0.3}, {"precision": "float32"}])
@@ -198,7 +203,7 @@ def splat(tmp_path: Path) -> Path:
 
 @pytest.mark.usefixtures("encoder")
 @pytest.mark.parametrize("check", [True, False])
-def test_the_command_prints_and_records_each_promise_and_what_became_of_it(
+def test_the_command_prints_and_records_each_limit_and_what_became_of_it(
     splat: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], check: bool
 ) -> None:
     out = tmp_path / "out"
@@ -206,10 +211,10 @@ def test_the_command_prints_and_records_each_promise_and_what_became_of_it(
     assert cli.main(["encode", *words, "budget.error=0.05", "budget.megabytes=1"]) == 0
     printed = capsys.readouterr().out
     budget = json.loads((out / "summary.json").read_text())["results"]["budget"]
-    assert budget["promised"] == {"error": 0.05, "megabytes": 1}
-    assert budget["realised"].keys() == ({"error", "megabytes"} if check else {"megabytes"})
-    assert ("budget.error: promised 0.05, realised" if check else "not measured (budget.check=false)") in printed
-    assert "room: budget: precision=bfloat16, rank=4" in printed
+    assert budget["limits"] == {"error": 0.05, "megabytes": 1}
+    assert budget["measured"].keys() == ({"error", "megabytes"} if check else {"megabytes"})
+    assert ("budget.error: limit 0.05, measured" if check else "not measured (budget.check=false)") in printed
+    assert "room: budget: precision=bfloat16, halo=1.28, rank=4" in printed
     assert len(load_features(out).features["six"]) == 600
 
 

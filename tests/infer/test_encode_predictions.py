@@ -11,16 +11,13 @@ from splats import random_gaussians
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import save_features
-from gsencoder.infer import encode_budget as encode_within_module
-from gsencoder.infer import encode_budget as sample
-from gsencoder.infer.chunks import EncodeBudget, EncodeConfig, cut, exact_encoding
+from gsencoder.infer import encode_budget as module
+from gsencoder.infer.chunks import EncodeConfig, cut
 from gsencoder.infer.encode_budget import (
-    DEVIATIONS,
-    SAFETY,
-    Part,
-    Setting,
-    all_settings,
+    EncodeBudget,
+    SampledEncoding,
     encode_within,
+    exact_encoding,
     realised_error,
     seen_around,
 )
@@ -94,24 +91,29 @@ class NearSighted:
 EXACT = replace(exact_encoding(IN_CHUNKS), precision="float32")
 
 
-def settings_of(
-    gaussians: Gaussians, exact: EncodeConfig = EXACT, clock: Any = None, unit: float = 1.0, **promises: Any
-) -> list[Setting]:
-    options = {"metres_per_unit": unit} | ({} if clock is None else {"clock": clock})
-    return all_settings(gaussians, NearSighted(), exact, EncodeBudget(**promises), **options)[0]
+def sampled(gaussians: Gaussians, exact: EncodeConfig = EXACT, clock: Any = None, unit: float = 1.0) -> SampledEncoding:
+    return SampledEncoding(gaussians, NearSighted(), exact, unit, clock)
+
+
+def test_settings_are_halos_in_the_cheapest_precision_and_the_exact_one_last(gaussians: Gaussians) -> None:
+    assert [(each.precision, each.halo) for each in sampled(gaussians).settings] == [
+        *(("bfloat16", halo) for halo in module.HALOS),
+        ("float32", 1.28),
+    ]
 
 
 def test_a_splat_in_other_units_of_length_gets_the_same_setting_and_the_same_errors(gaussians: Gaussians) -> None:
     quarters = replace(gaussians, means=gaussians.means * np.float32(4), scales=gaussians.scales * np.float32(4))
     made = []
     for one, unit in ((gaussians, 1.0), (quarters, 0.25)):
-        settings = settings_of(one, unit=unit, error=0.3)
+        sample = sampled(one, unit=unit)
+        errors = [sample.error(setting) for setting in sample.settings]
         encoding = encode_within(
             one, NearSighted(), ["double"], IN_CHUNKS, EncodeBudget(error=0.9), metres_per_unit=unit
         )
-        assert encoding.setting.config != encoding.exact
+        assert encoding.choice.setting != encoding.exact
         error = realised_error(encoding, one, NearSighted(), metres_per_unit=unit)["double"].total
-        made.append((settings, encoding.setting, encoding.features["double"].features.tolist(), error))
+        made.append((errors, encoding.choice.setting, encoding.features["double"].features.tolist(), error))
     assert made[0] == made[1]
 
 
@@ -119,65 +121,52 @@ def test_the_error_that_is_predicted_is_near_that_of_the_worst_teacher(
     gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Parts as large as the scene predict best."""
-    monkeypatch.setattr(sample, "LEAST_ROWS", len(gaussians))
-    encoder = NearSighted()
+    monkeypatch.setattr(module, "LEAST_ROWS", len(gaussians))
+    monkeypatch.setattr(NearSighted, "precisions", lambda *_: ("float32",))
+    encoder, sample = NearSighted(), sampled(gaussians)
     exact = encoder.encode_spaces(gaussians, EXACT)
-    for setting in settings_of(gaussians, error=0.1):
-        made = encoder.encode_spaces(gaussians, setting.config)
+    assert sample.error(EXACT) == (0, 0)
+    for setting in sample.settings[:-1]:
+        made = encoder.encode_spaces(gaussians, setting)
         error = max(field_error(made[name], exact[name], sample=0).total for name in exact)
-        assert error <= setting.bound
-        if setting.config.precision == "float32":
-            assert error <= setting.error <= 5 * error
-            if setting.config.halo == 0:
-                assert setting.error == pytest.approx(error, rel=0.1)
+        predicted, bound = sample.error(setting)
+        assert error <= predicted <= min(5 * error, bound)
+        if setting.halo == 0:
+            assert predicted == pytest.approx(error, rel=0.1)
 
 
-def test_the_bound_grows_with_the_standard_error_over_parts(
+def test_chunks_that_are_counted_on_a_part_of_a_scene_take_the_seconds_that_they_do_on_all_of_it(
     gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    errors = np.array([0.01, 0.02, 0.06])
-    parts = [Part(rows=1, seconds={}, distances=np.zeros(1), cutting=np.array([error])) for error in errors]
-    monkeypatch.setattr(encode_within_module, "measure_parts", lambda *_, **__: parts)
-    setting = settings_of(gaussians, error=0.1)[-2]
-    assert setting.error == pytest.approx(errors.mean())
-    assert setting.bound == pytest.approx(SAFETY * errors.mean() + DEVIATIONS * errors.std(ddof=1) / 3**0.5)
-
-
-def test_chunks_that_are_counted_on_a_part_of_a_scene_cost_what_they_do_on_all_of_it(
-    gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = settings_of(gaussians, seconds=1.0, clock=iter(np.arange(99.0)).__next__)
-    monkeypatch.setattr(encode_within_module, "CUT_ROWS", len(gaussians) // 3)
-    for setting, other in zip(
-        settings_of(gaussians, seconds=1.0, clock=iter(np.arange(99.0)).__next__), whole, strict=True
-    ):
-        assert setting.cost == pytest.approx(other.cost, rel=0.2)
-        assert setting.seconds == pytest.approx(other.seconds, rel=0.2)
+    whole = sampled(gaussians, clock=iter(np.arange(99.0)).__next__)
+    seconds = [whole.seconds(setting) for setting in whole.settings]
+    monkeypatch.setattr(module, "CUT_ROWS", len(gaussians) // 3)
+    part = sampled(gaussians, clock=iter(np.arange(99.0)).__next__)
+    assert [part.seconds(setting) for setting in part.settings] == pytest.approx(seconds, rel=0.2)
+    assert seconds[:5] == sorted(seconds[:5])
 
 
 def test_seconds_of_a_first_pass_that_loads_kernels_are_not_predicted_for_later_ones(gaussians: Gaussians) -> None:
-    def clock(first: float) -> Any:
-        return iter([0.0, first, *np.arange(1000.0, 1099.0)]).__next__
+    def seconds(first: float) -> list[float]:
+        sample = sampled(gaussians, clock=iter([0.0, first, *np.arange(1000.0, 1099.0)]).__next__)
+        return [sample.seconds(setting) for setting in sample.settings]
 
-    slow, plain = (settings_of(gaussians, seconds=1.0, clock=clock(first)) for first in (500.0, 1.0))
-    assert slow == plain
+    assert seconds(500.0) == seconds(1.0)
 
 
-def test_a_small_scene_has_all_precisions_to_choose_among_where_seconds_are_promised(
+def test_a_small_scene_has_all_precisions_to_choose_among_where_seconds_are_limited(
     gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(encode_within_module, "SMALL_SCENE", len(gaussians) + 1)
+    monkeypatch.setattr(module, "SMALL_SCENE", len(gaussians) + 1)
     whole = replace(EXACT, chunk=0)
-    assert [setting.config.precision for setting in settings_of(gaussians, whole, seconds=9.0)] == [
-        "float32",
-        "bfloat16",
-    ]
-    assert [setting.config.precision for setting in settings_of(gaussians, whole, error=0.1)] == ["float32"]
+    timed, untimed = sampled(gaussians, whole, clock=lambda: 0.0), sampled(gaussians, whole)
+    assert [setting.precision for setting in timed.settings] == ["bfloat16", "float32"]
+    assert untimed.settings == [whole]
 
 
 def test_megabytes_are_those_of_the_files_of_all_teachers_together(gaussians: Gaussians, tmp_path: Path) -> None:
     encoder, teachers = NearSighted(), ["single", "double"]
-    with pytest.raises(InputError, match="one coordinate of each Gaussian takes ") as refused:
+    with pytest.raises(InputError, match="the smallest result takes ") as refused:
         encode_within(gaussians, encoder, teachers, EXACT, EncodeBudget(megabytes=0.005))
     smallest = float(str(refused.value).split("takes ")[1].split(" MB;")[0])
     with pytest.raises(InputError, match="give more"):
@@ -192,13 +181,13 @@ def test_megabytes_are_those_of_the_files_of_all_teachers_together(gaussians: Ga
     assert (ranks[0], ranks[-1]) == ((1, 1), (4, 4))
 
 
-def test_a_setting_and_the_coordinates_left_out_share_a_promised_error(
+def test_a_setting_and_the_coordinates_left_out_share_the_limit_of_error(
     gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(encode_within_module, "SMALL_SCENE", 0)
+    monkeypatch.setattr(module, "SMALL_SCENE", 0)
     for error in (0.05, 0.2, 0.45):
         made = encode_within(
             gaussians, NearSighted(), ["single"], EncodeConfig(), EncodeBudget(error=error, megabytes=1e-6)
         )
-        left_out = made.predicted - made.setting.error
-        assert made.setting.bound + left_out <= error
+        left_out = made.predicted["error"] - made.choice.estimate.error
+        assert made.choice.estimate.bound + left_out <= error

@@ -10,21 +10,21 @@ from reconstructions import cut_at
 from splats import random_gaussians
 from walls import cameras, wall_views
 
+from gsencoder.core.budget import PLANNED
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import PLANNED
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
 from gsencoder.reconstruct.parameters import RowAdam, parameters_from
 from gsencoder.reconstruct.plan import (
     LEAST_STEPS,
-    PROMISED_STEPS,
-    BudgetConfig,
+    STEPS_IN_SECONDS,
+    ReconstructBudget,
     affordable_steps,
     choose_scale,
+    spread_views,
     step_seconds,
     steps_for_minutes,
-    trial_views,
 )
 from gsencoder.reconstruct.run import ReconstructConfig, reconstruct
 from gsencoder.types import Cameras, Scene
@@ -39,13 +39,15 @@ def pictures(width: int, height: int) -> Cameras:
 def test_small_photographs_stay_and_phone_photographs_are_made_smaller(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
-    ten = BudgetConfig()
+    ten = ReconstructBudget()
     assert choose_scale(pictures(320, 240), ten, CPU, USUAL) == 1
     phone = choose_scale(pictures(4000, 3000), ten, CPU, USUAL)
     assert 0.05 < phone < 0.2
-    assert choose_scale(pictures(4000, 3000), BudgetConfig(minutes=0.0), CPU, USUAL) == 1
+    assert choose_scale(pictures(4000, 3000), ReconstructBudget(minutes=0.0), CPU, USUAL) == 1
     # More time gives larger pictures, whatever they are; a GPU needs less.
-    scales = [choose_scale(pictures(4000, 3000), BudgetConfig(minutes=float(m)), CPU, USUAL) for m in (3, 10, 30, 100)]
+    scales = [
+        choose_scale(pictures(4000, 3000), ReconstructBudget(minutes=float(m)), CPU, USUAL) for m in (3, 10, 30, 100)
+    ]
     assert scales == sorted(scales)
     assert scales[0] < scales[-1]
     assert choose_scale(pictures(4000, 3000), ten, torch.device("cuda"), USUAL) > phone
@@ -54,15 +56,15 @@ def test_small_photographs_stay_and_phone_photographs_are_made_smaller(monkeypat
     assert steps_for_minutes(10.0, USUAL) * step_seconds(pixels, 60_000.0, CPU, USUAL) <= 600 * 0.81
 
 
-def test_for_promised_seconds_photographs_are_made_smaller_only_where_there_is_no_time_for_some_steps(
+def test_for_a_limit_of_seconds_photographs_are_made_smaller_only_where_there_is_no_time_for_some_steps(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("torch.get_num_threads", lambda: 2)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
-    needed = PROMISED_STEPS * step_seconds(640.0 * 480.0, 60_000.0, CPU, USUAL) / (PLANNED * 0.8)
+    needed = STEPS_IN_SECONDS * step_seconds(640.0 * 480.0, 60_000.0, CPU, USUAL) / (PLANNED * 0.8)
 
     def scale(seconds: float, *, width: int = 640, height: int = 480, spent: float = 0.0) -> float:
-        return choose_scale(pictures(width, height), BudgetConfig(seconds=seconds), CPU, USUAL, spent=spent)
+        return choose_scale(pictures(width, height), ReconstructBudget(seconds=seconds), CPU, USUAL, spent=spent)
 
     assert scale(1.01 * needed) == 1
     assert 0.6 < scale(0.75 * needed) < 1
@@ -81,21 +83,15 @@ def test_the_usual_photograph_decides_by_how_much_all_are_made_smaller() -> None
     usual = pictures(4000, 3000)
     widths, heights = np.int32([4000, 4000, 12000]), np.int32([3000, 3000, 9000])
     other = replace(usual, widths=widths, heights=heights)
-    assert choose_scale(other, BudgetConfig(), CPU, USUAL) == choose_scale(usual, BudgetConfig(), CPU, USUAL)
+    assert choose_scale(other, ReconstructBudget(), CPU, USUAL) == choose_scale(usual, ReconstructBudget(), CPU, USUAL)
 
 
-def test_promised_seconds_come_before_the_aim_in_minutes_and_leave_a_second_at_least() -> None:
-    assert BudgetConfig(minutes=3.0).minutes_left(1e6) == 3
-    promise = BudgetConfig(minutes=3.0, seconds=600.0)
-    assert promise.minutes_left() == pytest.approx(PLANNED * 10)
-    assert promise.minutes_left(60.0) == pytest.approx(PLANNED * 10 - 1)
-    assert promise.minutes_left(600.0) == pytest.approx(1 / 60)
-
-
-def test_the_option_that_chooses_the_steps_is_the_promise_that_comes_first() -> None:
-    assert BudgetConfig(megabytes=1.0).option_of_steps == "budget.minutes"
-    assert BudgetConfig(megabytes=1.0, seconds=9.0).option_of_steps == "budget.seconds"
-    assert BudgetConfig(error=0.1, seconds=9.0).option_of_steps == "budget.error"
+def test_limited_seconds_come_before_the_aim_in_minutes_and_leave_a_second_at_least() -> None:
+    assert ReconstructBudget(minutes=3.0).minutes_left(1e6) == 3
+    limited = ReconstructBudget(minutes=3.0, seconds=600.0)
+    assert limited.minutes_left() == pytest.approx(PLANNED * 10)
+    assert limited.minutes_left(60.0) == pytest.approx(PLANNED * 10 - 1)
+    assert limited.minutes_left(600.0) == pytest.approx(1 / 60)
 
 
 def test_cores_and_stages_count(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -130,10 +126,10 @@ def optimizer(config: OptimizeConfig) -> Optimizer:
 
 
 def test_four_views_from_the_first_to_the_last_stand_for_all() -> None:
-    assert trial_views(range(100, 110)) == [100, 103, 106, 109]
-    assert trial_views([2, 3, 5, 8, 13]) == [2, 3, 5, 13]
-    assert trial_views([7, 4]) == [7, 4]
-    assert trial_views([7]) == [7]
+    assert spread_views(range(100, 110), 4) == [100, 103, 106, 109]
+    assert spread_views([2, 3, 5, 8, 13], 4) == [2, 3, 8, 13]
+    assert spread_views([7, 4], 4) == [7, 4]
+    assert spread_views([7], 4) == [7]
 
 
 def test_steps_that_were_asked_for_are_taken_and_the_default_fits_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,7 +150,7 @@ def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
 ) -> None:
     """Also on a machine that would have planned other ones."""
     scene = Scene(name="wall", views=wall_views(6, depth=True), metres_per_unit=1.0)
-    config = ReconstructConfig(holdout=0, seeds=SeedConfig(voxel=0.15), budget=BudgetConfig(minutes=0.01))
+    config = ReconstructConfig(holdout=0, seeds=SeedConfig(voxel=0.15), budget=ReconstructBudget(minutes=0.01))
     monkeypatch.setattr("gsencoder.reconstruct.plan.LEAST_STEPS", 20)
     with cut_at(7):
         reconstruct(scene, config, work=tmp_path)
@@ -169,4 +165,4 @@ def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
 @pytest.mark.parametrize("minutes", [-1.0, float("inf")])
 def test_a_time_that_cannot_be_is_refused(minutes: float) -> None:
     with pytest.raises(InputError, match="minutes: expected 0"):
-        BudgetConfig(minutes=minutes)
+        ReconstructBudget(minutes=minutes)

@@ -1,11 +1,10 @@
-"""The time that is announced: the sum of all that is left to do, on the Gaussians that pruning will leave."""
+"""The time that is announced, by a few trial steps, and the clock that changes the number of steps."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from splats import random_gaussians
 from walls import wall_views
 
 from gsencoder.data.photographs import Photographs
@@ -47,61 +46,45 @@ class Work:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 0.0
-        gradients, contributing = Optimizer.gradients, Optimizer.contributing
+        gradients = Optimizer.gradients
 
         def timed_gradients(one: Optimizer, view: int, shrink: int) -> PhotographGradients:
             slopes = gradients(one, view, shrink)
             self.now += len(slopes.rows) / shrink**2
             return slopes
 
-        def timed_contributing(one: Optimizer) -> torch.Tensor:
-            self.now += 3 * len(one.parameters["means"])
-            return contributing(one)
-
         def timed_score(one: Optimizer, views: list[int]) -> Score:
             self.now += 500 * len(views)
             return score(one, views)
 
         monkeypatch.setattr(Optimizer, "gradients", timed_gradients)
-        monkeypatch.setattr(Optimizer, "contributing", timed_contributing)
         monkeypatch.setattr(expected_time, "score", timed_score)
         monkeypatch.setattr(expected_time.time, "perf_counter", lambda: self.now)
 
 
-def test_what_is_announced_is_the_work_that_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
-    work, one = Work(monkeypatch), optimizer(splat())
+def test_a_trial_is_short_and_announces_the_work_that_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    work, one = Work(monkeypatch), optimizer(splat(), at=())
     announced = sum(expected_seconds(one, HELD_OUT, 3))
-    begun, before = work.now, len(one.parameters["means"])
+    trial, begun = work.now, work.now
     while one.step < CONFIG.steps:
         one.advance()
-    assert len(one.parameters["means"]) < 0.7 * before
     assert announced == pytest.approx(work.now - begun + 3 * 500, rel=0.15)
+    # Of each kind of step and of a picture three looks.
+    rows = max(len(one.gradients(view, 1).rows) for view in TRAINING)
+    assert trial <= 3 * (rows + rows / 4 + 500)
 
 
-@pytest.mark.parametrize(("at", "at_step"), [((0.5,), 10), ((0.5, 0.75), 10), ((0.25, 0.5, 0.75), 5)])
-def test_every_pruning_is_announced_and_steps_after_the_first_are_of_what_it_leaves(
-    monkeypatch: pytest.MonkeyPatch, at: tuple[float, ...], at_step: int
-) -> None:
-    """A step costs as many units as there are Gaussians, a quarter of it at half the size, and a pruning three."""
-    work, one = Work(monkeypatch), optimizer(splat(), at=at)
-    before, left = len(one.parameters["means"]), len(one.contributing())
-    assert left < 0.7 * before
-
-    def step(one: Optimizer, shrink: int, view: int) -> None:
-        assert view in TRAINING
-        work.now += len(one.parameters["means"]) / shrink**2
-
-    monkeypatch.setattr(expected_time, "_step", step)
-    steps = sum((before if step < at_step else left) / (4 if step < 6 else 1) for step in range(20))
-    prunings = 3 * (before + (len(at) - 1) * left)
-    assert expected_seconds(one, [], 0) == pytest.approx((steps, prunings), rel=1e-6)
+def test_every_pruning_is_announced_as_a_step_of_half_the_size_for_each_photograph() -> None:
+    work = measured_costs(optimizer(splat()), [])
+    assert work.pruning == len(TRAINING) * min(work.steps.values()) > 0
+    assert work.steps.keys() == {1, 2}
 
 
 def test_each_kind_of_work_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     work = Work(monkeypatch)
     one = optimizer(splat(), at=())
     steps = expected_seconds(one, [], 0).steps
-    rows = [len(one.gradients(view, 1).rows) for view in TRAINING[:4]]
+    rows = [len(one.gradients(view, 1).rows) for view in (TRAINING[0], TRAINING[-1])]
     # Two stages: 6 steps of photographs of half the size, and 14 of the full size.
     assert steps == pytest.approx(np.mean(rows) * (6 / 4 + 14), rel=0.1)
     assert expected_seconds(one, HELD_OUT, 2) == pytest.approx((steps, 2 * 500))
@@ -114,20 +97,22 @@ def test_each_kind_of_work_counts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def seconds_of_steps() -> Costs:
-    """A second each, and of two prunings 5 and 3."""
-    kinds = {(shrink, pruned): 1.0 for shrink in (1, 2) for pruned in (False, True)}
-    return Costs(step=0, steps=kinds, prunings=(5.0, 3.0), validation=0.0, picture=0.0)
+    """A second each, and of a pruning 5."""
+    return Costs(steps={1: 1.0, 2: 1.0}, pruning=5.0, validation=0.0, picture=0.0)
 
 
 def test_prunings_before_the_steps_that_are_asked_for_do_not_count() -> None:
     config, prune = replace(CONFIG, steps=20), PruneConfig(at=(0.25, 0.75))
-    assert seconds_of_steps().expected(config, prune, 0, 20, 0) == (20, 8)
-    assert seconds_of_steps().expected(config, prune, 10, 20, 0) == (10, 3)
+    assert seconds_of_steps().expected(config, prune, 0, 20, 0) == (20, 10)
+    assert seconds_of_steps().expected(config, prune, 10, 20, 0) == (10, 5)
 
 
-def test_the_clock_is_looked_at_after_a_quarter_of_what_is_left_and_changes_the_steps_by_the_pace_since_then() -> None:
+def test_the_clock_is_looked_at_after_a_quarter_of_what_is_left_and_changes_the_steps_by_the_pace_since_then(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(expected_time, "MOST_STEPS", 70)
     one, now = optimizer(splat(), at=()), 0.0
-    pace = Pace(seconds_of_steps(), 100.0, lambda: now)
+    pace = Pace(seconds_of_steps(), one.step, 100.0, lambda: now)
     # Second and step, the steps that were planned, and those that there is time for, 70 at most.
     for second, step, planned, steps in (
         (24.0, 10, 100, 100),
@@ -139,19 +124,13 @@ def test_the_clock_is_looked_at_after_a_quarter_of_what_is_left_and_changes_the_
         (120.0, 62, 70, 63),
     ):
         now, one.step, one.config = second, step, replace(CONFIG, steps=planned)
-        assert pace.steps(one, lambda step, of: False, 70) == steps
+        assert pace.steps(one, lambda step, of: False) == steps
     # A fiftieth is changed as well.
-    now = 0.0
-    pace = Pace(seconds_of_steps(), 100.0, lambda: now)
+    monkeypatch.undo()
+    now, one.step = 0.0, 0
+    pace = Pace(seconds_of_steps(), one.step, 100.0, lambda: now)
     one.config, one.step, now = replace(CONFIG, steps=100), 50, 52.0
-    assert pace.steps(one, lambda step, of: False, 1000) == 96
-
-
-def test_a_pruning_that_would_leave_nothing_now_is_no_error_before_its_time() -> None:
-    nothing = replace(random_gaussians(50), opacities=np.full(50, 0.003, np.float32))
-    made = np.random.default_rng(0)
-    means = np.column_stack((made.uniform(-1, 1, 50), made.uniform(-1, 1, 50), np.full(50, 3.0)))
-    assert expected_seconds(optimizer(replace(nothing, means=means.astype(np.float32))), HELD_OUT, 2).steps > 0
+    assert pace.steps(one, lambda step, of: False) == 96
 
 
 def test_the_trial_changes_nothing() -> None:

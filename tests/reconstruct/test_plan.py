@@ -13,12 +13,10 @@ from gsencoder.reconstruct import plan as planning
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
 from gsencoder.reconstruct.parameters import RowAdam, parameters_from
 from gsencoder.reconstruct.plan import (
-    BudgetConfig,
     Costs,
-    PhotographsTooLargeError,
     Plan,
-    error_of,
-    follow,
+    ReconstructBudget,
+    apply_plan,
     late_notes,
     make_plan,
 )
@@ -26,8 +24,6 @@ from gsencoder.reconstruct.score import MAX_COMPARISONS, split
 from gsencoder.types import Scene
 
 SEEDS = SeedConfig(voxel=0.15)
-STEPS = (2, 4, 8)
-"""In place of hundreds."""
 
 
 @pytest.fixture
@@ -40,12 +36,10 @@ def optimizer(scene: Scene) -> Optimizer:
 
 def costs() -> Costs:
     """Of a step 3 s, of each of three prunings 4 s."""
-    return Costs(step=0, steps={(2, False): 3.0, (1, True): 3.0}, prunings=(4.0, 4.0), validation=0.0, picture=0.0)
+    return Costs(steps={1: 3.0, 2: 3.0}, pruning=4.0, validation=0.0, picture=0.0)
 
 
-def planned(
-    optimizer: Optimizer, budget: BudgetConfig, *, spent: float = 0.0, double: bool = False, may_shrink: bool = False
-) -> Plan:
+def planned(optimizer: Optimizer, budget: ReconstructBudget, *, spent: float = 0.0, double: bool = False) -> Plan:
     return make_plan(
         optimizer,
         budget,
@@ -53,27 +47,26 @@ def planned(
         lambda steps: 2,
         double_means=double,
         spent=lambda: spent,
-        may_shrink=may_shrink,
     )
 
 
 def test_less_room_first_costs_degrees_of_color_and_then_gaussians(optimizer: Optimizer) -> None:
     contributing = len(optimizer.contributing())
     plans = [
-        planned(optimizer, BudgetConfig(megabytes=(2048 + contributing * row) / 1e6 + 1e-9))
+        planned(optimizer, ReconstructBudget(megabytes=(2048 + contributing * row) / 1e6 + 1e-9))
         for row in (164, 163, 104, 103, 68, 34)
     ]
     assert [plan.sh_degree for plan in plans] == [2, 1, 1, 0, 0, 0]
     assert [plan.most is not None and plan.most >= contributing for plan in plans] == [True] * 5 + [False]
     assert plans[-1].most == contributing // 2
     # Positions as doubles take 12 bytes more.
-    follow(optimizer, Plan(steps=9, sh_degree=0))
-    wide = BudgetConfig(megabytes=(2048 + contributing * 68) / 1e6)
+    apply_plan(optimizer, Plan(steps=9, sh_degree=0))
+    wide = ReconstructBudget(megabytes=(2048 + contributing * 68) / 1e6)
     assert planned(optimizer, wide, double=True).most == (contributing * 68) // 80
 
 
 def test_a_size_that_one_gaussian_fits_into_is_planned_with_that_one_in_a_single_color(optimizer: Optimizer) -> None:
-    plan = planned(optimizer, BudgetConfig(megabytes=(2048 + 68.5) / 1e6))
+    plan = planned(optimizer, ReconstructBudget(megabytes=(2048 + 68.5) / 1e6))
     assert (plan.sh_degree, plan.most) == (0, 1)
 
 
@@ -87,28 +80,23 @@ def test_where_nothing_contributes_yet_all_gaussians_are_to_fit(
     count = len(optimizer.parameters["means"])
     for row, degree in ((164, 2), (163, 1), (103, 0)):
         size = (2048 + count * row) / 1e6 + 1e-9
-        plan = planned(optimizer, BudgetConfig(megabytes=size))
+        plan = planned(optimizer, ReconstructBudget(megabytes=size))
         assert plan.sh_degree == degree
         assert plan.megabytes == pytest.approx((2048 + count * (164, 104, 68)[2 - degree]) / 1e6)
         optimizer.adam = RowAdam(dict(optimizer.parameters, shN=torch.zeros(count, 8, 3)))
 
 
-def test_an_error_is_that_of_surfaces_that_a_fitted_photograph_shows_where_these_are_known() -> None:
-    assert error_of({"ssim": 0.5, "seen_ssim": 0.75}) == 0.25
-    assert error_of({"ssim": 0.5}) == 0.5
-
-
-@pytest.mark.parametrize("promises", [{}, {"error": 0.5}, {"megabytes": 1.0}])
-def test_a_plan_holds_the_seconds_before_its_first_step_whatever_is_promised(
-    optimizer: Optimizer, promises: dict[str, float]
+@pytest.mark.parametrize("limits", [{}, {"megabytes": 1.0}])
+def test_a_plan_holds_the_seconds_before_its_first_step_whatever_is_limited(
+    optimizer: Optimizer, limits: dict[str, float]
 ) -> None:
-    assert planned(optimizer, BudgetConfig(**promises), spent=7.0).spent == 7
+    assert planned(optimizer, ReconstructBudget(**limits), spent=7.0).spent == 7
 
 
 def test_the_colors_of_a_plan_are_those_that_were_there_without_the_higher_coefficients(optimizer: Optimizer) -> None:
     optimizer.parameters["shN"].normal_()
     before = {name: value.clone() for name, value in optimizer.parameters.items()}
-    follow(optimizer, Plan(steps=7, sh_degree=1, most=9))
+    apply_plan(optimizer, Plan(steps=7, sh_degree=1, most=9))
     assert (optimizer.config.steps, optimizer.config.sh_degree, optimizer.most) == (7, 1, 9)
     for name, value in optimizer.parameters.items():
         np.testing.assert_array_equal(value, before[name][:, :3] if name == "shN" else before[name])
@@ -136,41 +124,15 @@ def test_a_full_pruning_leaves_those_that_contribute_most_in_their_order(optimiz
 
 
 @pytest.mark.parametrize(
-    ("errors", "steps"),
-    [
-        ([0.9, 0.8], 150),
-        ([0.9, 0.8, 0.85], 200),
-        ([0.9, 0.8, 0.85, 0.79], 300),
-        ([0.9, 0.8, 0.85, 0.8], 200),
-        ([0.9, 0.9, 0.9], 150),
-        ([0.9, 0.4], 100),
-    ],
-)
-def test_an_error_that_two_looks_did_not_make_smaller_is_given_up(errors: list[float], steps: int) -> None:
-    rows = [{"step": 0, "ssim": 0.0, "psnr": 9.0}]
-    rows += [{"step": step, "ssim": 1 - error} for step, error in zip(planning.STEPS, errors, strict=False)]
-    # Validations between two looks say nothing.
-    rows.insert(1, {"step": 30, "ssim": 0.55})
-    plan = Plan(steps=int(rows[-1]["step"]), sh_degree=2)
-    longer = planning.extended(plan, BudgetConfig(error=0.5), rows)
-    assert longer.steps == steps
-    given_up = errors[-2:] == [0.85, 0.8] or errors == [0.9, 0.9, 0.9]
-    assert bool(longer.notes) == given_up
-    if errors[-1] == 0.8 and given_up:
-        assert longer.notes == (
-            "budget.error=0.5: it has not fallen since step 100 (0.8000), so no more steps are done",
-        )
-
-
-@pytest.mark.parametrize(
     ("seconds", "steps", "total"), [(100.0, 22, 98.0), (1000.0, 100, 332.0), (50.0, 5, 47.0), (40.0, 2, 38.0)]
 )
 def test_seconds_buy_steps_by_what_trial_steps_take(
     optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch, seconds: float, steps: int, total: float
 ) -> None:
     """A step takes 3 s, all else 12 s, and 20 s are spent; at most 100 steps."""
-    monkeypatch.setattr(planning, "STEPS", (5, 100))
-    plan = planned(optimizer, BudgetConfig(seconds=seconds), spent=20.0)
+    monkeypatch.setattr(planning, "MOST_STEPS", 100)
+    monkeypatch.setattr(planning, "FEW_STEPS", 5)
+    plan = planned(optimizer, ReconstructBudget(seconds=seconds), spent=20.0)
     assert (plan.steps, plan.seconds, plan.spent) == (steps, pytest.approx(total), 20.0)
     few = ("budget.seconds=40: has time for 2 steps; budget.seconds=48 has for 5",)
     assert plan.notes == (few if steps < 5 else ())
@@ -181,7 +143,7 @@ def test_seconds_are_kept_for_as_many_validations_as_the_steps_have_and_for_the_
     measured = replace(costs(), validation=6.0, picture=4.0)
     plan = make_plan(
         optimizer,
-        BudgetConfig(seconds=500.0),
+        ReconstructBudget(seconds=500.0),
         lambda: measured,
         lambda steps: 2 + steps // 50,
         double_means=False,
@@ -192,35 +154,17 @@ def test_seconds_are_kept_for_as_many_validations_as_the_steps_have_and_for_the_
     assert plan.seconds == pytest.approx(needed, abs=6)
 
 
-def test_minutes_that_are_exceeded_by_more_than_half_are_said_where_nothing_is_promised() -> None:
-    assert late_notes(BudgetConfig(minutes=10.0), 900.0) == ()
-    (note,) = late_notes(BudgetConfig(minutes=10.0), 901.0)
+def test_minutes_that_are_exceeded_by_more_than_half_are_said_where_nothing_is_limited() -> None:
+    assert late_notes(ReconstructBudget(minutes=10.0), 900.0) == ()
+    (note,) = late_notes(ReconstructBudget(minutes=10.0), 901.0)
     assert "budget.minutes=10 aims at less; budget.seconds=600" in note
-    for budget in (BudgetConfig(minutes=0.0), BudgetConfig(minutes=10.0, error=0.5)):
+    for budget in (ReconstructBudget(minutes=0.0), ReconstructBudget(minutes=10.0, seconds=900.0)):
         assert late_notes(budget, 901.0) == ()
 
 
 def test_seconds_that_are_over_before_the_first_step_are_refused(optimizer: Optimizer) -> None:
     problem = "budget.seconds=20: is over before the first step: 20 s went into reading photographs and seeding; "
     with pytest.raises(InputError, match=problem + "give more seconds, a smaller data.image_scale"):
-        planned(optimizer, BudgetConfig(seconds=20.0), spent=19.7)
+        planned(optimizer, ReconstructBudget(seconds=20.0), spent=19.7)
     with pytest.raises(InputError, match="budget.seconds=35: has time for 0 steps; budget.seconds=186 has for 50"):
-        planned(optimizer, BudgetConfig(seconds=35.0), spent=20.0)
-    # A promised error comes before seconds.
-    assert planned(optimizer, BudgetConfig(seconds=20.0, error=0.5), spent=19.7).steps == planning.STEPS[0]
-
-
-def test_photographs_are_to_be_smaller_where_there_is_time_for_few_steps_and_for_another_beginning(
-    optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # Photographs as small as these are made no smaller.
-    few, enough = BudgetConfig(seconds=240.0), BudgetConfig(seconds=400.0)
-    assert planned(optimizer, few, spent=20.0, may_shrink=True).steps == 67
-    monkeypatch.setattr(planning, "least_pixels", lambda *_: 100.0)
-    with pytest.raises(PhotographsTooLargeError) as wanted:
-        planned(optimizer, few, spent=20.0, may_shrink=True)
-    # (0.98 · 240 − 20 − 12) / 3 = 67 steps, of 200 that are wished for.
-    assert wanted.value.args[0] == pytest.approx((67 / 200) ** 0.5, abs=1e-3)
-    assert planned(optimizer, few, spent=20.0).steps == 67
-    assert planned(optimizer, few, spent=110.0, may_shrink=True).steps == 37
-    assert planned(optimizer, enough, spent=20.0, may_shrink=True).steps > planning.FEW_STEPS
+        planned(optimizer, ReconstructBudget(seconds=35.0), spent=20.0)

@@ -6,18 +6,19 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 from gsencoder.app.options import SharedScenesConfig, settings, typed
 from gsencoder.app.output import Summary
-from gsencoder.app.run import Progress, Run
+from gsencoder.app.run import Run
 from gsencoder.app.scenes import with_reported_up
-from gsencoder.app.summary import basis_figures, describe_basis, report_choice, report_promises
+from gsencoder.app.summary import basis_figures, describe_basis, report_budget, report_choice
 from gsencoder.core.arrays import even_indices
+from gsencoder.core.budget import MEGABYTE
 from gsencoder.core.errors import InputError, SceneWarning, about, counted
 from gsencoder.core.pretrained import digest_files
 from gsencoder.core.process import retain_freed_memory
-from gsencoder.core.settings import MEGABYTE, option
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
@@ -31,32 +32,27 @@ from gsencoder.fusion.folder import (
     save_features,
     save_tables,
 )
-from gsencoder.infer.chunks import EncodeBudget, EncodeConfig, check_encode_budget, exact_encoding
-from gsencoder.infer.encode_budget import BudgetEncoding, encode_within, realised_error
+from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode_budget import (
+    BudgetEncoding,
+    EncodeBudget,
+    check_encode_budget,
+    encode_within,
+    exact_encoding,
+    realised_error,
+)
 from gsencoder.infer.load import Encoder, file_of_encoder, load_encoder
 from gsencoder.models.output_space import teacher_of_space
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene
-
-
-@runtime_checkable
-class BudgetOptions(Protocol):
-    """The options of a command that encodes within a budget."""
-
-    @property
-    def encode(self) -> EncodeConfig: ...
-    @property
-    def budget(self) -> EncodeBudget: ...
-    @property
-    def quiet(self) -> bool: ...
 
 
 def encode_in_budget(
     scene: Scene,
     encoder: Encoder,
     teachers: Sequence[str],
-    config: BudgetOptions,
+    config: "EncodeCommandConfig",
     made_with: Mapping[str, str],
-    summary: Summary,
+    run: Run,
     *,
     metres_per_unit: float,
 ) -> BudgetEncoding:
@@ -72,54 +68,37 @@ def encode_in_budget(
         config.budget,
         metres_per_unit=metres_per_unit,
         header={"encode": settings(longest), **made_with},
-        track=Progress(quiet=config.quiet),
+        track=run.track,
     )
-    summary.add_seconds({"choose": encoding.choosing, "encode": encoding.seconds - encoding.choosing})
-    ranks = {"rank" if len(encoding.ranks) == 1 else f"rank of {name}": rank for name, rank in encoding.ranks.items()}
-    report_choice(
-        summary,
-        scene.name,
-        {**encoding.setting.knobs, **ranks},
-        predicted={
-            "error": encoding.predicted,
-            "seconds": encoding.choosing + encoding.setting.seconds if config.budget.seconds is not None else None,
-        },
-        notes=encoding.notes,
-        quiet=config.quiet,
-        gaussians_sampled=encoding.sampled,
-    )
+    run.add_seconds({"choose": encoding.choosing, "encode": encoding.seconds - encoding.choosing})
+    setting, ranks = encoding.choice.setting, encoding.ranks
+    chosen: dict[str, Any] = {"precision": setting.precision, "halo": setting.halo}
+    chosen |= {"rank" if len(ranks) == 1 else f"rank of {name}": rank for name, rank in ranks.items()}
+    report_choice(run, scene.name, chosen, predicted=encoding.predicted, notes=encoding.notes, quiet=config.quiet)
     return encoding
 
 
-def check_promises(
+def report_encoded(
     encoding: BudgetEncoding,
     scene: Scene,
     encoder: Encoder,
     files: Sequence[Path],
-    config: BudgetOptions,
-    summary: Summary,
+    config: "EncodeCommandConfig",
+    run: Run,
     *,
     metres_per_unit: float,
 ) -> list[str]:
-    """Measures what was promised; returns a line for each promise, and warns of those that are broken."""
+    """Measures what is limited; returns a line for each limit, and warns of those that are broken."""
     assert scene.gaussians is not None
-    budget, realised = config.budget, dict[str, float]()
+    budget = config.budget
+    measured = {"seconds": encoding.seconds, "megabytes": sum(file.stat().st_size for file in files) / MEGABYTE}
     if budget.error is not None and budget.check:
-        with summary.step("check"):
+        with run.step("check"):
             errors = realised_error(
-                encoding,
-                scene.gaussians,
-                encoder,
-                metres_per_unit=metres_per_unit,
-                seed=budget.seed,
-                track=Progress(quiet=config.quiet),
+                encoding, scene.gaussians, encoder, metres_per_unit=metres_per_unit, track=run.track
             )
-        realised["error"] = max(error.total for error in errors.values())
-    if budget.seconds is not None:
-        realised["seconds"] = encoding.seconds
-    if budget.megabytes is not None:
-        realised["megabytes"] = sum(file.stat().st_size for file in files) / MEGABYTE
-    return report_promises(summary, budget, realised)
+        measured["error"] = max(error.total for error in errors.values())
+    return report_budget(run, budget, measured)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,22 +200,20 @@ def _encode_into(
     encoder: Encoder,
     config: EncodeCommandConfig,
     made_with: Mapping[str, str],
-    summary: Summary,
+    run: Run,
 ) -> tuple[list[FeatureSpace], list[str]]:
     """Encodes a scene and writes its features and words, and what they were made with; returns the spaces that were
-    written, and a line for each promise."""
+    written, and a line for each limit."""
     assert scene.gaussians is not None
     unit = unit_of(scene, encoder.voxel)
     teachers = requested_teachers(encoder, config.spaces)
     budgeted: BudgetEncoding | None = None
-    if config.budget.promised:
-        budgeted = encode_in_budget(scene, encoder, teachers, config, made_with, summary, metres_per_unit=unit)
-        by_teacher, encoding = budgeted.features, budgeted.setting.config
+    if config.budget.limits:
+        budgeted = encode_in_budget(scene, encoder, teachers, config, made_with, run, metres_per_unit=unit)
+        by_teacher, encoding = budgeted.features, budgeted.choice.setting
     else:
-        with summary.step("encode"):
-            by_teacher = encoder.encode_spaces(
-                scene.gaussians, config.encode, metres_per_unit=unit, track=Progress(quiet=config.quiet)
-            )
+        with run.step("encode"):
+            by_teacher = encoder.encode_spaces(scene.gaussians, config.encode, metres_per_unit=unit, track=run.track)
         by_teacher, encoding = {name: by_teacher[name] for name in teachers}, config.encode
     if config.basis_views and all(each.basis is None for each in by_teacher.values()):
         raise InputError("basis_views: the encoder gives all channels, and has no basis; leave it out")
@@ -247,19 +224,19 @@ def _encode_into(
         figures[name] = {
             "channels": features.space.channels,
             "rank": features.features.shape[1],
-            "basis": _basis_figures(scene, name, features, encoder, config, summary),
+            "basis": _basis_figures(scene, name, features, encoder, config, run),
             "space": features.space.describe(),
             "features": file,
         }
-    with summary.step("write"):
+    with run.step("write"):
         save_features(folder, scene, by_teacher, {"encode": settings(encoding), **made_with})
         save_tables(folder, {name: encoder.tables[name] for name in by_teacher if name in encoder.tables}, by_teacher)
     lines = []
     if budgeted is not None:
         files = [folder / str(each["features"]) for each in figures.values()]
-        lines = check_promises(budgeted, scene, encoder, files, config, summary, metres_per_unit=unit)
+        lines = report_encoded(budgeted, scene, encoder, files, config, run, metres_per_unit=unit)
     first = next(iter(by_teacher.values()))
-    summary.results.update(
+    run.results.update(
         gaussians=len(first),
         seen=int(first.seen.sum()),
         views=len(scene.views) if scene.views is not None else 0,

@@ -2,28 +2,36 @@
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
 from gsencoder.app.inputs import load_fusable
 from gsencoder.app.options import SharedScenesConfig, settings
 from gsencoder.app.output import Summary
-from gsencoder.app.run import Progress, Run
-from gsencoder.app.summary import describe_basis, report_choice, report_promises
+from gsencoder.app.run import Run
+from gsencoder.app.summary import describe_basis, report_budget, report_choice
+from gsencoder.core.archive import LONGEST_SHARE
+from gsencoder.core.budget import MEGABYTE
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.process import Clock, Device
-from gsencoder.core.settings import MEGABYTE, option
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
-from gsencoder.fusion.budget import BudgetFusion, fuse_within, realised_error
+from gsencoder.fusion.budget import (
+    BudgetFusion,
+    FusionBudget,
+    check_budget,
+    exact_config,
+    fuse_within,
+    realised_error,
+)
 from gsencoder.fusion.cameras import CamerasOfSplat, check_orbits
-from gsencoder.fusion.cost_model import BudgetConfig, check_budget
 from gsencoder.fusion.errors import project_maps, sample_cells
 from gsencoder.fusion.folder import FEATURES_FILE, HEADS_FILE, WORDS_FILE, save_features
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
@@ -45,21 +53,9 @@ from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
 
 
-@runtime_checkable
-class BudgetOptions(Protocol):
-    """The options of a command that fuses within a budget."""
-
-    @property
-    def fusion(self) -> FuseConfig: ...
-    @property
-    def budget(self) -> BudgetConfig: ...
-    @property
-    def device(self) -> Device: ...
-    @property
-    def quiet(self) -> bool: ...
-
-
-def fuse_in_budget(scene: Scene, teacher: Teacher, config: BudgetOptions, summary: Summary, work: Path) -> BudgetFusion:
+def fuse_in_budget(
+    scene: Scene, teacher: Teacher, config: "FuseCommandConfig", header: Mapping[str, Any], run: Run, work: Path
+) -> BudgetFusion:
     """Chooses a setting and fuses; says which setting that is, and what is predicted of it."""
     with Clock().running() as clock:
         fused = fuse_within(
@@ -67,53 +63,27 @@ def fuse_in_budget(scene: Scene, teacher: Teacher, config: BudgetOptions, summar
             teacher,
             config.fusion,
             config.budget,
+            header=header,
             work=None if teacher.cheap else work,
             device=config.device,
-            track=Progress(quiet=config.quiet),
+            track=run.track,
         )
-    choice = fused.choice
-    summary.add_seconds({"choose": fused.choosing, **clock.seconds})
-    report_choice(
-        summary,
-        scene.name,
-        choice.knobs,
-        predicted=_predicted(fused),
-        notes=choice.notes,
-        quiet=config.quiet,
-        of=f", of {len(fused.scene.views or ())} views",
-        of_views=len(scene.views) if scene.views is not None else 0,
-        scatter=choice.scatter,
-        rays_followed=choice.followed,
-        rays_exact=choice.all_rays,
-    )
+    run.add_seconds({"choose": fused.choosing, **clock.seconds})
+    chosen = {"views": len(fused.fusion.views), "rank": fused.fusion.features.features.shape[1]}
+    report_choice(run, scene.name, chosen, predicted=fused.predicted, notes=fused.notes, quiet=config.quiet)
     return fused
 
 
-def _predicted(fused: BudgetFusion) -> Mapping[str, float | None]:
-    choice = fused.choice
-    size = None if choice.bytes is None else choice.bytes / MEGABYTE
-    return {
-        "error": choice.predicted.error,
-        "error_deviation": choice.predicted.deviation,
-        "seconds": choice.seconds,
-        "megabytes": size,
-    }
-
-
-def check_promises(fused: BudgetFusion, file: Path, config: BudgetOptions, summary: Summary) -> list[str]:
-    """Measures what was promised; returns a line for each promise, and warns of those that are broken."""
-    budget, realised = config.budget, dict[str, float]()
+def report_fused(fused: BudgetFusion, scene: Scene, file: Path, config: "FuseCommandConfig", run: Run) -> list[str]:
+    """Measures what is limited; returns a line for each limit, and warns of those that are broken."""
+    budget = config.budget
+    measured = {"seconds": fused.seconds, "megabytes": file.stat().st_size / MEGABYTE}
     if budget.error is not None and budget.check:
-        with summary.step("check"):
-            track = Progress(quiet=config.quiet)
-            error = realised_error(fused, config.fusion, seed=budget.seed, device=config.device, track=track)
-        realised["error"] = error.total
-        summary.results["budget"]["covered"] = error.covered
-    if budget.seconds is not None:
-        realised["seconds"] = fused.seconds
-    if budget.megabytes is not None:
-        realised["megabytes"] = file.stat().st_size / MEGABYTE
-    return report_promises(summary, budget, realised)
+        with run.step("check"):
+            error = realised_error(fused, scene, config.fusion, device=config.device, track=run.track)
+        measured["error"] = error.total
+        run.results["budget"]["covered"] = error.covered
+    return report_budget(run, budget, measured)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,7 +110,7 @@ class FuseCommandConfig(SharedScenesConfig):
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     fusion: FuseConfig = field(default_factory=FuseConfig)
-    budget: BudgetConfig = field(default_factory=BudgetConfig)
+    budget: FusionBudget = field(default_factory=FusionBudget)
     teacher: AutoConfig | TeacherConfig = field(
         default_factory=AutoConfig,
         metadata={
@@ -188,8 +158,11 @@ def run(config: FuseCommandConfig, run: Run) -> None:
                 run.print(f"{scene.name}: {chosen.reason}; {chosen.describe()}")
             basis = None if outputs is None else basis_for(teacher.space, outputs, config.basis)
             in_budget: BudgetFusion | None = None
-            if config.budget.promised:
-                in_budget = fuse_in_budget(scene, teacher, config, run, work_folder(out))
+            if config.budget.limits:
+                # Of the settings that are written, those that take the most bytes.
+                longest = replace(exact_config(config.fusion), energy=LONGEST_SHARE)
+                header = recipe(chosen.teacher, longest)
+                in_budget = fuse_in_budget(scene, teacher, config, header, run, work_folder(out))
                 fusion = in_budget.fusion
             else:
                 work = None if teacher.cheap else work_folder(out)
@@ -203,7 +176,7 @@ def run(config: FuseCommandConfig, run: Run) -> None:
                 run.results.update(project_maps(basis, fusion.teacher, scene.views, fusion.views).fit().figures())
             lines = []
             if in_budget is not None:
-                lines = check_promises(in_budget, folder / FEATURES_FILE, config, run)
+                lines = report_fused(in_budget, scene, folder / FEATURES_FILE, config, run)
             lines += write_heads(folder, heads, scene, fusion, run)
             if config.report:
                 from gsencoder.app.reports import report_fusion
@@ -244,14 +217,18 @@ def work_folder(out: Path) -> Path:
     return out.parent / f".{out.name}.fusing"
 
 
+def recipe(teacher: TeacherConfig, fusion: FuseConfig) -> dict[str, Any]:
+    """The settings that are written with features."""
+    return {"teacher": settings(teacher), "fusion": settings(fusion)}
+
+
 def write_features(
     folder: Path, scene: Scene, fusion: Fusion, words: TextTable | None, teacher: TeacherConfig, summary: Summary
 ) -> None:
     """Writes features, scene and words, and adds the figures of the fusion to the summary."""
     features = fusion.features
     with summary.step("write"):
-        recipe = {"teacher": settings(teacher), "fusion": settings(fusion.config)}
-        save_features(folder, scene, features, recipe)
+        save_features(folder, scene, features, recipe(teacher, fusion.config))
         if words is not None:
             save_text_table(folder / WORDS_FILE, words)
     summary.results.update(

@@ -7,10 +7,11 @@ from pathlib import Path
 
 from gsencoder.app.options import CommonConfig
 from gsencoder.app.run import Run
-from gsencoder.app.summary import report_choice, report_promises
+from gsencoder.app.summary import report_budget, report_choice
 from gsencoder.core.archive import copy_checked
+from gsencoder.core.budget import MEGABYTE, reject_options_set_by_budget
 from gsencoder.core.errors import InputError, counted
-from gsencoder.core.settings import MEGABYTE, check_governed, option
+from gsencoder.core.settings import option
 from gsencoder.fusion.folder import HEADS_FILE, WORDS_FILE, copy_heads, load_features, table_path
 from gsencoder.fusion.package import (
     PACKAGE_FILE,
@@ -65,14 +66,14 @@ class PackConfig(CommonConfig):
 
     def __post_init__(self) -> None:
         CommonConfig.__post_init__(self)
-        if self.budget.promised and self.form not in CODED:
+        if self.budget.limits and self.form not in CODED:
             raise InputError(
-                f"{self.budget.names}: form={self.form} writes features as they are; take form=compact or index, or "
+                f"{self.budget.options}: form={self.form} writes features as they are; take form=compact or index, or "
                 "leave the budget out"
             )
         if self.index != IndexConfig() and self.form != "index":
             raise InputError(f"index: has the settings of form=index, and form={self.form} takes none; leave them out")
-        check_governed(self.budget, self.index, IndexConfig(), ("threshold", "rows"), "index")
+        reject_options_set_by_budget(self.budget, self.index, IndexConfig(), ("threshold", "rows"), "index")
         if self.decoded and self.form in CODED:
             raise InputError(f"decoded=true: form={self.form} holds codes; use form=npz, safetensors or ply")
 
@@ -133,7 +134,7 @@ def _write(folder: Path, scene: Scene, features: GaussianFeatures, config: PackC
 def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, run: Run) -> str:
     budget = config.budget
     if budget.error is None and budget.megabytes is not None:
-        compacted = save_package_within(folder, scene, features, megabytes=budget.megabytes)
+        compacted = save_package_within(folder, scene, features, budget)
     else:
         compacted = save_package(folder, scene, features, error=budget.error or DEFAULT_ERROR)
     size = (folder / PACKAGE_FILE).stat().st_size
@@ -157,7 +158,7 @@ def _write_compact(folder: Path, scene: Scene, features: GaussianFeatures, confi
 
 
 def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config: PackConfig, run: Run) -> str:
-    if config.budget.promised:
+    if config.budget.limits:
         indexed, error = index_within(features, config.budget, partial(index_bytes, scene, features))
     else:
         indexed = index_features(features, config.index)
@@ -182,17 +183,17 @@ def _write_index(folder: Path, scene: Scene, features: GaussianFeatures, config:
 
 
 def _report(
-    scene: Scene, knobs: Mapping[str, int | float], error: float, size: int, config: PackConfig, run: Run
+    scene: Scene, chosen: Mapping[str, int | float], error: float, size: int, config: PackConfig, run: Run
 ) -> None:
     """Says what a budget chose and what became of it: both are measured over all Gaussians, of the file as it is."""
     budget, megabytes = config.budget, size / MEGABYTE
-    if not budget.promised:
+    if not budget.limits:
         return
     over_budget = budget.error is not None and budget.megabytes is not None and megabytes > budget.megabytes
-    notes = [budget.conflict("error", "megabytes", megabytes)] if over_budget else []
-    report_choice(run, scene.name, knobs, predicted={}, notes=notes, quiet=config.quiet)
-    realised = {name: value for name, value in (("error", error), ("megabytes", megabytes)) if name in budget.promised}
-    run.print(*(f"{scene.name}: {line}" for line in report_promises(run, budget, realised)))
+    notes = [budget.conflict("megabytes", megabytes)] if over_budget else []
+    report_choice(run, scene.name, chosen, predicted={}, notes=notes, quiet=config.quiet)
+    lines = report_budget(run, budget, {"error": error, "megabytes": megabytes})
+    run.print(*(f"{scene.name}: {line}" for line in lines))
 
 
 def _ratio(share: float) -> str:

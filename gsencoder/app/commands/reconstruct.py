@@ -12,13 +12,14 @@ import numpy as np
 from gsencoder.app.options import SharedScenesConfig, settings
 from gsencoder.app.output import Summary
 from gsencoder.app.run import Run
-from gsencoder.app.summary import report_choice, report_promises
+from gsencoder.app.summary import report_budget, report_choice
+from gsencoder.core.budget import MEGABYTE
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import SceneWarning, counted
 from gsencoder.core.files import write_picture
 from gsencoder.core.logs import LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory
-from gsencoder.core.settings import MEGABYTE, option
+from gsencoder.core.settings import option
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.splats.files import READABLE, save_splat
@@ -26,11 +27,10 @@ from gsencoder.data.video import RECORD_FILE, VideoConfig
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.infer.draw import contact_sheet
 from gsencoder.reconstruct.parameters import CHECKPOINT_FILE, IMAGE_SCALE, image_scale_of
-from gsencoder.reconstruct.plan import PhotographsTooLargeError, choose_scale, error_of, refuse_late
+from gsencoder.reconstruct.plan import choose_scale, refuse_late
 from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
 from gsencoder.reconstruct.score import Comparison, LogRow, Score, describe
 from gsencoder.reconstruct.sfm import FRAMES_FOLDER, OpenedScene, SfmConfig, find_photographed, open_scene
-from gsencoder.types import Scene
 
 PLY_FILE, PICTURES_FILE, MODEL_FOLDER = "splat.ply", "held_out.png", "sparse/0"
 
@@ -74,8 +74,7 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, ru
     with run.resumable(out, "reconstruction", resume=config.resume) as (folder, work):
         opened = _open(path, work, config, config.data, spent, run)
         scale = _affordable_scale(opened, work, config, spent=spent())
-        full = opened
-        opened = _at_scale(full, scale, path, work, config, run)
+        opened = _at_scale(opened, scale, path, work, config, run)
         run.add_seconds(opened.seconds)
         with run.step("check"):
             warn_of_faults(opened.scene)
@@ -87,25 +86,16 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, ru
         reading = {name: settings(getattr(config, name)) for name in parts}
         made_from = {"scene": str(path.resolve()), "splat": config.splat, **reading}
 
-        def fitted(scene: Scene, scale: float, may_shrink: bool) -> Reconstruction:
-            return reconstruct(
-                scene,
-                ReconstructConfig(**{item.name: getattr(config, item.name) for item in fields(ReconstructConfig)}),
-                device=config.device,
-                work=work,
-                made_from={**made_from, IMAGE_SCALE: scale},
-                spent=spent(),
-                may_shrink=may_shrink,
-                track=run.track,
-                report=run.print,
-            )
-
-        try:
-            result = fitted(opened.scene, scale, may_shrink=config.data.image_scale == 1 and not config.splat)
-        except PhotographsTooLargeError as found:
-            scale = round(scale * float(found.args[0]), 3)
-            opened = _at_scale(full, scale, path, work, config, run)
-            result = fitted(opened.scene, scale, may_shrink=False)
+        result = reconstruct(
+            opened.scene,
+            ReconstructConfig(**{item.name: getattr(config, item.name) for item in fields(ReconstructConfig)}),
+            device=config.device,
+            work=work,
+            made_from={**made_from, IMAGE_SCALE: scale},
+            spent=spent(),
+            track=run.track,
+            report=run.print,
+        )
         ended = time.perf_counter()
         run.add_seconds(result.seconds)
         origin = opened.scene.origin
@@ -135,8 +125,8 @@ def _reconstruct_one(path: Path, out: Path, config: ReconstructCommandConfig, ru
         seconds = result.elapsed + time.perf_counter() - ended
         # A scene without poses of its own has the name of the folder of its state.
         name = opened.scene.name if opened.sfm is None else path.name
-        promises = _report_budget(run, name, scale, result, folder / PLY_FILE, seconds, config)
-    run.print(*(f"{out}: {line}" for line in promises))
+        lines = _report_budget(run, name, scale, result, folder / PLY_FILE, seconds, config)
+    run.print(*(f"{out}: {line}" for line in lines))
     scores = f"; {describe(last)} on {counted(len(result.held_out), 'held-out photograph')}" if last else ""
     run.print(f"{out / PLY_FILE}: {counted(len(result.gaussians), 'Gaussian')}{scores}")
     if opened.sfm is not None:
@@ -172,9 +162,9 @@ def _report_budget(
     seconds: float,
     config: ReconstructCommandConfig,
 ) -> list[str]:
-    """What promises chose and what became of them; none where nothing is promised."""
+    """What limits chose and what became of them; nothing where there are none."""
     budget, plan = config.budget, result.plan
-    if not budget.promised:
+    if not budget.limits:
         return []
     image_scale = scale * config.data.image_scale
     chosen = {"image_scale": image_scale, "steps": result.steps, "sh_degree": plan.sh_degree}
@@ -186,15 +176,12 @@ def _report_budget(
         summary,
         scene,
         chosen,
-        predicted={"seconds": plan.seconds, "megabytes": plan.megabytes},
+        predicted={name: value for name in budget.limits if (value := getattr(plan, name)) is not None},
         notes=plan.notes,
         quiet=config.quiet,
         options=[*options, "budget.minutes=0"],
     )
-    realised = {"seconds": seconds, "megabytes": file.stat().st_size / MEGABYTE}
-    if result.log:
-        realised["error"] = error_of(result.log[-1])
-    return report_promises(summary, budget, {name: realised[name] for name in budget.promised})
+    return report_budget(summary, budget, {"seconds": seconds, "megabytes": file.stat().st_size / MEGABYTE})
 
 
 def _affordable_scale(opened: OpenedScene, work: Path, config: ReconstructCommandConfig, *, spent: float) -> float:
@@ -226,7 +213,7 @@ def _at_scale(
         smaller = _open(path, work, config, data, lambda: 0.0, run)
     width, height = (int(np.median(sizes)) for sizes in (views.cameras.widths, views.cameras.heights))
     budget = config.budget
-    option = f"budget.minutes={budget.minutes:g}" if budget.seconds is None else budget.shown("seconds")
+    option = f"budget.minutes={budget.minutes:g}" if budget.seconds is None else budget.option("seconds")
     run.print(
         f"photographs of {width}×{height} are looked at {scale:g} times as large, because of {option} "
         "(data.image_scale= states another size)"

@@ -3,18 +3,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 from gsencoder.app.heads import features_for_heads, heads_of_folder
 from gsencoder.app.options import QueriesConfig
-from gsencoder.app.output import Summary
 from gsencoder.app.run import Run
 from gsencoder.app.scenes import queried_scene, query_words, shown_scene
-from gsencoder.app.summary import report_choice, report_promises
+from gsencoder.app.summary import report_budget, report_choice
 from gsencoder.core.archive import write_archive
+from gsencoder.core.budget import MEGABYTE
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_json
-from gsencoder.core.settings import MEGABYTE, option
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.folder import check_heads_space
 from gsencoder.fusion.measured_heads import find_head, head_space, head_tokens
@@ -52,62 +51,48 @@ from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Box, Scene
 
 
-@runtime_checkable
-class BudgetOptions(Protocol):
-    """The options of a command that chooses views within a budget."""
-
-    @property
-    def choose(self) -> ViewsConfig: ...
-    @property
-    def budget(self) -> ViewsBudget: ...
-    @property
-    def quiet(self) -> bool: ...
-
-
 def choose_in_budget(
-    scene: Scene, targets: Sequence[Target], config: BudgetOptions, summary: Summary
+    scene: Scene, targets: Sequence[Target], config: "ViewsCommandConfig", run: Run
 ) -> tuple[BudgetViews, ViewSet, list[Picture]]:
     """Chooses views and the sizes of their pictures; says which they are, and what is predicted of them.
 
     Returns:
-        The choice, the views that are shown of it, and their pictures; none where no megabytes are promised.
+        The choice, the views that are kept of it, and their pictures; none where megabytes are not limited.
     """
     budget = config.budget
-    with summary.step("choose"):
+    with run.step("choose"):
         choice = choose_views_within(scene, targets, config.choose, budget)
     views, pictures = choice.views, list[Picture]()
-    knobs, predicted, notes = dict(choice.knobs), dict(choice.predicted), choice.notes
+    chosen, predicted, notes = dict(choice.chosen), dict(choice.predicted), choice.notes
     if budget.megabytes is not None:
-        with summary.step("render"):
+        with run.step("render"):
             sized = pictures_within(scene, views, budget)
         views, pictures = sized.views, sized.pictures
         predicted["megabytes"] = sized.predicted
-        knobs |= {"count": len(views), "side": sized.side}
+        chosen |= {"count": len(views), "side": sized.side}
         notes += sized.notes
-    report_choice(summary, scene.name, knobs, predicted=predicted, notes=notes, quiet=config.quiet)
+    report_choice(run, scene.name, chosen, predicted=predicted, notes=notes, quiet=config.quiet)
     return choice, views, pictures
 
 
-def check_promises(
+def report_views(
     choice: BudgetViews,
     scene: Scene,
     targets: Sequence[Target],
     views: ViewSet,
     files: Sequence[Path],
-    config: BudgetOptions,
-    summary: Summary,
+    config: "ViewsCommandConfig",
+    run: Run,
 ) -> list[str]:
-    """Measures what was promised; returns a line for each promise, and warns of those that are broken."""
-    budget, realised = config.budget, dict[str, float]()
+    """Measures what is limited, of views that were kept and their pictures; returns a line for each limit, and warns of
+    those that are broken."""
+    budget = config.budget
+    measured = {"seconds": choice.seconds, "megabytes": sum(file.stat().st_size for file in files) / MEGABYTE}
     if budget.error is not None and budget.check:
-        with summary.step("check"):
+        with run.step("check"):
             side = int(max(views.cameras.widths.max(), views.cameras.heights.max()))
-            realised["error"] = choice.realised_error(scene, targets, largest_side=side)
-    if budget.seconds is not None:
-        realised["seconds"] = choice.seconds
-    if budget.megabytes is not None:
-        realised["megabytes"] = sum(file.stat().st_size for file in files) / MEGABYTE
-    return report_promises(summary, budget, realised)
+            measured["error"] = choice.realised_error(scene, targets, largest_side=side)
+    return report_budget(run, budget, measured)
 
 
 VIEWS, TOKENS = "views.json", "tokens.safetensors"
@@ -167,8 +152,8 @@ def run(config: ViewsCommandConfig, run: Run) -> None:
             raise InputError(f"views: none of the words has a box in scene {scene.name}: {listing}")
         boxes = best_boxes(localization, config.boxes)
         run.results.update(boxes=[box_to_json(box) for box in boxes], words=words_to_json(localization))
-    choice, pictures, promises = None, list[Picture](), list[str]()
-    if config.budget.promised:
+    choice, pictures, lines = None, list[Picture](), list[str]()
+    if config.budget.limits:
         choice, views, pictures = choose_in_budget(scene, targets, config, run)
     else:
         with run.step("choose"):
@@ -185,10 +170,10 @@ def run(config: ViewsCommandConfig, run: Run) -> None:
                 write_tokens(target / TOKENS, scene, views, config)
         if choice is not None:
             files = [target / row["picture"] for row in rows]
-            promises = check_promises(choice, scene, targets, views, files, config, run)
+            lines = report_views(choice, scene, targets, views, files, config, run)
     run.print(*(f"{word}: {text}" for word, text in absent.items()))
     run.print(*(f"{number:2d}  {describe_view(each)}" for number, each in enumerate(views.chosen)))
-    run.print(*(f"{out}: {line}" for line in promises))
+    run.print(*(f"{out}: {line}" for line in lines))
     run.print(f"{out}: {len(views)} of {views.judged} views, {SHEET}, {VIEWS}" + (f", {TOKENS}" * bool(config.grid)))
 
 

@@ -53,7 +53,7 @@ from gsencoder.infer.views.scores import score_views
 from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, target_of, targets_of
 from gsencoder.memory.index import IndexConfig, index_features
 from gsencoder.reconstruct.exposure import apply_colors
-from gsencoder.reconstruct.plan import BudgetConfig
+from gsencoder.reconstruct.plan import ReconstructBudget
 from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
 from gsencoder.render import BlendConfig
 from gsencoder.render.images import psnr, ssim, view_colors
@@ -70,7 +70,7 @@ class ReconstructionSettings:
 
     data: SceneConfig = field(default_factory=SceneConfig)
     reconstruct: ReconstructConfig = field(
-        default_factory=lambda: ReconstructConfig(budget=BudgetConfig(minutes=0.0), validate_every=0)
+        default_factory=lambda: ReconstructConfig(budget=ReconstructBudget(minutes=0.0), validate_every=0)
     )
 
 

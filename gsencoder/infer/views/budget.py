@@ -1,10 +1,10 @@
-"""A choice of views within a budget: the fewest views that leave little unseen.
+"""A choice of views within a budget: the fewest views that leave little unseen, as many candidates as can be judged in
+time, and pictures as large as fit.
 
-What a few views leave unseen of what all candidates show: the error that a budget of views promises.
-
-A Gaussian counts as far as views show it as well as the candidate that shows it best does, by its blending weight as a
-share of the picture; the error is 1 − the mean over the Gaussians that any candidate shows, meaned over targets. It is
-predicted from the small renders that candidates are judged by, and measured at the size of the pictures.
+The error is what a few views leave unseen of what all candidates show. A Gaussian counts as far as views show it as
+well as the candidate that shows it best does, by its blending weight as a share of the picture; the error is 1 − the
+mean over the Gaussians that any candidate shows, meaned over targets. It is predicted from the small renders that
+candidates are judged by, and measured at the size of the pictures.
 """
 
 import math
@@ -15,9 +15,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from gsencoder.core.budget import (
+    MEGABYTE,
+    Budget,
+    Choice,
+    Estimate,
+    check_any_limit,
+    choose,
+    reject_options_set_by_budget,
+)
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import picture_bytes
-from gsencoder.core.settings import MEGABYTE, PLANNED, Budget, check_governed, shown_value
+from gsencoder.core.settings import shown_value
 from gsencoder.infer.draw import Picture
 from gsencoder.infer.views.candidates import FreeSpace
 from gsencoder.infer.views.choose import Judged, Picked, checked_gaussians, chosen_views, judge_candidates
@@ -63,23 +72,25 @@ def errors_after(gains: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
     return np.append(np.cumsum(gains[:0:-1])[::-1], 0.0)
 
 
-def fewest_views(scores: Sequence[ViewScores], error: float) -> tuple[Picked, float]:
-    """The fewest candidates that keep an error in all likelihood, and their error by the small renders.
-
-    The order is that of any error, so that a looser one never takes more views.
+def fewest_views(scores: Sequence[ViewScores], budget: Budget) -> tuple[Picked, Choice[int]]:
+    """The fewest candidates that keep a limit of error in all likelihood, and their number with its error by the small
+    renders. The order is that of any error, so that a looser one never takes more views.
 
     Args:
         scores: of each target.
-        error: that is promised, 0 to 1.
     """
     order, gains = order_by_error(scores)
     errors = errors_after(gains)
     # Small renders err, and of targets of few Gaussians, which are few pixels, they err most.
-    shown = [max(int(np.count_nonzero(each.target.any(axis=0))), 1) for each in scores]
-    margin = CONSTANTS.unsure_gaussians * float(np.mean(1 / np.array(shown)))
-    bounds = np.where(errors > 0, CONSTANTS.error_safety * errors + margin, 0)
-    count = int(np.flatnonzero(bounds <= error)[0]) + 1
-    return Picked(order[:count], gains[:count]), float(errors[count - 1])
+    seen = [max(int(np.count_nonzero(each.target.any(axis=0))), 1) for each in scores]
+    margin = CONSTANTS.unsure_gaussians * float(np.mean(1 / np.array(seen)))
+
+    def measure(count: int) -> Estimate:
+        error = float(errors[count - 1])
+        return Estimate(error=error, bound=CONSTANTS.error_safety * error + margin)
+
+    choice = choose(range(1, len(order) + 1), measure, budget)
+    return Picked(order[: choice.setting], gains[: choice.setting]), choice
 
 
 def measured_errors(
@@ -93,11 +104,8 @@ def measured_errors(
     """The errors of choices of views over all Gaussians of the targets, by renders at the cameras' sizes.
 
     Args:
-        gaussians: the splat.
-        targets: what is looked at.
         cameras: of all candidates, in the sizes of their pictures.
-        choices: which of them are shown, once or several times.
-        config: accuracy of the renders.
+        choices: which of them are chosen, once or several times.
     """
     most = [np.zeros(len(target.rows)) for target in targets]
     most_chosen = [[np.zeros(len(target.rows)) for target in targets] for _ in choices]
@@ -153,13 +161,12 @@ def _weights_in_window(
     return np.asarray(weights / float(max(cameras.widths[view], cameras.heights[view])) ** 2)
 
 
-GOVERNED: Mapping[str, tuple[str, ...]] = {
+OPTIONS_SET_BY_BUDGET: Mapping[str, tuple[str, ...]] = {
     "error": ("count",),
     "seconds": ("candidates",),
     "megabytes": ("width", "height", "frame_side"),
 }
-"""The options of the choice that each promise sets. Beside a promised error, seconds set nothing: it is one about what
-`choose.candidates` show, which are all judged."""
+"""Beside a limit of error, seconds set nothing: it is one about what `choose.candidates` show, which are all judged."""
 CANDIDATES = (8, 12, 16, 24, 32, 48, 64)
 """Numbers that are chosen among; the last is that of preset=exact. The first is judged in any case, and timed."""
 
@@ -201,19 +208,18 @@ class BudgetViews:
     """Views that were chosen within a budget.
 
     Attributes:
-        views: these.
-        picked: which of the candidates they are, with a budget of error.
+        picked: which of the candidates they are, with a limit of error.
         cameras: of all candidates, which may be fewer than there was time for where the scene has no more.
-        knobs: values that were chosen, by name.
-        predicted: by promise.
+        chosen: values that were chosen, by name.
+        predicted: by limit.
         seconds: from the beginning to the choice.
-        notes: for the user, about a promise that is not kept.
+        notes: warnings about limits that are expected to be broken.
     """
 
     views: ViewSet
     picked: Picked | None
     cameras: Cameras
-    knobs: Mapping[str, int]
+    chosen: Mapping[str, int]
     predicted: Mapping[str, float]
     seconds: float
     notes: tuple[str, ...]
@@ -222,9 +228,7 @@ class BudgetViews:
         """The error of the chosen views at the size of their pictures, over all Gaussians of the targets.
 
         Args:
-            scene: in which they were chosen.
-            targets: that they were chosen for.
-            largest_side: of the pictures that are shown, pixels; candidates are compared in no larger ones.
+            largest_side: of the pictures, pixels; candidates are compared in no larger ones.
         """
         assert scene.gaussians is not None
         assert self.picked is not None
@@ -240,17 +244,14 @@ class BudgetViews:
 
 
 def check_views_budget(budget: ViewsBudget, config: ViewsConfig) -> None:
-    """Refuses what a budget cannot be combined with.
-
-    Raises:
-        InputError: `GOVERNED` options are set, or views are not chosen from candidates.
-    """
-    for name in budget.promised:
+    """Refuses what a budget cannot be combined with: options that it chooses, and views that are not chosen from
+    candidates."""
+    for name in budget.limits:
         if name != "seconds" or budget.error is None:
-            check_governed(budget, config, ViewsConfig(), GOVERNED[name], "choose")
-    if budget.promised and config.method != "greedy":
+            reject_options_set_by_budget(budget, config, ViewsConfig(), OPTIONS_SET_BY_BUDGET[name], "choose")
+    if budget.limits and config.method != "greedy":
         raise InputError(
-            f"choose.method={config.method}: {budget.names} is for method=greedy, which judges candidates; leave one "
+            f"choose.method={config.method}: {budget.options} is for method=greedy, which judges candidates; leave one "
             "of the two out"
         )
 
@@ -264,69 +265,62 @@ def choose_views_within(
     clock: Callable[[], float] = time.perf_counter,
 ) -> BudgetViews:
     """The views that show targets best, of as many candidates as can be judged in time; or the fewest that keep an
-    error.
+    error. A limit of megabytes chooses nothing here.
 
     Args:
         scene: see `choose_views`.
         targets: see `choose_views`.
         config: options that the budget does not choose.
-        budget: at least one promise; one of megabytes chooses nothing here.
-        clock: seconds.
-
-    Raises:
-        InputError: no budget, or what `choose_views` refuses.
     """
     check_views_budget(budget, config)
-    if not budget.promised:
-        raise InputError("budget: expected budget.error=, budget.seconds= or budget.megabytes=, got none of them")
+    check_any_limit(budget)
     start = clock()
     gaussians = checked_gaussians(scene, targets, config)
     free = FreeSpace(gaussians)
-    predicted: dict[str, float] = {}
-    knobs: dict[str, int] = {}
-    notes: tuple[str, ...] = ()
 
     def judged(number: int) -> Judged:
         return judge_candidates(scene, gaussians, targets, free, replace(config, candidates=number))
 
-    if budget.seconds is None or budget.error is not None:
+    picked, choice, chosen = None, Choice(setting=config.candidates, estimate=Estimate()), dict[str, int]()
+    if budget.error is not None:
         judgment = judged(config.candidates)
-    else:
+        picked, choice = fewest_views(judgment.scores, replace(budget, seconds=None, megabytes=None))
+        chosen["count"] = choice.setting
+    elif budget.seconds is not None:
         numbers = sorted({max(number, config.count, len(targets)) for number in CANDIDATES})
         begun = clock()
-        judgment, number = judged(numbers[0]), numbers[0]
-        seconds_each = (clock() - begun) / number
-        spent = predicted["seconds"] = clock() - start
-        # Placing candidates takes some of that time whatever their number, so that this is on the safe side.
-        fitting = [more for more in numbers[1:] if spent + more * seconds_each <= PLANNED * budget.seconds]
-        if fitting:
-            number = fitting[-1]
-            predicted["seconds"], judgment = spent + number * seconds_each, judged(number)
-        elif spent > budget.seconds:
-            notes = (f"{budget.shown('seconds')}: judging {number} candidates took {spent:.3g} s; they are used",)
-    cameras = judgment.candidates.cameras
-    picked = None
-    if budget.error is not None:
-        picked, predicted["error"] = fewest_views(judgment.scores, budget.error)
-        knobs["count"] = len(picked.order)
-    elif budget.seconds is not None:
-        knobs["candidates"] = len(cameras)
+        judgment, least = judged(numbers[0]), numbers[0]
+        each, spent = (clock() - begun) / least, clock() - start
+
+        def measure(number: int) -> Estimate:
+            # Placing candidates takes some of that time whatever their number, so that this is on the safe side.
+            return Estimate(seconds=spent + number * each if number > least else spent)
+
+        choice = choose(numbers, measure, replace(budget, megabytes=None))
+        if choice.setting > least:
+            judgment = judged(choice.setting)
+        chosen["candidates"] = len(judgment.candidates.cameras)
+    else:
+        judgment = judged(config.candidates)
     views = chosen_views(scene, targets, judgment, free, config, picked=picked)
-    seconds = clock() - start
+    seconds, notes = clock() - start, choice.notes
     if budget.error is not None and budget.seconds is not None and seconds > budget.seconds:
-        notes = (budget.conflict("error", "seconds", seconds),)
+        notes = (budget.conflict("seconds", seconds),)
     return BudgetViews(
-        views=views, picked=picked, cameras=cameras, knobs=knobs, predicted=predicted, seconds=seconds, notes=notes
+        views=views,
+        picked=picked,
+        cameras=judgment.candidates.cameras,
+        chosen=chosen,
+        predicted={"error": choice.estimate.error, "seconds": choice.estimate.seconds},
+        seconds=seconds,
+        notes=notes,
     )
 
 
-PLANNED_BYTES = 0.95
-"""Share of promised bytes that is planned with, since they are predicted from few pictures."""
-SAMPLED, CORRECTIONS = 2, 2
-"""Pictures that are rendered in full to tell how bytes grow with pixels, and how often a side that took too many bytes
-is lowered before the least one is taken."""
-EXPONENTS, BISECTIONS = (0.3, 1.5), 20
-"""Between which powers of pixels bytes are taken to grow, and by how many halvings one is solved for."""
+SAMPLED = 2
+"""Pictures that are rendered to predict the bytes of all, those that grow most."""
+RATIO = 1.05
+"""Of one side of pictures to the next smaller one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -335,10 +329,9 @@ class SizedPictures:
 
     Attributes:
         views: with cameras in the sizes of the pictures; fewer than there were where not all fit.
-        pictures: of these.
         side: largest longer side, pixels.
         predicted: megabytes.
-        notes: for the user, about a promise that is not kept or views that are left out.
+        notes: warnings about a limit that is broken, or views that are left out.
     """
 
     views: ViewSet
@@ -349,110 +342,80 @@ class SizedPictures:
 
 
 def pictures_within(scene: Scene, views: ViewSet, budget: ViewsBudget) -> SizedPictures:
-    """The largest pictures of views whose files keep a budget.
+    """The largest pictures of views whose files keep a limit of megabytes.
 
-    All are encoded at the least side, and few in full; what lies between is predicted, encoded, and made smaller where
-    it takes more than was promised. Where the least side takes too much, the views that were chosen last are left out,
-    or, beside a promised error, none.
+    All are encoded at the least side; by how much the bytes of larger ones grow a few tell. A side that takes more than
+    was predicted is made smaller. Where the least side takes too much, the views that were chosen last are left out,
+    or, beside a limit of error, none.
 
     Args:
-        scene: see `view_pictures`.
         views: as chosen, in the sizes that their pictures would have without a budget.
-        budget: that promises megabytes.
 
     Raises:
-        InputError: no error is promised, and not even the first view fits at the least side.
+        InputError: no error is limited, and not even the first view fits at the least side.
     """
-    limit = budget.promise("megabytes") * MEGABYTE
-    largest = _longest(views)
+    limit, largest = budget.limit("megabytes"), _longest(views)
     least = min(CONSTANTS.least_picture_side, largest)
-    smallest = _capped(views, least)
+    smallest = _resized(views, least)
     pictures, _ = view_pictures(scene, smallest)
-    sizes = _sizes(pictures)
+    sizes = _megabytes(pictures)
     if sizes.sum() > limit:
         return _least(scene, smallest, pictures, sizes, budget)
-    exponent = _exponent(scene, views, smallest, sizes)
-    for _ in range(1 + CORRECTIONS):
-        # The largest side that is predicted to fit; the least one does.
-        low, high = least, largest
-        while low < high:
-            middle = (low + high + 1) // 2
-            fits = _predicted(views, smallest, sizes, exponent, middle) <= PLANNED_BYTES * limit
-            low, high = (middle, high) if fits else (low, middle - 1)
-        side, predicted = low, _predicted(views, smallest, sizes, exponent, low)
-        sized = _capped(views, side)
-        pictures, _ = view_pictures(scene, sized)
-        taken = float(_sizes(pictures).sum())
-        if taken <= limit:
-            return SizedPictures(views=sized, pictures=pictures, side=side, predicted=predicted / MEGABYTE, notes=())
-        exponent, largest = _refitted(views, smallest, sizes, side, taken), side - 1
-    pictures, _ = view_pictures(scene, smallest)
-    return SizedPictures(
-        views=smallest, pictures=pictures, side=least, predicted=float(sizes.sum()) / MEGABYTE, notes=()
-    )
+    sample = np.argsort(-_pixels(views) / _pixels(smallest), kind="stable")[:SAMPLED]
+    sampled = replace(views, cameras=views.cameras.select(sample), chosen=tuple(views.chosen[row] for row in sample))
+    sides = [least]
+    while sides[-1] < largest:
+        sides.append(min(largest, max(sides[-1] + 1, round(RATIO * sides[-1]))))
+    predicted = {least: float(sizes.sum())}
+
+    def measure(side: int) -> Estimate:
+        if side not in predicted:
+            growth = _pixels(_resized(views, side)) / _pixels(smallest)
+            larger = sizes * growth
+            larger *= np.where(growth > 1, _megabytes(view_pictures(scene, _resized(sampled, side))[0]).sum(), 1)
+            larger /= np.where(growth > 1, (sizes * growth)[sample].sum(), 1)
+            predicted[side] = float(larger.sum())
+        return Estimate(megabytes=predicted[side])
+
+    of_bytes = ViewsBudget(megabytes=limit)
+    while True:
+        side = choose(sides, measure, of_bytes).setting
+        sized = _resized(views, side)
+        if side > least:
+            pictures, _ = view_pictures(scene, sized)
+        if side == least or _megabytes(pictures).sum() <= limit:
+            return SizedPictures(views=sized, pictures=pictures, side=side, predicted=predicted[side], notes=())
+        sides = sides[: sides.index(side)]
 
 
 def _least(
     scene: Scene, views: ViewSet, pictures: list[Picture], sizes: Float64[np.ndarray, " n"], budget: ViewsBudget
 ) -> SizedPictures:
-    """Views whose pictures take too much at the least side: as many as fit, or all where an error is promised."""
-    total = np.cumsum(sizes) / MEGABYTE
-    side, count, notes = _longest(views), len(views), tuple[str, ...]()
+    """Views whose pictures take too much at the least side: as many as fit, or all where an error is limited."""
+    total = np.cumsum(sizes)
+    side, count = _longest(views), len(views)
     if budget.error is not None:
-        notes = (budget.conflict("error", "megabytes", total[-1]),)
+        note = budget.conflict("megabytes", total[-1])
     else:
-        count = int((total <= budget.promise("megabytes")).sum())
+        count = int((total <= budget.limit("megabytes")).sum())
         if count == 0:
             raise InputError(
-                f"{budget.shown('megabytes')}: one picture of {side} pixels in scene {scene.name} takes "
-                f"{math.ceil(sizes[0] / 10) / 1e5:.6g} MB; give more"
+                f"{budget.option('megabytes')}: one picture of {side} pixels in scene {scene.name} takes "
+                f"{math.ceil(1e5 * sizes[0]) / 1e5:.6g} MB; give more"
             )
-        notes = (
-            f"{budget.shown('megabytes')}: {count} of {counted(len(views), 'view')} fit in pictures of {side} pixels, "
-            f"the least; all take {shown_value(math.ceil(1e4 * total[-1]) / 1e4)} MB",
+        note = (
+            f"{budget.option('megabytes')}: {count} of {counted(len(views), 'view')} fit in pictures of {side} pixels, "
+            f"the least; all take {shown_value(math.ceil(1e4 * total[-1]) / 1e4)} MB"
         )
     kept = replace(views, cameras=views.cameras.select(slice(count)), chosen=views.chosen[:count])
     return SizedPictures(
-        views=kept, pictures=pictures[:count], side=side, predicted=float(total[count - 1]), notes=notes
+        views=kept, pictures=pictures[:count], side=side, predicted=float(total[count - 1]), notes=(note,)
     )
 
 
-def _exponent(scene: Scene, views: ViewSet, smallest: ViewSet, sizes: Float64[np.ndarray, " n"]) -> float:
-    """The power of pixels that bytes grow with, by a few pictures in full, those that grow most of them."""
-    growth = _pixels(views) / _pixels(smallest)
-    sample = np.argsort(-growth, kind="stable")[:SAMPLED]
-    sample = sample[growth[sample] > 1]
-    if not len(sample):
-        return 1.0
-    pictures, _ = view_pictures(scene, _selected(views, sample))
-    powers = np.log(_sizes(pictures) / sizes[sample]) / np.log(growth[sample])
-    return float(np.clip(powers.max(), *EXPONENTS))
-
-
-def _refitted(views: ViewSet, smallest: ViewSet, sizes: Float64[np.ndarray, " n"], side: int, taken: float) -> float:
-    """The power at which pictures of a side would take the bytes that they took."""
-    low, high = EXPONENTS
-    for _ in range(BISECTIONS):
-        middle = (low + high) / 2
-        low, high = (middle, high) if _predicted(views, smallest, sizes, middle, side) < taken else (low, middle)
-    return high
-
-
-def _predicted(
-    views: ViewSet, smallest: ViewSet, sizes: Float64[np.ndarray, " n"], exponent: float, side: int
-) -> float:
-    """Bytes of all pictures whose longer side is no larger than `side`."""
-    growth = _pixels(_capped(views, side)) / _pixels(smallest)
-    return float((sizes * growth**exponent).sum())
-
-
-def _capped(views: ViewSet, side: int) -> ViewSet:
+def _resized(views: ViewSet, side: int) -> ViewSet:
     """The same views in pictures whose longer side has at most so many pixels."""
     return replace(views, cameras=views.cameras.resized(side, enlarge=False))
-
-
-def _selected(views: ViewSet, rows: np.ndarray) -> ViewSet:
-    return replace(views, cameras=views.cameras.select(rows), chosen=tuple(views.chosen[row] for row in rows))
 
 
 def _longest(views: ViewSet) -> int:
@@ -463,6 +426,5 @@ def _pixels(views: ViewSet) -> Float64[np.ndarray, " n"]:
     return views.cameras.widths.astype(np.float64) * views.cameras.heights
 
 
-def _sizes(pictures: Sequence[Picture]) -> Float64[np.ndarray, " n"]:
-    """Bytes of the files."""
-    return np.array([len(picture_bytes(picture, SUFFIX)) for picture in pictures], np.float64)
+def _megabytes(pictures: Sequence[Picture]) -> Float64[np.ndarray, " n"]:
+    return np.array([len(picture_bytes(picture, SUFFIX)) for picture in pictures], np.float64) / MEGABYTE

@@ -1,0 +1,135 @@
+"""Reconstructions within a budget: its limits, and what became of them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from archives import header_of, rewrite
+from reconstructions import cut_at, refusal, summary_of
+
+from gsencoder.app import main as cli
+from gsencoder.core.errors import InputError
+from gsencoder.data.seeding.seed import SeedConfig, seed
+from gsencoder.data.splats.files import save_splat
+from gsencoder.reconstruct import plan as planning
+from gsencoder.reconstruct import reconstruct
+from gsencoder.reconstruct.optimize import OptimizeConfig, PruneConfig
+from gsencoder.reconstruct.parameters import CHECKPOINT_FILE, PLANNED_DEGREE
+from gsencoder.reconstruct.plan import ReconstructBudget
+from gsencoder.reconstruct.run import ReconstructConfig
+from gsencoder.types import Scene
+
+SEEDS = SeedConfig(voxel=0.15)
+STEPS = 8
+"""In place of thousands."""
+
+
+def limited(**limits: float) -> ReconstructConfig:
+    """Settings with a budget."""
+    return ReconstructConfig(holdout=3, validate_every=0, seeds=SEEDS, budget=ReconstructBudget(**limits))
+
+
+def short(**limits: float) -> ReconstructConfig:
+    """Settings with a budget that does not choose the steps."""
+    return replace(limited(**limits), optimize=OptimizeConfig(steps=4, shrinks=(1,), shares=(1.0,)))
+
+
+@pytest.mark.parametrize("share", [0.7, 0.1])
+def test_the_file_is_no_larger_than_limited_and_as_large_as_predicted(
+    scene: Scene, share: float, tmp_path: Path
+) -> None:
+    limit = share * len(seed(scene, SEEDS)) * 164 / 1e6
+    result = reconstruct(scene, short(megabytes=limit))
+    save_splat(tmp_path / "part.ply", result.gaussians)
+    size = (tmp_path / "part.ply").stat().st_size / 1e6
+    assert 0.5 * limit < size <= limit
+    assert result.plan.megabytes == pytest.approx(size, rel=0.05, abs=0.002)
+    assert result.gaussians.sh_degree == result.plan.sh_degree
+
+
+def test_a_run_for_a_size_that_was_cut_ends_with_the_same_splat(scene: Scene, tmp_path: Path) -> None:
+    config = short(megabytes=0.05)
+    whole = reconstruct(scene, config)
+    assert whole.plan.sh_degree < 2
+    with cut_at(1):
+        reconstruct(scene, config, work=tmp_path)
+    header = header_of(tmp_path / CHECKPOINT_FILE)
+    assert header["seconds"] > 0
+    # What the first run took counts, however long ago that was.
+    rewrite(tmp_path / CHECKPOINT_FILE, header={**header, "seconds": 1000.0})
+    again = reconstruct(scene, config, work=tmp_path)
+    assert again.elapsed > again.log[-1]["seconds"] > 1000 > whole.elapsed
+    np.testing.assert_array_equal(again.gaussians.sh, whole.gaussians.sh)
+    np.testing.assert_array_equal(again.gaussians.means, whole.gaussians.means)
+    assert again.plan == replace(whole.plan, spent=again.plan.spent)
+
+
+def test_what_reading_took_counts_to_limited_seconds(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planning, "MOST_STEPS", STEPS)
+    result = reconstruct(scene, limited(seconds=100.0), spent=30.0)
+    assert result.steps == STEPS
+    assert 30 < result.plan.spent < result.elapsed < 90
+    # What is done between planning and the first step, and after the last one, counts as well.
+    assert result.elapsed > 30 + sum(seconds for name, seconds in result.seconds.items())
+    with pytest.raises(InputError, match="budget.seconds=100: is over before the first step: 99 s"):
+        reconstruct(scene, limited(seconds=100.0), spent=99.0)
+
+
+@pytest.mark.parametrize(
+    ("config", "problem"),
+    [
+        (lambda: replace(short(megabytes=1.0), prune=PruneConfig(at=())), "prune.at=.. never prunes"),
+        (lambda: replace(short(megabytes=1.0), optimize=OptimizeConfig(steps=0)), "optimize.steps=0 never prunes"),
+        (lambda: short(seconds=9.0), "optimize.steps=4: is chosen by budget.seconds"),
+        (lambda: limited(seconds=float("nan")), "seconds: expected a number above 0, got nan"),
+    ],
+)
+def test_limits_that_mean_nothing_or_exclude_each_other_are_refused(
+    config: Callable[[], ReconstructConfig], problem: str
+) -> None:
+    with pytest.raises(InputError, match=problem):
+        config()
+
+
+def test_a_size_that_no_gaussian_fits_into_is_refused_with_one_that_does(scene: Scene) -> None:
+    with pytest.raises(InputError, match="budget.megabytes=0.0021: the smallest result takes 0.00212 MB"):
+        reconstruct(scene, short(megabytes=0.0021))
+
+
+def test_a_run_of_another_limit_and_one_of_impossible_colors_do_not_go_on(scene: Scene, tmp_path: Path) -> None:
+    with cut_at(0):
+        reconstruct(scene, short(), work=tmp_path)
+    with pytest.raises(InputError, match=r"was made with .*budget"):
+        reconstruct(scene, short(megabytes=1.0), work=tmp_path)
+
+    header = header_of(tmp_path / CHECKPOINT_FILE)
+    impossible = {**header, "facts": {**header["facts"], PLANNED_DEGREE: 3}}
+    rewrite(tmp_path / CHECKPOINT_FILE, header=impossible)
+    with pytest.raises(InputError, match=r"colors of a degree that no run has \(3\)"):
+        reconstruct(scene, short(), work=tmp_path)
+
+
+def test_limits_and_what_became_of_them_are_printed_and_recorded(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(planning, "MOST_STEPS", STEPS)
+    words = ["reconstruct", str(folder), f"out={tmp_path / 'out'}", "seeds.voxel=0.15", "holdout=3"]
+    words += ["data.image_scale=0.5"]
+    assert cli.main([*words, "budget.seconds=500", "budget.megabytes=0.04"]) == 0
+    printed = capsys.readouterr()
+    results = summary_of(tmp_path / "out")["results"]
+    budget = results["budget"]
+    assert budget["limits"] == {"seconds": 500.0, "megabytes": 0.04}
+    assert budget["chosen"]["steps"] == STEPS
+    assert budget["chosen"]["image_scale"] == 0.5
+    assert 0 < results["gaussians"] <= budget["chosen"]["most_gaussians"] < 0.04e6 / 68
+    assert budget["measured"]["megabytes"] == (tmp_path / "out" / "splat.ply").stat().st_size / 1e6 <= 0.04
+    assert "budget.megabytes: limit 0.04, measured 0.0" in printed.out
+    assert "budget.seconds: limit 500, measured" in printed.out
+
+
+def test_a_limit_beside_an_option_that_it_chooses_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    problem = refusal(capsys, str(folder), "budget.seconds=60", "preset=exact")
+    assert "optimize.steps=3000: is chosen by budget.seconds; leave it (or the preset that sets it) out" in problem
