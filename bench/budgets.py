@@ -2,10 +2,10 @@
 
     python bench/budgets.py SCENE… [--error 0.01] [--teacher labels|palette|MODEL.onnx] [--out budgets.csv]
 
-A line for each scene: the limit (promise), the error on a tenth of the Gaussians that `preset=exact` sees, the same over
-all of them, the number of views, and CPU seconds of choosing, of the fusion and of the fusion at exact. Maps that are made
-while choosing are used by the fusion and count to that. `cpu_exact` counts every map, those that were made before at
-the mean of the others.
+A line for each scene: the limit (promise), the error on a tenth of the Gaussians that `preset=exact` sees, the same
+over all of them, the number of views, and CPU seconds of choosing, of the fusion and of the fusion at exact. Maps that
+are made while choosing are used by the fusion and count to that. `cpu_exact` counts every map, those that were made
+before at the mean of the others.
 """
 
 import argparse
