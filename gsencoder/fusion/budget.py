@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from gsencoder.core.budget import (
 )
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Device, Track, untracked
+from gsencoder.core.settings import option
 from gsencoder.core.threads import parallel
 from gsencoder.fusion.basis import distinct_rows
 from gsencoder.fusion.checkpoint import CachedTeacher, WrappedTeacher, open_checkpoint, upright
@@ -85,23 +86,14 @@ class FusionBudget(Budget):
     the most exact setting that keeps them.
     """
 
-    error: float | None = field(
-        default=None,
-        metadata={
-            "help": "largest mean of 1 − centered cosine to the features of preset=exact, over all Gaussians that it "
-            "sees; one that only it sees counts as 1"
-        },
+    error: float | None = option(
+        None,
+        "largest mean of 1 − centered cosine to the features of preset=exact, over all Gaussians that it "
+        "sees; one that only it sees counts as 1",
     )
-    seconds: float | None = field(
-        default=None, metadata={"help": "largest time from the choice of the setting to the features"}
-    )
-    megabytes: float | None = field(
-        default=None, metadata={"help": "largest size of the file of features, in units of 1,000,000 bytes"}
-    )
-    check: bool = field(
-        default=True,
-        metadata={"help": "measure the error afterwards, which fuses at preset=exact; false = leave it unmeasured"},
-    )
+    seconds: float | None = option(None, "largest time from the choice of the setting to the features")
+    megabytes: float | None = option(None, "largest size of the file of features, in units of 1,000,000 bytes")
+    check: bool = option(True, "measure the error afterwards, which fuses at preset=exact; false = leave it unmeasured")
 
 
 def check_budget(budget: FusionBudget, config: FuseConfig, *, basis: bool = False) -> None:

@@ -7,7 +7,7 @@ So is the smallest one, where Gaussians share the rows of a table (`index_file`)
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -27,7 +27,7 @@ from gsencoder.core.archive import (
 from gsencoder.core.budget import Budget
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import atomic_file
-from gsencoder.core.settings import Knob
+from gsencoder.core.settings import Knob, option
 from gsencoder.data.scene_arrays import check_splat, read_scene, read_space, scaled_halves, scene_parts, space_parts
 from gsencoder.data.splats.files import FINGERPRINT_DIGITS, fingerprint, load_splat, save_splat
 from gsencoder.fusion.quantize import CompactFeatures, compact, compact_within
@@ -372,9 +372,9 @@ is hidden, and a narrower one leaves out what is seen."""
 class PackageSettings:
     """How features are packed."""
 
-    form: Form = field(default="compact", metadata={"help": "see `pack form=`"})
-    error: float = field(default=0.01, metadata={"help": "largest mean loss of centered cosine, for form=compact"})
-    threshold: float = field(default=0.9, metadata={"help": "centered cosine that the rows of form=index reach"})
+    form: Form = option("compact", "see `pack form=`")
+    error: float = option(0.01, "largest mean loss of centered cosine, for form=compact")
+    threshold: float = option(0.9, "centered cosine that the rows of form=index reach")
 
     def __post_init__(self) -> None:
         if not 0 < self.error < 1:
@@ -395,13 +395,9 @@ class PackBudget(Budget):
     With a budget of error the smallest package that keeps it is made; with one of megabytes alone, the most exact one.
     """
 
-    error: float | None = field(
-        default=None,
-        metadata={
-            "help": "largest mean of 1 − centered cosine to the features that are packed, over Gaussians and over "
-            "kinds of features; without a budget 0.01 for form=compact"
-        },
+    error: float | None = option(
+        None,
+        "largest mean of 1 − centered cosine to the features that are packed, over Gaussians and over "
+        "kinds of features; without a budget 0.01 for form=compact",
     )
-    megabytes: float | None = field(
-        default=None, metadata={"help": "largest size of features.gsf, in units of 1,000,000 bytes"}
-    )
+    megabytes: float | None = option(None, "largest size of features.gsf, in units of 1,000,000 bytes")

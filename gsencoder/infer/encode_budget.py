@@ -8,7 +8,7 @@ and the boxes of the chunks how many Gaussians of the scene are how far from the
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -27,6 +27,7 @@ from gsencoder.core.budget import (
     reject_options_set_by_budget,
 )
 from gsencoder.core.process import Precision, Track, untracked
+from gsencoder.core.settings import option
 from gsencoder.fusion.coordinates import reduce_to_fit
 from gsencoder.fusion.errors import FieldError, judge, row_cosines
 from gsencoder.fusion.folder import features_bytes
@@ -46,22 +47,15 @@ class EncodeBudget(Budget):
     the most exact setting that keeps them.
     """
 
-    error: float | None = field(
-        default=None,
-        metadata={
-            "help": "largest mean of 1 − centered cosine to the features of preset=exact, over all Gaussians; of "
-            "several teachers that of the worst"
-        },
+    error: float | None = option(
+        None,
+        "largest mean of 1 − centered cosine to the features of preset=exact, over all Gaussians; of "
+        "several teachers that of the worst",
     )
-    seconds: float | None = field(
-        default=None, metadata={"help": "largest time from the choice of the setting to the features"}
-    )
-    megabytes: float | None = field(
-        default=None, metadata={"help": "largest size of the files of features, in units of 1,000,000 bytes"}
-    )
-    check: bool = field(
-        default=True,
-        metadata={"help": "measure the error afterwards, which encodes at preset=exact; false = leave it unmeasured"},
+    seconds: float | None = option(None, "largest time from the choice of the setting to the features")
+    megabytes: float | None = option(None, "largest size of the files of features, in units of 1,000,000 bytes")
+    check: bool = option(
+        True, "measure the error afterwards, which encodes at preset=exact; false = leave it unmeasured"
     )
 
 

@@ -10,7 +10,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ import torch
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.budget import MEGABYTE, PLANNED, Budget
 from gsencoder.core.errors import InputError
+from gsencoder.core.settings import option
 from gsencoder.data.splats.ply import inria_row_bytes
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
 from gsencoder.reconstruct.parameters import PLANNED_DEGREE, RowAdam
@@ -65,23 +66,17 @@ class ReconstructBudget(Budget):
     """What a reconstruction may take: the most steps, the highest degree of colors and the most Gaussians that the
     limits allow."""
 
-    minutes: float = field(
-        default=DEFAULT_MINUTES,
-        metadata={
-            "help": "aim at so many minutes: photographs are made smaller and the default optimize.steps fewer or "
-            "more; 0 = neither. No limit, and not used beside budget.seconds"
-        },
+    minutes: float = option(
+        DEFAULT_MINUTES,
+        "aim at so many minutes: photographs are made smaller and the default optimize.steps fewer or "
+        "more; 0 = neither. No limit, and not used beside budget.seconds",
     )
-    seconds: float | None = field(
-        default=None,
-        metadata={
-            "help": "largest time from the start of the command to its results, which the clock keeps: it changes the "
-            "number of steps while they are done; what a kill made be repeated is extra"
-        },
+    seconds: float | None = option(
+        None,
+        "largest time from the start of the command to its results, which the clock keeps: it changes the "
+        "number of steps while they are done; what a kill made be repeated is extra",
     )
-    megabytes: float | None = field(
-        default=None, metadata={"help": "largest size of splat.ply, in units of 1,000,000 bytes"}
-    )
+    megabytes: float | None = option(None, "largest size of splat.ply, in units of 1,000,000 bytes")
 
     def __post_init__(self) -> None:
         Budget.__post_init__(self)

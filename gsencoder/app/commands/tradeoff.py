@@ -13,7 +13,7 @@ from gsencoder.app.options import CommonConfig, settings
 from gsencoder.app.run import Run
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import csv_text, json_bytes, write_bytes
-from gsencoder.core.settings import check_limits, option
+from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, find_scenes
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.benchmarks.localization import LocalizationProtocol
@@ -28,7 +28,6 @@ from gsencoder.evaluate.tradeoff.sweep import (
     StageResult,
     SweepConfig,
     check_sweep,
-    pick_within,
     scene_row,
     sweep_stage,
 )
@@ -47,28 +46,6 @@ TABLE, SCENES, RESULTS, PAGE, PICTURE, EXPONENTS = (
     "tradeoff.png",
     "exponents.csv",
 )
-SECTIONS = {
-    "reconstruction": "",
-    "fusion": "fusion.",
-    "encoder": "",
-    "packages": "",
-    "localization": "localize.",
-    "views": "choose.",
-}
-"""What stands before a stage's knobs on the command line."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LimitConfig:
-    """Limits of time and error; the best setting of fusion within them is reported."""
-
-    seconds: float | None = option(
-        None, "largest time for fusing one scene without the teacher, seconds", gt=0, lt=math.inf
-    )
-    error: float | None = option(None, "largest error against the reference, 1 − centered cosine", gt=0, lt=math.inf)
-
-    def __post_init__(self) -> None:
-        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,7 +58,6 @@ class TradeoffConfig(CommonConfig):
     sweep: SweepConfig = field(default_factory=SweepConfig)
     halving: HalvingConfig = field(default_factory=HalvingConfig)
     scaling: ScalingConfig = field(default_factory=ScalingConfig)
-    budget: LimitConfig = field(default_factory=LimitConfig)
     asked: LocalizationProtocol = field(default_factory=LocalizationProtocol)
     data: SceneConfig = field(default_factory=SceneConfig)
     seeds: SeedConfig = field(default_factory=SeedConfig)
@@ -98,7 +74,7 @@ class TradeoffConfig(CommonConfig):
 
 
 def run(config: TradeoffConfig, run: Run) -> None:
-    """Measures all settings, prints and writes tables and plots, and names the setting for a budget."""
+    """Measures all settings, prints and writes tables and plots."""
     inputs = Inputs(
         teacher=config.teacher,
         protocol=config.asked,
@@ -132,7 +108,6 @@ def run(config: TradeoffConfig, run: Run) -> None:
                     config.stages, paths, inputs, config.scaling, seed=config.sweep.seed, track=run.track
                 )
         _write(folder, results, exponents, run)
-        run.results["picked"] = advice = _advice(results, config.budget)
     for each in results:
         run.print(_table(each))
         run.print(f"knobs that matter: {', '.join(each.matter) or 'none'}")
@@ -142,8 +117,6 @@ def run(config: TradeoffConfig, run: Run) -> None:
     for scaled in exponents:
         value, low, high, *_ = scaled.exponent
         run.print(f"{scaled.stage}: CPU time grows as {scaled.factor}^{value:.2f} (95 %: {low:.2f} to {high:.2f})")
-    if advice:
-        run.print(advice)
     run.print(f"{out}: {TABLE}, {SCENES}, {RESULTS}, {PAGE} and {PICTURE}")
 
 
@@ -180,26 +153,6 @@ def _csv_of_stages(rows: Sequence[Mapping[str, Any]]) -> bytes:
     """Rows as CSV with the columns of all stages, which give different scores."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     return csv_text([{name: row.get(name) for name in columns} for row in rows]).encode()
-
-
-def _advice(results: Sequence[StageResult], budget: LimitConfig) -> str:
-    """The setting of fusion within the budget, or a message that there is none; the measurements are written in both
-    cases."""
-    fusion = [each for each in results if each.stage.name == "fusion"]
-    if not fusion or (budget.seconds is None and budget.error is None):
-        return ""
-    try:
-        setting = pick_within(fusion[0].results, budget.seconds, budget.error)
-    except InputError as error:
-        return str(error)
-    options = options_of_setting(fusion[0], setting)
-    return f"budget: {options or 'the defaults'} ({setting.seconds:.3g} s a scene, error {setting.score('error'):.3g})"
-
-
-def options_of_setting(result: StageResult, setting: SettingResult) -> str:
-    """The options of the command line that make a setting."""
-    keys = {knob.name: SECTIONS[result.stage.name] + knob.key for knob in result.stage.knobs}
-    return " ".join(f"{keys[name]}={str(value).lower()}" for name, value in setting.knobs.items())
 
 
 def _table(result: StageResult) -> Table:

@@ -25,6 +25,8 @@ from gsencoder.types import FeatureMap, FeatureSpace, Gaussians, Scene, Views
 from gsencoder.types.orientation import upright_views
 
 Factor = Literal["gaussians", "views", "channels", "pixels"]
+SPAN = 8.0
+"""The largest size as a multiple of the smallest."""
 DENSE_CELL = 8
 """Pixels along a cell of the labels teacher where channels are counted: maps of single pixels are codes into a table,
 and cost the same whatever the table's width."""
@@ -37,14 +39,11 @@ class ScalingConfig:
     points: int = field(
         default=0, metadata={"help": "sizes of each kind for exponents of cost (fusion, encoder); 0 = no exponents"}
     )
-    span: float = field(default=8.0, metadata={"help": "the largest size as a multiple of the smallest"})
     rounds: int = field(default=2, metadata={"help": "timed runs at each size"})
 
     def __post_init__(self) -> None:
         if self.points < 0 or self.points in (1, 2):
             raise InputError(f"points: expected 0 (none) or 3 and more, got {self.points}")
-        if not 1 < self.span < 1e6:
-            raise InputError(f"span: expected more than 1, got {self.span}")
         if self.rounds < 1:
             raise InputError(f"rounds: expected 1 or more, got {self.rounds}")
 
@@ -85,7 +84,7 @@ class ScalingResult:
 
 def geometric_sizes(most: int, config: ScalingConfig, least: int = 1) -> list[int]:
     """Whole sizes up to `most` at equal ratios, without repeats."""
-    smallest = max(least, most / config.span)
+    smallest = max(least, most / SPAN)
     return sorted({int(size) for size in np.geomspace(smallest, most, config.points).round()})
 
 
@@ -179,7 +178,7 @@ def fusion_runs(path: Path, inputs: Inputs, config: ScalingConfig) -> Iterator[d
         for size in geometric_sizes(teacher.space.channels, config):
             dense = DenseTeacher(source, views, size)
             runs["channels"].append((size, fused(scene, dense, basis=False)))
-        for size in np.geomspace(1 / config.span, 1, config.points):
+        for size in np.geomspace(1 / SPAN, 1, config.points):
             scale = inputs.data.image_scale * float(np.sqrt(size))
             smaller = load_scene(path, options=replace(inputs.data, image_scale=scale))
             assert smaller.views is not None

@@ -82,6 +82,8 @@ def on_front(costs: Sequence[Sequence[float]]) -> list[bool]:
 
 Evaluate = Callable[[Sequence[Knobs], int], Sequence[Sequence[float]]]
 """Costs of settings on the first so many scenes, one row each; less is better in every column."""
+KEEP = 1 / 3
+"""Share of the settings that the next, longer rung takes over."""
 LEAST = 4
 """Settings that go on from any rung: a front of cost and accuracy has two ends, and something between them."""
 
@@ -93,15 +95,12 @@ class HalvingConfig:
     settings: int = field(
         default=0, metadata={"help": "combinations of the knobs that matter that are tried together; 0 = none"}
     )
-    keep: float = field(default=1 / 3, metadata={"help": "share of the settings that the next, longer rung takes over"})
-    first: int = field(default=1, metadata={"help": "scenes of the first rung; each rung has 1 / keep times as many"})
+    first: int = field(default=1, metadata={"help": "scenes of the first rung; each rung has three times as many"})
 
     def __post_init__(self) -> None:
         for name, least in (("settings", 0), ("first", 1)):
             if getattr(self, name) < least:
                 raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
-        if not 0 < self.keep < 1:
-            raise InputError(f"keep: expected a share between 0 and 1, got {self.keep}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -159,11 +158,11 @@ def successive_halving(
         costs = np.asarray(evaluate(current, count), np.float64).reshape(len(current), -1)
         order = [current[index] for index in best_first(costs)]
         last = count == scenes
-        survivors = order if last else order[: max(LEAST, math.ceil(config.keep * len(order) - 1e-9))]
+        survivors = order if last else order[: max(LEAST, math.ceil(KEEP * len(order) - 1e-9))]
         rungs.append(Rung(scenes=count, settings=tuple(current), survivors=tuple(survivors)))
         if last:
             break
-        current, count = survivors, min(scenes, max(count + 1, round(count / config.keep)))
+        current, count = survivors, min(scenes, max(count + 1, round(count / KEEP)))
     return rungs
 
 
@@ -362,35 +361,6 @@ def mark_front(results: Sequence[SettingResult], accuracy: str, cost: Cost) -> l
     return [replace(result, on_front=result.scenes == most and next(marks)) for result in results]
 
 
-def pick_within(results: Sequence[SettingResult], seconds: float | None, error: float | None) -> SettingResult:
-    """Picks the cheapest setting within a limit of error, or with one of seconds alone the most exact within it.
-
-    Args:
-        results: of one stage that gives an error.
-        seconds: largest wall-clock seconds; None = any.
-        error: largest error against the exact reference; None = any.
-
-    Raises:
-        InputError: no setting is within the limits; the fastest and the most exact are named.
-    """
-    affordable = [
-        result
-        for result in results
-        if (seconds is None or result.seconds <= seconds) and (error is None or result.score("error") <= error)
-    ]
-    if not affordable:
-        fastest = min(results, key=lambda result: result.seconds)
-        most_exact = min(results, key=lambda result: result.score("error"))
-        raise InputError(
-            f"budget: no setting is within it; the fastest ({fastest.label}) takes {fastest.seconds:.3g} s at an error "
-            f"of {fastest.score('error'):.3g}, the most exact ({most_exact.label}) {most_exact.seconds:.3g} s at "
-            f"{most_exact.score('error'):.3g}"
-        )
-    if error is None:
-        return min(affordable, key=lambda result: (result.score("error"), result.seconds))
-    return min(affordable, key=lambda result: (result.cpu_seconds, result.score("error")))
-
-
 STAGES: Mapping[StageName, Callable[[Inputs], Stage]] = {
     "reconstruction": reconstruction_stage,
     "fusion": fusion_stage,
@@ -421,13 +391,6 @@ class SweepConfig:
     grid: bool = field(default=False, metadata={"help": "try all combinations instead of changing one knob at a time"})
     rounds: int = field(default=3, metadata={"help": "timed runs of each setting, of which the median is reported"})
     seed: int = field(default=0, metadata={"help": "of the order of the runs, and of the settings tried together"})
-    cost: Cost | None = field(
-        default=None,
-        metadata={
-            "help": "what is held against accuracy: cpu_seconds, seconds, mib or bytes; empty = bytes for packages, "
-            "cpu_seconds for all others"
-        },
-    )
 
     def __post_init__(self) -> None:
         if self.rounds < 1:
@@ -543,7 +506,7 @@ def sweep_stage(
         halving: how many settings are tried together.
         track: progress.
     """
-    cost = sweep.cost or stage.cost
+    cost = stage.cost
 
     def measured(settings: Sequence[Knobs], scenes: int) -> list[list[Record]]:
         return measure(stage, paths[:scenes], settings, records, rounds=sweep.rounds, seed=sweep.seed, track=track)

@@ -10,7 +10,7 @@ candidates are judged by, and measured at the size of the pictures.
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -26,7 +26,7 @@ from gsencoder.core.budget import (
 )
 from gsencoder.core.errors import InputError, counted
 from gsencoder.core.files import picture_bytes
-from gsencoder.core.settings import shown_value
+from gsencoder.core.settings import option, shown_value
 from gsencoder.infer.draw import Picture
 from gsencoder.infer.views.candidates import FreeSpace
 from gsencoder.infer.views.choose import Judged, Picked, checked_gaussians, chosen_views, judge_candidates
@@ -175,31 +175,22 @@ CANDIDATES = (8, 12, 16, 24, 32, 48, 64)
 class ViewsBudget(Budget):
     """What a choice of views may cost, or must show. Where they conflict, the one that stands first here wins."""
 
-    error: float | None = field(
-        default=None,
-        metadata={
-            "help": "largest share that the chosen views leave unseen of what all candidates show, mean over targets; "
-            "a Gaussian counts as far as it is shown as well as by the candidate that shows it best; the fewest views "
-            "are taken"
-        },
+    error: float | None = option(
+        None,
+        "largest share that the chosen views leave unseen of what all candidates show, mean over targets; "
+        "a Gaussian counts as far as it is shown as well as by the candidate that shows it best; the fewest views "
+        "are taken",
     )
-    seconds: float | None = field(
-        default=None,
-        metadata={"help": "largest time of choosing views; localization and the pictures come on top of it"},
+    seconds: float | None = option(
+        None, "largest time of choosing views; localization and the pictures come on top of it"
     )
-    megabytes: float | None = field(
-        default=None,
-        metadata={
-            "help": "largest size of the pictures of the views (view_00.png, view_01.png, …, without sheet.png), in "
-            "units of 1,000,000 bytes; they are made smaller, and at last fewer"
-        },
+    megabytes: float | None = option(
+        None,
+        "largest size of the pictures of the views (view_00.png, view_01.png, …, without sheet.png), in "
+        "units of 1,000,000 bytes; they are made smaller, and at last fewer",
     )
-    check: bool = field(
-        default=True,
-        metadata={
-            "help": "measure the error afterwards, which renders the targets for all candidates; false = leave it "
-            "unmeasured"
-        },
+    check: bool = option(
+        True, "measure the error afterwards, which renders the targets for all candidates; false = leave it unmeasured"
     )
 
 

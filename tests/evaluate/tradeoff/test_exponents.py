@@ -55,7 +55,7 @@ def test_what_no_line_fits_is_refused(sizes: list[float], costs: list[float]) ->
 
 
 def test_sizes_are_whole_different_and_end_at_all() -> None:
-    config = ScalingConfig(points=5, span=8.0)
+    config = ScalingConfig(points=5)
     assert geometric_sizes(24, config) == [3, 5, 8, 14, 24]
     assert geometric_sizes(2, config) == [1, 2]
     for points in (1, 2, -1):

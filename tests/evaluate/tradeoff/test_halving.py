@@ -45,9 +45,7 @@ def test_rungs_grow_in_scenes_and_shrink_in_settings() -> None:
         calls.append((len(some), scenes))  # type: ignore[arg-type]
         return [(float(number),) for number in range(len(some))]  # type: ignore[arg-type]
 
-    rungs = successive_halving(
-        [{"n": number} for number in range(27)], 12, evaluate, HalvingConfig(settings=27, keep=1 / 3)
-    )
+    rungs = successive_halving([{"n": number} for number in range(27)], 12, evaluate, HalvingConfig(settings=27))
     assert calls == [(27, 1), (9, 3), (4, 9), (4, 12)]
     assert [rung.scenes for rung in rungs] == [1, 3, 9, 12]
     assert rungs[-1].survivors == tuple({"n": number} for number in range(4))
@@ -62,7 +60,7 @@ def test_settings_are_all_combinations_or_a_choice_by_the_seed() -> None:
     assert all(each in everything for each in some)
 
 
-@pytest.mark.parametrize("wrong", [{"keep": 0.0}, {"keep": 1.0}, {"first": 0}, {"settings": -1}])
+@pytest.mark.parametrize("wrong", [{"first": 0}, {"settings": -1}])
 def test_rungs_that_would_not_end_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(InputError, match=f"^.*{next(iter(wrong))}.*: expected"):
         HalvingConfig(**wrong)  # type: ignore[arg-type]

@@ -218,7 +218,7 @@ def test_combinations_that_a_stage_refuses_are_left_out_and_every_result_has_its
         return Judged(scores=scores, bytes=100 * settings.effort + settings.color)
 
     monkeypatch.setattr(ToyScene, "judge", judge)
-    stage, sweep = replace(Toy().stage(), base=Picky()), SweepConfig(rounds=1, cost="bytes")
+    stage, sweep = replace(Toy().stage(), base=Picky(), cost="bytes"), SweepConfig(rounds=1)
     result = sweep_stage(stage, SCENES, Records(), sweep, HalvingConfig(settings=50))
     assert result.matter == ("effort", "color")
     assert len(result.rungs[0].settings) == 4 * 3 - 1
@@ -228,8 +228,9 @@ def test_combinations_that_a_stage_refuses_are_left_out_and_every_result_has_its
     assert measured == {each.label: each.scenes for each in result.results}
 
 
-def test_the_cost_that_is_asked_for_is_the_one_that_decides() -> None:
-    result = sweep_stage(Toy().stage(), SCENES[:1], Records(), SweepConfig(rounds=1, knobs=("color",), cost="seconds"))
+def test_the_cost_of_the_stage_is_the_one_that_decides() -> None:
+    stage = replace(Toy().stage(), cost="seconds")
+    result = sweep_stage(stage, SCENES[:1], Records(), SweepConfig(rounds=1, knobs=("color",)))
     assert result.cost == "seconds"
     (effort, _), rows = Toy().stage().knobs, []
     for knobs, seconds in (({}, 2.0), ({"effort": 1}, 1.0)):

@@ -7,7 +7,6 @@ import pytest
 from scipy.stats import sem
 from toy_stage import Toy, record
 
-from gsencoder.core.errors import InputError
 from gsencoder.evaluate.tradeoff.measure import Record
 from gsencoder.evaluate.tradeoff.stage import Judged, Score
 from gsencoder.evaluate.tradeoff.sweep import (
@@ -15,7 +14,6 @@ from gsencoder.evaluate.tradeoff.sweep import (
     estimate_difference,
     knobs_that_matter,
     mark_front,
-    pick_within,
     scene_row,
     summarize,
 )
@@ -129,16 +127,3 @@ def test_the_front_is_drawn_among_settings_of_as_many_scenes() -> None:
         "cpu_seconds",
     )
     assert [each.on_front for each in marked] == [True, True, False, False]
-
-
-def test_a_limit_of_error_takes_the_cheapest_and_one_of_seconds_the_most_exact() -> None:
-    def result(seconds: float, error: float, **knobs: int):  # type: ignore[no-untyped-def]
-        rows = [record("a", [seconds / 2], {"error": Score(error)}, **knobs)]
-        return summarize(rows, rows, "grid")
-
-    trades = [result(3.0, 0.1), result(2.0, 0.2, n=1), result(1.0, 0.3, n=2)]
-    assert pick_within(trades, None, 0.25).knobs == {"n": 1}
-    assert pick_within(trades, 2.5, None).knobs == {"n": 1}
-    assert pick_within(trades, 5.0, 0.3).knobs == {"n": 2}
-    with pytest.raises(InputError, match=r"fastest \(n=2\).*most exact \(defaults\)"):
-        pick_within(trades, 0.5, None)
