@@ -38,12 +38,12 @@ class Once:
     def compose_config(self, command: str, written: Sequence[str], mode: Any, *, from_shell: bool) -> Any:
         from omegaconf import OmegaConf
 
-        from gsencoder.app.compose import unseal
+        from gsencoder.app.compose import decode_text
 
         texts: list[str] = []
 
         def numbered(match: re.Match[str]) -> str:
-            texts.append(unseal(match[1]))
+            texts.append(decode_text(match[1]))
             return f"${{text_of_line:{len(texts) - 1}}}"
 
         form = [SEALED.sub(numbered, word) for word in written]

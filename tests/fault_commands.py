@@ -135,7 +135,7 @@ CASES: dict[str, Case] = {
     "score": Case(
         lambda given: [
             "score", "recognition", f"predictions={given / 'named' / 'predictions.json'}",
-            f"truth={given / 'named' / 'truth.json'}", "ks=1",
+            f"truth={given / 'named' / 'truth.json'}",
         ]
     ),
     "questions": Case(

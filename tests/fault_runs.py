@@ -128,7 +128,6 @@ class FaultServer:
         at: int = 0,
         action: int = COUNT,
         reads: Path | None = None,
-        clock: tuple[int, int] | None = None,
         warm: bool = False,
         environment: dict[str, str] | None = None,
         meanwhile: list[str] | None = None,
@@ -141,7 +140,6 @@ class FaultServer:
             at: the number of the call at which the fault is; 0 = none.
             action: what the fault is.
             reads: a folder whose files are counted as inputs as they are opened; changes are not counted then.
-            clock: after how many readings of the time of day it jumps, and by how many seconds.
             warm: whether to run it in the server itself, so that children have its modules and kernels.
             environment: changes to that of the server.
             meanwhile: a command line that is run while this one stands still (`HALT`). Where it waits for this one,
@@ -158,7 +156,7 @@ class FaultServer:
         }  # fmt: skip
         for name in ("log", "other"):
             (side / name).unlink(missing_ok=True)
-        answer = self._ask(asked | ({"clock": clock} if clock else {}))
+        answer = self._ask(asked)
         log, other = (
             (side / name).read_text(errors="replace") if (side / name).exists() else "" for name in ("log", "other")
         )

@@ -38,8 +38,6 @@ def forked(asked: dict[str, Any]) -> int:
         os.environ.update(asked.get("environment", {}))
         os.chdir(asked["folder"])
         names = (asked["writes"], asked["reads"])
-        if "clock" in asked:
-            SHIM.fault_clock(ctypes.c_long(asked["clock"][0]), ctypes.c_long(asked["clock"][1]))
         SHIM.fault_arm(
             *(os.fsencode(name) for name in names),
             ctypes.c_long(asked["at"]),

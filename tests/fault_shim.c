@@ -17,7 +17,6 @@
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <sys/uio.h>
-#include <time.h>
 #include <unistd.h>
 
 enum action { COUNT, KILL, TEAR, FULL, IO_ERROR, SHORT, SHORT_FULL, DENY, VANISH, CUT, READ_ERROR, HALT };
@@ -27,8 +26,6 @@ static atomic_long changes, inputs;
 static long at;
 static int action = -1, trace = -1;
 static atomic_int full;
-static long clock_shift_after = -1, clock_shift;
-static atomic_long clock_calls;
 
 void fault_arm(const char *writes, const char *reads, long n, int what, const char *trace_path) {
     snprintf(write_root, sizeof write_root, "%s", writes);
@@ -268,11 +265,3 @@ int rename(const char *from, const char *path) { PATH_CALL("rename", AT_FDCWD, p
 int renameat(int a, const char *from, int b, const char *path) { PATH_CALL("rename", b, path, 0, SYS_renameat2, a, from, b, path, 0) }
 int renameat2(int a, const char *from, int b, const char *path, unsigned flags) { PATH_CALL("exchange", b, path, 0, SYS_renameat2, a, from, b, path, flags) }
 
-/* After so many readings of the clock of days, it jumps by so many seconds. */
-void fault_clock(long after, long seconds) { clock_shift_after = after; clock_shift = seconds; atomic_store(&clock_calls, 0); }
-int clock_gettime(clockid_t which, struct timespec *now) {
-    int result = (int)syscall(SYS_clock_gettime, which, now);
-    if (which == CLOCK_REALTIME && clock_shift_after >= 0 && atomic_fetch_add(&clock_calls, 1) >= clock_shift_after)
-        now->tv_sec += clock_shift;
-    return result;
-}

@@ -1,4 +1,4 @@
-"""Composition of a command line into settings by Hydra, with text taken literally.
+"""Composition of a command line into settings by Hydra, with text taken literally, and several runs from one line.
 
 Hydra's override grammar is made for numbers and sweeps. In it `query=mug,banana` is a sweep, `question=What's red?` a
 syntax error, `query=1` a number, `query=${oc.env:HOME}` a look-up. Options whose type is text, a path, or a list of
@@ -10,20 +10,12 @@ name exists, and an error if not. Every other word is a path. After `--` all wor
 sections before the last dot where that is unambiguous (`voxel=` for `fusion.voxel=`); of several options with one last
 part, the one with the fewest sections before it.
 
-Hydra's config store, filled from a command's settings class, so that defaults stand in the dataclasses alone.
+Hydra's config store is filled from a command's settings class. One node holds all defaults of the command; the config
+groups hold what can be chosen by name: the members of choices, presets of sections, `preset`, and `experiment`. YAML
+files in the folder of a group are further members, which set only what differs from the member they build on. The nodes
+are plain dicts: OmegaConf makes a node of a frozen dataclass read-only, and refuses Literal.
 
-One node holds all defaults of the command. Beside it are the config groups, for what can be chosen by name:
-- a field whose type is a union of dataclasses; each of them is a member (`teacher=onnx`);
-- a section with presets; `field(…, metadata={"preset": "tiny"})` names the member that is its default (`model=tiny`);
-- `preset`, whose members set options of several sections from the table in `gsencoder.app.options`;
-- `experiment` of a command that has experiments (`CommonConfig.has_experiments`); its member `none` sets nothing.
-YAML files in the folder of a group are further members. They set only what differs from the member they build on.
-
-The nodes are plain dicts: OmegaConf makes a node of a frozen dataclass read-only, and refuses Literal.
-
-Several runs from one command line (`-m`), by Hydra's multirun, sweepers and launchers.
-
-Values follow Hydra's grammar here (`voxel=0.01,0.02`, `teacher=labels,palette`), except for text, which is taken
+With `-m`, values follow Hydra's grammar (`voxel=0.01,0.02`, `teacher=labels,palette`), except for text, which is taken
 literally unless it has the form `query=choice(mug,banana)`. Run k writes to OUT/k; Hydra leaves its `multirun.yaml` in
 OUT.
 """
@@ -293,14 +285,14 @@ SWEPT_TEXT = re.compile(r"choice\(.*\)", re.DOTALL)
 """Form of the value of a text option that is swept, with -m."""
 
 
-def seal(text: str) -> str:
+def encode_text(text: str) -> str:
     """Encodes text as a value in Hydra's grammar that resolves to exactly this text."""
     digits = text.encode("utf-8", "surrogatepass").hex()
     return f"'${{text:x{digits}}}'"
 
 
-def unseal(digits: str) -> str:
-    """Decodes the digits that `seal` wrote."""
+def decode_text(digits: str) -> str:
+    """Decodes the digits that `encode_text` wrote."""
     return bytes.fromhex(digits[1:]).decode("utf-8", "surrogatepass")
 
 
@@ -310,10 +302,8 @@ def open_hydra(command: str, cls: type[CommonConfig], conf: Path | None) -> Iter
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
     from hydra.errors import HydraException
-    from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
-    OmegaConf.register_new_resolver("text", unseal, replace=True)
     store_settings(command, cls)
     folder = str((conf or conf_folder()).resolve())
     try:
@@ -416,7 +406,7 @@ def overrides(texts: Mapping[str, str], choices: Choices, *, sweep: bool = False
             if not (sweep and SWEPT_TEXT.fullmatch(value)):
                 # Users of Hydra write brackets around a list; text may begin with one, names do not.
                 bracketed = option.names and re.fullmatch(r"\[(.*)\]", value)
-                text = seal(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
+                text = encode_text(re.sub(r"\s*,\s*", ",", bracketed[1].strip()) if bracketed else value)
         elif option is not None and not sweep and _is_list(option) and not value.startswith("["):
             text = f"[{value}]"
         name = option.hydra_key if option is not None and option.like_group and key not in choices.groups else key
@@ -460,7 +450,6 @@ def compose(
 
 def plain_settings(composed: Any) -> dict[str, Any]:
     """The composed settings as plain dicts, lists and scalars, without Hydra's own."""
-    from omegaconf import OmegaConf
 
     settings = OmegaConf.masked_copy(composed, [key for key in composed if key != "hydra"])
     data = OmegaConf.to_container(settings, resolve=True)
@@ -536,7 +525,7 @@ def command_help(
 
 
 # A launcher that runs jobs in other processes imports this module there before it resolves the settings.
-OmegaConf.register_new_resolver("text", unseal, replace=True)
+OmegaConf.register_new_resolver("text", decode_text, replace=True)
 
 
 def _job(
@@ -594,7 +583,7 @@ def run_many(
     hydra_settings = {
         "hydra.mode": "MULTIRUN",
         "hydra.output_subdir": "null",
-        "hydra.sweep.dir": seal(texts["out"]),
+        "hydra.sweep.dir": encode_text(texts["out"]),
         "hydra.sweep.subdir": ".",
         "hydra/job_logging": "none",
         "hydra/hydra_logging": "none",

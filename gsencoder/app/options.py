@@ -1,23 +1,15 @@
-"""The options of a command: names, types, defaults and help texts, from its settings class.
+"""The options of a command: a frozen dataclass, into which command lines and YAML files are parsed and validated.
 
-Settings of the commands: frozen dataclasses, into which command lines and YAML files are parsed and validated.
+A field is made by `option`, whose metadata hold its meaning and its limits. Further metadata: `required=True` (the
+command cannot run without it), `metavar` (the word that stands for the value in the help), `secret=True` (the value is
+never shown or written), `names=True` (a list of names, around which brackets may stand) and `like_group=True` (a choice
+of other commands has the option's name).
 
-Each command owns a `@dataclass(frozen=True, slots=True, kw_only=True)` whose fields carry `metadata={"help": …}`;
-that text is what `gsencoder COMMAND --help` shows. Further metadata: `required=True` (the command cannot run without
-it), `metavar` (the word that stands for the value in the help), `secret=True` (the value is never shown or written),
-`names=True` (a list of names, around which brackets may stand) and `like_group=True` (a choice of other commands has
-the option's name). A field whose type is a dataclass is a section, and its
-options are written `section.name=value`. A field whose type is a union of dataclasses is a choice, written
-`section=member`: every member has a field `name: Literal["…"]`. `preset="NAME"` in the metadata of a section makes it a
-choice too, between its default, which has that name, and the presets in `conf/SECTION/*.yaml`. A mapping from names to
-such a union, with `several="SECTION"`, takes several members of that choice: `sections=member,NAME:member`, whose
-options are `sections.NAME.option=value`.
-
-Presets: `preset=fast|balanced|exact` sets the options of a command that trade cost for accuracy.
-
-`balanced` is the defaults. A row of the table holds an option by its full key; a preset sets it in every command that
-has this option. The values are those of measurements ("Trade-off" in docs/measurements.md). Experiments and the command
-line go over presets.
+A field whose type is a dataclass is a section, and its options are written `section.name=value`. A field whose type is
+a union of dataclasses is a choice, written `section=member`: every member has a field `name: Literal["…"]`.
+`preset="NAME"` in the metadata of a section makes it a choice too, between its default, which has that name, and the
+files `conf/SECTION/*.yaml`. A mapping from names to such a union, with `several="SECTION"`, takes several members of
+that choice: `sections=member,NAME:member`, whose options are `sections.NAME.option=value`.
 """
 
 import difflib
@@ -112,11 +104,8 @@ def union_members(annotation: Any) -> tuple[Any, ...]:
 
 
 def allows_none(annotation: Any) -> bool:
+    """Whether a type is a union with None."""
     return get_origin(annotation) in (Union, types.UnionType) and type(None) in get_args(annotation)
-
-
-def _is_text(annotation: Any) -> bool:
-    return annotation in (str, Path)
 
 
 def _is_word(annotation: Any) -> bool:
@@ -126,14 +115,14 @@ def _is_word(annotation: Any) -> bool:
 def kind_of(annotation: Any) -> Kind:
     """Whether the value of an option is taken literally ("text", "list") or parsed by Hydra ("value")."""
     members = union_members(annotation)
-    if all(_is_text(member) for member in members):
+    if all(member in (str, Path) for member in members):
         return "text"
     if get_origin(annotation) is Mapping:
         return "list"
     if len(members) == 1 and get_origin(members[0]) is tuple:
         items = get_args(members[0])
         if len(items) == 2 and items[1] is Ellipsis:
-            return "list" if _is_text(items[0]) or _is_word(items[0]) else "value"
+            return "list" if items[0] in (str, Path) or _is_word(items[0]) else "value"
     return "value"
 
 
@@ -302,50 +291,37 @@ def _words(annotation: Any) -> tuple[Any, ...]:
 Preset = Literal["fast", "balanced", "exact"]
 PRESET = "preset"
 DEFAULT_PRESET: Preset = "balanced"
-PRESETS: tuple[str, ...] = get_args(Preset)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PresetOption:
-    """An option that presets set; None = its default.
-
-    Attributes:
-        key: of the option.
-        fast: its value where time counts.
-        exact: its value where accuracy counts.
-    """
-
-    key: str
-    fast: Any = None
-    exact: Any = None
-
-
-PRESET_OPTIONS = (
-    PresetOption(key="fusion.view_share", fast=0.5),
-    PresetOption(key="fusion.blend.rays_per_patch", exact=196),
-    PresetOption(key="fusion.blend.stop_transmittance", fast=0.1, exact=1e-6),
-    PresetOption(key="fusion.energy", exact=1.0),
-    PresetOption(key="fusion.table_energy", exact=1.0),
-    PresetOption(key="fusion.max_rank", exact=0),
-    PresetOption(key="prepare.fusion.blend.rays_per_patch", exact=196),
-    PresetOption(key="prepare.fusion.blend.stop_transmittance", exact=1e-6),
-    PresetOption(key="encode.precision", exact="float32"),
-    PresetOption(key="encode.halo", fast=0.0, exact=1.28),
-    PresetOption(key="choose.candidates", fast=16, exact=64),
-    PresetOption(key="budget.minutes", fast=5.0, exact=0.0),
-    PresetOption(key="optimize.steps", exact=3000),
-)
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "fast": {
+        "fusion.view_share": 0.5,
+        "fusion.blend.stop_transmittance": 0.1,
+        "encode.halo": 0.0,
+        "choose.candidates": 16,
+        "budget.minutes": 5.0,
+    },
+    "balanced": {},
+    "exact": {
+        "fusion.blend.rays_per_patch": 196,
+        "fusion.blend.stop_transmittance": 1e-6,
+        "fusion.energy": 1.0,
+        "fusion.table_energy": 1.0,
+        "fusion.max_rank": 0,
+        "prepare.fusion.blend.rays_per_patch": 196,
+        "prepare.fusion.blend.stop_transmittance": 1e-6,
+        "encode.precision": "float32",
+        "encode.halo": 1.28,
+        "choose.candidates": 64,
+        "budget.minutes": 0.0,
+        "optimize.steps": 3000,
+    },
+}
+"""What `preset=` sets, by full key, in every command that has the option; experiments and the command line go over it.
+The values are those of measurements ("Trade-off" in docs/measurements.md)."""
 
 
 def preset_values(cls: type, preset: str) -> dict[str, Any]:
-    """What a preset sets in a command, by full key.
-
-    Args:
-        cls: the settings class of the command.
-    """
-    options = options_by_key(cls)
-    values = {each.key: getattr(each, preset, None) for each in PRESET_OPTIONS}
-    return {key: value for key, value in values.items() if value is not None and key in options}
+    """What a preset sets in a command, by full key."""
+    return {key: value for key, value in PRESETS[preset].items() if key in options_by_key(cls)}
 
 
 def preset_node(cls: type, preset: str) -> dict[str, Any]:
@@ -362,12 +338,13 @@ def preset_node(cls: type, preset: str) -> dict[str, Any]:
 
 def describe_presets(cls: type) -> Mapping[str, str]:
     """What each preset changes in a command, in words."""
-    described: dict[str, str] = {}
-    for preset in PRESETS:
-        values = preset_values(cls, preset)
-        changes = ", ".join(f"{key}={shown_value(value)}" for key, value in values.items())
-        described[preset] = "the defaults" if preset == DEFAULT_PRESET else changes or "changes nothing in this command"
-    return described
+    changes = {
+        preset: ", ".join(f"{key}={shown_value(value)}" for key, value in preset_values(cls, preset).items())
+        for preset in PRESETS
+    }
+    return {name: text or "changes nothing in this command" for name, text in changes.items()} | {
+        DEFAULT_PRESET: "the defaults"
+    }
 
 
 T = TypeVar("T")

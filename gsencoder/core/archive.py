@@ -1,18 +1,13 @@
 """Archives: safetensors files with a JSON header and checksums, written atomically and validated when they are read.
 
-Files are not trusted: an array of another size would otherwise be broadcast, or fail far from the cause. Against
-damage, files carry checksums of the header and the arrays, and each array is verified when it is read.
+Files are not trusted: an array of another size would otherwise be broadcast, or fail far from the cause. Each block of
+each array has a CRC-32, and a SHA-256 covers the header and all of these, so that a reader that maps a file checks only
+what it reads: a training step touches a small part of a scene. A CRC-32 detects every error of up to 32 neighboring
+bits in a block, and misses one in 2³² of all others; it is no protection against deliberate changes.
 
-Checksums of array files: a CRC-32 for each block of each array, and one SHA-256 over the header and all of these.
-
-Blocks let a reader that maps a file check only what it reads: a training step touches a small part of a scene. A CRC-32
-detects every error of up to 32 neighboring bits in a block, and misses one in 2³² of all others; it is no protection
-against deliberate changes.
-
-The bytes of safetensors files: arrays read without a memory map, and files written without a second copy of them.
-
-A process that touches a page of a map beyond the end of its file is ended by the system (SIGBUS) without a word. Read
-as here, a file that is cut off by another program is shorter than expected, and an error names it.
+A process that touches a page of a map beyond the end of its file is ended by the system (SIGBUS) without a word. Arrays
+are therefore read without a map where they are read whole: a file that another program cuts off is then shorter than
+expected, and an error names it.
 """
 
 import hashlib

@@ -1,15 +1,7 @@
-"""The process of a command: signals, rank, progress, clock, memory and the names of devices.
+"""The process of a command: signals, its rank among those that one launcher started, seconds, and memory.
 
-The rank of this process among those that one launcher started.
-
-torchrun and SLURM (srun, submitit) give a process its rank through environment variables; without either there is one
-process. No other module reads these variables.
-
-Heap settings of a CPU process that runs networks: freed blocks are reused instead of returned to the system.
-
-glibc returns every block above 32 MB to the system when it is freed, and threads other than the first get heaps that
-cannot grow beyond 64 MB. Each layer's activations are then new pages, which the system must clear: that costs more than
-the arithmetic (`bench/cpu.py`).
+torchrun and SLURM (srun, submitit) give a process its rank through environment variables, which no other module reads;
+without either there is one process.
 """
 
 import ctypes
@@ -351,6 +343,10 @@ _NEVER_TRIM = (1 << 31) - 1
 
 def retain_freed_memory() -> bool:
     """Makes this process reuse freed memory from now on; False if the C library does not support it (glibc does).
+
+    glibc returns every block above 32 MB to the system when it is freed, and threads other than the first get heaps
+    that cannot grow beyond 64 MB. Each layer's activations are then new pages, which the system must clear: that costs
+    more than the arithmetic.
 
     The process then never shrinks below its peak. Meant for commands, which have a process of their own. To be called
     before the first network runs, since oneDNN reads the capacity of its cache of compiled products once; the default

@@ -29,29 +29,49 @@ PIECES = 32
 """Number of pieces that work is cut into: enough to balance a dozen cores, few enough to cost nothing on two."""
 
 
-def kernel(function: Callable[..., Any]) -> Any:
-    """Compiles a function for `parallel`; reassociation is off, so that sums have one order."""
-    return compiled(function, fastmath={"contract", "nsz"})
+class Kernel:
+    """A numba function that does not hold the GIL. It is compiled when it is first called, with the kernels that it
+    calls: numba takes half a second to load, and most commands need few kernels or none."""
+
+    def __init__(self, function: Callable[..., Any], *, fused: bool = True) -> None:
+        """With `fused` products are fused with sums; reassociation is off, so that sums have one order."""
+        self._function = function
+        self._options = {"nogil": True, "error_model": "numpy", "fastmath": {"contract", "nsz"} if fused else False}
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.dispatcher(*arguments)
+
+    @functools.cached_property
+    def dispatcher(self) -> Callable[..., Any]:
+        """The compiled function, which is stored for later runs.
+
+        Warns:
+            SceneWarning: it cannot be stored; once a process.
+        """
+        from numba import njit
+
+        names = getattr(getattr(self._function, "__code__", None), "co_names", ())
+        used = getattr(self._function, "__globals__", {})
+        for name in names:
+            if isinstance(used.get(name), Kernel):
+                used[name] = used[name].dispatcher
+        try:
+            return njit(cache=True, **self._options)(self._function)
+        except RuntimeError as error:
+            # A package that another user installed, and no home that can be written, as in some containers.
+            if "no locator available" not in str(error):
+                raise
+            _warn_uncached()
+            return njit(**self._options)(self._function)
 
 
-def compiled(function: Callable[..., Any], **options: Any) -> Any:
-    """Compiles a function that does not hold the GIL, with further options of numba, and stores what was compiled.
+kernel = Kernel
+"""Decorates a function that `parallel` calls."""
 
-    Warns:
-        SceneWarning: it cannot be stored for later runs; once a process.
-    """
-    # Threads are also asked for where nothing is compiled, and numba takes half a second to load.
-    from numba import njit
 
-    options |= {"nogil": True, "error_model": "numpy"}
-    try:
-        return njit(cache=True, **options)(function)
-    except RuntimeError as error:
-        # A package that another user installed, and no home that can be written, as in some containers.
-        if "no locator available" not in str(error):
-            raise
-        _warn_uncached()
-        return njit(**options)(function)
+def compiled(function: Callable[..., Any]) -> Kernel:
+    """Decorates a function whose products are not fused with sums."""
+    return Kernel(function, fused=False)
 
 
 @functools.cache

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
-from scipy.spatial.transform import Rotation
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.check.agreement import SAMPLES, depth_views
@@ -209,6 +208,8 @@ def _surface_areas(gaussians: Gaussians) -> Float64[np.ndarray, "x y z"]:
         rows = np.sort(np.random.default_rng(0).choice(rows, MAX_GAUSSIANS, replace=False))
     if not total:
         return np.zeros((1, 1, 1))
+    from scipy.spatial.transform import Rotation
+
     frame = _frame(gaussians, gaussians.means[rows].astype(np.float64))
     means, scales = gaussians.means[rows] @ frame.T, gaussians.scales[rows].astype(np.float64)
     low, high = np.quantile(means, EXTENT, axis=0)
@@ -229,6 +230,8 @@ def _surface_areas(gaussians: Gaussians) -> Float64[np.ndarray, "x y z"]:
 def _frame(gaussians: Gaussians, means: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3 3"]:
     """The axes, as rows, of the grid: those of the walls, those in which the means spread most, or the world's,
     whichever give the smallest box."""
+    from scipy.spatial.transform import Rotation
+
     means = means[even_indices(len(means), MAX_FRAME_MEANS)]
     normals = surfaces_of_gaussians(gaussians).normals[:MAX_FRAME_MEANS]
     starts = Rotation.random(STARTS, random_state=0).as_matrix() if len(normals) else ()

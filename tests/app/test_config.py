@@ -10,7 +10,18 @@ from toy_settings import FusionConfig, LabelsConfig, OnnxConfig, ToyConfig, toy
 
 from gsencoder.app import main as cli
 from gsencoder.app.compose import compose
-from gsencoder.app.options import HIDDEN, CommonConfig, check_required, describe, settings, typed
+from gsencoder.app.main import COMMANDS
+from gsencoder.app.options import (
+    HIDDEN,
+    CommonConfig,
+    Option,
+    check_required,
+    describe,
+    options_of,
+    settings,
+    typed,
+    union_members,
+)
 from gsencoder.core.errors import InputError
 
 
@@ -190,3 +201,39 @@ def test_secrets_are_repeated_by_no_error_and_taken_by_no_sweep(
         error = capsys.readouterr().err
         assert problem in error
         assert "sk-" not in error
+
+
+def written(option: Option, value: object) -> dict[str, Any]:
+    """Settings with a value of one option, in the member of a choice that has it."""
+    data: dict[str, Any] = {}
+
+    def section(names: list[str]) -> dict[str, Any]:
+        inner = data
+        for name in names:
+            inner = inner.setdefault(name, {})
+        return inner
+
+    *sections, last = option.key.split(".")
+    section(sections)[last] = value
+    choice, _, member = option.member.partition("=")
+    if member:
+        section(choice.split("/"))["name"] = member
+    return data
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_number_that_is_not_finite_is_refused_by_name_with_what_is_expected(name: str) -> None:
+    cls, _ = COMMANDS[name].load()
+    # Without its protocol `score` looks at no option.
+    beside = {"paths": ["captions"]} if name == "score" else {}
+    for option in options_of(cls):
+        if not {int, float} & {*union_members(option.annotation)}:
+            continue
+        for value in (math.nan, math.inf, -math.inf):
+            with pytest.raises(InputError) as refused:
+                typed(cls, written(option, value) | beside)
+            message = str(refused.value)
+            names, _, said = message.partition(": ")
+            assert option.key in names.split(", "), message
+            assert said.startswith("expected"), message
+            assert not math.isnan(value) or "whole number" in said or "nan is not a finite" in said or "," in names

@@ -4,11 +4,14 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from no_files import ends_within, make_no_file
 from viewed_rooms import save_viewed_room
 
-from gsencoder.app.main import COMMANDS, main
+from gsencoder.app.main import COMMANDS, _impossible_sizes, main
+from gsencoder.core.errors import InputError
 
 SECONDS = 10.0
 OUT = {"export": "out.onnx", "repair": "out.ply"}
@@ -101,7 +104,8 @@ def test_an_option_that_names_no_file_is_refused(
     for part in ("room", "features", "tables", "truth"):
         (tmp_path / part).symlink_to(made / part)
     path = tmp_path / name.replace("BAD", "bad")
-    for kind in KINDS:
+    # A pipe, which blocks whoever opens it, and one of the others.
+    for kind in ("pipe", KINDS[1 + OPTIONS.index(words) % 3]):
         make_no_file(path, kind)
         assert path.name in refusal(words, tmp_path, capsys), kind
         path.rmdir() if kind == "folder" else path.unlink()
@@ -114,7 +118,57 @@ def test_a_file_of_a_scene_that_is_none_is_refused(
     shutil.copytree(made, tmp_path, dirs_exist_ok=True)
     path = tmp_path / name
     path.unlink()
-    for kind in KINDS:
+    for kind in ("pipe", "folder"):
         make_no_file(path, kind)
         assert path.name in refusal(words, tmp_path, capsys), kind
         path.rmdir() if kind == "folder" else path.unlink()
+
+
+SETTINGS = {"seed": 0, "model": {"projector": 10**15}, "sizes": [2, 10**11]}
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: np.zeros(10**14),
+        lambda: np.zeros((10**12, 10**12)),
+        lambda: torch.zeros(10**14),
+        lambda: torch.zeros(10**12, 10**12),
+        lambda: np.zeros(10**20),
+        lambda: bytearray(10**20),
+        lambda: [0] * 10**18,
+    ],
+)
+def test_sizes_that_cannot_be_allocated_name_the_large_settings(make: object) -> None:
+    with (
+        pytest.raises(
+            InputError, match=r"^model.projector=1000000000000000, sizes=\[2, 100000000000\]: the machine has"
+        ),
+        _impossible_sizes(SETTINGS),
+    ):
+        make()  # type: ignore[operator]
+
+
+def test_other_errors_stay_as_they_are() -> None:
+    for error in (RuntimeError("shape"), ValueError("shape"), OverflowError("math range error"), InputError("its own")):
+        with pytest.raises(type(error), match=str(error)), _impossible_sizes(SETTINGS):
+            raise error
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["view", "LOOP"],
+        ["inspect", "LOOP"],
+        ["localize", "LOOP", "query=mug"],
+        ["export", "sizes=[99999999999]", "out=LOOP.onnx"],
+        ["train", "LOOP", "model.projector=1000000000"],
+    ],
+)
+def test_commands_end_in_one_line(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    assert main([word.replace("LOOP", str(loop)) for word in words]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1

@@ -25,6 +25,7 @@ from gsencoder.reconstruct.sfm import find_photographed
 class QueueConfig(SharedScenesConfig):
     paths: tuple[str, ...] = ("a",)
     voxel: float = 0.02
+    device: str = "auto"
 
 
 class Work:
@@ -60,7 +61,7 @@ def test_failures_are_listed_at_the_end_and_the_same_command_tries_them_again(
     said = capsys.readouterr().err.splitlines()
     assert said == [f"failed: {tmp_path / 'scenes' / name}: no photographs" for name in "bd"]
     second = Work()
-    queue(tmp_path, second, quiet=True)
+    queue(tmp_path, second, device="cpu")
     assert second.done == ["b", "d"]
     assert "2 of 4 scenes were finished before" in capsys.readouterr().out
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == list("abcd")

@@ -5,8 +5,9 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,12 +84,12 @@ def test_depth_that_was_read_does_not_depend_on_its_file(tmp_path: Path) -> None
 def test_words_that_are_cut_off_while_they_are_copied_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def cut_off(source: Path) -> Iterator[bytes]:
-        content = source.read_bytes()
-        yield content[: len(content) // 2]
+    def cut_off(source: Any, copy: Any) -> None:
+        content = source.read()
+        copy.write(content[: len(content) // 2])
 
     save_room(tmp_path / "features")
-    monkeypatch.setattr("gsencoder.core.archive._blocks", cut_off)
+    monkeypatch.setattr("gsencoder.core.archive.shutil.copyfileobj", cut_off)
     assert cli.main(["pack", str(tmp_path / "features"), "form=npz", f"out={tmp_path / 'out'}", "quiet=true"]) == 2
     assert capsys.readouterr().err.startswith(f"error: {tmp_path / 'features' / 'words.safetensors'}: ")
     assert not (tmp_path / "out").exists()

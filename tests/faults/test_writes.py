@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 from fault_checks import Checker, role
-from fault_runs import FULL, IO_ERROR, KILL, SHORT, SHORT_FULL, TEAR, Call, FaultServer
+from fault_pairs import Pairs
+from fault_runs import CUT, DENY, FULL, IO_ERROR, KILL, READ_ERROR, SHORT, SHORT_FULL, TEAR, VANISH, Call, FaultServer
 
 QUICK = ("encode", "train", "reconstruct", "pack as npz", "score", "questions", "repair")
 """The ways in which commands write: folders, single files, folders of state that a run continues from, logs, copies."""
@@ -57,4 +58,24 @@ def test_results_that_are_replaced_are_there_before_and_after_every_call(server:
     checker = Checker(server, tmp_path, "score")
     last = len(checker.reference.calls)
     wrong = [each for number in range(last - 3, last + 1) for each in checker.check(number, KILL, over=True)]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("name", ["encode", "pack as npz", "score", "questions"])
+def test_an_input_that_is_lost_on_the_way_is_one_line(name: str, server: FaultServer, tmp_path: Path) -> None:
+    rng = random.Random(name)
+    checker = Checker(server, tmp_path, name)
+    calls, wrong = checker.count_inputs(), []
+    for action in (DENY, VANISH, CUT, READ_ERROR):
+        wrong += checker.check_input(rng.choice(calls).number, action)
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("name", ["train", "repair"])
+def test_of_two_runs_in_one_folder_one_writes_it(name: str, server: FaultServer, tmp_path: Path) -> None:
+    pairs = Pairs(Checker(server, tmp_path, name))
+    last = len(pairs.checker.reference.calls)
+    # The first has nothing before its first call, and all of its results stand before its last.
+    calls = [1, random.Random(name).randrange(2, last), last]
+    wrong = [each for call in calls for each in pairs.check(call)]
     assert not wrong, "\n".join(wrong)

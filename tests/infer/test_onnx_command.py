@@ -35,8 +35,8 @@ def test_the_command_tells_what_it_compared(folder: Path) -> None:
     ("words", "message"),
     [
         (["out=encoder.safetensors"], "expected a file that ends in .onnx"),
-        (["out=encoder.onnx", "sizes=[0]"], "sizes: expected one or more numbers from 1"),
-        (["out=encoder.onnx", "tolerance=0"], "tolerance: expected a share between 0 and 1"),
+        (["out=encoder.onnx", "sizes=[0]"], "sizes: expected 1 to 10,000,000, got [0]"),
+        (["out=encoder.onnx", "tolerance=0"], "tolerance: expected above 0 and below 1"),
         (["out=encoder.onnx", "cosine=2"], "cosine: expected -1 to 1"),
         (["out=encoder.onnx", "precision=int4"], "precision"),
         (["out=encoder.onnx", "weights=nothing"], "weights: no file at nothing"),

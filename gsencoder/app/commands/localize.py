@@ -18,6 +18,7 @@ from gsencoder.core.settings import option
 from gsencoder.core.threads import import_ahead
 from gsencoder.data.readers.transforms_json import read_cameras
 from gsencoder.data.scenes import SceneConfig
+from gsencoder.data.up import with_up
 from gsencoder.infer.draw import write_boxes_ply
 from gsencoder.infer.localize import LocalizeConfig, describe_absent, localization_to_json, localize, words_to_json
 from gsencoder.text.table import TextEncoder
@@ -58,7 +59,7 @@ def run(config: LocalizeCommandConfig, run: Run) -> None:
         # Drawing needs torch, which finding boxes does without; it takes as long to load as they take to find.
         import_ahead("gsencoder.infer.pictures")
     with run.step("load"):
-        scene = shown_scene(folder, config.photos, config.data)
+        scene, _ = with_up(shown_scene(folder, config.photos, config.data))
         queried, table = queried_scene(
             scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
         )

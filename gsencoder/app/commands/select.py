@@ -14,6 +14,7 @@ from gsencoder.core.files import write_json
 from gsencoder.core.settings import option
 from gsencoder.core.threads import import_ahead
 from gsencoder.data.splats.files import save_splat
+from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, describe_absent, words_to_json
 from gsencoder.infer.select import select
@@ -60,7 +61,7 @@ def run(config: SelectCommandConfig, run: Run) -> None:
     words = query_words(config.query, config.queries)
     import_ahead("torch")
     with run.step("load"):
-        scene = load_features(folder)
+        scene, _ = with_up(load_features(folder))
         queried, table = queried_scene(
             scene, folder, head=config.head, space=config.space, words_file=config.words, text=config.text
         )

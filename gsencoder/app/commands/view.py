@@ -13,6 +13,7 @@ from gsencoder.core.errors import InputError, printable
 from gsencoder.core.files import write_bytes
 from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, distinct_paths, load_scene
+from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, select_features
 from gsencoder.infer.page.page import Bundle, FileOptions, fitting_page, load_bundle, scene_container, served_page
@@ -99,7 +100,7 @@ def run(config: ViewConfig, run: Run) -> None:
 
 
 def _load(folder: Path, config: ViewConfig, photographed: Scene | None) -> tuple[Scene, Words | None]:
-    scene = load_features(folder)
+    scene, _ = with_up(load_features(folder))
     scene = upright_scene(scene if photographed is None else with_photographs(scene, photographed))
     if not (config.head or config.words) and isinstance(config.text, TableTextConfig):
         _, features = select_features(scene, config.space or None)

@@ -80,7 +80,7 @@ def test_two_folders_are_two_scenes_of_one_page(folder: Path, built: Path, tmp_p
     [
         (["out=page.txt"], "ends in .html"),
         (["max_gaussians=0"], "max_gaussians: expected 1 or more"),
-        (["port=70000"], "port: expected 0 to 65535"),
+        (["port=70000"], "port: expected 0 or more and below 65,536"),
         (["host=0.0.0.0"], "host: expected one address"),
         (["megabytes=0"], "megabytes: expected"),
         (["error=1"], "error: expected"),
