@@ -15,7 +15,7 @@ from gsencoder.core.files import check_written, read_foreign_text, write_json
 from gsencoder.data.splats.files import load_property, load_splat, save_splat
 from gsencoder.infer.draw import word_color
 from gsencoder.infer.localize import box_around
-from gsencoder.infer.selection import Selection
+from gsencoder.infer.select import Selection
 from gsencoder.types import Gaussians, Scene
 
 LABELS_PLY, LABELS_JSON = "labels.ply", "labels.json"

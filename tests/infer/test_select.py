@@ -9,13 +9,13 @@ import torch
 from selected_rooms import BOOK, MUG, NAMES, circling, permuted, selected_room, with_more, words
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.select import select
-from gsencoder.infer.selection import (
+from gsencoder.infer.select import (
     SelectConfig,
     Selection,
     labels_of_parts,
     object_shares,
     sampling,
+    select,
     threshold_parts,
     votes,
 )

@@ -12,8 +12,8 @@ from selected_rooms import selected_room
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_property, load_splat, save_splat
 from gsencoder.infer.draw import word_color
+from gsencoder.infer.select import Selection
 from gsencoder.infer.select_files import LABELS_JSON, LABELS_PLY, file_stems, read_labels, write_labels
-from gsencoder.infer.selection import Selection
 
 SCENE, KINDS = selected_room()
 LABELS = np.array([1, 2, 0], np.int32)[KINDS]

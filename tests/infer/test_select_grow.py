@@ -11,12 +11,14 @@ from gsencoder.infer.select import (
     NO_SHARE,
     Candidates,
     Labels,
+    Parts,
+    SelectConfig,
+    Votes,
     labels_by_features,
     labels_by_pixels,
     labels_of_hidden,
     select,
 )
-from gsencoder.infer.selection import Parts, SelectConfig, Votes
 from gsencoder.types import GaussianFeatures, Gaussians, Scene, Views
 
 USUAL = (1.0, 10.0, 10.0, 10.0, 100.0)

@@ -7,7 +7,7 @@ import pytest
 from selected_rooms import selected_room, splat_of
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.selection import find_holes, sampling
+from gsencoder.infer.select import find_holes, sampling
 from gsencoder.types import Cameras, Gaussians
 
 SIDE = np.arange(-0.2, 0.2001, 0.01)

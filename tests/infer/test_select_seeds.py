@@ -10,8 +10,7 @@ from selected_rooms import EMBEDDINGS, selected_room, words
 from gsencoder.core.errors import InputError
 from gsencoder.infer import select as module
 from gsencoder.infer.localize import LocalizeConfig
-from gsencoder.infer.select import select
-from gsencoder.infer.selection import Parts, SelectConfig, box_parts, threshold_parts
+from gsencoder.infer.select import Parts, SelectConfig, box_parts, select, threshold_parts
 from gsencoder.types import Box, Localization, Scene
 
 SCENE, KINDS = selected_room()

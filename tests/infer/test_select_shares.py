@@ -6,7 +6,7 @@ from scipy.spatial.distance import cdist
 from selected_rooms import SPACE
 
 from gsencoder.infer import selection as module
-from gsencoder.infer.selection import object_shares
+from gsencoder.infer.select import object_shares
 from gsencoder.types import GaussianFeatures
 
 REACH, SPACING = 3.0, 1.1

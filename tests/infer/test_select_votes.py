@@ -7,7 +7,7 @@ import pytest
 from selected_rooms import splat_of
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.selection import Votes, sampling, votes
+from gsencoder.infer.select import Votes, sampling, votes
 from gsencoder.types import Cameras, Gaussians
 
 

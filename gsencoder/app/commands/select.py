@@ -17,9 +17,8 @@ from gsencoder.data.splats.files import save_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, describe_absent, words_to_json
-from gsencoder.infer.select import select
+from gsencoder.infer.select import SelectConfig, Selection, find_holes, sampling, select
 from gsencoder.infer.select_files import LABELS_JSON, LABELS_PLY, file_stems, labels_to_json, write_labels
-from gsencoder.infer.selection import SelectConfig, Selection
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Scene
 
@@ -117,9 +116,6 @@ def _files(selection: Selection, config: SelectCommandConfig) -> dict[int, str]:
 
 def _holes(scene: Scene, selection: Selection, config: SelectConfig, track: Progress) -> dict[str, Any]:
     """The holes of each view that has one, and of all views together, as JSON values."""
-    # The matrix of a view needs torch.
-    from gsencoder.infer.selection import find_holes, sampling
-
     assert scene.gaussians is not None
     assert scene.views is not None
     samples = sampling(scene.views.cameras, views=config.views, pixels=config.pixels)

@@ -13,9 +13,8 @@ from gsencoder.app import main as cli
 from gsencoder.data.splats.files import load_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
-from gsencoder.infer.select import select
+from gsencoder.infer.select import find_holes, sampling, select
 from gsencoder.infer.select_files import read_labels
-from gsencoder.infer.selection import find_holes, sampling
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.types import Scene
 
