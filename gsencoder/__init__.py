@@ -27,6 +27,7 @@ _HOME = {
     "load_features": "gsencoder.fusion.folder",
     "save_features": "gsencoder.fusion.folder",
     "encode": "gsencoder.infer.encode",
+    "Encoder": "gsencoder.infer.load",
     "load_encoder": "gsencoder.infer.load",
     "load_weights": "gsencoder.models.weights",
     "localize": "gsencoder.infer.localize",

@@ -1,6 +1,8 @@
 """Feed-forward inference: features of a splat in one pass, without photographs or teacher (SplatDistill, sec. 3.4)."""
 
+import importlib
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -8,6 +10,7 @@ from jaxtyping import Float32
 
 from gsencoder.core.device import autocast_dtype, choose_device
 from gsencoder.core.errors import InputError
+from gsencoder.core.files import write_bytes
 from gsencoder.core.process import Device, Precision, Track, untracked
 from gsencoder.fusion.folder import load_tables
 from gsencoder.infer.chunks import EncodeConfig, encode_by_chunks
@@ -17,6 +20,8 @@ from gsencoder.models.output_space import OutputSpaces
 from gsencoder.models.weights import find_weights, load_weights
 from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, check_unit
+
+EXPORTER = "gsencoder.infer.onnx.export"
 
 
 class TorchEncoder:
@@ -82,6 +87,15 @@ class TorchEncoder:
         return encode_spaces(
             gaussians, self.network, self.outputs, config, metres_per_unit=metres_per_unit, track=track
         )
+
+    def export(self, path: str | Path) -> None:
+        """Writes the encoder as one ONNX file in float32, which runs without torch, after comparing the two."""
+        # The exporter imports this module.
+        exporter = importlib.import_module(EXPORTER)
+        model = exporter.export_onnx(self, exporter.lower(self))
+        cloud = exporter.Cloud("300 random Gaussians", exporter.random_cloud(300, self.voxel))
+        exporter.check_parity(model, self, [cloud])
+        write_bytes(path, model)
 
 
 def encode(

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from gsencoder.core.pretrained import find_file
 from gsencoder.core.process import Device, Precision, Track, untracked
@@ -11,10 +11,30 @@ from gsencoder.infer.onnx.runtime import SUFFIX, OnnxEncoder
 from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians
 
+if TYPE_CHECKING:
+    from gsencoder.infer.encode import TorchEncoder
+
+
+class _Loads(type(Protocol)):  # type: ignore[misc]
+    """Gives `Encoder` its `load`, which is none of the things that an encoder does."""
+
+    def load(cls, weights: str, device: Device = "auto") -> "TorchEncoder | OnnxEncoder":
+        """The encoder of a file, a folder or a name, such as "house" or "model.onnx", which runs without torch.
+
+        Args:
+            weights: a file that `gsencoder export` wrote, else what `gsencoder.models.weights.find_weights` takes.
+            device: where an exported graph runs; trained weights follow `EncodeConfig.device`.
+        """
+        if Path(weights).suffix.lower() == SUFFIX:
+            return OnnxEncoder(weights, device=device)
+        from gsencoder.infer.encode import TorchEncoder
+
+        return TorchEncoder(weights)
+
 
 @runtime_checkable
-class Encoder(Protocol):
-    """Computes a feature for every Gaussian of a splat."""
+class Encoder(Protocol, metaclass=_Loads):
+    """Computes a feature for every Gaussian of a splat; `Encoder.load(weights)` gives one of torch or of ONNX."""
 
     @property
     def voxel(self) -> float:
@@ -70,15 +90,4 @@ def file_of_encoder(weights: str) -> Path:
     return find_weights(weights)
 
 
-def load_encoder(weights: str, device: Device = "auto") -> Encoder:
-    """Loads the encoder of a file, a folder or a name.
-
-    Args:
-        weights: a file that `gsencoder export` wrote, else what `gsencoder.models.weights.find_weights` takes.
-        device: where an exported graph runs; trained weights follow `EncodeConfig.device`.
-    """
-    if Path(weights).suffix.lower() == SUFFIX:
-        return OnnxEncoder(weights, device=device)
-    from gsencoder.infer.encode import TorchEncoder
-
-    return TorchEncoder(weights)
+load_encoder = Encoder.load

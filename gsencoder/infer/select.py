@@ -18,7 +18,7 @@ left out.
 import math
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -27,12 +27,13 @@ from jaxtyping import Bool, Float32, Float64, Int32, Int64
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Track, untracked
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.seeding.points import scene_spacing
 from gsencoder.fusion.cameras import check_orbits, with_views
 from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize, select_features
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.text.table import TextEncoder
-from gsencoder.types import Box, Cameras, GaussianFeatures, Gaussians, Localization, Scene
+from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Localization, Scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,52 +41,39 @@ class SelectConfig:
     """How the Gaussians of a box become those of an object. Lengths are in spacings of the scene
     (`gsencoder.data.seeding.points.scene_spacing`)."""
 
-    grow: bool = field(
-        default=True,
-        metadata={"help": "grow to the whole object; false = the Gaussians of the boxes, or above threshold=, alone"},
+    grow: bool = option(
+        True, "grow to the whole object; false = the Gaussians of the boxes, or above threshold=, alone"
     )
-    probable: float = field(
-        default=0.5,
-        metadata={
-            "help": "without box= those boxes of a word are taken whose probability is at least this share of the "
-            "most probable one's"
-        },
+    probable: float = option(
+        0.5,
+        "without box= those boxes of a word are taken whose probability is at least this share of the most probable "
+        "one's",
+        ge=0,
+        le=1,
     )
-    share: float = field(
-        default=0.5,
-        metadata={
-            "help": "a Gaussian is taken if its feature is more than this share object and less background; smaller = "
-            "more of the rims"
-        },
+    share: float = option(
+        0.5,
+        "a Gaussian is taken if its feature is more than this share object and less background; smaller = more of the "
+        "rims",
+        gt=0,
+        lt=1,
     )
-    reach: float = field(
-        default=4.0, metadata={"help": "no Gaussian farther than this from those of a box is taken, in spacings"}
+    reach: float = option(
+        4.0, "no Gaussian farther than this from those of a box is taken, in spacings", ge=0, lt=math.inf
     )
-    only: float = field(
-        default=0.9,
-        metadata={
-            "help": "a Gaussian whose feature is partly object is taken if so much of its blending weight over the "
-            "views falls on pixels that the object dominates, and lost if no more than the rest of 1 does"
-        },
+    only: float = option(
+        0.9,
+        "a Gaussian whose feature is partly object is taken if this share of its blending weight over the views falls "
+        "on pixels that the object dominates, and lost if no more than the rest of 1 does",
+        ge=0.5,
+        le=1,
     )
-    views: int = field(default=48, metadata={"help": "so many views, evenly spaced, are looked at; 0 = none"})
-    pixels: int = field(
-        default=100_000, metadata={"help": "of views with more pixels every second, third, … in both directions counts"}
-    )
-    orbits: int = field(default=24, metadata={"help": "cameras for a splat without views"})
+    views: int = option(48, "number of views, evenly spaced, that are looked at; 0 = none", ge=0)
+    pixels: int = option(100_000, "of views with more pixels every second, third, … in both directions counts", ge=1)
+    orbits: int = option(24, "cameras for a splat without views")
 
     def __post_init__(self) -> None:
-        if not 0 <= self.probable <= 1:
-            raise InputError(f"probable: expected a share in [0, 1], got {self.probable}")
-        if not 0.5 <= self.only <= 1:
-            raise InputError(f"only: expected a share in [0.5, 1], got {self.only}")
-        if not 0 < self.share < 1:
-            raise InputError(f"share: expected a share between 0 and 1, got {self.share}")
-        if not 0 <= self.reach < math.inf:
-            raise InputError(f"reach: expected zero or a positive number, got {self.reach}")
-        for name, least in (("views", 0), ("pixels", 1)):
-            if getattr(self, name) < least:
-                raise InputError(f"{name}: expected {least} or more, got {getattr(self, name)}")
+        check_limits(self)
         check_orbits(self.orbits)
 
 
@@ -149,14 +137,10 @@ def box_parts(localization: Localization, ranks: Sequence[int], *, probable: flo
                 has = "no box" if not boxes else "one box, number 0" if len(boxes) == 1 else several
                 why = "" if boxes else f": {describe_absent(localization.absent[word])}"
                 raise InputError(f"box={rank}: {word!r} has {has}{why}")
-        chosen = [boxes[rank] for rank in dict.fromkeys(ranks)] if ranks else _probable(boxes, probable)
+        least = probable * max((box.probability for box in boxes), default=0.0)
+        chosen = [boxes[rank] for rank in dict.fromkeys(ranks)] or [box for box in boxes if box.probability >= least]
         parts.append(tuple(np.sort(box.rows).astype(np.int64) for box in chosen))
     return tuple(parts)
-
-
-def _probable(boxes: Sequence[Box], share: float) -> list[Box]:
-    most = max((box.probability for box in boxes), default=0.0)
-    return [box for box in boxes if box.probability >= share * most]
 
 
 def threshold_parts(words: Sequence[str], relevancy: Float32[np.ndarray, "Q N"], threshold: float) -> Parts:
@@ -164,14 +148,10 @@ def threshold_parts(words: Sequence[str], relevancy: Float32[np.ndarray, "Q N"],
     # Comparisons with NaN are false: Gaussians never seen are never taken.
     rows = [np.flatnonzero(scores >= threshold) for scores in relevancy]
     if not any(len(each) for each in rows):
-        best = ", ".join(f"{word!r} {_best(scores):.7g}" for word, scores in zip(words, relevancy, strict=True))
+        most = [max(scores[np.isfinite(scores)].tolist(), default=math.nan) for scores in relevancy]
+        best = ", ".join(f"{word!r} {value:.7g}" for word, value in zip(words, most, strict=True))
         raise InputError(f"threshold={threshold:g}: no Gaussian is as relevant; the best are {best}")
     return tuple((each,) if len(each) else () for each in rows)
-
-
-def _best(scores: Float32[np.ndarray, " N"]) -> float:
-    seen = scores[np.isfinite(scores)]
-    return float(seen.max()) if seen.size else float("nan")
 
 
 def labels_of_parts(parts: Parts, relevancy: Float32[np.ndarray, "Q N"]) -> Int32[np.ndarray, " N"]:
@@ -310,18 +290,13 @@ def sampling(cameras: Cameras, *, views: int, pixels: int) -> Sampling:
     return Sampling(views=tuple(int(row) for row in rows), pixels=pixels)
 
 
-def label_masses(b: Blend, labels: Int32[np.ndarray, " N"], count: int) -> torch.Tensor:
-    """How much of each pixel's opacity is of each label from 1 to `count`: [P, count]."""
+def pixel_labels(b: Blend, labels: Int32[np.ndarray, " N"], count: int) -> Int32[torch.Tensor, " P"]:
+    """The label, of 1 to `count`, that dominates each pixel of a view; 0 = none of them."""
     # Gaussians of the label 0 are most of a scene, and have no column.
     one_hot = torch.zeros(len(labels), count)
     labeled = np.flatnonzero(labels)
     one_hot[torch.from_numpy(labeled), torch.from_numpy(labels[labeled].astype(np.int64) - 1)] = 1
-    return b.render(one_hot)
-
-
-def pixel_labels(b: Blend, labels: Int32[np.ndarray, " N"], count: int) -> Int32[torch.Tensor, " P"]:
-    """The label that dominates each pixel of a view, 0 = none of them."""
-    mass, best = label_masses(b, labels, count).max(dim=1)
+    mass, best = b.render(one_hot).max(dim=1)
     return torch.where(mass > DOMINANT * b.alpha, best + 1, 0).int()
 
 
@@ -590,7 +565,7 @@ def grow(
     labels = candidates.labels
     unknown = ~features.seen
     view_count = 0
-    if cameras is not None and config.views and len(cameras):
+    if cameras is not None and config.views:
         chosen = sampling(cameras, views=config.views, pixels=config.pixels)
         by_pixels = votes(gaussians, cameras, labels, len(parts), chosen, spacing=spacing, track=track)
         labels = labels_by_pixels(candidates, features.seen, by_pixels, config)
@@ -633,13 +608,11 @@ def select(
     """
     if boxes and threshold is not None:
         raise InputError("box= and threshold= are two ways to choose where a selection starts; give one of them")
-    if threshold is not None and not -1 <= threshold <= 1:
-        raise InputError(f"threshold: expected a relevancy in [-1, 1], got {threshold}")
     if len(words) > MOST_WORDS:
         raise InputError(f"query: expected at most {MOST_WORDS} words to select, got {len(words)}")
-    gaussians, features = select_features(scene, None)
-    _check_distinct(words, text)
     localized = localize(scene, words, text, localization)
+    _check_distinct(words, text)
+    gaussians, features = select_features(scene, None)
     if threshold is None:
         parts = box_parts(localized, boxes, probable=config.probable)
     else:

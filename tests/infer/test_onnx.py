@@ -7,6 +7,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -297,3 +298,20 @@ def test_without_the_packages_of_an_export_it_says_which(both: tuple[TorchEncode
         patch.setitem(sys.modules, "onnxscript", None)
         with pytest.raises(InputError, match=r"needs the package onnxscript: pip install 'gsencoder\[export\]'"):
             lower(both[0])
+
+
+def test_one_class_loads_what_torch_and_what_onnxruntime_runs_and_exports(
+    folder: Path, tmp_path: Path, lowered: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gsencoder.infer.onnx.export.lower", lambda _: lowered)
+    encoder = Encoder.load(str(folder))
+    encoder.export(tmp_path / "again.onnx")
+    exported = Encoder.load(str(tmp_path / "again.onnx"), "cpu")
+    assert isinstance(encoder, TorchEncoder)
+    assert isinstance(exported, OnnxEncoder)
+    assert isinstance(encoder, Encoder)
+    assert isinstance(exported, Encoder)
+    cloud = random_cloud(50, encoder.voxel)
+    assert apart(exported, encoder, cloud) <= TOLERANCE
+    with pytest.raises(InputError, match="an ONNX file already"):
+        exported.export(tmp_path / "third.onnx")

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.distance import cdist
 from selected_rooms import SPACE
 
-from gsencoder.infer import selection as module
+from gsencoder.infer import select as module
 from gsencoder.infer.select import object_shares
 from gsencoder.types import GaussianFeatures
 

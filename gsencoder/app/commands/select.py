@@ -12,7 +12,6 @@ from gsencoder.app.scenes import queried_scene, query_words
 from gsencoder.core.errors import InputError, counted, one_line
 from gsencoder.core.files import write_json
 from gsencoder.core.settings import option
-from gsencoder.core.threads import import_ahead
 from gsencoder.data.splats.files import save_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
@@ -58,7 +57,6 @@ def run(config: SelectCommandConfig, run: Run) -> None:
     """Finds the Gaussians of each word and writes them, what is left, and the labels."""
     folder = Path(config.paths[0])
     words = query_words(config.query, config.queries)
-    import_ahead("torch")
     with run.step("load"):
         scene, _ = with_up(load_features(folder))
         queried, table = queried_scene(

@@ -330,6 +330,10 @@ class OnnxEncoder:
         """That of the file, which it was exported in."""
         return ("auto",)
 
+    def export(self, path: str | Path) -> None:
+        """Refuses: the encoder has been exported."""
+        raise InputError(f"export: {path}: the encoder is an ONNX file already; copy it")
+
     def encode(
         self,
         gaussians: Gaussians,
