@@ -42,7 +42,7 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.benchmarks.absent import auroc, auroc_standard_error, calibration_error, names_of
 from gsencoder.evaluate.benchmarks.localization import aabb_iou, queryable_objects
-from gsencoder.evaluate.sources import FeatureSource, encoder_source, fusion_source, table_beside, with_features
+from gsencoder.evaluate.sources import FeatureSource, encoder_source, find_table, fusion_source, with_features
 from gsencoder.infer.load import load_encoder
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.relevancy import ThresholdConfig
@@ -277,7 +277,7 @@ def main() -> None:
             parser.error(f"--space {arguments.space}: the encoder has the spaces {listed(list(encoder.spaces))}")
         source = encoder_source(encoder, space=arguments.space)
         words = encoder.tables.get(arguments.space or "", words)
-        words = with_training_names(words, table_beside(encoder, arguments.space))
+        words = with_training_names(words, find_table(encoder, arguments.space))
     score(rooms, arguments.rooms, source, words, kinds)
 
 

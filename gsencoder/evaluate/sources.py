@@ -86,7 +86,7 @@ def space_of_words(encoder: Encoder, words: Words) -> str | None:
     return fitting[0]
 
 
-def table_beside(encoder: Encoder, space: str | None) -> TextTable | None:
+def find_table(encoder: Encoder, space: str | None) -> TextTable | None:
     """The text table beside an encoder: that of a teacher, or without a name that of the first that has one."""
     return encoder.tables.get(space) if space else encoder.words
 

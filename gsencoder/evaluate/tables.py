@@ -13,7 +13,6 @@ from jaxtyping import Float64
 from gsencoder.core.errors import InputError
 
 PUBLISHED = Path(__file__).parent / "published"
-SOURCES = ("measured", "published")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -27,12 +27,12 @@ from gsencoder.evaluate.benchmarks.protocols import AnyProtocol
 from gsencoder.evaluate.sources import (
     FeatureSource,
     encoder_source,
+    find_table,
     fused_head_source,
     fusion_source,
     head_source,
     load_scenes,
     space_of_words,
-    table_beside,
 )
 from gsencoder.fusion.folder import heads_beside, load_features
 from gsencoder.fusion.fuse import FuseConfig
@@ -148,13 +148,13 @@ def teacher_or_encoder(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
         return fusion_source(config.teacher, words, config.fusion), words
     retain_freed_memory()
     encoder = load_encoder(config.weights, config.encode.device)
-    table = table_beside(encoder, config.space)
+    table = find_table(encoder, config.space)
     if table is not None and config.teacher == LabelsConfig() and config.text == TableTextConfig():
         words = words_of_table(table)
     else:
         words = _given_words(config)
     space = config.space or space_of_words(encoder, words)
-    words = with_training_names(words, table_beside(encoder, space))
+    words = with_training_names(words, find_table(encoder, space))
     return encoder_source(encoder, config.encode, space), words
 
 

@@ -58,11 +58,11 @@ def run(config: QuestionsCommandConfig, run: Run) -> None:
             )
         write_scanqa(folder / QUESTIONS, questions)
         write_sqa3d(folder / SITUATED, situations)
-        write_scanrefer(folder / EXPRESSIONS, [each.expression for each in expressions])
+        write_scanrefer(folder / EXPRESSIONS, expressions)
         counts = Counter(kind_of(each) for each in questions)
         kinds = {kind: counts[kind] for kind in KINDS}
         situated = Counter(each.id.rsplit("-", 2)[1] for each in situations)
-        unique = sum(each.unique for each in expressions)
+        unique = sum(not each.multiple for each in expressions)
         run.results.update(
             scenes=[scene.name for scene in scenes],
             questions=len(questions),
@@ -72,7 +72,7 @@ def run(config: QuestionsCommandConfig, run: Run) -> None:
             situated_kinds=dict(situated),
             expressions=len(expressions),
             unique_expressions=unique,
-            described_objects=len({each.expression.key[:2] for each in expressions}),
+            described_objects=len({each.key[:2] for each in expressions}),
             files=[QUESTIONS, SITUATED, EXPRESSIONS],
         )
     for kind, count in (kinds | dict(situated)).items():

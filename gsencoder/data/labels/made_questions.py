@@ -3,12 +3,12 @@
 A question is made only where people would agree on its answer:
 
 - A thing is asked about if some photograph shows at least `min_pixels` of it, by its name, if no other name of the
-  scene may stand for the same thing (`english_nouns.alike`). "The" thing is the only one of its name in the labels.
+  scene may stand for the same thing (`names.alike`). "The" thing is the only one of its name in the labels.
 - next_to: the nearest thing beside it, at most 0.5 m away, and nearer than any of another name by 0.1 m and by half
-  (`relations.neighbor`).
+  (`seen_objects.neighbor`).
 - how_many: every object of the name that any photograph shows is shown well enough; at most ten.
-- color: nearly all pixels of it have one color word in every photograph that shows it well (`color_names`).
-- where: what it stands on, if one thing qualifies and it is in none (`relations.supporter`), or what it is next to.
+- color: nearly all pixels of it have one color word in every photograph that shows it well (`names.color_word`).
+- where: what it stands on, if one thing qualifies and it is in none (`seen_objects.supporter`), or what it is next to.
 - is_there: yes where an object of the name is shown well enough; no for names that no label has, nor any name that may
   stand for the same thing.
 
@@ -397,24 +397,9 @@ EXPRESSIONS_PART = 100
 """Of the scene's random numbers, those of expressions."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MadeExpression:
-    """An expression, and what its words need.
-
-    Attributes:
-        expression: as a file has it.
-        unique: whether the object is the only one of its name in the labels: ScanRefer's "unique".
-        needed: ids of the objects that it speaks of, its own first.
-    """
-
-    expression: Expression
-    unique: bool
-    needed: tuple[int, ...]
-
-
 def make_expressions(
     scenes: Iterable[SeenScene], *, seed: int = 0, per_object: int = 3, per_scene: int = 0
-) -> tuple[MadeExpression, ...]:
+) -> tuple[Expression, ...]:
     """Expressions for all objects that are shown well enough and can be described.
 
     Args:
@@ -433,7 +418,7 @@ def make_expressions(
     return tuple(expressions)
 
 
-def _expressions_of_scene(scene: SeenScene, seed: int, per_object: int, per_scene: int) -> list[MadeExpression]:
+def _expressions_of_scene(scene: SeenScene, seed: int, per_object: int, per_scene: int) -> list[Expression]:
     rng = scene_rng(seed, scene.name, EXPRESSIONS_PART)
     scene_objects = movables(scene.objects)
     near = near_things(scene_objects)
@@ -446,33 +431,30 @@ def _expressions_of_scene(scene: SeenScene, seed: int, per_object: int, per_scen
     expressions = []
     for row in sorted(shuffled[:per_scene] if per_scene else shuffled):
         scene_object, ways = described[row]
-        wordings = [ways[way] for way in rng.permutation(len(ways))[:per_object]]
-        for number, (text, others) in enumerate(wordings):
-            expressions.append(_made(scene, scene_object, text, others, number))
+        for number, way in enumerate(rng.permutation(len(ways))[:per_object]):
+            expressions.append(_expression(scene, scene_object, ways[way], number))
     return expressions
 
 
-def _ways_to_say(
-    scene: SeenScene, scene_object: SeenObject, near: Mapping[int, Sequence[SeenObject]]
-) -> list[tuple[str, tuple[SeenObject, ...]]]:
-    """All clear descriptions of a thing, and the other things that each speaks of."""
+def _ways_to_say(scene: SeenScene, scene_object: SeenObject, near: Mapping[int, Sequence[SeenObject]]) -> list[str]:
+    """All clear descriptions of a thing."""
     name = str(scene_object.name)
     others = [other for other in scene.objects if other.name == name and other is not scene_object]
-    ways: list[tuple[str, tuple[SeenObject, ...]]] = []
+    ways: list[str] = []
     if scene.unique(name) is scene_object:
-        ways.append((f"the only {name} in the room", ()))
+        ways.append(f"the only {name} in the room")
     anchor = _anchor(scene, scene_object, others, near[scene_object.id])
     if anchor is not None:
-        ways.append((f"the {name} next to the {anchor.name}", (anchor,)))
+        ways.append(f"the {name} next to the {anchor.name}")
     below = supporter(scene_object, near[scene_object.id])
     if (
         below is not None
         and scene.shown(below)
         and not any(_may_be_on(other, below, near[other.id]) for other in others)
     ):
-        ways.append((f"the {name} on the {below.name}", (below,)))
+        ways.append(f"the {name} on the {below.name}")
     if others and all(scene.shown(other) for other in others) and largest([scene_object, *others]) is scene_object:
-        ways.append((f"the largest {name}", tuple(others)))
+        ways.append(f"the largest {name}")
     return ways
 
 
@@ -501,26 +483,18 @@ def _may_be_on(scene_object: SeenObject, below: SeenObject, scene_objects: Seque
     return any(gap(scene_object, other) < NEAR / 2 for other in same)
 
 
-def _made(
-    scene: SeenScene, scene_object: SeenObject, text: str, others: Sequence[SeenObject], number: int
-) -> MadeExpression:
+def _expression(scene: SeenScene, scene_object: SeenObject, text: str, number: int) -> Expression:
     lower, upper = (
         (corner / scene.metres_per_unit).tolist() for corner in (scene_object.aabb_min, scene_object.aabb_max)
     )
-    name = str(scene_object.name)
-    unique = len([other for other in scene.objects if other.name == scene_object.name]) == 1
-    return MadeExpression(
-        expression=Expression(
-            scene=scene.name,
-            object_id=scene_object.id,
-            object_name=name.replace(" ", "_"),
-            annotation=str(number),
-            text=text,
-            tokens=tuple(text.lower().split()),
-            aabb=((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])),
-            multiple=not unique,
-            others=False,
-        ),
-        unique=unique,
-        needed=(scene_object.id, *(other.id for other in others)),
+    return Expression(
+        scene=scene.name,
+        object_id=scene_object.id,
+        object_name=str(scene_object.name).replace(" ", "_"),
+        annotation=str(number),
+        text=text,
+        tokens=tuple(text.lower().split()),
+        aabb=((lower[0], lower[1], lower[2]), (upper[0], upper[1], upper[2])),
+        multiple=sum(other.name == scene_object.name for other in scene.objects) > 1,
+        others=False,
     )

@@ -9,8 +9,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.expressions import read_scanrefer, write_scanrefer
-from gsencoder.data.labels.made_questions import make_expressions, make_situations, side_of
-from gsencoder.data.labels.questions import read_questions, write_sqa3d
+from gsencoder.data.labels.made_questions import make_expressions, make_situations
 from gsencoder.data.labels.seen_objects import SeenObject, SeenScene, see_objects
 from gsencoder.data.synthetic import make_room
 
@@ -34,7 +33,7 @@ def scene_of(*things: SeenObject) -> SeenScene:
 
 def described(*things: SeenObject) -> dict[str, int]:
     made = make_expressions([scene_of(*things)])
-    return {each.expression.text: each.expression.object_id for each in made}
+    return {each.text: each.object_id for each in made}
 
 
 def test_an_only_thing_is_meant_by_its_name_and_one_of_several_is_not() -> None:
@@ -65,18 +64,19 @@ def test_the_largest_is_meant_where_it_clearly_is() -> None:
 
 def test_each_expression_of_a_room_means_the_one_object_that_its_words_say(rooms: list[SeenScene]) -> None:
     made = make_expressions(rooms, per_object=10)
-    assert {
-        re.sub(r"^the (only|\S+)( \S+)? .*?(next to|on|in) the .*$", r"\3", each.expression.text) for each in made
-    } == {"next to", "on", "in"}
+    assert {re.sub(r"^the (only|\S+)( \S+)? .*?(next to|on|in) the .*$", r"\3", each.text) for each in made} == {
+        "next to",
+        "on",
+        "in",
+    }
     scenes = {each.name: each for each in rooms}
     for each in made:
-        things = scenes[each.expression.scene].objects
-        (meant,) = [one for one in things if one.id == each.expression.object_id]
-        assert each.needed[0] == meant.id
-        assert each.unique  # No two things of a room have one name.
-        assert each.expression.aabb is not None
-        np.testing.assert_allclose(each.expression.aabb, [meant.aabb_min, meant.aabb_max])
-        assert str(meant.name) in each.expression.text
+        things = scenes[each.scene].objects
+        (meant,) = [one for one in things if one.id == each.object_id]
+        assert not each.multiple  # No two things of a room have one name.
+        assert each.aabb is not None
+        np.testing.assert_allclose(each.aabb, [meant.aabb_min, meant.aabb_max])
+        assert str(meant.name) in each.text
         assert meant.pixels >= 40
 
 
@@ -84,16 +84,16 @@ def test_expressions_are_written_as_scanrefer_has_them(rooms: list[SeenScene], t
     files = [tmp_path / f"{number}.json" for number in range(3)]
     for file, scenes, seed in zip(files, (rooms, rooms[::-1], rooms), (0, 0, 1), strict=True):
         made = make_expressions(scenes, seed=seed, per_object=1)
-        write_scanrefer(file, [each.expression for each in made])
+        write_scanrefer(file, made)
     assert files[0].read_bytes() == files[1].read_bytes() != files[2].read_bytes()
     assert {row["unique_multiple"] for row in json.loads(files[0].read_text())} == {0}
-    assert list(read_scanrefer(files[0])) == [each.expression for each in make_expressions(rooms, per_object=1)]
+    assert list(read_scanrefer(files[0])) == [*make_expressions(rooms, per_object=1)]
 
 
 def test_fewer_objects_may_be_asked_for(rooms: list[SeenScene]) -> None:
     made = make_expressions(rooms, per_scene=2, per_object=1)
     assert len(made) == 4
-    assert {each.expression.annotation for each in made} == {"0"}
+    assert {each.annotation for each in made} == {"0"}
     for wrong in ({"per_object": 0}, {"per_scene": -1}):
         with pytest.raises(InputError, match="per_object from 1"):
             make_expressions(rooms, **wrong)
@@ -129,24 +129,3 @@ def test_sides_are_those_of_any_place_to_stand_at(rooms: list[SeenScene]) -> Non
     assert nearer
     answers = [each.answers[0] for each in questions if "left" in each.text]
     assert answers.count("left") == answers.count("right")
-
-
-def test_a_side_is_none_straight_ahead_behind_and_where_boxes_overlap() -> None:
-    at, facing = thing(1, "table", (0, 0, 0), size=0.5), thing(2, "lamp", (5, 0.2, 0))
-    assert side_of(at, facing, thing(3, "ball", (2, 4, 0))) == "left"
-    assert side_of(at, facing, thing(3, "ball", (2, -4, 0))) == "right"
-    for spot in ((9, 0.2, 0), (-9, 0.2, 0), (0.2, 0.2, 1.0), (9, 1.5, 0)):
-        assert side_of(at, facing, thing(3, "ball", spot)) is None
-
-
-def test_situations_are_written_as_sqa3d_has_them(rooms: list[SeenScene], tmp_path: Path) -> None:
-    questions = make_situations(rooms, per_kind=4)
-    write_sqa3d(tmp_path / "situated_questions.json", questions)
-    read = read_questions(tmp_path / "situated_questions.json")
-    assert [(each.id, each.text, each.situation, each.answers) for each in read] == [
-        (each.id, each.text, each.situation, each.answers) for each in questions
-    ]
-    np.testing.assert_allclose([each.position for each in read], [each.position for each in questions])
-    np.testing.assert_allclose([each.rotation for each in read], [each.rotation for each in questions])
-    with pytest.raises(InputError, match="questions in it"):
-        write_sqa3d(tmp_path / "other.json", questions)

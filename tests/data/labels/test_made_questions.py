@@ -11,7 +11,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
-from gsencoder.data.labels.names import RANGES, color_counts, color_word, inner_pixels
+from gsencoder.data.labels.names import RANGES, color_counts, inner_pixels
 from gsencoder.data.labels.questions import Question, read_questions, write_scanqa
 from gsencoder.data.labels.seen_objects import SeenObject, SeenScene, see_objects
 from gsencoder.data.synthetic import color_words, make_room
@@ -165,30 +165,6 @@ def test_names_that_may_mean_the_same_are_not_asked_about() -> None:
     assert not any("table" in text for text in questions)
 
 
-@pytest.mark.parametrize(
-    ("second", "clear"), [(0.05 + 0.1 + 1e-9, True), (0.05 + 0.099, False), (0.05, False), (0.6, True)]
-)
-def test_a_neighbor_is_clear_only_where_the_next_kind_of_thing_is_farther(second: float, clear: bool) -> None:
-    # Boxes of 0.1 m along a line: the gaps to the mug are 0.05 m and `second`.
-    questions = texts(
-        thing(1, "mug", (0, 0, 0)), thing(2, "ball", (0.15, 0, 0)), thing(3, "book", (-0.1 - second, 0, 0))
-    )
-    assert ("What is next to the mug?" in questions) is clear
-    if clear:
-        assert questions["What is next to the mug?"] == ("ball",)
-
-
-def test_a_neighbor_may_be_one_of_several_of_its_name_and_not_more_than_half_a_meter_away() -> None:
-    pair = (thing(2, "ball", (0.15, 0, 0)), thing(3, "ball", (-0.151, 0, 0)))
-    assert texts(thing(1, "mug", (0, 0, 0)), *pair)["What is next to the mug?"] == ("ball",)
-    assert "What is next to the mug?" not in texts(thing(1, "mug", (0, 0, 0)), thing(2, "ball", (0.61, 0, 0)))
-
-
-def test_a_nearer_thing_without_a_name_leaves_no_neighbor() -> None:
-    questions = texts(thing(1, "mug", (0, 0, 0)), thing(2, None, (0.11, 0, 0)), thing(3, "ball", (0.25, 0, 0)))
-    assert "What is next to the mug?" not in questions
-
-
 def test_what_a_thing_stands_on_is_where_it_is_and_not_next_to_it() -> None:
     table = thing(1, "table", (-0.5, -0.5, -1.0), size=1.0)
     questions = texts(table, thing(2, "mug", (0, 0, 0.02)), thing(3, "ball", (0.2, 0, 0)))
@@ -213,27 +189,6 @@ def test_plural_names_are_asked_about_as_such() -> None:
     assert questions["Are there any scissors in the room?"] == ("yes",)
     assert questions["Where are the scissors?"] == ("next to the apple",)
     assert not any(text.startswith("How many sci") for text in questions)
-
-
-def test_no_answer_has_more_than_half_of_a_kind_in_a_scene() -> None:
-    names = ("mug", "ball", "lamp", "apple", "lemon", "clock", "book", "stool")
-    things = [thing(number, name, (3.0 * number, 0, 0)) for number, name in enumerate(names, start=1)]
-    counted = make_questions([scene_of(*things)], replace(ALL, per_kind=6))
-    assert sum(kind_of(each) == "how_many" for each in counted) == 3  # All of them with the answer 1.
-
-
-def test_colors_are_words_of_pixels_that_lie_in_one_range() -> None:
-    def picture(*colors: tuple[int, int, int]) -> np.ndarray:
-        return np.tile(np.array(colors, np.uint8)[None], (4, 1, 1)).repeat(4, axis=0).repeat(3, axis=1)
-
-    whole = np.ones((16, 12), bool)
-    red, blue, gray = (200, 20, 30), (20, 60, 220), (128, 128, 128)
-    assert color_word(picture(red, red, red, red), whole) == "red"
-    assert color_word(picture(blue, blue, blue, gray), whole) == "blue"
-    assert color_word(picture(red, red, red, blue), whole) is None  # A quarter is of another color.
-    assert color_word(picture(blue, blue, gray, gray), whole) is None
-    assert color_word(picture(gray, gray, gray, gray), whole) is None
-    assert color_word(picture(red, red, red, red), np.eye(16, 12, dtype=bool)) is None  # Only border pixels.
 
 
 def test_color_ranges_do_not_overlap() -> None:

@@ -168,18 +168,11 @@ def test_of_many_questions_of_a_kind_only_so_many_are_asked() -> None:
 
 def test_the_largest_means_the_largest_and_words_of_names_are_joined_in_files() -> None:
     boxes = [thing(1, "card box", (0, 0, 0)), thing(2, "card box", (5, 0, 0)), thing(3, "card box", (9, 0, 0), 0.2)]
-    made = {each.expression.text: each for each in make_expressions([scene_of(*boxes, unit=0.5)])}
-    assert set(made) == {"the largest card box"}
-    expression = made["the largest card box"]
-    assert (expression.expression.object_id, expression.expression.object_name, expression.unique) == (
-        3,
-        "card_box",
-        False,
-    )
-    assert expression.needed == (3, 1, 2)
+    (expression,) = make_expressions([scene_of(*boxes, unit=0.5)])
+    assert (expression.text, expression.tokens) == ("the largest card box", ("the", "largest", "card", "box"))
+    assert (expression.object_id, expression.object_name, expression.multiple) == (3, "card_box", True)
     # Files have units of half a metre.
-    np.testing.assert_allclose(expression.expression.aabb, [[18, 0, 0], [18.4, 0.4, 0.4]])
-    assert (expression.expression.multiple, expression.expression.tokens) == (True, ("the", "largest", "card", "box"))
+    np.testing.assert_allclose(expression.aabb, [[18, 0, 0], [18.4, 0.4, 0.4]])
 
 
 # Situations
@@ -256,13 +249,8 @@ def test_situated_questions_are_written_in_sqa3ds_two_files(tmp_path: Path) -> N
     assert annotation["position"] == {"x": 1.0, "y": 2.0, "z": 0.0}
     assert [(row["answer"], row["answer_id"]) for row in annotation["answers"]] == [("yes", 1), ("y", 2)]
     assert read_questions(tmp_path / "v1_questions_x.json") == (SITUATED,)
+    with pytest.raises(InputError, match="questions in it"):
+        write_sqa3d(tmp_path / "other.json", [SITUATED])
     for lacking in ("situation", "position", "rotation"):
         with pytest.raises(InputError, match="question 7 has no situation"):
             write_sqa3d(tmp_path / "questions.json", [replace(SITUATED, **{lacking: None})])
-
-
-def test_two_hundred_pixels_are_enough_to_be_asked_about_where_nothing_else_is_said() -> None:
-    assert QuestionsConfig().min_pixels == 200
-    seen = see_objects(photographed([picture(RED, 10)]))
-    assert (seen.objects[0].pixels, seen.shown(seen.objects[0])) == (200, True)
-    assert not replace(seen, min_pixels=seen.min_pixels + 1).shown(seen.objects[0])
