@@ -1,4 +1,4 @@
-"""The naming protocol, on features whose names are known."""
+"""Classes of Gaussians and of sets of them, against cosines that numpy computes one by one."""
 
 from dataclasses import replace
 
@@ -7,8 +7,75 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.benchmarks.naming import NamingCounts, naming_scores, nearest_words
+from gsencoder.evaluate.sources import NAMES_AT_ONCE, class_cosines, nearest_class
 from gsencoder.evaluate.validation import nearest_classes
+from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
+
+CHANNELS = 6
+NAMES = [f"name {number}" for number in range(2 * NAMES_AT_ONCE + 3)]
+
+
+@pytest.fixture
+def words() -> TextTable:
+    vectors = np.random.default_rng(1).normal(size=(len(NAMES), CHANNELS)).astype(np.float32)
+    return make_text_table(NAMES, vectors / np.linalg.norm(vectors, axis=1, keepdims=True), "words")
+
+
+def features_of(words: TextTable, vectors: np.ndarray, seen: np.ndarray | None = None) -> GaussianFeatures:
+    return GaussianFeatures(
+        features=vectors.astype(np.float32),
+        weights=np.ones(len(vectors), np.float32) if seen is None else seen.astype(np.float32),
+        mean=words.mean,
+        space=words.space,
+    )
+
+
+def cosine(vector: np.ndarray, word: np.ndarray, mean: np.ndarray, text_mean: np.ndarray) -> float:
+    """Of one vector and one word, after their means are removed."""
+    a, b = vector.astype(np.float64) - mean, word.astype(np.float64) - text_mean
+    return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
+
+
+def expected(features: GaussianFeatures, vectors: np.ndarray, names: list[str], words: TextTable) -> np.ndarray:
+    encoded = words.encode(names)
+    return np.array([[cosine(vector, word, features.mean, words.mean) for word in encoded] for vector in vectors])
+
+
+def test_the_nearest_class_is_that_of_the_largest_cosine_among_more_names_than_fit_at_once(words: TextTable) -> None:
+    vectors = np.random.default_rng(2).normal(size=(200, CHANNELS))
+    features = features_of(words, vectors)
+    nearest = nearest_class(features, NAMES, words)
+    assert np.array_equal(nearest, expected(features, vectors, NAMES, words).argmax(axis=1))
+    # Every part of the names has some.
+    assert {int(number) // NAMES_AT_ONCE for number in nearest} == {0, 1, 2}
+
+
+def test_of_equal_classes_the_first_is_nearest_and_gaussians_without_a_feature_have_none(words: TextTable) -> None:
+    vectors = words.encode(["name 3"]).repeat(3, axis=0)
+    features = features_of(words, vectors * [[1], [1], [0]], np.array([1, 1, 0]))
+    assert nearest_class(features, ["name 1", "name 3", "name 3"], words).tolist() == [1, 1, -1]
+
+
+def test_a_set_has_the_cosine_of_the_mean_of_its_seen_gaussians(words: TextTable) -> None:
+    vectors = np.random.default_rng(3).normal(size=(8, CHANNELS))
+    seen = np.array([1, 1, 0, 0.1, 1, 5, 0, 1])
+    features = features_of(words, vectors * (seen > 0)[:, None], seen)
+    parts = [np.array([0, 1, 2]), np.array([3, 5]), np.array([2, 6]), np.array([], np.int64), np.array([7])]
+    cosines = class_cosines(features, parts, NAMES[:3], words)
+    # Each Gaussian counts the same, whatever its weight.
+    means = [vectors[[0, 1]].mean(axis=0), vectors[[3, 5]].mean(axis=0), vectors[7]]
+    assert cosines.shape == (5, 3)
+    np.testing.assert_allclose(cosines[[0, 1, 4]], expected(features, np.array(means), NAMES[:3], words), atol=1e-5)
+    assert np.isnan(cosines[[2, 3]]).all()
+
+
+def test_words_of_another_space_are_refused(words: TextTable) -> None:
+    other = FeatureSpace(name="others", channels=CHANNELS)
+    features = replace(features_of(words, np.ones((2, CHANNELS))), space=other)
+    for call in (lambda: nearest_class(features, NAMES, words), lambda: class_cosines(features, [], NAMES, words)):
+        with pytest.raises(InputError, match="others"):
+            call()
 
 
 def outcome(total: dict[str, int], correct: dict[str, int]) -> NamingCounts:

@@ -4,11 +4,12 @@ import csv
 import io
 import math
 
+import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import csv_text
-from gsencoder.evaluate.tables import PUBLISHED, published_rows, table_of
+from gsencoder.evaluate.tables import PUBLISHED, mean_of, published_rows, table_of
 
 TABLES = sorted(path.stem for path in PUBLISHED.glob("*.csv"))
 
@@ -90,3 +91,10 @@ def test_classes_are_rows_of_a_second_table_beside_the_methods_that_have_them() 
     assert lamp == ["lamp", "0.0", *[""] * (len(columns) - 2)]
     assert table.csv_rows()[0]["lamp"] == 0.0
     assert table.without_classes().columns == ("mean",)
+
+
+def test_values_that_are_no_numbers_are_left_out() -> None:
+    assert mean_of([1.0, math.nan, 4.0]) == 2.5
+    assert mean_of(np.array([0.25])) == 0.25
+    assert math.isnan(mean_of([]))
+    assert math.isnan(mean_of(np.full(3, math.nan)))

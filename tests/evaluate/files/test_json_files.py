@@ -1,7 +1,6 @@
 """Files of recognized objects and of sentences' boxes: what is written is read back, and bad entries are named."""
 
 import json
-import pickle
 from pathlib import Path
 from typing import Any
 
@@ -112,23 +111,8 @@ def test_ids_are_the_same_as_numbers_and_as_text(tmp_path: Path) -> None:
             {"bbox": CORNERS[:7]},
             "entry 0: bbox must be a list of 8 corners .*, or of a lower and an upper one, got a list",
         ),
-        ({"bbox": [1, 2, 3, 4, 5, 6]}, "entry 0: bbox must be a list of 8 corners"),
-        ({"bbox": [1, 2]}, r"entry 0: bbox\[0\] must be a corner \[x, y, z\], got 1"),
-        ({"bbox": "box"}, "entry 0: bbox must be a list of 8 corners .* got 'box'"),
-        ({"bbox": BOX[::-1].tolist()}, "entry 0: bbox: the lower corner .* is not below the upper"),
-        ({"bbox": [[0, 0, float("nan")], [1, 1, 1]]}, r"entry 0: bbox\[0\] must be a finite number .* got nan"),
-        ({"bbox": [[0, 0, 0], [1, 1, float("inf")]]}, r"bbox\[1\] must be a finite number .* got inf"),
-        ({"bbox": [[0, 0, 0], [1, 1, 10**400]]}, r"bbox\[1\] must be a finite number"),
-        ({"bbox": [[0, 0, 0], [1, 1, 2e9]]}, "must be a finite number of at most 1e.09, got 2000000000.0"),
-        ({"bbox": [[0, 0, "0"], [1, 1, 1]]}, r"bbox\[0\] must be a number, got '0'"),
-        ({"bbox": [[0, 0, True], [1, 1, 1]]}, r"bbox\[0\] must be a number, got True"),
         ({"scene_id": 7}, "entry 0: the scene must be a text, got 7"),
-        ({"scene_id": ""}, "entry 0: the scene is empty"),
-        ({"scene_id": "x" * 10_000_000}, "the scene has 10,000,000 characters"),
         ({"object_id": "chair"}, "entry 0: object_id must be a whole number from 0, got 'chair'"),
-        ({"object_id": 1.0}, "object_id must be a whole number"),
-        ({"object_id": -1}, "object_id must be a whole number"),
-        ({"object_id": None}, "object_id must be a whole number from 0, got nothing"),
         ({"ann_id": True}, "ann_id must be a whole number"),
         ({"ann_id": "x" * 10_000_000}, "ann_id must be a whole number .* got 10,000,000 characters"),
         ({"others": 2}, "entry 0: others must be 0 or 1, got 2"),
@@ -241,32 +225,6 @@ def test_names_that_the_label_map_lacks_are_counted_and_are_others(tmp_path: Pat
         truth = read_referring_labels(path, label_map=label_map, scans=scans)
     assert [each.others for each in truth] == [True, False, True, False]
     assert [each.multiple for each in truth] == [True, False, True, False]
-
-
-def test_scans_that_do_not_belong_to_the_sentences_are_refused(tmp_path: Path) -> None:
-    path, scans, _ = scan_refer(tmp_path)
-    rows = json.loads(path.read_text())
-    with pytest.raises(InputError, match="scene0022_00: no annotation of ScanNet"):
-        read_referring_labels(written(path, [rows[0] | {"scene_id": "scene0022_00"}]), scans=scans)
-    with pytest.raises(InputError, match="scene0011_00: its labels have no object with the objectId 4"):
-        read_referring_labels(written(path, [rows[0] | {"object_id": "4"}]), scans=scans)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "not a readable JSON file"),
-        (b'[{"a": 1, "a": 2}]', "the key 'a' is there twice"),
-        (b"[" * 100_000, "not a readable JSON file"),
-        (b'["\xff"]', "not a readable JSON file"),
-        (pickle.dumps([TRUTH]), "is a pickle, which is refused"),
-    ],
-)
-def test_a_file_that_is_no_list_is_named(tmp_path: Path, content: bytes, message: str) -> None:
-    (tmp_path / "a.json").write_bytes(content)
-    for read in (read_referring_labels, read_recognition_labels):
-        with pytest.raises(InputError, match=f"a.json: {message}"):
-            read(tmp_path / "a.json")
 
 
 # Recognition

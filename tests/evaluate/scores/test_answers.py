@@ -228,3 +228,13 @@ def test_words_are_mended_as_leos_and_sqa3ds_scripts_mend_them(wrong: str, right
     for word in (f"b{wrong}", f"{wrong}s"):
         if not wrong.isdigit():
             assert clean_answer(word) == word
+
+
+def test_the_f_value_takes_precision_from_the_answer_and_recall_from_the_reference() -> None:
+    # Of "a a b" two words are in "a c", of which one of two is in the answer: 2 · (1/2 · 2/3) / (1/2 + 2/3).
+    assert f_value("a a b", ["a c"], str) == pytest.approx(4 / 7)
+    assert f_value("a c", ["a a b"], str) == pytest.approx(4 / 7)
+    assert f_value("a b", ["x", "b y z"], str) == pytest.approx(2 / 5)
+    # An equal answer is right even where its lemmas are none.
+    assert f_value("", [""], str) == 1
+    assert f_value("a", [""], str) == f_value("", ["a"], str) == f_value("a", [], str) == 0

@@ -125,3 +125,18 @@ def test_the_order_of_boxes_and_objects_decides_nothing(rows: list[int]) -> None
     assert other.ious == pytest.approx(first.ious[rows])
     assert other.sentences.cider_each == pytest.approx(first.sentences.cider_each[rows])
     assert other.sentences.bleu == pytest.approx(first.sentences.bleu)
+
+
+def test_a_caption_belongs_to_its_object_and_scene() -> None:
+    objects = [
+        true_object(1, 0, "sos thing 1 eos", scene="s"),
+        true_object(1, 0, scene="t"),
+        true_object(2, 0, "sos thing 2 eos", scene="t"),
+    ]
+    captions = [
+        NamedCaption(scene="t", object_id=2, caption="thing 2"),
+        NamedCaption(scene="s", object_id=1, caption="no"),
+    ]
+    scores = score_named_captions(objects, captions, tools=NO_JAVA)
+    assert scores.sentences.rouge_l_each[2] == pytest.approx(1)
+    assert (scores.missing, scores.ious) == (1, None)

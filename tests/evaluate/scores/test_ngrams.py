@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
-from gsencoder.evaluate.benchmarks.text_metrics import bleu, cider, python_tokens, rouge_l
+from gsencoder.evaluate.benchmarks.text_metrics import bleu, cider, python_tokens, rouge_l, score_sentences
 
 SENTENCES = st.lists(st.sampled_from("abcd"), max_size=8).map(" ".join)
 SAMPLES = st.lists(st.tuples(SENTENCES, st.lists(SENTENCES, min_size=1, max_size=3)), min_size=1, max_size=6)
@@ -144,6 +144,8 @@ def longest_by_table(first: Sequence[str], second: Sequence[str]) -> int:
         ("naïve café – dash — em", "naïve café dash em"),
         ("it’s “good”\ta;b:c,d\nno1", "it 's good a b c d no1"),
         ("3D-aware 3x4 2-3", "3d-aware 3x4 2-3"),
+        ("cannot (see) [it] {at} all", "can not -lrb- see -rrb- -lsb- it -rsb- -lcb- at -rcb- all"),
+        ("Mr. X's table--big... ‘no’", "mr. x 's table big no"),
         ("", ""),
         (" .,! ; \n", ""),
     ],
@@ -157,3 +159,29 @@ def test_python_tokens_have_one_blank_between_them(text: str) -> None:
     tokens = python_tokens(text)
     assert tokens == " ".join(tokens.split())
     assert "\n" not in tokens
+
+
+def test_a_reference_counts_an_ngram_as_often_as_it_has_it_and_a_document_counts_once_a_sample() -> None:
+    corpus, _ = bleu(["a a a"], [["a", "a a"]])
+    # Two of three: no reference has a three times, and they are not added. Lengths are 3 and 2.
+    assert corpus[0] == pytest.approx(2 / 3)
+    # "a" is in both references of the first sample: in one of two documents. Its weight is log 2 beside that of b.
+    both = cider(["a", "b"], [["a", "a"], ["b"]])
+    assert both == pytest.approx([10 / 4, 10 / 4])
+    # The lengths that count are numbers of bigrams: 0 and 2, so exp(-4 / 72), and cosines of a in "a b c".
+    scores = cider(["a", "x"], [["a b c"], ["y"]])
+    assert scores[0] == pytest.approx(10 / 4 * math.exp(-4 / 72) / math.sqrt(3))
+
+
+def test_sentences_and_references_stay_with_their_samples() -> None:
+    scores = score_sentences(
+        ["A chair.", "two lamps", "x"],
+        [["A chair."], ["one", "Two lamps!"], ["y z", "x"]],
+        tokens="python",
+        tools="no Java here",
+    )
+    assert scores.rouge_l_each.tolist() == pytest.approx([1, 1, 1])
+    assert not scores.official
+    assert math.isnan(scores.meteor)
+    as_given = score_sentences(["A chair."], [["a chair"]], tokens="given", tools="no Java here")
+    assert (as_given.official, as_given.tokens, as_given.rouge_l) == (True, "tokens as given", 0)
