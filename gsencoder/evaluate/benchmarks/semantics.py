@@ -33,6 +33,7 @@ from jaxtyping import Int32, Int64
 from gsencoder.core.errors import InputError, about, counted
 from gsencoder.core.settings import option
 from gsencoder.data.labels.classes import (
+    IDS_PER_CLASS,
     ClassTable,
     ids_of_names,
     load_classes,
@@ -63,6 +64,8 @@ BACKGROUND = ("wall", "floor", "ceiling")
 """Names that SceneSplat excludes from the foreground. ScanNet's 20 classes have no ceiling."""
 NO_CLASS, NO_CLASS_BESIDE_ZERO = 0, -100
 """Ids of points of no class, in labels and predictions; the second where 0 is the id of a class, as in ScanNet++."""
+RAW_IDS = range(1100, 1358)
+"""Ids from here to the end of ScanNet's raw ones are no instances: no scene has a hundred of class 1."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -332,8 +335,10 @@ def count_label_files(
 ) -> Iterator[LabelCounts]:
     """Counts the labels in two folders, one scene in memory at a time; arguments as of `score_semantics`."""
     for files in scene_files(predictions, labels, scenes=scenes, scans=raw_ids is not None):
-        true_ids = _class_ids(files.labels) if raw_ids is None else class_ids_of_scan(files.labels, raw_ids, classes)
-        predicted = _class_ids(files.prediction)
+        true_ids = (
+            _class_ids(files.labels, classes) if raw_ids is None else class_ids_of_scan(files.labels, raw_ids, classes)
+        )
+        predicted = _class_ids(files.prediction, classes)
         with about(files.prediction):
             yield count_labels(files.scene, true_ids, predicted, classes)
 
@@ -348,8 +353,14 @@ def class_ids_of_scan(folder: Path, raw_ids: Mapping[str, int], classes: ClassTa
     return vertex_classes(labels.instances, names, class_of, none=-1).astype(np.int64)
 
 
-def _class_ids(path: Path) -> Int64[np.ndarray, " V"]:
+def _class_ids(path: Path, classes: ClassTable) -> Int64[np.ndarray, " V"]:
     labels = read_whole_numbers(path)
     if not len(labels):
         raise InputError(f"{path}: no vertices; expected one class id for each")
+    large = labels[(labels >= IDS_PER_CLASS) & ((labels < RAW_IDS.start) | (labels >= RAW_IDS.stop))]
+    if not (classes.rows(labels) >= 0).any() and (classes.rows(large // IDS_PER_CLASS) >= 0).any():
+        raise InputError(
+            f"{path}: ids such as {labels.max()} are those of instances, class id · {IDS_PER_CLASS} + number; expected "
+            "class ids"
+        )
     return labels

@@ -129,9 +129,9 @@ def test_the_order_of_boxes_and_objects_decides_nothing(rows: list[int]) -> None
 
 def test_a_caption_belongs_to_its_object_and_scene() -> None:
     objects = [
-        true_object(1, 0, "sos thing 1 eos", scene="s"),
-        true_object(1, 0, scene="t"),
-        true_object(2, 0, "sos thing 2 eos", scene="t"),
+        true_object(1, 0.0, "sos thing 1 eos", scene="s"),
+        true_object(1, 0.0, scene="t"),
+        true_object(2, 0.0, "sos thing 2 eos", scene="t"),
     ]
     captions = [
         NamedCaption(scene="t", object_id=2, caption="thing 2"),
