@@ -277,6 +277,7 @@ def open_checkpoint(
     cameras = (getattr(views.cameras, name) for name in ("cam_from_world", "Ks", "widths", "heights"))
     names = np.frombuffer(repr(views.names).encode("utf-8", "backslashreplace"), np.uint8)
     settings["scene"] = {"gaussians": _digest(*splat), "views": _digest(names, *cameras)}
+    settings["scene"]["depth"] = views.depths is not None
     return FusionCheckpoint(folder, settings)
 
 

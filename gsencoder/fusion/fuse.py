@@ -7,8 +7,8 @@ does not grow with the number of views or with the teacher's width.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -130,12 +130,10 @@ def fuse(
             `work` holds another run.
     """
     gaussians, views = validate_scene(scene)
-    visibility = resolve(config.visibility, views, config.lift)
-    rows = select_views(gaussians, views, config, visibility) if rows is None else tuple(rows)
+    rows = select_views(gaussians, views, config) if rows is None else tuple(rows)
     teacher, checkpoint = upright(teacher), None
     if work is not None:
-        settings = asdict(replace(config, visibility=visibility))
-        checkpoint = open_checkpoint(work, settings, teacher, gaussians, views, rows, basis)
+        checkpoint = open_checkpoint(work, asdict(config), teacher, gaussians, views, rows, basis)
         teacher = checkpoint.cached(teacher)
     maps = timed("teacher")(partial(teacher.feature_map, views))
     target = choose_device(device) if isinstance(device, str) else device
@@ -146,26 +144,21 @@ def fuse(
         raise InputError(f"fuse: the basis is of ({basis.space.describe()}), the maps of ({teacher.space.describe()})")
     else:
         mean = basis.mean
+    visibility = resolve(config.visibility, views, config.lift)
     sums = FeatureSums(len(gaussians), teacher.space, basis, teacher.table, target, with_mean=mean is None)
     remaining = rows if checkpoint is None else rows[checkpoint.resume(sums) :]
 
     def prepare(view: int) -> tuple[FeatureMap, Blend]:
         feature_map = maps(view)
-        matrix = view_matrix(
-            gaussians,
-            views,
-            view,
-            feature_map,
-            lift=config.lift,
-            visibility=visibility,
-            config=config.blend,
-            device=target,
-        )
-        return feature_map, matrix
+        options = {"lift": config.lift, "visibility": visibility, "config": config.blend, "device": target}
+        return feature_map, view_matrix(gaussians, views, view, feature_map, **options)
 
-    for view, (feature_map, matrix) in zip(
-        track(remaining, "lifting views"), _prepared(prepare, remaining, teacher, target), strict=True
-    ):
+    # A costly teacher has threads of its own and may have large maps: its views are prepared one after the other.
+    side_by_side = teacher.cheap and target.type == "cpu"
+    prepared = (
+        ahead(prepare, remaining, min(thread_count(), VIEWS_AT_ONCE)) if side_by_side else map(prepare, remaining)
+    )
+    for view, (feature_map, matrix) in zip(track(remaining, "lifting views"), prepared, strict=True):
         sums.add(matrix, feature_map, views.masks[view] if views.masks is not None else None)
         if checkpoint is not None:
             checkpoint.save_if_due(sums)
@@ -201,13 +194,12 @@ def validate_scene(scene: Scene) -> tuple[Gaussians, Views]:
     return scene.gaussians, scene.views
 
 
-def select_views(
-    gaussians: Gaussians, views: Views, config: FuseConfig, visibility: VisibilityConfig
-) -> tuple[int, ...]:
-    """Row numbers of the views that are used; `visibility` is resolved."""
+def select_views(gaussians: Gaussians, views: Views, config: FuseConfig) -> tuple[int, ...]:
+    """Row numbers of the views that are used."""
     share = max(1, math.ceil(config.view_share * len(views) - 1e-9))
     count = min(config.views or len(views), share, len(views))
     if config.view_choice == "coverage":
+        visibility = resolve(config.visibility, views, config.lift)
         return covering_views(gaussians, views, visibility, config.blend, count)
     return tuple(even_indices(len(views), count).tolist())
 
@@ -232,13 +224,3 @@ def find_basis(
         moments.mean, moments.covariance(), space, energy=config.energy, max_rank=config.max_rank
     )
     return basis, basis.mean if mean is None else mean
-
-
-def _prepared(
-    prepare: Callable[[int], tuple[FeatureMap, Blend]], rows: Sequence[int], teacher: Teacher, device: torch.device
-) -> Iterable[tuple[FeatureMap, Blend]]:
-    """Maps and matrices of views in their order. A costly teacher has threads of its own and may have large maps: its
-    views are prepared one after the other."""
-    if not teacher.cheap or device.type != "cpu":
-        return map(prepare, rows)
-    return ahead(prepare, rows, min(thread_count(), VIEWS_AT_ONCE))

@@ -288,7 +288,7 @@ def test_a_share_of_the_views_is_rounded_up_and_never_none() -> None:
         scene, config = make_scene(count=count), replace(EXACT, view_share=share, views=views)
         assert scene.gaussians is not None
         assert scene.views is not None
-        return select_views(scene.gaussians, scene.views, config, config.visibility)
+        return select_views(scene.gaussians, scene.views, config)
 
     assert chosen(5, 1.0) == (0, 1, 2, 3, 4)
     assert chosen(5, 0.6) == (0, 2, 4)
