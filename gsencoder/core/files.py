@@ -448,3 +448,21 @@ def unsealed(row: Any) -> dict[str, Any]:
 
 UNFINISHED_FILE = "unfinished.txt"
 """The file by which the state of an unfinished run is recognized."""
+
+
+def file_of_scene(option: str, name: str | Path, folder: Path) -> Path:
+    """The file that an option of several scenes names: in each scene's own folder, or else from here. `{scene}` in it
+    stands for the name of the scene's folder, as in splats/{scene}/splat.ply.
+
+    Raises:
+        InputError: neither exists.
+    """
+    name = str(name).replace("{scene}", folder.name)
+    try:
+        # An absolute path stays itself.
+        for path in (folder / name, Path(name)):
+            if path.exists():
+                return path
+    except (OSError, ValueError) as error:
+        raise InputError(f"{option}={str(name)[:200]}: is not a path ({type(error).__name__})") from error
+    raise InputError(f"{option}={name}: no such file (looked in {folder} and from here)")

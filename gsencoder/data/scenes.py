@@ -15,7 +15,7 @@ from jaxtyping import Float64, UInt8
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.core.files import SUMMARY_NAME, UNFINISHED_FILE, read_foreign_text
+from gsencoder.core.files import SUMMARY_NAME, UNFINISHED_FILE, file_of_scene, read_foreign_text
 from gsencoder.core.settings import check_limits, option
 from gsencoder.data.labels.scans import (
     labels_of_layout,
@@ -37,7 +37,6 @@ from gsencoder.data.readers.images import (
 from gsencoder.data.readers.layouts import (
     SPLAT_SUFFIXES,
     describe_layouts,
-    file_of_scene,
     find_splat,
     layout_of,
     read_bare_splat,

@@ -175,20 +175,6 @@ def find_splat(root: Path) -> Path:
     raise InputError(f"{root}: not a scene; {describe_layouts()}")
 
 
-def file_of_scene(option: str, name: str | Path, folder: Path) -> Path:
-    """The file that an option of several scenes names: in each scene's own folder, or else from here. `{scene}` in it
-    stands for the name of the scene's folder, as in splats/{scene}/splat.ply."""
-    name = str(name).replace("{scene}", folder.name)
-    try:
-        # An absolute path stays itself.
-        for path in (folder / name, Path(name)):
-            if path.exists():
-                return path
-    except (OSError, ValueError) as error:
-        raise InputError(f"{option}={str(name)[:200]}: is not a path ({type(error).__name__})") from error
-    raise InputError(f"{option}={name}: no such file (looked in {folder} and from here)")
-
-
 def read_bare_splat(path: Path) -> tuple[Gaussians, Float64[np.ndarray, "3"]]:
     """A splat without views, and an origin near the median of its means, taken off before they become float32."""
     raw = read_raw(path)

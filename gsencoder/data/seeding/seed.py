@@ -20,9 +20,9 @@ from jaxtyping import Float64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.files import file_of_scene
 from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import check_limits, option
-from gsencoder.data.readers.layouts import file_of_scene
 from gsencoder.data.seeding.depth import depth_samples, read_rgbd, surface_pixels
 from gsencoder.data.seeding.mesh import mesh_bounds, seed_from_mesh, seed_from_tsdf
 from gsencoder.data.seeding.points import flat_gaussians, seed_from_points, typical_spacing
