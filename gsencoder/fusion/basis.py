@@ -37,11 +37,7 @@ class Moments:
         self._shift: Float32[np.ndarray, " D"] | None = None
 
     def add(self, vectors: Float[np.ndarray, "n D"]) -> None:
-        """Takes more vectors into account.
-
-        Raises:
-            InputError: a vector is not finite.
-        """
+        """Takes more vectors into account."""
         if len(vectors) == 0:
             return
         if self._shift is None:
@@ -88,11 +84,7 @@ class Moments:
 
     @classmethod
     def read(cls, file: Archive, channels: int) -> "Moments":
-        """Moments from the arrays of a file.
-
-        Raises:
-            InputError: the file is damaged, or of another number of channels.
-        """
+        """Moments from the arrays of a file."""
         moments = cls(channels)
         moments.restore(
             {name: file.array(name, value.dtype.name, value.shape) for name, value in moments.state().items()}
@@ -124,14 +116,10 @@ def fit_basis(
     """The leading eigenvectors of a covariance.
 
     Args:
-        mean: the space's mean.
         covariance: second moment about that mean.
         space: what the vectors are.
         energy: share of the trace to keep, in (0, 1].
         max_rank: at most so many components; 0 = no limit. `energy_kept` of the result tells what it cost.
-
-    Raises:
-        InputError: knobs out of range.
     """
     if not 0 < energy <= 1:
         raise InputError(f"energy: expected a share in (0, 1], got {energy}")

@@ -156,11 +156,7 @@ AROUND, INSIDE = "orbit", "inside"
 
 
 def check_orbits(count: int) -> None:
-    """Complains of a number of cameras that nobody means.
-
-    Raises:
-        InputError: fewer than one, or more than 10,000.
-    """
+    """Complains of a number of cameras that nobody means."""
     if not 1 <= count <= MOST_ORBITS:
         raise InputError(f"orbits: expected 1 to {MOST_ORBITS} cameras, got {count}")
 
@@ -176,9 +172,6 @@ def with_views(
         config: accuracy of the rendering.
         cameras: around the splat, inside it, or "auto": inside if it is a room (`gsencoder.data.enclosure`) and that
             shows most of it.
-
-    Raises:
-        InputError: cameras inside are wanted, and nowhere in the splat is there room for one.
     """
     return with_explained_views(scene, count, config, cameras=cameras)[0]
 

@@ -32,12 +32,7 @@ def write_map(path: Path, feature_map: FeatureMap, *, with_table: bool = False) 
     not finite are no part of the map, and are marked as such. Codes are written as they are.
 
     Args:
-        path: the file.
-        feature_map: to write.
         with_table: write the table of a coded or mixed map, too, because it is that of no other map.
-
-    Raises:
-        InputError: the disk is full, or the system refuses.
     """
     arrays = {"grid": feature_map.grid_from_image}
     if with_table:
@@ -60,12 +55,7 @@ def read_map(path: Path, space: FeatureSpace, table: Float32[np.ndarray, "C D"] 
     """The map of a file; cells of a dense map that had none are NaN.
 
     Args:
-        path: the file.
-        space: of the map.
         table: of a mixed map whose file does not hold it.
-
-    Raises:
-        InputError: the file is damaged, or of another space.
     """
     with open_archive(path) as file:
         grid = file.array("grid", "float64", (2, 3))
@@ -145,11 +135,7 @@ class CachedTeacher(WrappedTeacher):
         self._folder, self._before_write, self._advice = folder, before_write, advice
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The map of a view, from its file where there is one.
-
-        Raises:
-            InputError: whatever the teacher refuses, a damaged file, or a full disk.
-        """
+        """The map of a view, from its file where there is one."""
         if self.cheap:
             return self.teacher.feature_map(views, view)
         path = self._folder / f"map_{view:05d}.safetensors"
@@ -192,9 +178,6 @@ class FusionCheckpoint:
         Args:
             folder: of the maps and the sums.
             settings: all that maps and sums depend on, the scene included, as JSON values.
-
-        Raises:
-            InputError: the folder holds a checkpoint of other settings (the difference is named), or cannot be used.
         """
         self.folder, self._saved_at, self._advice = folder, time.monotonic(), f"delete {folder} to start again"
         self._settings = json.loads(json.dumps(settings))
@@ -216,11 +199,7 @@ class FusionCheckpoint:
         return CachedTeacher(teacher, self.folder, before_write=self._make_folder, advice=self._advice)
 
     def resume(self, sums: Sums) -> int:
-        """Restores the sums of an interrupted run, if there are any; the number of views that they are over.
-
-        Raises:
-            InputError: the checkpoint is damaged, or of other sizes.
-        """
+        """Restores the sums of an interrupted run, if there are any; the number of views that they are over."""
         if (self.folder / SUMS_FILE).is_file():
             with advised(self._advice), open_archive(self.folder / SUMS_FILE) as file:
                 state = {name: file.array(name, each.dtype.name, each.shape) for name, each in sums.state().items()}
@@ -261,14 +240,10 @@ def open_checkpoint(
     Args:
         folder: of the maps and the sums.
         config: settings of the fusion, as JSON values.
-        teacher: what is lifted.
         gaussians: what is lifted onto.
         views: of the scene; photographs count by their names alone.
         rows: the views that are lifted, in this order.
         basis: one that was given to the fusion; one that it fits itself depends on nothing else.
-
-    Raises:
-        InputError: as `FusionCheckpoint`.
     """
     settings: dict[str, Any] = {"fuse": dict(config), "teacher": teacher.settings(), "views": list(rows)}
     if basis is not None:

@@ -83,11 +83,7 @@ class ProjectionSums:
         self.add(basis, rows[np.isfinite(rows[:, 0])])
 
     def fit(self) -> BasisFit:
-        """The figures of all vectors that were added.
-
-        Raises:
-            InputError: there are none.
-        """
+        """The figures of all vectors that were added."""
         vectors = float(self.histogram.sum())
         explained, total, cosines = self.sums.tolist()
         if not vectors:
@@ -102,11 +98,7 @@ class ProjectionSums:
 
 
 def total_fit(sums: Iterable[ProjectionSums]) -> BasisFit:
-    """The figures over the vectors of several sums.
-
-    Raises:
-        InputError: there are none.
-    """
+    """The figures over the vectors of several sums."""
     total = ProjectionSums()
     for each in sums:
         total.histogram += each.histogram
@@ -115,11 +107,7 @@ def total_fit(sums: Iterable[ProjectionSums]) -> BasisFit:
 
 
 def project_maps(basis: FeatureBasis, teacher: Teacher, views: Views, rows: Iterable[int]) -> ProjectionSums:
-    """The sums over a teacher's maps of some views.
-
-    Raises:
-        InputError: the teacher is of another space.
-    """
+    """The sums over a teacher's maps of some views."""
     if teacher.space != basis.space:
         raise InputError(f"basis: is of ({basis.space.describe()}), the maps of ({teacher.space.describe()})")
     sums, teacher = ProjectionSums(), upright(teacher)
@@ -150,11 +138,7 @@ class CellSample:
         self._parts.append(rows[:: -(-len(rows) // self._per_map)] if len(rows) else rows)
 
     def vectors(self) -> Float32[np.ndarray, "n D"]:
-        """The vectors of all cells of the sample.
-
-        Raises:
-            InputError: there are none.
-        """
+        """The vectors of all cells of the sample."""
         if not sum(len(part) for part in self._parts):
             raise InputError("heads: no view has a cell with a vector; check the teacher's maps")
         return np.concatenate(self._parts).astype(np.float32, copy=False)
@@ -204,13 +188,9 @@ def field_error(
     """Compares two fields in the full space.
 
     Args:
-        features: what is judged.
         reference: what is taken for right.
         sample: at most so many Gaussians, evenly spaced over those that the reference saw; 0 = all.
         rows: the Gaussians that are compared, of those that the reference saw; None = a sample.
-
-    Raises:
-        InputError: fields of different splats or spaces, or a reference that saw nothing.
     """
     if len(features) != len(reference) or features.space != reference.space:
         raise InputError(

@@ -68,11 +68,7 @@ def stated_frames(folder: Path | None, splat: Path) -> list[SplatFrame]:
     """The frames that files beside a splat, or in the scene's folder, say it may be in.
 
     `dataparser_transforms.json` leads from the world before `applied_transform` of transforms.json, as nerfstudio
-    writes it, or from that of its matrices, as where there is none.
-
-    Raises:
-        InputError: a file is damaged, or its transform is no rotation.
-    """
+    writes it, or from that of its matrices, as where there is none."""
     folders = list(dict.fromkeys(each for each in (splat.parent, folder) if each is not None))
     frames = list[SplatFrame]()
     applied = None
@@ -130,7 +126,6 @@ def moved(gaussians: Gaussians, frame: SplatFrame, origin: Float64[np.ndarray, "
 
     Args:
         gaussians: relative to `origin` of their file's world.
-        frame: which that is.
         origin: that positions are relative to, before and after.
     """
     from gsencoder.geometry import sh_basis  # with torch
@@ -196,9 +191,6 @@ def with_fitting_splat(scene: Scene, splat: str, options: SceneConfig) -> Scene:
         scene: as `load_scene` reads it.
         splat: the file of its Gaussians, as `load_scene` takes it; empty = none, and nothing is checked.
         options: how it was read; `check_fit` = whether a splat that does not fit is refused.
-
-    Raises:
-        InputError: the splat fits in another frame, which no file states.
 
     Warns:
         SceneWarning: the splat is moved; or it does not fit, or nothing can tell, and no frame was found.
@@ -289,8 +281,6 @@ def agreement(
     """How a splat agrees with photographs, if its world is that of a frame.
 
     Args:
-        gaussians: relative to `origin`.
-        views: photographs.
         frame: the world of the splat.
         origin: that Gaussians and cameras are relative to.
     """

@@ -57,13 +57,8 @@ def write_memory(path: Path, memory: QueryMemory, gaussians: Gaussians, more: Ma
     magnitude.
 
     Args:
-        path: the file.
-        memory: to write.
         gaussians: that the queries belong to.
         more: further entries of the header, as JSON values.
-
-    Raises:
-        InputError: another number of Gaussians, or the disk is full.
     """
     if len(memory) != len(gaussians):
         raise InputError(f"{path}: {len(memory):,} queries need as many Gaussians, got {len(gaussians):,}")
@@ -91,11 +86,7 @@ def write_memory(path: Path, memory: QueryMemory, gaussians: Gaussians, more: Ma
 
 
 def read_memory(file: Archive, gaussians: Gaussians) -> QueryMemory:
-    """Reads a memory.
-
-    Raises:
-        InputError: damaged, or of another splat.
-    """
+    """Reads a memory."""
     check_splat(file, gaussians, "make the memory of this splat again")
     space, mean, basis = read_space(file)
     rows, count = file.array("rows", "int32", ("n",)), len(gaussians)
@@ -189,11 +180,7 @@ def save_memories(
     Args:
         folder: made if it does not exist, as in `save_features`.
         scene: with the Gaussians that the queries belong to.
-        memories: by teacher.
         settings: what made them, as JSON values.
-
-    Raises:
-        InputError: queries of another number of Gaussians, or a folder that cannot be written.
     """
     folder, gaussians = Path(folder), scene.gaussians
     if gaussians is None:
@@ -274,9 +261,7 @@ def features_bytes(
     """The size of the file that `save_features` would write.
 
     Args:
-        space: of the features.
         rows: number of Gaussians that were seen.
-        rank: coordinates of each.
         settings: as `save_features` takes them.
         basis: whether the coordinates are in a basis.
     """
@@ -330,11 +315,7 @@ def load_features(folder: str | Path) -> Scene:
 
 
 def load_memories(folder: str | Path) -> dict[str | None, QueryMemory]:
-    """The memories of a folder that `save_memories` wrote, by teacher; the name of a single one is None.
-
-    Raises:
-        InputError: not such a folder, damaged, of another version, or memories of another splat.
-    """
+    """The memories of a folder that `save_memories` wrote, by teacher; the name of a single one is None."""
     folder = Path(folder)
     if not folder.is_dir() or not _files_of_teachers(folder, MEMORY_FILE):
         raise InputError(
@@ -353,11 +334,7 @@ def _read_memories(folder: Path, gaussians: Gaussians) -> dict[str | None, Query
 
 
 def _files_of_teachers(folder: Path, file: str) -> dict[str | None, str]:
-    """The files of a kind in a folder by teacher; the name of a single one is None.
-
-    Raises:
-        InputError: there are those of one teacher and of several.
-    """
+    """The files of a kind in a folder by teacher; the name of a single one is None."""
     teachers = teachers_in(folder, file)
     if not (folder / file).is_file():
         return {name: file_of_teacher(file, name) for name in teachers}
@@ -412,13 +389,8 @@ def save_tables(
     """Writes text tables beside features or weights.
 
     Args:
-        folder: an existing folder.
         tables: by the teacher in whose space they are.
         teachers: all teachers of the features or the encoder, with tables or not; a single one is not named in files.
-        dtype: of the embeddings.
-
-    Raises:
-        InputError: a file cannot be written.
     """
     single = len(list(teachers)) == 1
     for teacher, table in tables.items():
@@ -426,11 +398,7 @@ def save_tables(
 
 
 def load_tables(folder: Path, teachers: Iterable[str]) -> dict[str, TextTable]:
-    """The text tables of a folder by teacher; teachers without a file are left out.
-
-    Raises:
-        InputError: a file is damaged.
-    """
+    """The text tables of a folder by teacher; teachers without a file are left out."""
     names = list(teachers)
     paths = {name: folder / file_of_teacher(WORDS_FILE, name if len(names) > 1 else None) for name in names}
     return {name: load_text_table(path) for name, path in paths.items() if path.is_file()}
@@ -440,7 +408,6 @@ def table_path(folder: Path, text_encoder: str) -> Path | None:
     """The file in a folder of features whose words lead into the features of one space; None where there is none.
 
     Args:
-        folder: of features.
         text_encoder: of the space of these features.
 
     Raises:
@@ -484,14 +451,9 @@ def copy_heads(
     """Copies a file of adapter heads beside features or weights; an earlier one is replaced once the copy is whole.
 
     Args:
-        source: the file.
-        target: its copy.
         spaces: of the features or the weights, one for each teacher; the heads take features of one of them.
         left_out: spaces of the other teachers of the source, whose features are not written; heads that take these are
             not copied.
-
-    Raises:
-        InputError: the file is damaged, or of another backbone; or the target cannot be written.
     """
     with open_archive(source) as file:
         heads = read_heads_space(file)
@@ -503,11 +465,7 @@ def copy_heads(
 
 
 def read_heads_space(file: Archive) -> FeatureSpace:
-    """The space of the features that the heads of a file take.
-
-    Raises:
-        InputError: the file does not say.
-    """
+    """The space of the features that the heads of a file take."""
     values = file.value("space", dict)
     if set(values) != set(FeatureSpace.__dataclass_fields__):
         raise InputError(f"expected a feature space with {', '.join(FeatureSpace.__dataclass_fields__)}")
@@ -515,11 +473,7 @@ def read_heads_space(file: Archive) -> FeatureSpace:
 
 
 def check_heads_space(heads: FeatureSpace, features: FeatureSpace) -> None:
-    """Checks that heads take features of a space.
-
-    Raises:
-        InputError: they take features of another backbone; both are named.
-    """
+    """Checks that heads take features of a space."""
     if heads != features:
         raise InputError(
             f"the heads take features of ({heads.describe()}), and these are of ({features.describe()}); expected "

@@ -115,7 +115,6 @@ def fuse(
     Args:
         scene: with Gaussians and views.
         teacher: whose maps are lifted.
-        config: settings.
         basis: fuse in the coordinates of this basis, which scenes that are trained on together share; None = one of the
             scene's own, where `config` asks for one.
         rows: numbers of the views that are lifted, in this order; None = those that `config` chooses.
@@ -182,11 +181,7 @@ def fuse(
 
 
 def validate_scene(scene: Scene) -> tuple[Gaussians, Views]:
-    """The Gaussians and views of a scene that can be fused.
-
-    Raises:
-        InputError: it lacks them.
-    """
+    """The Gaussians and views of a scene that can be fused."""
     if scene.gaussians is None or len(scene.gaussians) == 0:
         raise InputError(f"fuse: scene {scene.name} has no Gaussians; make some from its depth or points (seeds)")
     if scene.views is None or len(scene.views) == 0:

@@ -43,11 +43,7 @@ class VisibilityConfig:
 
 def resolve(config: VisibilityConfig, views: Views, lift: str) -> VisibilityConfig:
     """The same with "auto" replaced: sensor depth where there is one; else rendered depth for centers, which see
-    through walls without a test, and none for B, whose weights are what is left behind other Gaussians.
-
-    Raises:
-        InputError: a test against sensor depth in a scene without.
-    """
+    through walls without a test, and none for B, whose weights are what is left behind other Gaussians."""
     has_depth = views.depths is not None
     if "sensor" in config.against and not has_depth:
         raise InputError(
@@ -355,13 +351,9 @@ def view_matrix(
     """The matrix that a view's map is lifted with: B of its cells, or one entry for each visible center.
 
     Args:
-        gaussians: the splat.
         views: cameras, and sensor depth where it is tested against.
-        view: which of them.
         feature_map: its cells are the rows.
-        lift: blend or center.
         visibility: what hides an entry, resolved (`resolve`).
-        config: knobs of B.
         device: where B is made and held against depth maps; centers are tested on the CPU, and go there as a matrix.
     """
     depths = depth_maps(gaussians, views, view, visibility, config, device)

@@ -85,7 +85,6 @@ def fitted_colors(
 
     Args:
         render: in [0, 1].
-        image: the photograph.
         mask: pixels to compare; without any the map is the identity.
 
     Returns:

@@ -98,9 +98,7 @@ def register_photographs(
     looked at a second time, for features that match from farther aside.
 
     Args:
-        folder: of the photographs.
         work: an existing folder for COLMAP's database; the model is written to `sparse/0` in it.
-        config: settings.
         single_camera: whether one camera took them all with one focal length, as the frames of a video.
         in_time: is called before each part of the work, and may end it.
 
@@ -170,7 +168,6 @@ def load_placement(folder: Path, work: Path, config: SfmConfig = SfmConfig()) ->
     have their checksums. A second run of structure from motion with several threads need not give the same poses.
 
     Args:
-        folder: of the photographs.
         work: that the call was given.
         config: that it was given.
     """

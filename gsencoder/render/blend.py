@@ -131,11 +131,7 @@ class Blend:
 
     @cached_property
     def median_depth(self) -> Float[Tensor, " P"]:
-        """Depth at which a ray has lost half its transmittance, for single rays; 0 where it never does.
-
-        Raises:
-            InputError: the rows pool several rays, which have no common order.
-        """
+        """Depth at which a ray has lost half its transmittance, for single rays; 0 where it never does."""
         if self.lattice.side != 1:
             raise InputError(f"median_depth needs one ray a row; this blend pools {self.lattice.side**2} rays")
         total = torch.cat((self.weight.new_zeros(1), self.weight)).double().cumsum(0)
@@ -255,15 +251,11 @@ def blend(
     """The blending weights of one view.
 
     Args:
-        gaussians: the splat.
-        cameras: in the same world.
-        view: which camera.
         patch: pixels along the side of a square patch; None for one row a pixel.
         like: a feature map whose grid the rows follow, in place of `patch`.
         stride: where the rows are pixels, only every so many of them, in both directions.
         between: smallest and largest depth of the entries of each row, as `Blend.keep_between` takes them: it gives the
             same, and what lies behind is not composited at all.
-        config: accuracy knobs.
         device: where the result is made and lives; the numba backend computes on a CPU alone.
         dtype: float type of the torch backends; the numba backend computes in float64 and stores float32.
 

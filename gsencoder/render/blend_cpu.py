@@ -321,7 +321,6 @@ def blend_weights(
         depths: of all Gaussians, which are held against `between`.
         between: smallest and largest depth of the entries that each row stores.
         stop: transmittance at which a ray ends.
-        keep: smallest weight stored.
     """
     tile = lattice.tile
     tiles_x, tiles_y = -(-lattice.width * lattice.side // tile), -(-lattice.height * lattice.side // tile)

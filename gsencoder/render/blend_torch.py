@@ -88,13 +88,9 @@ def _composite_tiles(
     """Composites the lists of some tiles: (row, Gaussian, weight) of the entries of each round.
 
     Args:
-        tiles: which.
-        starts: see `tile_lists`.
-        members: the same.
         packed: means, conics and opacities of the Gaussians on the image plane.
         lattice: where the rays are.
         stop: transmittance at which a ray ends.
-        keep: smallest weight stored.
     """
     tile, side, device = lattice.tile, lattice.side, packed.device
     cells, (tiles_x, _) = tile // side, _tile_counts(lattice)

@@ -44,9 +44,6 @@ def render_image(
     """One view in color.
 
     Args:
-        gaussians: the splat.
-        cameras: in the same world.
-        view: which camera.
         blended: this view's pixel blend, where it has been made already.
         background: RGB in [0, 1] behind everything.
         config: accuracy knobs, where the blend must be made.
@@ -92,11 +89,7 @@ def psnr(
 
 def ssim_map(picture: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> Float[Tensor, "h w 3"]:
     """Structural similarity (Wang et al. 2004) of pictures in [0, 1]: 11 × 11 windows weighted by a Gaussian of 1.5
-    pixels, at the H − 10 by W − 10 places where the window lies inside.
-
-    Raises:
-        InputError: a picture smaller than the window.
-    """
+    pixels, at the H − 10 by W − 10 places where the window lies inside."""
     if min(picture.shape[:2]) < WINDOW:
         raise InputError(f"ssim: expected pictures of at least {WINDOW} pixels a side, got {tuple(picture.shape[:2])}")
     x, y = picture.permute(2, 0, 1), truth.permute(2, 0, 1)
@@ -156,9 +149,7 @@ def visible_shares(
     """The share of the pixels of each view in which a Gaussian of each group is the nearest, or nearly.
 
     Args:
-        gaussians: the splat.
         cameras: small pictures; the cost is one pass over all Gaussians for each.
-        groups: rows of Gaussians.
     """
     radii = (RADIUS * np.median(gaussians.scales, axis=1)).astype(np.float32)
     opaque = gaussians.opacities >= OPAQUE

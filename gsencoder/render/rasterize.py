@@ -93,14 +93,10 @@ def rasterize(
         scales: standard deviations, world units.
         opacities: in [0, 1].
         colors: as seen from this camera.
-        cam_from_world: rigid.
         K: intrinsics in pixels.
         width: image width in pixels.
         height: image height in pixels.
         config: accuracy knobs and backend.
-
-    Raises:
-        InputError: a backend that cannot compute on these tensors' device.
     """
     backend = _backend(config.backend, means)
     if backend == "gsplat":
@@ -464,10 +460,6 @@ def differentiate(
 
     Args:
         tiles: as `composite` had them.
-        splats: the same.
-        values: the same.
-        stop: the same.
-        out: what `composite` gave.
         grads: derivatives of the loss by `out`.
     """
     height, width = out.shape[:2]
@@ -504,11 +496,7 @@ def rasterize_gsplat(
     eps2d: float,
     stop_transmittance: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The fields of a Raster; the arguments are those of `rasterize` and of `RasterConfig`.
-
-    Raises:
-        InputError: gsplat is not installed, or a transmittance other than that of its kernels.
-    """
+    """The fields of a Raster; the arguments are those of `rasterize` and of `RasterConfig`."""
     if stop_transmittance != STOP_TRANSMITTANCE:
         raise InputError(
             f"stop_transmittance: gsplat ends rays at {STOP_TRANSMITTANCE:g} and takes no other value, "

@@ -49,11 +49,7 @@ def pixel_lattice(width: int, height: int) -> Lattice:
 
 
 def strided_lattice(width: int, height: int, stride: int) -> Lattice:
-    """One ray through the center of every `stride`-th pixel, from the middle of the first block of that many on.
-
-    Raises:
-        InputError: a stride of no pixels.
-    """
+    """One ray through the center of every `stride`-th pixel, from the middle of the first block of that many on."""
     if stride < 1:
         raise InputError(f"stride: expected at least 1 pixel, got {stride}")
     first_x, first_y = min(stride, width) // 2, min(stride, height) // 2
@@ -69,11 +65,7 @@ def strided_lattice(width: int, height: int, stride: int) -> Lattice:
 
 
 def patch_lattice(width: int, height: int, patch: int, rays_per_patch: int) -> Lattice:
-    """Square patches from the image's top left corner; the last ones may reach over the right and lower border.
-
-    Raises:
-        InputError: a patch of no pixels, or a number of rays that is not a square.
-    """
+    """Square patches from the image's top left corner; the last ones may reach over the right and lower border."""
     if patch < 1:
         raise InputError(f"patch: expected at least 1 pixel, got {patch}")
     grid_from_image = np.array([[1 / patch, 0, 0], [0, 1 / patch, 0]])
@@ -88,9 +80,6 @@ def grid_lattice(grid_from_image: Float64[np.ndarray, "2 3"], width: int, height
         width: cells in a line of the grid.
         height: lines of the grid.
         rays_per_patch: 1, 4, 9, 16, …
-
-    Raises:
-        InputError: a number of rays that is not a square.
     """
     side = math.isqrt(max(rays_per_patch, 0))
     if side < 1 or side * side != rays_per_patch:

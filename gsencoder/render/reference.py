@@ -23,11 +23,9 @@ def blend_weights(
     dense rays × Gaussians table: w = α·exp(Σ_before log1p(−α)).
 
     Args:
-        projected: see geometry.project.
         opacities: of the same N Gaussians.
         lattice: where the rays are.
         stop: transmittance at which a ray ends, the Gaussian that would cross it excluded.
-        keep: smallest weight stored.
     """
     rows, cols, weights = [], [], []
     side = lattice.side
@@ -56,9 +54,7 @@ def composite(
     """B @ values for single rays, differentiable in the geometry as well: the twin of the kernels in rasterize.py.
 
     Args:
-        projected: see geometry.project.
         opacities: of the same N Gaussians.
-        values: what is composited.
         lattice: where the rays are, one a row.
         stop: transmittance at which a ray ends, the Gaussian that would cross it excluded.
     """
@@ -138,9 +134,7 @@ def count_codes(
     """Adds CSR @ one_hot(codes) to out[targets], by sums over entries sorted by target and code; code −1 gives nothing.
 
     Args:
-        crow: row starts.
         col: column of each entry.
-        weight: of each entry.
         codes: of the columns, −1 or below C.
         targets: distinct, of the rows.
         out: what is added to.
