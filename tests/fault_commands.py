@@ -81,7 +81,7 @@ CASES: dict[str, Case] = {
             "reconstruct", "optimize.steps=3", "holdout=3", "seeds.voxel=0.15", "optimize.sh_degree=0",
             "checkpoint_every=0",
         ),
-        other=("optimize.leash=0.3",),
+        other=("optimize.anchor_sigmas=0.3",),
     ),
     "memory": Case(
         lambda given: [

@@ -21,6 +21,7 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Device, Track, timed, untracked
+from gsencoder.core.settings import check_limits, option
 from gsencoder.core.threads import ahead, thread_count
 from gsencoder.fusion.basis import Moments, distinct_rows, fit_basis, table_basis
 from gsencoder.fusion.checkpoint import open_checkpoint, upright
@@ -39,35 +40,24 @@ thread, such as sorting, run side by side. Each holds a matrix in memory."""
 class FuseConfig:
     """How maps become per-Gaussian features."""
 
-    lift: Literal["blend", "center"] = field(
-        default="blend",
-        metadata={"help": "blend: Bᵀ, every pixel gives by its blending weights; center: the paper's nearest pixel"},
+    lift: Literal["blend", "center"] = option(
+        "blend", "blend: Bᵀ, every pixel gives by its blending weights; center: the paper's nearest pixel"
     )
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
     blend: BlendConfig = field(default_factory=BlendConfig)
-    energy: float = field(
-        default=0.999, metadata={"help": "share of the energy of a teacher's vectors that the basis keeps"}
-    )
-    table_energy: float = field(
-        default=0.9999, metadata={"help": "the same for maps that share a table (labels, captions)"}
-    )
-    max_rank: int = field(default=128, metadata={"help": "largest rank of the basis; 0 = as many as the energy asks"})
-    basis: bool = field(default=True, metadata={"help": "fuse in a low-rank basis; false = in all channels"})
-    narrow: int = field(default=64, metadata={"help": "teachers with no more channels than this keep all of them"})
-    views: int = field(default=0, metadata={"help": "views used; 0 = all"})
-    view_share: float = field(default=1.0, metadata={"help": "share of the views used; with views= the fewer of both"})
-    view_choice: Literal["even", "coverage"] = field(
-        default="even",
-        metadata={"help": "which views are used: evenly spaced ones, or those that show most of the Gaussians"},
+    energy: float = option(0.999, "share of the energy of a teacher's vectors that the basis keeps", gt=0, le=1)
+    table_energy: float = option(0.9999, "the same for maps that share a table (labels, captions)", gt=0, le=1)
+    max_rank: int = option(128, "largest rank of the basis; 0 = as many as the energy asks", ge=0)
+    basis: bool = option(True, "fuse in a low-rank basis; false = in all channels")
+    narrow: int = option(64, "teachers with no more channels than this keep all of them", ge=0)
+    views: int = option(0, "views used; 0 = all", ge=0)
+    view_share: float = option(1.0, "share of the views used; with views= the fewer of both", gt=0, le=1)
+    view_choice: Literal["even", "coverage"] = option(
+        "even", "which views are used: evenly spaced ones, or those that show most of the Gaussians"
     )
 
     def __post_init__(self) -> None:
-        for name in ("energy", "table_energy", "view_share"):
-            if not 0 < getattr(self, name) <= 1:
-                raise InputError(f"{name}: expected a share in (0, 1], got {getattr(self, name)}")
-        for name in ("max_rank", "narrow", "views"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,7 +1,7 @@
 """Lifting one view: the matrix that carries its map to the Gaussians, and the sums over all views."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal, no_type_check
 
 import numpy as np
@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Float32, Int32, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import timed
+from gsencoder.core.settings import check_limits, option
 from gsencoder.core.threads import kernel
 from gsencoder.fusion.basis import Moments, distinct_rows, to_coordinates
 from gsencoder.render import Blend, BlendConfig, blend
@@ -24,19 +25,14 @@ Source = Literal["auto", "sensor", "rendered"]
 class VisibilityConfig:
     """Which depth maps a Gaussian is held against, and how near it must be; all chosen tests must pass."""
 
-    against: tuple[Source, ...] = field(
-        default=("auto",),
-        metadata={
-            "help": "depth maps to test against: sensor, rendered; auto = sensor if there, else rendered if lift=center"
-        },
+    against: tuple[Source, ...] = option(
+        ("auto",), "depth maps to test against: sensor, rendered; auto = sensor if there, else rendered if lift=center"
     )
-    relative: float = field(default=0.02, metadata={"help": "largest |d − z| as a share of d; 0 = not tested"})
-    absolute: float = field(default=0.0, metadata={"help": "largest |d − z| in world units; 0 = not tested"})
+    relative: float = option(0.02, "largest |d − z| as a share of d; 0 = not tested", ge=0, le=1e12)
+    absolute: float = option(0.0, "largest |d − z| in world units; 0 = not tested", ge=0, le=1e12)
 
     def __post_init__(self) -> None:
-        for name in ("relative", "absolute"):
-            if not 0 <= getattr(self, name) <= 1e12:
-                raise InputError(f"{name}: expected a tolerance from 0 to 1e12, got {getattr(self, name)}")
+        check_limits(self)
         if self.against and not (self.relative or self.absolute):
             raise InputError("against: a test against a depth map needs relative or absolute above 0; [] = no test")
 

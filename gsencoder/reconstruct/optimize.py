@@ -4,7 +4,7 @@ densification.
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import defer_signals
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.reconstruct.exposure import ROUNDS, Exposures, apply_colors, compared_pixels, fitted_colors
 from gsencoder.reconstruct.parameters import (
@@ -30,90 +31,67 @@ from gsencoder.render.images import ssim
 from gsencoder.render.rasterize import Raster, RasterConfig, rasterize
 from gsencoder.types import Cameras, Gaussians
 
-MAX_RATE = 10.0
-"""Largest learning rate. A step of Adam is about as large as the rate, and a step of 1 makes a scale e times larger."""
+RATES = {
+    "means": 3e-4,
+    "quats": 1e-3,
+    "log_scales": 2e-2,
+    "logit_opacities": 5e-2,
+    "sh0": 2.5e-3,
+    "shN": 2.5e-3 / 20,
+}
+"""Learning rates by parameter; that of the means is times the extent of the scene."""
+FINAL_MEANS_RATE = 0.01
+"""Share of the rate of the means that is left at the end."""
+SH_EVERY = 0.2
+"""Share of the steps after which the degree of colors rises by one."""
+SSIM_WEIGHT, DEPTH_WEIGHT = 0.2, 0.5
+"""Of 1 − SSIM, where the rest of 1 is L1's; of the relative error of depth, where a sensor measured it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OptimizeConfig:
     """Settings of the optimization of a splat."""
 
-    steps: int = field(default=1500, metadata={"help": "photographs looked at, one a step"})
-    earlier: tuple[int, ...] = field(
-        default=(),
-        metadata={
-            "help": "numbers of steps that were planned before, each with that of the step until which it was; written "
-            "by budget.seconds, whose splat they reproduce (results.budget in summary.json)"
-        },
+    steps: int = option(1500, "photographs looked at, one a step", ge=0)
+    earlier: tuple[int, ...] = option(
+        (),
+        "numbers of steps that were planned before, each with that of the step until which it was; written "
+        "by budget.seconds, whose splat they reproduce (results.budget in summary.json)",
     )
-    sh_degree: int = field(default=2, metadata={"help": "how colors may depend on the direction, 0 to 3"})
-    sh_every: float = field(default=0.2, metadata={"help": "share of the steps after which the degree rises by one"})
-    shrinks: tuple[int, ...] = field(
-        default=(2, 1), metadata={"help": "photographs are made smaller so many times, one stage after the other"}
+    sh_degree: int = option(2, "how colors may depend on the direction, 0 to 3", ge=0, le=3)
+    shrinks: tuple[int, ...] = option(
+        (2, 1), "photographs are made smaller so many times, one stage after the other", ge=1
     )
-    shares: tuple[float, ...] = field(
-        default=(0.3, 0.7), metadata={"help": "share of the steps of each of these stages"}
+    shares: tuple[float, ...] = option((0.3, 0.7), "share of the steps of each of these stages")
+    empty_weight: float = option(
+        0.5, "of the opacity where transparency, or a background of one color, says that nothing is there", ge=0, le=100
     )
-    ssim_weight: float = field(default=0.2, metadata={"help": "of 1 − SSIM; the rest of 1 is L1's"})
-    depth_weight: float = field(
-        default=0.5, metadata={"help": "of the relative error of depth, where a sensor measured it"}
+    anchor_sigmas: float = option(
+        0.4,
+        "Gaussians that begin on a measured surface (depth, mesh, tsdf) stay within about so many of their "
+        "first standard deviations of there; 0 = they go where they like",
+        ge=0,
+        le=1e6,
     )
-    empty_weight: float = field(
-        default=0.5,
-        metadata={
-            "help": "of the opacity where transparency, or a background of one color, says that nothing is there"
-        },
+    exposure: bool = option(
+        True,
+        "fit an affine map of colors to each photograph, for exposure and white balance that differ; "
+        "false = photographs are fitted as they are",
     )
-    means_rate: float = field(default=3e-4, metadata={"help": "learning rate of positions, times the scene's size"})
-    means_final: float = field(default=0.01, metadata={"help": "share of that rate which is left at the end"})
-    leash: float = field(
-        default=0.4,
-        metadata={
-            "help": "Gaussians that begin on a measured surface (depth, mesh, tsdf) stay within about so many of their "
-            "first standard deviations of there; 0 = they go where they like"
-        },
-    )
-    scales_rate: float = field(default=2e-2, metadata={"help": "learning rate of the logarithms of scales"})
-    quats_rate: float = field(default=1e-3, metadata={"help": "learning rate of rotations"})
-    opacities_rate: float = field(default=5e-2, metadata={"help": "learning rate of the logits of opacities"})
-    colors_rate: float = field(default=2.5e-3, metadata={"help": "learning rate of colors; a 20th for directions"})
-    exposure: bool = field(
-        default=True,
-        metadata={
-            "help": "fit an affine map of colors to each photograph, for exposure and white balance that differ; "
-            "false = photographs are fitted as they are"
-        },
-    )
-    seed: int = field(default=0, metadata={"help": "of the order in which photographs are looked at"})
+    seed: int = option(0, "of the order in which photographs are looked at", ge=0, lt=2**63)
 
     def __post_init__(self) -> None:
-        if self.steps < 0:
-            raise InputError(f"steps: expected 0 or more, got {self.steps}")
+        check_limits(self)
         ends = (0, *self.earlier[1::2], self.steps)
         follow = all(until < planned for planned, until in zip(self.earlier[::2], ends[1:], strict=False))
         if self.earlier and (len(self.earlier) % 2 or not follow or sorted({*ends}) != [*ends]):
             raise InputError(
                 f"earlier: expected numbers of steps, each with a later step before it, got {self.earlier}"
             )
-        if not 0 <= self.sh_degree <= 3:
-            raise InputError(f"sh_degree: expected 0 to 3, got {self.sh_degree}")
         if len(self.shrinks) != len(self.shares) or not self.shrinks:
             raise InputError(f"shrinks and shares: expected as many of each, got {self.shrinks} and {self.shares}")
-        if min(self.shrinks) < 1:
-            raise InputError(f"shrinks: expected whole numbers from 1, got {self.shrinks}")
         if not min(self.shares) >= 0 or not math.isclose(sum(self.shares), 1, abs_tol=1e-6):
             raise InputError(f"shares: expected numbers that add up to 1, got {self.shares}")
-        if not 0 <= self.ssim_weight <= 1:
-            raise InputError(f"ssim_weight: expected a number from 0 to 1, got {self.ssim_weight}")
-        if not 0 < self.means_final <= 1:
-            raise InputError(f"means_final: expected a share above 0, up to 1, got {self.means_final}")
-        if not 0 <= self.seed < 2**63:
-            raise InputError(f"seed: expected 0 or more, got {self.seed}")
-        limits = {"sh_every": 1.0, "depth_weight": 100.0, "empty_weight": 100.0, "leash": 1e6}
-        limits |= dict.fromkeys((field.name for field in fields(self) if field.name.endswith("_rate")), MAX_RATE)
-        for name, limit in limits.items():
-            if not 0 <= getattr(self, name) <= limit:
-                raise InputError(f"{name}: expected a number from 0 to {limit:g}, got {getattr(self, name)}")
 
     def _plan_at(self, step: int) -> tuple[int, int, float]:
         """The number of steps that was planned at a step, when that plan began, and the share of the schedule that was
@@ -147,23 +125,21 @@ class OptimizeConfig:
     def degree_at(self, step: int) -> int:
         """Degree of the color coefficients that a step uses."""
         place, steps = self._place_of(step)
-        return min(self.sh_degree, int(place / max(1.0, self.sh_every * steps)))
+        return min(self.sh_degree, int(place / max(1.0, SH_EVERY * steps)))
 
     def rates_at(self, step: int, extent: float) -> dict[str, float]:
         """Learning rates of a step; that of the positions falls exponentially."""
         place, steps = self._place_of(step)
-        return {
-            "means": self.means_rate * extent * self.means_final ** (place / max(1, steps)),
-            "quats": self.quats_rate,
-            "log_scales": self.scales_rate,
-            "logit_opacities": self.opacities_rate,
-            "sh0": self.colors_rate,
-            "shN": self.colors_rate / 20,
-        }
+        return RATES | {"means": RATES["means"] * extent * FINAL_MEANS_RATE ** (place / max(1, steps))}
 
 
 def losses_of(
-    raster: Raster, photo: ScaledPhotograph, *, ssim_weight: float, depth_weight: float, empty_weight: float = 0.0
+    raster: Raster,
+    photo: ScaledPhotograph,
+    *,
+    ssim_weight: float = SSIM_WEIGHT,
+    depth_weight: float = DEPTH_WEIGHT,
+    empty_weight: float = 0.0,
 ) -> dict[str, Float[Tensor, ""]]:
     """(1 − λ)·L1 + λ·(1 − SSIM) over the pixels of the mask, the relative error of depth where it is known, and the
     opacity where the photograph shows that nothing is there.
@@ -210,23 +186,15 @@ def losses_of(
 class PruneConfig:
     """What is taken out, and when."""
 
-    at: tuple[float, ...] = field(
-        default=(0.3, 0.6, 0.9), metadata={"help": "shares of the steps after which is pruned"}
-    )
-    opacity: float = field(default=0.005, metadata={"help": "opacities below are taken out"})
-    screen: float = field(
-        default=1.0, metadata={"help": "wider than so many times the picture's longer side in some view"}
-    )
-    contribution: float = field(
-        default=0.1, metadata={"help": "less than so many pixels' worth in every photograph, at its full size"}
+    at: tuple[float, ...] = option((0.3, 0.6, 0.9), "shares of the steps after which is pruned", gt=0, le=1)
+    opacity: float = option(0.005, "opacities below are taken out", ge=0, lt=math.inf)
+    screen: float = option(1.0, "wider than so many times the picture's longer side in some view", ge=0, lt=math.inf)
+    contribution: float = option(
+        0.1, "less than so many pixels' worth in every photograph, at its full size", ge=0, lt=math.inf
     )
 
     def __post_init__(self) -> None:
-        if any(not 0 < share <= 1 for share in self.at):
-            raise InputError(f"at: expected shares in (0, 1], got {self.at}")
-        for name in ("opacity", "screen", "contribution"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        check_limits(self)
 
     def due(self, step: int, schedule: OptimizeConfig) -> bool:
         """Whether is pruned after `step` steps; small shares are of the first step."""
@@ -435,8 +403,7 @@ class Optimizer:
         raster, rows, leaves, colors = self._render_exposed(view, photo)
         if not len(rows):
             return PhotographGradients({}, rows, {}, colors)
-        weights = {name: getattr(self.config, name) for name in ("ssim_weight", "depth_weight", "empty_weight")}
-        losses = losses_of(raster, photo, **weights)
+        losses = losses_of(raster, photo, empty_weight=self.config.empty_weight)
         total = torch.stack([*losses.values()]).sum()
         total.backward()
         grads = {name: value.grad for name, value in leaves.items() if value.grad is not None}

@@ -287,7 +287,7 @@ def save_state(path: Path, state: State, settings: Mapping[str, Any]) -> None:
         for name, value in table.items()
     }
     if state.anchor is not None:
-        arrays |= {f"leash.{name}": getattr(state.anchor, name).cpu().numpy() for name in ANCHOR_SHAPES}
+        arrays |= {f"anchor.{name}": getattr(state.anchor, name).cpu().numpy() for name in ANCHOR_SHAPES}
     if state.exposures is not None:
         arrays["exposure.maps"] = state.exposures.numpy()
     header = {
@@ -349,8 +349,8 @@ def load_state(
             for kind in RowAdam.KINDS
         }
         anchor = None
-        if "leash.means" in file:
-            arrays = {name: file.array(f"leash.{name}", "float32", shape) for name, shape in ANCHOR_SHAPES.items()}
+        if "anchor.means" in file:
+            arrays = {name: file.array(f"anchor.{name}", "float32", shape) for name, shape in ANCHOR_SHAPES.items()}
             anchor = Anchor(**{name: torch.from_numpy(value.copy()).to(device) for name, value in arrays.items()})
         exposures = None
         if "exposure.maps" in file:

@@ -492,5 +492,9 @@ def initial_state(
                 stacklevel=3,
             )
     adam = RowAdam(parameters_from(start.gaussians, config.optimize.sh_degree, device))
-    anchor = anchor_at(adam.parameters, config.optimize.leash) if start.measured and config.optimize.leash else None
+    anchor = (
+        anchor_at(adam.parameters, config.optimize.anchor_sigmas)
+        if start.measured and config.optimize.anchor_sigmas
+        else None
+    )
     return State(adam=adam, anchor=anchor, step=0, seconds=0.0, facts=seeding)

@@ -1,19 +1,19 @@
 """Structure from motion for photographs without poses, by pycolmap on a CPU."""
 
-import hashlib
 import json
 import math
 import os
 import shutil
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from gsencoder.core.errors import InputError, SceneWarning, advised, listed
 from gsencoder.core.files import atomic_file, read_foreign_text, sha256_of
 from gsencoder.core.process import Clock, Track, untracked
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.readers.images import check_picture
 from gsencoder.data.readers.posed import inside
 from gsencoder.data.readers.undistort import load_pycolmap
@@ -26,7 +26,8 @@ from gsencoder.types import Scene
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".ppm")
 OTHER_SUFFIXES = (".webp", ".heic", ".heif", ".avif", ".gif", ".dng", ".cr2", ".nef", ".arw", *VIDEO_SUFFIXES)
 """Pictures and videos that pycolmap does not read; that they are left out is said."""
-MAX_PIXELS, MAX_FEATURES = 100_000, 1_000_000
+CAMERA = "SIMPLE_RADIAL"
+"""COLMAP's camera model, of one focal length and one coefficient of distortion."""
 PLACED_FILE = "placed.json"
 BYTES_PER_FEATURE, TYPICAL_FEATURES = 160, 8192
 """In the database: descriptor and place. Photographs seldom have more, whatever is allowed."""
@@ -40,21 +41,16 @@ MAX_THOROUGH, ENOUGH_PLACED = 30, 0.8
 class SfmConfig:
     """How photographs are placed."""
 
-    pairs: Literal["auto", "exhaustive", "sequential"] = field(
-        default="auto",
-        metadata={
-            "help": "which photographs are compared: all pairs, or neighbors by name; auto = all pairs up to "
-            f"{MAX_EXHAUSTIVE} photographs"
-        },
+    pairs: Literal["auto", "exhaustive", "sequential"] = option(
+        "auto",
+        "which photographs are compared: all pairs, or neighbors by name; auto = all pairs up to "
+        f"{MAX_EXHAUSTIVE} photographs",
     )
-    size: int = field(default=1600, metadata={"help": "longer side in pixels at which features are sought"})
-    features: int = field(default=8192, metadata={"help": "most features of a photograph"})
-    camera: str = field(default="SIMPLE_RADIAL", metadata={"help": "COLMAP's camera model"})
+    size: int = option(1600, "longer side in pixels at which features are sought", ge=64, le=100_000)
+    features: int = option(8192, "most features of a photograph", ge=64, le=1_000_000)
 
     def __post_init__(self) -> None:
-        for name, most in (("size", MAX_PIXELS), ("features", MAX_FEATURES)):
-            if not 64 <= getattr(self, name) <= most:
-                raise InputError(f"{name}: expected 64 to {most}, got {getattr(self, name)}")
+        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,9 +113,6 @@ def register_photographs(
     inputs = _inputs(folder, names, config)
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
-    camera_models = sorted(set(pycolmap.CameraModelId.__members__) - {"INVALID"})
-    if config.camera not in camera_models:
-        raise InputError(f"sfm.camera: expected one of {', '.join(camera_models)}, got {config.camera!r}")
     attempts, model = work / "attempts", work / "sparse" / "0"
     for stale in (work / PLACED_FILE, work / "database.db", attempts, model.parent):
         shutil.rmtree(stale, ignore_errors=True)
@@ -157,9 +150,8 @@ def register_photographs(
         "points": best.num_points3D(),
         "error": float(best.compute_mean_reprojection_error()),
     }
-    record = {"asked": inputs, "found": summary, "files": _digests(model)}
     with atomic_file(work / PLACED_FILE) as stream:
-        stream.write(json.dumps({**record, "digest": _digest(record)}).encode())
+        stream.write(json.dumps({"asked": inputs, "found": summary, "files": _digests(model)}).encode())
     return _placed(model, summary)
 
 
@@ -175,7 +167,7 @@ def load_placement(folder: Path, work: Path, config: SfmConfig = SfmConfig()) ->
     try:
         record = json.loads(read_foreign_text(work / PLACED_FILE))
         same = model.is_dir() and record["asked"] == _inputs(folder, photographs_in(folder), config)
-        sound = record.pop("digest") == _digest(record) and record["files"] == _digests(model)
+        sound = record["files"] == _digests(model)
         placed = _placed(model, record["found"])
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
@@ -185,10 +177,6 @@ def load_placement(folder: Path, work: Path, config: SfmConfig = SfmConfig()) ->
 def _digests(model: Path) -> dict[str, str]:
     """The SHA-256 of each file of a model."""
     return {path.name: sha256_of(path) for path in sorted(model.iterdir())}
-
-
-def _digest(record: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
 def _inputs(folder: Path, names: list[str], config: SfmConfig) -> dict[str, Any]:
@@ -276,7 +264,7 @@ def _find_features(
     # Features that follow the slant of surfaces match from farther aside, and take several times as long.
     extraction.sift.estimate_affine_shape = extraction.sift.domain_size_pooling = thorough
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = config.camera
+    reader.camera_model = CAMERA
     pycolmap.extract_features(
         database,
         folder,

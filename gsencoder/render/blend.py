@@ -5,7 +5,7 @@ the other's gradient. B depends on geometry and camera alone; it is made once pe
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsencoder import geometry
 from gsencoder.core.errors import InputError
+from gsencoder.core.settings import check_limits, option
 from gsencoder.render import blend_torch, reference
 from gsencoder.render.rays import Lattice, grid_lattice, patch_lattice, strided_lattice
 from gsencoder.types import Cameras, FeatureMap, Gaussians
@@ -37,21 +38,15 @@ class BlendConfig:
             by tile), or "auto": "cpu" on a CPU in float32, else "torch".
     """
 
-    rays_per_patch: int = field(default=64, metadata={"help": "rays averaged into one patch: 1, 4, 9, 16, …"})
-    min_weight: float = field(default=0.0, metadata={"help": "smallest blending weight that is stored"})
-    stop_transmittance: float = field(default=1e-4, metadata={"help": "transmittance at which a ray ends"})
-    near: float = field(default=0.01, metadata={"help": "near plane in world units"})
-    eps2d: float = field(default=0.3, metadata={"help": "low-pass variance of projected Gaussians in pixels²"})
-    backend: Backend = field(default="auto", metadata={"help": "cpu (numba), torch, reference (its twin), or auto"})
+    rays_per_patch: int = option(64, "rays averaged into one patch: 1, 4, 9, 16, …")
+    min_weight: float = option(0.0, "smallest blending weight that is stored", ge=0, lt=1)
+    stop_transmittance: float = option(1e-4, "transmittance at which a ray ends", gt=0, lt=1)
+    near: float = option(0.01, "near plane in world units", gt=0, lt=math.inf)
+    eps2d: float = option(0.3, "low-pass variance of projected Gaussians in pixels²", gt=0, lt=math.inf)
+    backend: Backend = option("auto", "cpu (numba), torch, reference (its twin), or auto")
 
     def __post_init__(self) -> None:
-        if not 0 <= self.min_weight < 1:
-            raise InputError(f"min_weight: expected a number in [0, 1), got {self.min_weight}")
-        if not 0 < self.stop_transmittance < 1:
-            raise InputError(f"stop_transmittance: expected a number in (0, 1), got {self.stop_transmittance}")
-        for name in ("near", "eps2d"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        check_limits(self)
 
 
 class Blend:

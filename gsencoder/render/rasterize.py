@@ -15,7 +15,7 @@ Along a line of pixels exp(−quadratic) is a product of two geometric sequences
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, no_type_check
 
 import numpy as np
@@ -25,6 +25,7 @@ from torch import Tensor
 
 from gsencoder import geometry
 from gsencoder.core.errors import InputError
+from gsencoder.core.settings import check_limits, option
 from gsencoder.core.threads import PIECES, even_cuts, kernel, parallel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN, Projected
 from gsencoder.render import reference
@@ -37,21 +38,13 @@ RasterBackend = Literal["auto", "cpu", "reference", "gsplat"]
 class RasterConfig:
     """Accuracy knobs of differentiable rendering; as those of a Blend, with no smallest weight."""
 
-    stop_transmittance: float = field(
-        default=1e-4, metadata={"help": "transmittance at which a ray ends; always 1e-4 with gsplat"}
-    )
-    near: float = field(default=0.01, metadata={"help": "near plane in world units"})
-    eps2d: float = field(default=0.3, metadata={"help": "low-pass variance of projected Gaussians in pixels²"})
-    backend: RasterBackend = field(
-        default="auto", metadata={"help": "cpu (numba), reference (torch), gsplat (CUDA), or auto"}
-    )
+    stop_transmittance: float = option(1e-4, "transmittance at which a ray ends; always 1e-4 with gsplat", gt=0, lt=1)
+    near: float = option(0.01, "near plane in world units", gt=0, lt=math.inf)
+    eps2d: float = option(0.3, "low-pass variance of projected Gaussians in pixels²", gt=0, lt=math.inf)
+    backend: RasterBackend = option("auto", "cpu (numba), reference (torch), gsplat (CUDA), or auto")
 
     def __post_init__(self) -> None:
-        if not 0 < self.stop_transmittance < 1:
-            raise InputError(f"stop_transmittance: expected a number in (0, 1), got {self.stop_transmittance}")
-        for name in ("near", "eps2d"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise InputError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        check_limits(self)
 
 
 class Raster(NamedTuple):
@@ -159,33 +152,24 @@ class _Composite(torch.autograd.Function):
         height: int,
         stop: float,
     ) -> Float[Tensor, "H W 5"]:
-        from gsencoder.render import rasterize as raster_cpu
-
         splats = torch.cat((means2d, extents, conics, limit.unsqueeze(1), opacities.unsqueeze(1)), dim=1).numpy()
-        tiles = raster_cpu.bin_splats(splats, depths.numpy(), width, height)
+        tiles = bin_splats(splats, depths.numpy(), width, height)
         colors = np.ascontiguousarray(values.numpy())
-        out = raster_cpu.composite(tiles, splats, colors, width, height, stop)
+        out = composite(tiles, splats, colors, width, height, stop)
         ctx.saved = (tiles, splats, colors, stop, out)
         return torch.from_numpy(out).to(values.dtype)
 
     @staticmethod
     def backward(ctx: Any, grads: Float[Tensor, "H W 5"]) -> tuple[Tensor | None, ...]:
-        from gsencoder.render import rasterize as raster_cpu
-
         tiles, splats, colors, stop, out = ctx.saved
-        slopes = raster_cpu.differentiate(tiles, splats, colors, stop, out, grads.contiguous().numpy())
+        slopes = differentiate(tiles, splats, colors, stop, out, grads.contiguous().numpy())
         gradients = torch.from_numpy(slopes)
         return (
             gradients[:, :2],
             gradients[:, 2:5],
             gradients[:, 5],
             gradients[:, 6:],
-            None,
-            None,
-            None,
-            None,
-            None,
-            None,
+            *(None,) * 6,
         )
 
 

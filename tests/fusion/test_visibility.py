@@ -64,7 +64,7 @@ def test_a_tolerance_is_neither_negative_nor_without_end(name: str) -> None:
     for value in (0.0, 1e12):
         assert getattr(VisibilityConfig(against=(), **{name: value}), name) == value
     for wrong in (-1e-9, 1.01e12, float("nan")):
-        with pytest.raises(InputError, match="expected a tolerance"):
+        with pytest.raises(InputError, match=f"{name}: expected"):
             VisibilityConfig(**{name: wrong})
 
 

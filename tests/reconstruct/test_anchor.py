@@ -1,4 +1,4 @@
-"""Gaussians on a anchor stay near their seeds whatever pulls at them, and keep it through pruning and resuming."""
+"""Gaussians on an anchor stay near their seeds whatever pulls at them, and keep it through pruning and resuming."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,11 +9,16 @@ from walls import wall_views
 
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.optimize import RATES, OptimizeConfig, Optimizer, PruneConfig
 from gsencoder.reconstruct.parameters import Anchor, RowAdam, State, anchor_at, load_state, parameters_from, save_state
 
-ALL = OptimizeConfig(steps=30, sh_degree=0, shrinks=(2, 1), shares=(0.5, 0.5), means_rate=0.03)
+ALL = OptimizeConfig(steps=30, sh_degree=0, shrinks=(2, 1), shares=(0.5, 0.5))
 PRUNED = PruneConfig(at=(0.3,))
+
+
+@pytest.fixture(autouse=True)
+def _fast(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(RATES, "means", 0.03)
 
 
 def held(length: float, config: OptimizeConfig = ALL) -> Optimizer:

@@ -107,7 +107,7 @@ def test_a_schedule_does_not_depend_on_what_is_planned_later_and_is_always_compl
         for config in (once, twice):
             rates = [config.rates_at(step, 1.0)["means"] for step in range(config.steps + 1)]
             assert sorted(rates, reverse=True) == rates
-            assert rates[-1] == pytest.approx(config.means_rate * config.means_final)
+            assert rates[-1] == pytest.approx(0.01 * config.rates_at(0, 1.0)["means"])
             for share in PruneConfig().at:
                 assert any(config.completes(share, step) for step in range(1, config.steps + 1))
 

@@ -10,7 +10,7 @@ from walls import DEPTH, TILT, cameras, wall_points, wall_views
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.from_photographs import DenseConfig, covered_share, densify, outside_hull
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig, losses_of
+from gsencoder.reconstruct.optimize import RATES, OptimizeConfig, Optimizer, PruneConfig, losses_of
 from gsencoder.reconstruct.parameters import RowAdam, parameters_from
 from gsencoder.reconstruct.score import describe, score
 from gsencoder.render.rasterize import Raster
@@ -54,12 +54,11 @@ def test_the_loss_is_the_opacity_over_empty_pixels() -> None:
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.5])
-def test_what_floats_in_empty_space_fades_and_the_wall_stays(weight: float) -> None:
+def test_what_floats_in_empty_space_fades_and_the_wall_stays(weight: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The seeds stand on the wall everywhere; without the term nothing acts on those before empty pixels."""
+    monkeypatch.setitem(RATES, "logit_opacities", 0.5)
     gaussians = seed_from_depth(wall_views(depth=True), voxel=0.2)
-    config = OptimizeConfig(
-        steps=12, sh_degree=0, empty_weight=weight, opacities_rate=0.5, exposure=False, shrinks=(2,), shares=(1.0,)
-    )
+    config = OptimizeConfig(steps=12, sh_degree=0, empty_weight=weight, exposure=False, shrinks=(2,), shares=(1.0,))
     adam = RowAdam(parameters_from(gaussians, 0))
     one = Optimizer(adam, Photographs(half_empty_views()), [0, 1, 2], config, prune=PruneConfig(at=()))
     before = score(one, [3])
