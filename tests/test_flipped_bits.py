@@ -161,7 +161,7 @@ def reconstruction(folder: Path) -> Made:
     save_state(folder / "r", state, {"rate": 0.1})
 
     def read() -> Any:
-        got = load_state(folder / "r", {"rate": 0.1}, steps=5, sh_degree=1)
+        got = load_state(folder / "r", {"rate": 0.1}, sh_degree=1)
         assert got.anchor is not None
         return got.adam.tables(), got.adam.steps, got.anchor, got.exposures, got.step, got.seconds, got.facts
 

@@ -5,7 +5,7 @@ densification.
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from gsencoder.reconstruct.parameters import (
     Anchor,
     Parameters,
     RowAdam,
+    State,
     camera_of,
     gaussians_of,
     rows_in_view,
@@ -489,6 +490,17 @@ class Optimizer:
         rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"], photo: ScaledPhotograph
     ) -> Float[Tensor, "3 4"]:
         return fitted_colors(rgb, photo.image.to(rgb.device), compared_pixels(alpha, photo.mask))
+
+    def state(self, seconds: float, facts: Mapping[str, Any]) -> State:
+        """The state between two steps, as `State` has it."""
+        return State(
+            adam=self.adam,
+            anchor=self.anchor,
+            exposures=None if self.exposures is None or not self.step else self.exposures.maps,
+            step=self.step,
+            seconds=seconds,
+            facts=facts,
+        )
 
     def gaussians(self) -> Gaussians:
         """The current splat."""

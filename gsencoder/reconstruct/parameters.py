@@ -315,15 +315,12 @@ def image_scale_of(path: Path) -> float | None:
     return None
 
 
-def load_state(
-    path: Path, settings: Mapping[str, Any], *, steps: int, sh_degree: int, device: torch.device | str = "cpu"
-) -> State:
+def load_state(path: Path, settings: Mapping[str, Any], *, sh_degree: int, device: torch.device | str = "cpu") -> State:
     """The state that a run has left.
 
     Args:
         path: the file.
         settings: of this run.
-        steps: that this run takes at most.
         sh_degree: of its colors, unless `facts` have another one under `PLANNED_DEGREE`.
         device: where it computes.
 
@@ -336,8 +333,8 @@ def load_state(
             raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")
         step, adam_steps = file.value("step", int), file.value("adam_steps", int)
         seconds, facts = float(file.value("seconds", float, int)), file.value("facts", dict)
-        if not (0 <= adam_steps <= step <= steps and 0 <= seconds < math.inf):
-            raise InputError(f"a state that no run was in (step {step} of {steps})")
+        if not (0 <= adam_steps <= step and 0 <= seconds < math.inf):
+            raise InputError(f"a state that no run was in (step {step})")
         degree = facts.get(PLANNED_DEGREE, sh_degree)
         if degree not in range(sh_degree + 1):
             raise InputError(f"colors of a degree that no run has ({degree!r})")

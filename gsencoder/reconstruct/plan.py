@@ -9,9 +9,9 @@ changes the number of steps while they are done.
 import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ import torch
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.budget import MEGABYTE, PLANNED, Budget
 from gsencoder.core.errors import InputError
+from gsencoder.core.process import Track
 from gsencoder.core.settings import option
 from gsencoder.data.splats.ply import inria_row_bytes
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
@@ -53,8 +54,6 @@ SEEN_VIEWS, TRIAL_VIEWS = 4, 2
 """Views that stand for all where Gaussians are counted, and where steps are timed."""
 AIMED = 0.98
 """Share of a limit of seconds that the clock steers to."""
-LATE = 1.5
-"""A time that is so many times the aim in minutes is said."""
 HEADER_BYTES = 2048
 """Of a .ply file, at most."""
 PLAN = "plan"
@@ -412,9 +411,88 @@ def refuse_late(budget: ReconstructBudget, spent: float, subject: str, advice: s
         )
 
 
-def late_notes(budget: ReconstructBudget, seconds: float) -> tuple[str, ...]:
-    """What is said where so many seconds in all are far more than the aim in minutes, which no clock keeps."""
-    note = (
-        f"budget.minutes={budget.minutes:g} aims at less; budget.seconds={60 * budget.minutes:g} is kept by the clock"
-    )
-    return (note,) if not budget.limits and 0 < 60 * LATE * budget.minutes < seconds else ()
+def refusing_late(track: Track, budget: ReconstructBudget, elapsed: Callable[[], float]) -> Track:
+    """Progress of what comes before the first step, which ends where the limit of seconds is over."""
+
+    def in_time(items: Iterable[Any], label: str) -> Iterator[Any]:
+        for item in track(items, label):
+            refuse_late(budget, elapsed(), "reading photographs and seeding")
+            yield item
+
+    return track if budget.seconds is None else in_time
+
+
+class Pacing:
+    """The number of steps of a reconstruction: planned, and changed by a clock where seconds are limited.
+
+    Attributes:
+        plan: that is followed now.
+    """
+
+    plan: Plan
+
+    def __init__(
+        self,
+        optimizer: Optimizer,
+        held_out: Sequence[int],
+        budget: ReconstructBudget,
+        validates: Callable[[int, int], bool],
+        elapsed: Callable[[], float],
+    ) -> None:
+        """Args:
+        optimizer: before its first step, or where it goes on.
+        held_out: views that are validated on.
+        validates: whether is validated after a step of so many.
+        elapsed: seconds since the reconstruction began.
+        """
+        self._optimizer, self._held_out, self._budget = optimizer, held_out, budget
+        self._validates, self._elapsed = validates, elapsed
+        self._pace: Pace | None = None
+
+    def begin(self, facts: Mapping[str, Any], *, double_means: bool) -> Plan:
+        """Makes a plan, or takes up that of a checkpoint's `facts`, and follows it.
+
+        Raises:
+            InputError: as `make_plan`.
+        """
+        optimizer, budget = self._optimizer, self._budget
+        costs = cache(lambda: measured_costs(optimizer, self._held_out))
+
+        def validations(steps: int) -> int:
+            return sum(self._validates(step, steps) for step in range(optimizer.step, steps + 1))
+
+        if PLAN in facts:
+            plan = Plan.of(facts)
+        else:
+            plan = make_plan(optimizer, budget, costs, validations, double_means=double_means, spent=self._elapsed)
+        self._follow(plan)
+        if budget.seconds is not None:
+            # The pictures that are compared are rendered after the last step.
+            until = AIMED * budget.seconds - MAX_COMPARISONS * costs().picture
+            self._pace = Pace(costs(), optimizer.step, until, self._elapsed)
+        return plan
+
+    def steps(self, track: Track) -> Iterator[int]:
+        """The steps that are left; between two of them the clock may change their number."""
+        one = self._optimizer
+        while one.step < self.plan.steps:
+            for step in track(range(one.step, self.plan.steps), "optimising"):
+                yield step
+                if self._changes_steps():
+                    break
+
+    def _changes_steps(self) -> bool:
+        """Looks at the clock; whether the number of steps is another one now."""
+        one = self._optimizer
+        if self._pace is None or one.step >= self.plan.steps:
+            return False
+        steps = self._pace.steps(one, self._validates)
+        if steps == self.plan.steps:
+            return False
+        earlier = (*self.plan.earlier, self.plan.steps, one.step)
+        self._follow(replace(self.plan, steps=steps, earlier=earlier))
+        return True
+
+    def _follow(self, plan: Plan) -> None:
+        self.plan = plan
+        apply_plan(self._optimizer, plan)

@@ -3,10 +3,9 @@
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -42,24 +41,8 @@ from gsencoder.reconstruct.parameters import (
     parameters_from,
     save_state,
 )
-from gsencoder.reconstruct.plan import (
-    AIMED,
-    MOST_STEPS,
-    PLAN,
-    Costs,
-    Pace,
-    Plan,
-    ReconstructBudget,
-    apply_plan,
-    late_notes,
-    make_plan,
-    measured_costs,
-    refuse_late,
-    steps_for_minutes,
-)
+from gsencoder.reconstruct.plan import PLAN, Pacing, Plan, ReconstructBudget, refusing_late
 from gsencoder.reconstruct.score import (
-    MAX_COMPARISONS,
-    MIN_PHOTOGRAPHS,
     Comparison,
     LogRow,
     compare,
@@ -67,7 +50,6 @@ from gsencoder.reconstruct.score import (
     describe,
     describe_exposure,
     describe_plan,
-    drop_masked_views,
     score,
     split,
 )
@@ -188,90 +170,59 @@ def initial_gaussians(
     return Start(gaussians=gaussians, source=source, dense=added, triangulated=triangulated)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fitted:
-    """An optimization that came to its end.
+class Validation:
+    """Scores of held-out photographs at the steps of the settings: rows of the log, and lines for people.
 
     Attributes:
-        rows: of the log, oldest first.
-        plan: as the clock changed it.
+        rows: oldest first, those of the runs that this one continues among them.
     """
 
-    rows: list[LogRow]
-    plan: Plan
+    def __init__(
+        self, optimizer: Optimizer, held_out: Sequence[int], config: ReconstructConfig, work: Path, report: Report
+    ) -> None:
+        with advised(START_AGAIN):
+            self._log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
+            self.rows = read_rows(work / LOG_FILE)
+        self._optimizer, self._held_out, self._config, self._report = optimizer, held_out, config, report
+        self._seen = covisible_pixels(optimizer.photographs, held_out, optimizer.training)
 
-
-def fit(
-    optimizer: Optimizer,
-    state: State,
-    plan: Plan,
-    held_out: Sequence[int],
-    config: ReconstructConfig,
-    work: Path,
-    identity: Mapping[str, Any],
-    track: Track,
-    report: Report,
-    *,
-    pace: Pace | None = None,
-    now: Callable[[], float] = time.monotonic,
-) -> Fitted:
-    """All remaining steps of a plan, which is changed where a clock sets the pace. Whatever stops the run between two
-    steps leaves a checkpoint."""
-    with advised(START_AGAIN):
-        log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
-        rows = read_rows(work / LOG_FILE)
-    seen = covisible_pixels(optimizer.photographs, held_out, optimizer.training)
-    start, saved_at, saved_step = now() - state.seconds, now(), optimizer.step
-
-    def validate() -> None:
-        due = config.validates_at(optimizer.step, plan.steps)
+    def __call__(self, seconds: float) -> None:
+        """Validates where a step is due; `seconds` have gone since the first step."""
+        one, steps = self._optimizer, self._optimizer.config.steps
+        due = self._config.validates_at(one.step, steps)
         # A continued run may begin at a step whose validation was cut off, or whose row is in the log already.
-        if not held_out or not due or (rows and rows[-1]["step"] == optimizer.step):
+        if not self._held_out or not due or (self.rows and self.rows[-1]["step"] == one.step):
             return
-        scores = {
-            name: value for name, value in score(optimizer, held_out, seen)._asdict().items() if value is not None
-        }
-        row: LogRow = {"seconds": now() - start, "gaussians": len(optimizer.parameters["means"]), **scores}
-        log.add(optimizer.step, row)
-        rows.append({"step": optimizer.step, **row})
-        report(
-            f"step {optimizer.step} of {plan.steps}: {describe(row)}, {row['gaussians']:,} Gaussians, "
-            f"{row['seconds']:.0f} s"
+        scores = score(one, self._held_out, self._seen)._asdict().items()
+        row: LogRow = {"seconds": seconds, "gaussians": len(one.parameters["means"])}
+        row |= {name: value for name, value in scores if value is not None}
+        self._log.add(one.step, row)
+        self.rows.append({"step": one.step, **row})
+        self._report(
+            f"step {one.step} of {steps}: {describe(row)}, {row['gaussians']:,} Gaussians, {row['seconds']:.0f} s"
         )
 
-    def save() -> None:
-        between = State(
-            adam=optimizer.adam,
-            anchor=optimizer.anchor,
-            exposures=None if optimizer.exposures is None else optimizer.exposures.maps,
-            step=optimizer.step,
-            seconds=now() - start,
-            facts={**state.facts, **plan.facts()},
-        )
-        save_state(work / CHECKPOINT_FILE, between, identity)
+
+@contextmanager
+def checkpointed(
+    optimizer: Optimizer, every: float, save: Callable[[], None], now: Callable[[], float]
+) -> Iterator[Callable[[], None]]:
+    """Saves the state between two steps: every so many seconds, when the function that this gives is called, and as the
+    block ends, whatever ends it."""
+    saved_at, saved_step = now(), optimizer.step
+
+    def save_if_due() -> None:
+        nonlocal saved_at, saved_step
+        if now() - saved_at >= every:
+            save()
+            saved_at, saved_step = now(), optimizer.step
 
     try:
-        validate()
-        while True:
-            for _ in track(range(optimizer.step, plan.steps), "optimising"):
-                optimizer.advance()
-                validate()
-                if pace is not None and optimizer.step < plan.steps:
-                    steps = pace.steps(optimizer, config.validates_at)
-                    if steps != plan.steps:
-                        plan = replace(plan, steps=steps, earlier=(*plan.earlier, plan.steps, optimizer.step))
-                        break
-                if now() - saved_at >= config.checkpoint_every:
-                    save()
-                    saved_at, saved_step = now(), optimizer.step
-            else:
-                break
-            apply_plan(optimizer, plan)
+        yield save_if_due
     finally:
         # Also after the last step: writing the results may be interrupted as well.
         if optimizer.is_consistent and optimizer.step > saved_step:
             save()
-    return Fitted(rows=rows, plan=plan)
 
 
 def read_rows(path: Path) -> list[LogRow]:
@@ -362,34 +313,26 @@ def reconstruct(
     """
     if scene.views is None:
         raise InputError(f"reconstruct: scene {scene.name} has no photographs to fit a splat to")
-    clock, first = Clock(), now() - spent
-
-    def elapsed() -> float:
-        return now() - first
-
-    def in_time(items: Iterable[Any], label: str) -> Iterator[Any]:
-        for item in track(items, label):
-            if not continued:
-                refuse_late(config.budget, elapsed(), "reading photographs and seeding")
-            yield item
-
+    clock, budget, began = Clock(), config.budget, now() - spent
     with ExitStack() as stack:
         folder = work or Path(stack.enter_context(TemporaryDirectory()))
-        continued = os.path.lexists(checkpoint := folder / CHECKPOINT_FILE)
+        checkpoint = folder / CHECKPOINT_FILE
+        continued = os.path.lexists(checkpoint)
+        in_time = track if continued else refusing_late(track, budget, lambda: now() - began)
         with clock("read"):
             photographs = Photographs(scene.views, track=in_time)
-        training, held_out = split(len(photographs), config.holdout)
-        training = drop_masked_views(photographs, training, "photographs to fit", least=MIN_PHOTOGRAPHS)
-        held_out = drop_masked_views(photographs, held_out, "held-out photographs")
+        training, held_out = split(photographs, config.holdout)
         identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
-        chosen_device = choose_device(device)
+        with clock("seeds"):
+            if continued:
+                state = load_state(
+                    checkpoint, identity, sh_degree=config.optimize.sh_degree, device=choose_device(device)
+                )
+            else:
+                state = initial_state(scene, photographs, training, config, choose_device(device), in_time, report)
         if continued:
-            most = max(config.optimize.steps, steps_for_minutes(config.budget.minutes, config.optimize), MOST_STEPS)
-            shape = {"steps": most, "sh_degree": config.optimize.sh_degree}
-            state = load_state(checkpoint, identity, **shape, device=chosen_device)
-        else:
-            with clock("seeds"):
-                state = initial_state(scene, photographs, training, config, chosen_device, in_time, report)
+            # What is repeated does not count.
+            began = now() - state.facts[PLAN]["spent"] - state.seconds
         optimizer = Optimizer(
             state.adam,
             photographs,
@@ -401,42 +344,27 @@ def reconstruct(
             exposures=state.exposures,
             step=state.step,
         )
+        with clock("plan"):
+            pacing = Pacing(optimizer, held_out, budget, config.validates_at, lambda: now() - began)
+            plan = pacing.begin(state.facts, double_means=bool(scene.origin.any()))
+        option = "budget.minutes" if budget.seconds is None else "budget.seconds"
+        for line in (describe_plan(optimizer, config.optimize.steps, option), *plan.notes):
+            report(line)
+        start = now() - state.seconds
 
-        def validations(steps: int) -> int:
-            return sum(config.validates_at(step, steps) for step in range(optimizer.step, steps + 1))
+        def save() -> None:
+            facts = {**state.facts, **pacing.plan.facts()}
+            save_state(checkpoint, optimizer.state(now() - start, facts), identity)
 
-        @cache
-        def costs() -> Costs:
-            return measured_costs(optimizer, held_out)
-
-        with clock("trial"):
-            if continued:
-                plan = Plan.of(state.facts)
-            else:
-                double_means = bool(scene.origin.any())
-                plan = make_plan(optimizer, config.budget, costs, validations, double_means=double_means, spent=elapsed)
-            apply_plan(optimizer, plan)
-            saved_from = now()
-            if not continued:
-                state = replace(state, adam=optimizer.adam)
-                save_state(checkpoint, replace(state, facts={**state.facts, **plan.facts()}), identity)
-            saving = now() - saved_from
-            left = optimizer.step, plan.steps, validations(plan.steps)
-            seconds = sum(costs().expected(optimizer.config, config.prune, *left))
-            option = "budget.minutes" if config.budget.seconds is None else "budget.seconds"
-            report(describe_plan(optimizer, config.optimize.steps, seconds, option))
-            for note in (*plan.notes, *late_notes(config.budget, elapsed() + seconds)):
-                report(note)
-        if continued:
-            # What is repeated does not count.
-            first = now() - plan.spent - state.seconds
-        pace = None
-        if (limit := config.budget.seconds) is not None:
-            # The last checkpoint and the splat, and pictures beside it.
-            until = AIMED * limit - 2 * saving - MAX_COMPARISONS * costs().picture
-            pace = Pace(costs(), optimizer.step, until, elapsed)
-        with clock("optimise"):
-            fitted = fit(optimizer, state, plan, held_out, config, folder, identity, track, report, pace=pace, now=now)
+        if not continued:
+            save()
+        validate = Validation(optimizer, held_out, config, folder, report)
+        with clock("optimise"), checkpointed(optimizer, config.checkpoint_every, save, now) as save_if_due:
+            validate(now() - start)
+            for _ in pacing.steps(track):
+                optimizer.advance()
+                validate(now() - start)
+                save_if_due()
         exposure = differing = source = None
         predicted = predict_exposures(optimizer.exposures, photographs.cameras, held_out)
         if optimizer.exposures is not None:
@@ -445,20 +373,21 @@ def reconstruct(
         if differing is not None:
             report(differing)
         comparisons = compare(optimizer, held_out, matched=differing is not None and source == "mean")
+        plan = pacing.plan
         return Reconstruction(
             gaussians=optimizer.gaussians(),
-            seeding={name: value for name, value in {**state.facts, **fitted.plan.facts()}.items() if name != PLAN},
+            seeding={name: value for name, value in {**state.facts, **plan.facts()}.items() if name != PLAN},
             steps=optimizer.step,
             training=optimizer.training,
             held_out=tuple(held_out),
-            log=tuple(fitted.rows),
+            log=tuple(validate.rows),
             comparisons=comparisons,
             exposure=exposure,
             exposure_source=source,
             held_out_colors=predicted.maps.numpy(),
             seconds=clock.seconds,
-            plan=fitted.plan,
-            elapsed=elapsed(),
+            plan=plan,
+            elapsed=now() - began,
         )
 
 

@@ -47,12 +47,17 @@ class Score(NamedTuple):
     floating: float | None = None
 
 
-def split(count: int, every: int) -> tuple[list[int], list[int]]:
-    """Row numbers of the views to fit, and of every n-th view, which is held out.
+def split(photographs: Photographs, every: int) -> tuple[list[int], list[int]]:
+    """Row numbers of the views to fit, and of every n-th view, which is held out; those of which a mask leaves no
+    window of pixels are in neither.
 
     Raises:
-        InputError: too few.
+        InputError: too few to fit.
+
+    Warns:
+        SceneWarning: some are masked all over; they are named.
     """
+    count = len(photographs)
     held_out = [view for view in range(count) if every and view % every == 0]
     training = [view for view in range(count) if view not in held_out]
     if len(training) < MIN_PHOTOGRAPHS:
@@ -60,34 +65,21 @@ def split(count: int, every: int) -> tuple[list[int], list[int]]:
             f"reconstruct: expected at least {MIN_PHOTOGRAPHS} photographs to fit, got {len(training)} of {count}; "
             "give more photographs" + (f", or hold out fewer than every {every}th (holdout=)" if every else "")
         )
-    return training, held_out
-
-
-def drop_masked_views(photographs: Photographs, views: Sequence[int], subject: str, *, least: int = 0) -> list[int]:
-    """The views of which a mask leaves a window of pixels.
-
-    Args:
-        photographs: of all views.
-        views: some of them.
-        subject: they are called in messages.
-        least: so many must be left.
-
-    Raises:
-        InputError: fewer are.
-
-    Warns:
-        SceneWarning: some are not left; they are named.
-    """
-    masks = {view: photographs.mask(view) for view in views}
-    masked = [view for view, mask in masks.items() if mask is not None and not inner(mask).any()]
-    if not masked:
-        return list(views)
-    message = f"{len(masked)} of {len(views)} {subject} are masked all over"
-    names = listed([photographs.names[view] for view in masked])
-    if len(views) - len(masked) < least:
-        raise InputError(f"reconstruct: {message}: {names}; look at their masks, or at their alpha channels")
-    warnings.warn(f"{message} and not used: {names}", SceneWarning, stacklevel=2)
-    return [view for view in views if view not in masked]
+    masks = {view: photographs.mask(view) for view in range(count)}
+    masked = {view for view, mask in masks.items() if mask is not None and not inner(mask).any()}
+    for views, subject, least in (
+        (training, "photographs to fit", MIN_PHOTOGRAPHS),
+        (held_out, "held-out photographs", 0),
+    ):
+        names = [photographs.names[view] for view in views if view in masked]
+        message = f"{len(names)} of {len(views)} {subject} are masked all over"
+        if names and len(views) - len(names) < least:
+            raise InputError(
+                f"reconstruct: {message}: {listed(names)}; look at their masks, or at their alpha channels"
+            )
+        if names:
+            warnings.warn(f"{message} and not used: {listed(names)}", SceneWarning, stacklevel=2)
+    return [view for view in training if view not in masked], [view for view in held_out if view not in masked]
 
 
 def covisible_pixels(
@@ -187,13 +179,12 @@ class Comparison:
     render: UInt8[np.ndarray, "H W 3"]
 
 
-def describe_plan(optimizer: Optimizer, usual: int, seconds: float, option: str) -> str:
-    """What is about to happen, and how long it should take.
+def describe_plan(optimizer: Optimizer, usual: int, option: str) -> str:
+    """What is about to happen.
 
     Args:
         optimizer: before its first step, or where it goes on.
         usual: number of steps by default.
-        seconds: expected.
         option: that changes the number of steps.
     """
     widths, heights = optimizer.photographs.cameras.widths, optimizer.photographs.cameras.heights
@@ -201,10 +192,9 @@ def describe_plan(optimizer: Optimizer, usual: int, seconds: float, option: str)
     number = f"{steps - optimizer.step:,} more of {steps:,} steps" if optimizer.step else f"{steps:,} steps"
     if steps != usual:
         number += f" instead of {usual:,} ({option})"
-    expected = f"{seconds / 60:.1f} minutes" if seconds >= 90 else f"{seconds:.0f} s"
     return (
         f"{len(optimizer.training)} photographs of {int(np.median(widths))}×{int(np.median(heights))}, "
-        f"{len(optimizer.parameters['means']):,} Gaussians, {number}: about {expected}"
+        f"{len(optimizer.parameters['means']):,} Gaussians, {number}"
     )
 
 

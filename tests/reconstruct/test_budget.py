@@ -158,7 +158,7 @@ def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
     lines: list[str] = []
     result = reconstruct(scene, config, work=tmp_path, report=lines.append)
     assert result.steps == 20
-    assert "13 more of 20 steps instead of 1,500 (budget.minutes): about" in lines[0]
+    assert "13 more of 20 steps instead of 1,500 (budget.minutes)" in lines[0]
     assert result.seeding["steps_planned"] == 20
 
 

@@ -12,7 +12,6 @@ from reconstructions import cut_at, refusal
 from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.reconstruct import Reconstruction, reconstruct, sfm
-from gsencoder.reconstruct import run as running
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
 from gsencoder.reconstruct.plan import Costs, ReconstructBudget
 from gsencoder.reconstruct.run import ReconstructConfig
@@ -37,7 +36,7 @@ class Wall:
 
         monkeypatch.setattr(Optimizer, "advance", timed)
         costs = Costs(steps={1: 4.0, 2: 4.0}, pruning=0.0, validation=0.0, picture=0.0)
-        monkeypatch.setattr(running, "measured_costs", lambda *_: costs)
+        monkeypatch.setattr("gsencoder.reconstruct.plan.measured_costs", lambda *_: costs)
 
     def __call__(self) -> float:
         return self.now

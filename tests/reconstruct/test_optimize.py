@@ -123,8 +123,7 @@ def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None
     assert not torch.equal(maps[0], maps[1])
     state = State(adam=cut.adam, anchor=None, exposures=maps, step=cut.step, seconds=1.5, facts={"seeds": 7})
     save_state(tmp_path / "state", state, {"run": 1})
-    expected_run = {"steps": QUICK.steps, "sh_degree": QUICK.sh_degree}
-    read_state = load_state(tmp_path / "state", {"run": 1}, **expected_run)
+    read_state = load_state(tmp_path / "state", {"run": 1}, sh_degree=QUICK.sh_degree)
     assert (read_state.step, read_state.seconds, read_state.facts) == (8, 1.5, {"seeds": 7})
     carried_on = {"exposures": read_state.exposures, "step": read_state.step}
     again = Optimizer(read_state.adam, cut.photographs, cut.training, QUICK, prune=NEVER, **carried_on)
@@ -133,11 +132,9 @@ def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None
     for name, value in whole.parameters.items():
         assert torch.equal(value, again.parameters[name]), name
     with pytest.raises(InputError, match=r"run=1, and this run asks run=2; give resume=false"):
-        load_state(tmp_path / "state", {"run": 2}, **expected_run)
-    with pytest.raises(InputError, match=r"a state that no run was in \(step 8 of 7\)"):
-        load_state(tmp_path / "state", {"run": 1}, steps=7, sh_degree=1)
+        load_state(tmp_path / "state", {"run": 2}, sh_degree=QUICK.sh_degree)
     with pytest.raises(InputError, match=r"parameters.shN"):
-        load_state(tmp_path / "state", {"run": 1}, steps=40, sh_degree=2)
+        load_state(tmp_path / "state", {"run": 1}, sh_degree=2)
 
 
 def test_what_does_nothing_is_taken_out_and_nothing_else() -> None:

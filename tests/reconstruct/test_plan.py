@@ -17,7 +17,6 @@ from gsencoder.reconstruct.plan import (
     Plan,
     ReconstructBudget,
     apply_plan,
-    late_notes,
     make_plan,
 )
 from gsencoder.reconstruct.score import MAX_COMPARISONS, split
@@ -29,9 +28,9 @@ SEEDS = SeedConfig(voxel=0.15)
 @pytest.fixture
 def optimizer(scene: Scene) -> Optimizer:
     assert scene.views is not None
-    training, _ = split(len(scene.views), 3)
+    photographs = Photographs(scene.views)
     adam = RowAdam(parameters_from(seed(scene, SEEDS), 2))
-    return Optimizer(adam, Photographs(scene.views), training, OptimizeConfig(), prune=PruneConfig())
+    return Optimizer(adam, photographs, split(photographs, 3)[0], OptimizeConfig(), prune=PruneConfig())
 
 
 def costs() -> Costs:
@@ -152,14 +151,6 @@ def test_seconds_are_kept_for_as_many_validations_as_the_steps_have_and_for_the_
     needed = 20 + 12 + 6.0 * (2 + plan.steps // 50) + 4.0 * MAX_COMPARISONS + 3.0 * plan.steps
     assert 485 < needed <= 500
     assert plan.seconds == pytest.approx(needed, abs=6)
-
-
-def test_minutes_that_are_exceeded_by_more_than_half_are_said_where_nothing_is_limited() -> None:
-    assert late_notes(ReconstructBudget(minutes=10.0), 900.0) == ()
-    (note,) = late_notes(ReconstructBudget(minutes=10.0), 901.0)
-    assert "budget.minutes=10 aims at less; budget.seconds=600" in note
-    for budget in (ReconstructBudget(minutes=0.0), ReconstructBudget(minutes=10.0, seconds=900.0)):
-        assert late_notes(budget, 901.0) == ()
 
 
 def test_seconds_that_are_over_before_the_first_step_are_refused(optimizer: Optimizer) -> None:

@@ -20,13 +20,11 @@ def optimizer() -> Optimizer:
     return Optimizer(adam, Photographs(wall_views(7)), [1, 2], config, prune=PruneConfig(), step=400)
 
 
-def test_a_plan_names_what_is_left_and_the_time_in_the_unit_that_is_read_most_easily(optimizer: Optimizer) -> None:
+def test_a_plan_names_what_is_left_and_what_chose_the_number_of_steps(optimizer: Optimizer) -> None:
     size = f"2 photographs of 96×72, {len(optimizer.parameters['means']):,} Gaussians"
     left = f"{size}, 1,600 more of 2,000 steps"
-    assert describe_plan(optimizer, 2000, 89.4, "budget.seconds") == f"{left}: about 89 s"
-    assert describe_plan(optimizer, 2000, 90.0, "budget.seconds") == f"{left}: about 1.5 minutes"
-    fewer = describe_plan(optimizer, 3000, 630.0, "budget.minutes")
-    assert fewer == f"{left} instead of 3,000 (budget.minutes): about 10.5 minutes"
+    assert describe_plan(optimizer, 2000, "budget.seconds") == left
+    assert describe_plan(optimizer, 3000, "budget.minutes") == f"{left} instead of 3,000 (budget.minutes)"
 
 
 def test_matched_scores_are_named_where_they_are_clearly_better() -> None:

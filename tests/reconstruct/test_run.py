@@ -34,7 +34,7 @@ def test_the_result_says_what_was_fitted_and_what_was_held_out(scene: Scene, res
     assert [row["step"] for row in result.log] == [0, 2, 4]
     assert result.log[-1]["gaussians"] == len(result.gaussians)
     assert result.seeding["source"] == "depth"
-    assert set(result.seconds) == {"read", "seeds", "trial", "optimise"}
+    assert set(result.seconds) == {"read", "seeds", "plan", "optimise"}
     assert scene.views is not None
     assert [each.name for each in result.comparisons] == [scene.views.names[view] for view in result.held_out]
 
