@@ -139,8 +139,17 @@ def fuse(
 
     def prepare(view: int) -> tuple[FeatureMap, Blend]:
         feature_map = maps(view)
-        options = {"lift": config.lift, "visibility": visibility, "config": config.blend, "device": target}
-        return feature_map, view_matrix(gaussians, views, view, feature_map, **options)
+        matrix = view_matrix(
+            gaussians,
+            views,
+            view,
+            feature_map,
+            lift=config.lift,
+            visibility=visibility,
+            config=config.blend,
+            device=target,
+        )
+        return feature_map, matrix
 
     # A costly teacher has threads of its own and may have large maps: its views are prepared one after the other.
     side_by_side = teacher.cheap and target.type == "cpu"
