@@ -156,7 +156,7 @@ def test_photographs_that_cannot_be_placed_are_told_before_any_is(
     monkeypatch.setattr("gsencoder.reconstruct.sfm._find_features", never)
     for path in sorted(ten.iterdir())[:4]:
         shutil.copy(path, tmp_path)
-    assert "sfm.size: expected 64 or more and at most 100000" in refusal(capsys, *words, "sfm.size=99999999999")
+    assert "sfm.size: expected 64" in refusal(capsys, *words, "sfm.size=99999999999")
     bad = tmp_path / "bad.jpg"
     bad.write_bytes((tmp_path / "20240212_003919.jpg").read_bytes()[:5000])
     assert "bad.jpg: cannot be decoded" in refusal(capsys, *words)
