@@ -188,11 +188,9 @@ class PruneConfig:
     """What is taken out, and when."""
 
     at: tuple[float, ...] = option((0.3, 0.6, 0.9), "shares of the steps after which is pruned", gt=0, le=1)
-    opacity: float = option(0.005, "opacities below are taken out", ge=0, lt=math.inf)
-    screen: float = option(1.0, "wider than so many times the picture's longer side in some view", ge=0, lt=math.inf)
-    contribution: float = option(
-        0.1, "less than so many pixels' worth in every photograph, at its full size", ge=0, lt=math.inf
-    )
+    opacity: float = option(0.005, "opacities below are taken out", ge=0)
+    screen: float = option(1.0, "wider than so many times the picture's longer side in some view", ge=0)
+    contribution: float = option(0.1, "less than so many pixels' worth in every photograph, at its full size", ge=0)
 
     def __post_init__(self) -> None:
         check_limits(self)

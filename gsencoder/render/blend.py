@@ -4,7 +4,6 @@ With the geometry frozen, rendering anything is `B @ values`, lifting maps onto 
 the other's gradient. B depends on geometry and camera alone; it is made once per view and kept.
 """
 
-import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -41,8 +40,8 @@ class BlendConfig:
     rays_per_patch: int = option(64, "rays averaged into one patch: 1, 4, 9, 16, …")
     min_weight: float = option(0.0, "smallest blending weight that is stored", ge=0, lt=1)
     stop_transmittance: float = option(1e-4, "transmittance at which a ray ends", gt=0, lt=1)
-    near: float = option(0.01, "near plane in world units", gt=0, lt=math.inf)
-    eps2d: float = option(0.3, "low-pass variance of projected Gaussians in pixels²", gt=0, lt=math.inf)
+    near: float = option(0.01, "near plane in world units", gt=0)
+    eps2d: float = option(0.3, "low-pass variance of projected Gaussians in pixels²", gt=0)
     backend: Backend = option("auto", "cpu (numba), torch, reference (its twin), or auto")
 
     def __post_init__(self) -> None:

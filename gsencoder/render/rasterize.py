@@ -39,8 +39,8 @@ class RasterConfig:
     """Accuracy knobs of differentiable rendering; as those of a Blend, with no smallest weight."""
 
     stop_transmittance: float = option(1e-4, "transmittance at which a ray ends; always 1e-4 with gsplat", gt=0, lt=1)
-    near: float = option(0.01, "near plane in world units", gt=0, lt=math.inf)
-    eps2d: float = option(0.3, "low-pass variance of projected Gaussians in pixels²", gt=0, lt=math.inf)
+    near: float = option(0.01, "near plane in world units", gt=0)
+    eps2d: float = option(0.3, "low-pass variance of projected Gaussians in pixels²", gt=0)
     backend: RasterBackend = option("auto", "cpu (numba), reference (torch), gsplat (CUDA), or auto")
 
     def __post_init__(self) -> None:
