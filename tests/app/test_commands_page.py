@@ -66,6 +66,6 @@ def test_the_command_of_the_page_runs_as_it_says(opaque: Path, capsys: pytest.Ca
 
 def test_the_command_of_the_page_refuses_what_it_says(opaque: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["opaque", "room.ply", "min_opacity=2"]) == 2
-    assert capsys.readouterr().err == "error: min_opacity: expected 0 or more and at most 1, got 2.0\n"
+    assert capsys.readouterr().err == "error: min_opacity: expected 0 to 1, got 2.0\n"
     assert cli.main(["opaque"]) == 2
     assert capsys.readouterr().err == "error: SPLAT is missing: splat files\n"
