@@ -9,6 +9,7 @@ from dataclasses import is_dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from gsencoder.fusion.folder import (
     save_features,
     save_memories,
 )
+from gsencoder.fusion.lift import FeatureSums
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, load_heads, save_heads
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_package, save_package
 from gsencoder.memory.index import index_features
@@ -169,9 +171,18 @@ def reconstruction(folder: Path) -> Made:
 
 
 def sums(folder: Path) -> Made:
-    values = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
-    FusionCheckpoint(folder, {}).save_sums(2, values, np.abs(values[:, 0]))
-    return folder / SUMS_FILE, lambda: FusionCheckpoint(folder, {}).load_sums(50, 3)
+    def empty() -> FeatureSums:
+        return FeatureSums(50, FeatureSpace(name="s", channels=3), None, None)
+
+    def read() -> Any:
+        restored = empty()
+        return FusionCheckpoint(folder, {}).resume(restored), restored.state()
+
+    rng, made = np.random.default_rng(0), empty()
+    made.restore(2, {name: rng.random(each.shape).astype(each.dtype) for name, each in made.state().items()})
+    with mock.patch("gsencoder.fusion.checkpoint.SAVE_EVERY", 0.0):
+        FusionCheckpoint(folder, {}).save_if_due(made)
+    return folder / SUMS_FILE, read
 
 
 def teacher_map(folder: Path) -> Made:

@@ -96,7 +96,7 @@ def test_a_share_of_less_than_a_step_is_due_after_the_first() -> None:
 
 @pytest.mark.parametrize("at", [0.0, -0.5, 1.01])
 def test_shares_of_the_steps_outside_0_to_1_are_refused(at: float) -> None:
-    with pytest.raises(InputError, match="at: expected shares"):
+    with pytest.raises(InputError, match="at: expected above 0 and at most 1"):
         PruneConfig(at=(0.5, at))
 
 

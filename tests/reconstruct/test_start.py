@@ -61,7 +61,7 @@ def test_a_mesh_whose_triangles_have_no_corners_is_refused(tmp_path: Path) -> No
         "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
         "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 3\n1 0 3\n0 1 3\n3 0 1 9\n"
     )
-    with pytest.raises(InputError, match=r"wall.ply: its triangles name vertices from 0 to 9, and it has 3"):
+    with pytest.raises(InputError, match=r"wall.ply: its triangles name vertices up to 9 of 3"):
         begun(scene(), SeedConfig(source="mesh", mesh=str(path), voxel=0.1))
 
 

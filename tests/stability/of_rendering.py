@@ -220,7 +220,7 @@ def lift_error(case: Case) -> float:
     space = FeatureSpace(name="s", channels=cells.shape[1])
     grid = np.eye(2, 3)
     feature_map = FeatureMap(features=cells.reshape(height, width, -1), grid_from_image=grid, space=space)
-    sums = FeatureSums(b.gaussians, cells.shape[1], None, None)
+    sums = FeatureSums(b.gaussians, space, None, None)
     for _ in range(3):
         sums.add(b, feature_map, None)
     features, got_weights = sums.finish()

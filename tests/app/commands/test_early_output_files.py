@@ -67,7 +67,7 @@ def test_a_folder_that_takes_no_files(
 def test_a_folder_that_is_missing_and_a_name_that_is_too_long(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     words, file = COMMANDS[name]
     assert "the folder nowhere does not exist; make it first" in refusal(capsys, *words, f"out=nowhere/{file}")
-    assert "cannot write: File name too long" in refusal(capsys, *words, f"out=results/{'x' * 250}{file}")
+    assert "File name too long" in refusal(capsys, *words, f"out=results/{'x' * 250}{file}")
 
 
 def test_a_suffix_of_no_splat(capsys: pytest.CaptureFixture[str]) -> None:

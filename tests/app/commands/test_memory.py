@@ -152,7 +152,7 @@ def test_settings_and_scenes_that_cannot_be_are_refused_in_one_line(
         (["bank.threshold=-0.1"], "bank.threshold: expected a cosine above 0 and up to 1, got -0.1"),
         (["bank.threshold=0.9", "bank.components=4"], "bank.threshold, bank.components: expected one of the two"),
         (["memory.channels=0"], "memory.channels: expected 1 to 1,024, got 0"),
-        (["memory.temperature=0"], "memory.temperature: expected a positive number, got 0.0"),
+        (["memory.temperature=0"], "memory.temperature: expected above 0, got 0.0"),
         (["optimize=false", "memory.init=random"], "optimize=false: random queries mean nothing without training"),
         (["prepare.scale=false"], "prepare.center, prepare.scale: expected true"),
         (["memory.scoring=magic"], "memory.scoring"),

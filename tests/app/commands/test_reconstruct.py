@@ -10,13 +10,16 @@ import pytest
 import torch
 from archives import flip_bit
 from reconstructions import QUICK, interrupt, never, refusal, summary_of
+from textured_box import box_cameras
 
 from gsencoder.app import main as cli
 from gsencoder.app.commands import reconstruct as command
 from gsencoder.core.errors import InputError
+from gsencoder.data.photographs import Photographs
 from gsencoder.data.splats.files import load_splat
 from gsencoder.reconstruct import run as reconstruct
 from gsencoder.reconstruct.score import split
+from gsencoder.types import Views
 
 pytestmark = pytest.mark.slow
 
@@ -249,7 +252,12 @@ def test_a_bare_splat_cannot_be_fitted_to_anything(
 
 
 def test_every_eighth_photograph_is_kept() -> None:
-    assert split(10, 4) == ([1, 2, 3, 5, 6, 7, 9], [0, 4, 8])
-    assert split(3, 0) == ([0, 1, 2], [])
+    def photographs(count: int) -> Photographs:
+        cameras = box_cameras(count, width=8, height=8)
+        names = tuple(map(str, range(count)))
+        return Photographs(Views(cameras=cameras, names=names, images=[np.zeros((8, 8, 3), np.uint8)] * count))
+
+    assert split(photographs(10), 4) == ([1, 2, 3, 5, 6, 7, 9], [0, 4, 8])
+    assert split(photographs(3), 0) == ([0, 1, 2], [])
     with pytest.raises(InputError, match="at least 2 photographs"):
-        split(2, 2)
+        split(photographs(2), 2)

@@ -157,7 +157,7 @@ def test_masks_of_another_scene_or_of_another_length_are_refused(
         (["instances", "classes=scannet21"], "classes: scannet21 is no file; expected scannet20, scannet200"),
         (["recognition", "min_iou=0.25"], "min_iou: recognition has no such setting; it takes classes, allow_missing"),
         (["semantics", "classes=scannet20", "java=false"], "java: semantics has no such setting"),
-        (["captions", "min_iou=1.5"], "min_iou: expected 0 or more and at most 1, got 1.5"),
+        (["captions", "min_iou=1.5"], "min_iou: expected 0 to 1, got 1.5"),
         (["retrieval", "distractors=-1"], "distractors: expected 0 or more, got -1"),
     ],
 )

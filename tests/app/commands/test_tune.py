@@ -138,10 +138,10 @@ def test_an_interrupted_command_goes_on_as_if_nothing_had_happened(
     assert cli.main(words(given, tmp_path / "whole", "train.steps=6")) == 0
     rate_at = TrainerConfig.rate_at
 
-    def stop(self: TrainerConfig, step: int) -> float:
+    def stop(self: TrainerConfig, step: int, final: float) -> float:
         if step == 4:
             signal.raise_signal(signal.SIGINT)
-        return rate_at(self, step)
+        return rate_at(self, step, final)
 
     monkeypatch.setattr(TrainerConfig, "rate_at", stop)
     assert cli.main(words(given, tmp_path / "cut", "train.steps=6")) == 130
