@@ -99,9 +99,6 @@ def test_a_preparation_that_was_cut_off_is_not_continued_with_others(
         prepared(tmp_path / "made", predicted_features(seed=1))
     made = prepared(tmp_path / "made", predicted_features())
     np.testing.assert_array_equal(made.fused_features().weights, predicted_features().weights)
-    (tmp_path / "earlier" / "maps").mkdir(parents=True)
-    with pytest.raises(InputError, match="holds parts of a preparation.*resume=false"):
-        prepared(tmp_path / "earlier", None)
 
 
 def test_predictions_of_another_space_are_refused(tmp_path: Path) -> None:
