@@ -8,6 +8,7 @@ import operator
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cache
 from math import isfinite
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
@@ -34,12 +35,22 @@ def option(default: Any, help: str, **metadata: Any) -> Any:
     return field(default=default, metadata={"help": help, **metadata})
 
 
+@cache
+def _words(cls: type) -> Mapping[str, tuple[Any, ...]]:
+    """The words that fields of a Literal type take."""
+    hints = typing.get_type_hints(cls)
+    return {name: get_args(hint) for name, hint in hints.items() if get_origin(hint) is Literal}
+
+
 def check_limits(settings: Any) -> None:
-    """Checks the values of a settings dataclass against the limits at its fields; None is within all of them.
+    """Checks the values of a settings dataclass against the limits and words of its fields; None is within all limits.
 
     Raises:
         InputError: a value is outside; the field is named.
     """
+    for name, words in _words(type(settings)).items():  # type: ignore[arg-type]
+        if (value := getattr(settings, name)) not in words:
+            raise InputError(f"{name}: expected {' or '.join(map(str, words))}, got {value!r}")
     for item in fields(settings):
         value, limits = (
             getattr(settings, item.name),
