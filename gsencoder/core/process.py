@@ -10,6 +10,7 @@ import math
 import os
 import re
 import signal
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -52,7 +53,8 @@ def stop_of(error: BaseException) -> Stopped | KeyboardInterrupt | None:
 @contextmanager
 def stopping_signals() -> Iterator[None]:
     """Signals that end the process raise an exception within the block, for the main thread of a command; signals that
-    are ignored (nohup) remain so."""
+    are ignored (nohup) remain so. Python drops the exception where it is raised in a destructor or a weakref's
+    callback, as training does often enough to miss one: the signal is then sent once more."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -60,17 +62,27 @@ def stopping_signals() -> Iterator[None]:
     def stop(number: int, _: FrameType | None) -> None:
         raise Interrupted() if number == signal.SIGINT else Stopped(number)
 
+    def send_again(dropped: Any) -> None:
+        if (stopped := stop_of(dropped.exc_value)) is None:
+            report(dropped)
+        else:
+            number = stopped.number if isinstance(stopped, Stopped) else signal.SIGINT
+            # Not from here, where the exception of the handler would be dropped, too.
+            threading.Timer(0.05, os.kill, (os.getpid(), number)).start()
+
     replaced = {number: signal.getsignal(number) for number in SIGNALS}
     replaced = {
         number: handler
         for number, handler in replaced.items()
         if handler in (signal.SIG_DFL, signal.default_int_handler)
     }
+    report, sys.unraisablehook = sys.unraisablehook, send_again
     try:
         for number in replaced:
             signal.signal(number, stop)
         yield
     finally:
+        sys.unraisablehook = report
         for number, handler in replaced.items():
             signal.signal(number, handler)
 

@@ -285,3 +285,18 @@ def test_in_another_thread_nothing_is_installed() -> None:
     thread.start()
     thread.join()
     assert seen == [before]
+
+
+def test_a_signal_whose_exception_a_destructor_drops_is_sent_again() -> None:
+    class Dying:
+        def __del__(self) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    def run() -> None:
+        with stopping_signals():
+            dying = Dying()
+            del dying
+            time.sleep(5)
+
+    with pytest.raises(Stopped):
+        run()

@@ -34,11 +34,11 @@ def train(how, process, device):
     trainer = encoder_trainer(
         network, samples(dataset, names), LOSSES, SHORT, folder=work, settings=settings, process=process, device=device
     )
-    def lost(config, step):
+    def lost(config, step, final: float):
         if step == 2 and rank and how in ("dies", "hangs"):
             (folder / "lost").touch()
             os._exit(9) if how == "dies" else time.sleep(60)
-        return rate_at(config, step)
+        return rate_at(config, step, final)
 
     TrainerConfig.rate_at = lost
     trainer.run()
