@@ -386,7 +386,7 @@ class SharedScenesConfig(CommonConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class FeaturesConfig(CommonConfig):
+class FolderConfig(CommonConfig):
     """The options of commands that read one folder of features."""
 
     paths: tuple[str, ...] = option(
@@ -396,8 +396,14 @@ class FeaturesConfig(CommonConfig):
         required=True,
         one="folder of features",
     )
-    words: str = option("", "text table; empty = the one in the folder of the features")
     space: str = option("", "name of the feature space, if the folder holds several")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FeaturesConfig(FolderConfig):
+    """The options of commands that compare features with words."""
+
+    words: str = option("", "text table; empty = the one in the folder of the features")
     head: str = option(
         "",
         "adapter head whose outputs are compared with the words of text=, such as siglip; empty = the features "

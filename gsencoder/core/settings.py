@@ -50,7 +50,8 @@ def check_limits(settings: Any) -> None:
     """
     for name, words in _words(type(settings)).items():  # type: ignore[arg-type]
         if (value := getattr(settings, name)) not in words:
-            raise InputError(f"{name}: expected {' or '.join(map(str, words))}, got {value!r}")
+            *others, last = map(str, words)
+            raise InputError(f"{name}: expected {', '.join(others)}{' or ' if others else ''}{last}, got {value!r}")
     for item in fields(settings):
         value, limits = (
             getattr(settings, item.name),

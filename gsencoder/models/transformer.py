@@ -9,7 +9,7 @@ can be left out.
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int64, Integer
@@ -237,8 +237,6 @@ class TransformerConfig:
                 )
         if not self.orders:
             raise InputError("orders: expected at least one of z, z-trans, hilbert, hilbert-trans")
-        if self.shuffle_orders not in get_args(Shuffle):
-            raise InputError(f"shuffle_orders: expected once, pooling or never, got {self.shuffle_orders!r}")
 
     @property
     def levels(self) -> int:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from gsencoder.app.options import CommonConfig
+from gsencoder.app.options import FolderConfig
 from gsencoder.app.run import Run
 from gsencoder.app.summary import report_budget, report_choice
 from gsencoder.core.archive import copy_checked
@@ -37,17 +37,9 @@ CODED = ("compact", "index")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PackConfig(CommonConfig):
+class PackConfig(FolderConfig):
     """Settings of `pack`."""
 
-    paths: tuple[str, ...] = option(
-        (),
-        "a folder written by fuse, encode, pack or memory",
-        metavar="FEATURES",
-        required=True,
-        one="folder of features",
-    )
-    space: str = option("", "name of the feature space, if the folder holds several")
     head: str = option("", "adapter head whose outputs are packed, such as siglip; empty = the features themselves")
     text: TextConfig = field(
         default_factory=TableTextConfig,
@@ -65,7 +57,7 @@ class PackConfig(CommonConfig):
     )
 
     def __post_init__(self) -> None:
-        CommonConfig.__post_init__(self)
+        FolderConfig.__post_init__(self)
         if self.budget.limits and self.form not in CODED:
             raise InputError(
                 f"{self.budget.options}: form={self.form} writes features as they are; take form=compact or index, or "
