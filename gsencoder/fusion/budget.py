@@ -236,17 +236,17 @@ class KeptMaps(WrappedTeacher):
 
     def __init__(self, teacher: Teacher) -> None:
         super().__init__(teacher)
-        self.kept = dict[int, FeatureMap]()
+        self.maps = dict[int, FeatureMap]()
 
     def keep(self, views: Views, view: int) -> FeatureMap:
         """The map of a view, which is not made again."""
         feature_map = self.feature_map(views, view)
         if not self.cheap:
-            self.kept[view] = feature_map
+            self.maps[view] = feature_map
         return feature_map
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        return self.kept[view] if view in self.kept else self.teacher.feature_map(views, view)
+        return self.maps[view] if view in self.maps else self.teacher.feature_map(views, view)
 
 
 def bisection_order(count: int) -> tuple[int, ...]:
@@ -325,8 +325,8 @@ def sample_views(
     numbers = range(len(looked_at))
     looks = parallel(look, numbers) if teacher.cheap else [look(number) for number in numbers]
     sums, weights, means = (np.stack([each[kind] for each in looks[:maps]]) for kind in (1, 2, 3))
-    stated = teacher.table.mean(axis=0) if teacher.mean is None and teacher.table is not None else teacher.mean
-    turn = mean_turn(sums, weights, means if stated is None else np.stack([stated] * maps), looked_at)
+    mean = teacher.table.mean(axis=0) if teacher.mean is None and teacher.table is not None else teacher.mean
+    turn = mean_turn(sums, weights, means if mean is None else np.stack([mean] * maps), looked_at)
     # Views that are chosen by a sample show more of it than of the scene: they are judged by another one.
     by_view = np.stack([each[0] for each in looks])
     choosing, judging = (by_view[:, ::2], by_view[:, 1::2]) if by_view.shape[1] > 2 * PARTS else (by_view, by_view)

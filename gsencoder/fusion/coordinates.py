@@ -119,11 +119,11 @@ def reduce_to_fit(
         return features_bytes(each.space, int(each.seen.sum()), rank, header, basis=not all_channels)
 
     full = {name: each.features.shape[1] for name, each in features.items()}
-    whole = {name: size(name, rank) for name, rank in full.items()}
+    full_sizes = {name: size(name, rank) for name, rank in full.items()}
     ranks, lost, reduced = dict(full), 0.0, dict(features)
-    if sum(whole.values()) > limit:
+    if sum(full_sizes.values()) > limit:
         for name, each in features.items():
-            axes, share = principal_axes(each), limit * whole[name] / sum(whole.values())
+            axes, share = principal_axes(each), limit * full_sizes[name] / sum(full_sizes.values())
             fitting = [rank for rank in range(1, full[name] + 1) if size(name, rank) <= share]
             needed = axes.rank_within(error) if "error" in budget.limits else 1
             ranks[name] = rank = max([needed, *fitting])

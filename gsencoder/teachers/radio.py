@@ -134,10 +134,10 @@ def radio_folder(config: RadioConfig) -> Path:
 
 def check_radio(folder: Path) -> int:
     """Checks that a folder states that it holds a RADIO model; returns the channels of its backbone."""
-    stated = read_config(folder, WHAT)
-    if stated.model_type != "radio":
-        raise InputError(f"{WHAT}: {folder} holds a {stated.model_type} model, expected radio")
-    return int(stated.hidden_size)
+    model_config = read_config(folder, WHAT)
+    if model_config.model_type != "radio":
+        raise InputError(f"{WHAT}: {folder} holds a {model_config.model_type} model, expected radio")
+    return int(model_config.hidden_size)
 
 
 Part = Literal["summary", "features"]
@@ -282,8 +282,8 @@ def _read_head(weights: Mapping[str, Any], config: Mapping[str, Any], name: str,
     args = config.get("args")
     args = args if isinstance(args, dict) else {}
     teacher = _teacher_of(args, adapters[adapter], adapter)
-    stated = " ".join(str(teacher.get(key, "")) for key in ("type", "model")).strip()
-    kind = text_kind(stated, adapter)
+    type_and_model = " ".join(str(teacher.get(key, "")) for key in ("type", "model")).strip()
+    kind = text_kind(type_and_model, adapter)
     part = part or default_part(kind)
     full = f"{adapter}.{part}"
     with about(full):

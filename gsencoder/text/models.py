@@ -166,8 +166,8 @@ class OnnxTower:
 
     def _set_length(self) -> None:
         """Lengths: what a graph of fixed size, or one without a mask that its tokenizer pads for, must be given."""
-        stated = self._inputs["input_ids"][-1]
-        self._fixed = stated if isinstance(stated, int) else 0
+        length = self._inputs["input_ids"][-1]
+        self._fixed = length if isinstance(length, int) else 0
         padding, truncation = self._tokenizer.padding or {}, self._tokenizer.truncation or {}
         self._padding = int(padding.get("pad_id") or 0)
         if not self._fixed and "attention_mask" not in self._inputs:
@@ -186,11 +186,11 @@ class OnnxTower:
     def _probe(self) -> Float32[np.ndarray, " D"]:
         """The vector of the tokenizer's last token, which a graph with fewer rows in its embedding does not have."""
         last = self._tokenizer.get_vocab_size(with_added_tokens=True) - 1
-        stated = _read_json(self._folder / "config.json").get("vocab_size")
-        if isinstance(stated, int) and stated <= last:
+        vocab_size = _read_json(self._folder / "config.json").get("vocab_size")
+        if isinstance(vocab_size, int) and vocab_size <= last:
             raise InputError(
-                f"{self._folder}: tokenizer.json has {last + 1} tokens and config.json says {stated}; expected both of "
-                "one model"
+                f"{self._folder}: tokenizer.json has {last + 1} tokens and config.json says {vocab_size}; expected "
+                "both of one model"
             )
         try:
             return self._pool(*self._run(np.array([last], np.int64)))
@@ -220,9 +220,9 @@ def stated_pooling(folder: Path) -> str:
                 f"{folder}: modules.json lists {kind[:40]!r}, which is not supported; export it into the "
                 "graph, as an output sentence_embedding"
             )
-    stated = _read_json(folder / "1_Pooling" / "config.json")
+    pooling = _read_json(folder / "1_Pooling" / "config.json")
     names = {"pooling_mode_mean_tokens": "mean", "pooling_mode_cls_token": "cls", "pooling_mode_lasttoken": "eos"}
-    modes = [key for key, value in stated.items() if key.startswith("pooling_mode") and value is True]
+    modes = [key for key, value in pooling.items() if key.startswith("pooling_mode") and value is True]
     if not modes:
         return ""
     if len(modes) > 1 or modes[0] not in names:
@@ -325,17 +325,17 @@ class TransformersTower:
         if not config.model:
             raise InputError("text.model= is missing: the folder of a text tower")
         folder = find_file(config.model, "text.model", folder=True)
-        stated = read_config(folder, WHAT)
+        model_config = read_config(folder, WHAT)
         import torch
         import transformers
 
         from gsencoder.core.device import choose_device
 
         self.name = folder.resolve().name
-        self.model_type = str(stated.model_type)
-        self._kind = JOINT.get(stated.model_type)
-        self.pooling = _choose_pooling(folder, stated.model_type, config.pooling)
-        text = getattr(stated, "text_config", stated)
+        self.model_type = str(model_config.model_type)
+        self._kind = JOINT.get(model_config.model_type)
+        self.pooling = _choose_pooling(folder, model_config.model_type, config.pooling)
+        text = getattr(model_config, "text_config", model_config)
         self._longest = int(getattr(text, "max_position_embeddings", 0) or 0)
         # What looks like a special token in a phrase is text.
         self._tokenizer = load_tokenizer(folder, WHAT, split_special_tokens=True)

@@ -433,11 +433,11 @@ MAX_PHRASES = 20_000
 
 def cache_folder() -> Path | None:
     """The folder of cached vectors, or None where caching is off."""
-    stated = os.environ.get(CACHE_VARIABLE, "")
-    if stated == OFF:
+    folder = os.environ.get(CACHE_VARIABLE, "")
+    if folder == OFF:
         return None
-    if stated:
-        return Path(stated) / "text"
+    if folder:
+        return Path(folder) / "text"
     base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
     return Path(base) / "gsencoder" / "text"
 

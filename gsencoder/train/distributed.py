@@ -415,11 +415,11 @@ def check_agreement(subject: str, value: str, advice: str = "give all processes 
         value: of this process; empty = it has none, and any fits.
         advice: what to do where they differ.
     """
-    stated = [(rank, each) for rank, each in enumerate(values_of_all(value)) if each]
-    for rank, each in stated:
-        if each != stated[0][1]:
+    digests = [(rank, each) for rank, each in enumerate(values_of_all(value)) if each]
+    for rank, each in digests:
+        if each != digests[0][1]:
             raise InputError(
-                f"training: {subject} differ: their digest is {stated[0][1]} in process {stated[0][0]} and {each} in "
+                f"training: {subject} differ: their digest is {digests[0][1]} in process {digests[0][0]} and {each} in "
                 f"process {rank}; {advice}"
             )
 

@@ -280,9 +280,9 @@ def _without_remains(folders: Sequence[Path]) -> Iterator[None]:
     except BaseException:
         for each in folders:
             with suppress(OSError):
-                stated = each / DATASET_SETTINGS_FILE
-                if stated not in there and list(each.iterdir()) == [stated]:
-                    stated.unlink()
+                settings_file = each / DATASET_SETTINGS_FILE
+                if settings_file not in there and list(each.iterdir()) == [settings_file]:
+                    settings_file.unlink()
                 if each not in there:
                     each.rmdir()
         raise

@@ -388,7 +388,7 @@ def tune(
     """
     check_pairs(pairs)
     first = pairs[0].prompt.tokens
-    stated, processor, layout = open_processor(model, with_tokens=bool(first))
+    model_config, processor, layout = open_processor(model, with_tokens=bool(first))
     channels = store.tokens(first).shape[2] if first else None
     # Features replace the output of the model's tower; a linear layer leads to its channels where they are others.
     projected = None if layout is None or channels == layout.channels else channels
@@ -400,7 +400,7 @@ def tune(
         recompute_activations(adapted.get_base_model())
     network = TunedVlm(adapted, layout, projected, seed=seed)
     tokenizer = processor.tokenizer
-    longest = getattr(stated.get_text_config(), "max_position_embeddings", None)
+    longest = getattr(model_config.get_text_config(), "max_position_embeddings", None)
     padding = tokenizer.pad_token_id if tokenizer.pad_token_id is not None else tokenizer.eos_token_id
     settings = {
         "lora": plain(config.lora),

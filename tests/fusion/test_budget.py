@@ -76,7 +76,7 @@ def test_a_loose_limit_takes_fewer_views_and_each_of_their_maps_is_used(costly: 
     made = fuse_within(scene, teacher, BASE, FusionBudget(error=0.3))
     assert len(made.fusion.views) < 24
     if costly:
-        assert made.teacher.kept.keys() <= set(made.fusion.views)
+        assert made.teacher.maps.keys() <= set(made.fusion.views)
         assert teacher.calls == len(made.fusion.views)
 
 

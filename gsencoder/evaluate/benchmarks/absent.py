@@ -40,8 +40,8 @@ class AbsentProtocol(Protocol):
     min_views: int = option(5, "smallest number of views in which an object must be seen to be present", ge=0)
     min_pixels: int = option(60, "smallest area in its best view that an object must have to be present, pixels", ge=0)
 
-    def start(self, given: Evaluation) -> "AbsentBenchmark":
-        return AbsentBenchmark(self, given)
+    def start(self, evaluation: Evaluation) -> "AbsentBenchmark":
+        return AbsentBenchmark(self, evaluation)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,11 +65,11 @@ Asked = tuple[AskedWord, ...]
 
 
 class AbsentBenchmark(Benchmark[Asked]):
-    def __init__(self, protocol: AbsentProtocol, given: Evaluation) -> None:
-        self.protocol, self.given = protocol, given
+    def __init__(self, protocol: AbsentProtocol, evaluation: Evaluation) -> None:
+        self.protocol, self.evaluation = protocol, evaluation
         with about("protocol.vocabulary"):
-            check_known(given.words, protocol.vocabulary)
-        self.vocabulary = protocol.vocabulary or names_of(given.scenes())
+            check_known(evaluation.words, protocol.vocabulary)
+        self.vocabulary = protocol.vocabulary or names_of(evaluation.scenes())
 
     def check(self, scene: Scene) -> Scene:
         return with_counted_views(scene)
@@ -84,7 +84,7 @@ class AbsentBenchmark(Benchmark[Asked]):
         with warnings.catch_warnings():
             # That words have no box is the result here, not a fault.
             warnings.filterwarnings("ignore", ".*words have no box", SceneWarning)
-            result = localize(asked_scene, names, self.given.words, self.given.localization)
+            result = localize(asked_scene, names, self.evaluation.words, self.evaluation.localization)
         boxless = result.absent
         return tuple(
             AskedWord(word=name, present=row < len(present), probability=float(probability), boxed=name not in boxless)
@@ -97,7 +97,7 @@ class AbsentBenchmark(Benchmark[Asked]):
         shares = ("auroc", "calibration_error", "brier", "boxed_present", "boxed_absent")
         return ScoreReport(
             results={"protocol": "absent", **scores, "names": names, "scenes": [result.scene for result in results]},
-            table=table_of("Absent words", {self.given.method: {name: scores[name] for name in shares}}),
+            table=table_of("Absent words", {self.evaluation.method: {name: scores[name] for name in shares}}),
             rows={
                 "names": [{"name": name, **row} for name, row in names.items()],
                 "words": [

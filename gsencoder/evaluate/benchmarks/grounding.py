@@ -41,8 +41,8 @@ class GroundingProtocol(Protocol):
     min_pixels: int = option(60, "smallest area that the objects of a name must have in a view to be looked for", ge=1)
     furniture: bool = option(True, "whether furniture is looked for, and not the small objects alone")
 
-    def start(self, given: Evaluation) -> "GroundingBenchmark":
-        return GroundingBenchmark(self, given)
+    def start(self, evaluation: Evaluation) -> "GroundingBenchmark":
+        return GroundingBenchmark(self, evaluation)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,8 +97,8 @@ class GroundedScene:
 
 
 class GroundingBenchmark(Benchmark[GroundedScene]):
-    def __init__(self, protocol: GroundingProtocol, given: Evaluation) -> None:
-        self.protocol, self.given = protocol, given
+    def __init__(self, protocol: GroundingProtocol, evaluation: Evaluation) -> None:
+        self.protocol, self.evaluation = protocol, evaluation
 
     def check(self, scene: Scene) -> Scene:
         if scene.views is None or scene.views.instances is None or not scene.objects:
@@ -110,8 +110,8 @@ class GroundingBenchmark(Benchmark[GroundedScene]):
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> GroundedScene:
         assert scene.views is not None
-        memory = self.given.memory_of(scene)
-        pairs, small = ground_scene(scene, features, self.given.words, self.protocol, memory=memory)
+        memory = self.evaluation.memory_of(scene)
+        pairs, small = ground_scene(scene, features, self.evaluation.words, self.protocol, memory=memory)
         return GroundedScene(pairs=tuple(pairs), small=small, views=len(scene.views))
 
     def report(self, results: Sequence[SceneResult[GroundedScene]]) -> ScoreReport:
@@ -141,7 +141,7 @@ class GroundingBenchmark(Benchmark[GroundedScene]):
                 "scenes": by_scene,
             },
             table=table_of(
-                "Grounding", {self.given.method: shares}, published="m3_2_grounding_and_retrieval", columns=SHARES
+                "Grounding", {self.evaluation.method: shares}, published="m3_2_grounding_and_retrieval", columns=SHARES
             ),
             rows={
                 "names": [{"name": name, **row} for name, row in names.items()],

@@ -97,37 +97,37 @@ class InstancesProtocol(Protocol):
     )
     class_agnostic: bool = option(False, "leave the classes of masks out of account")
 
-    def start(self, given: Evaluation) -> "InstancesBenchmark":
-        return InstancesBenchmark(self, given)
+    def start(self, evaluation: Evaluation) -> "InstancesBenchmark":
+        return InstancesBenchmark(self, evaluation)
 
 
 class InstancesBenchmark(Benchmark[None]):
     """Each scene has its own two files, which are written as it is predicted."""
 
-    def __init__(self, protocol: InstancesProtocol, given: Evaluation) -> None:
-        self.protocol, self.given = protocol, given
-        self.classes = predicted_classes(given, instances=True)
+    def __init__(self, protocol: InstancesProtocol, evaluation: Evaluation) -> None:
+        self.protocol, self.evaluation = protocol, evaluation
+        self.classes = predicted_classes(evaluation, instances=True)
         self.classes.table.check_instance_ids()
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> None:
         points, classes = self.classes.points(scene), self.classes.table
         masks = predict_instances(
-            scene, points, features, classes, self.given.words, self.protocol, self.given.localization
+            scene, points, features, classes, self.evaluation.words, self.protocol, self.evaluation.localization
         )
         with about(f"scene {scene.name}"):
             ids = instance_ids(points.objects, points.names, classes.id_of)
         for name in (LABELS, PREDICTIONS):
-            self.given.file(name).mkdir(exist_ok=True)
-        write_whole_numbers(self.given.file(LABELS) / f"{scene.name}.txt", ids)
-        write_instance_prediction(self.given.file(PREDICTIONS), masks, form="npz")
+            self.evaluation.file(name).mkdir(exist_ok=True)
+        write_whole_numbers(self.evaluation.file(LABELS) / f"{scene.name}.txt", ids)
+        write_instance_prediction(self.evaluation.file(PREDICTIONS), masks, form="npz")
 
     def report(self, results: Sequence[SceneResult[None]]) -> ScoreReport:  # noqa: ARG002 - files hold all
-        write_classes(self.given.file(CLASS_IDS), self.classes.table)
+        write_classes(self.evaluation.file(CLASS_IDS), self.classes.table)
         return score_instances(
-            self.given.file(PREDICTIONS),
-            self.given.file(LABELS),
+            self.evaluation.file(PREDICTIONS),
+            self.evaluation.file(LABELS),
             self.classes.table,
-            method=self.given.method,
+            method=self.evaluation.method,
             class_agnostic=self.protocol.class_agnostic,
         )
 

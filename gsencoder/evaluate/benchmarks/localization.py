@@ -34,8 +34,8 @@ class LocalizationProtocol(Protocol):
     min_views: int = option(5, "smallest number of views in which an object must be seen to be queried", ge=0)
     min_pixels: int = option(60, "smallest area in its best view that an object must have to be queried, pixels", ge=0)
 
-    def start(self, given: Evaluation) -> "LocalizationBenchmark":
-        return LocalizationBenchmark(self, given)
+    def start(self, evaluation: Evaluation) -> "LocalizationBenchmark":
+        return LocalizationBenchmark(self, evaluation)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,14 +67,16 @@ class SceneHits:
 
 
 class LocalizationBenchmark(Benchmark[SceneHits]):
-    def __init__(self, protocol: LocalizationProtocol, given: Evaluation) -> None:
-        self.protocol, self.given = protocol, given
+    def __init__(self, protocol: LocalizationProtocol, evaluation: Evaluation) -> None:
+        self.protocol, self.evaluation = protocol, evaluation
 
     def check(self, scene: Scene) -> Scene:
         return with_counted_views(scene)
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> SceneHits:
-        hits, boxless = score_queries(scene, features, self.given.words, self.protocol, self.given.localization)
+        hits, boxless = score_queries(
+            scene, features, self.evaluation.words, self.protocol, self.evaluation.localization
+        )
         return SceneHits(
             hits=tuple(hits), boxless=boxless, seen=int(features.seen.sum()), rank=features.features.shape[1]
         )
@@ -98,7 +100,7 @@ class LocalizationBenchmark(Benchmark[SceneHits]):
         shares = {name: value for name, value in overall.items() if name != "objects"}
         return ScoreReport(
             results={"protocol": "localization", **overall, "boxless": boxless, "names": names, "scenes": by_scene},
-            table=table_of("Localization", {self.given.method: shares}),
+            table=table_of("Localization", {self.evaluation.method: shares}),
             rows={
                 "hits": [{"scene": h.scene, "name": h.name, "iou": h.iou, "oracle_iou": h.oracle_iou} for h in hits],
                 "names": [{"name": name, **row} for name, row in names.items()],

@@ -31,8 +31,8 @@ class NamingProtocol(Protocol):
 
     name: Literal["naming"] = "naming"
 
-    def start(self, given: Evaluation) -> "NamingBenchmark":
-        return NamingBenchmark(given)
+    def start(self, evaluation: Evaluation) -> "NamingBenchmark":
+        return NamingBenchmark(evaluation)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,11 +51,11 @@ class NamingCounts:
 
 
 class NamingBenchmark(Benchmark[NamingCounts]):
-    def __init__(self, given: Evaluation) -> None:
-        self.given = given
+    def __init__(self, evaluation: Evaluation) -> None:
+        self.evaluation = evaluation
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> NamingCounts:
-        words = self.given.words
+        words = self.evaluation.words
         if features.space.text_encoder != words.space.text_encoder:
             raise InputError(
                 f"naming: the features are of the space ({features.space.describe()}), but the words of "
@@ -63,7 +63,7 @@ class NamingBenchmark(Benchmark[NamingCounts]):
             )
         teacher = build_teacher(LabelsConfig(), scene, words)
         assert isinstance(teacher, LabelsTeacher)
-        return compare_names(fuse(scene, teacher, self.given.fusion).features, features, teacher)
+        return compare_names(fuse(scene, teacher, self.evaluation.fusion).features, features, teacher)
 
     def report(self, results: Sequence[SceneResult[NamingCounts]]) -> ScoreReport:
         scores = naming_scores([result.value for result in results])
@@ -78,7 +78,7 @@ class NamingBenchmark(Benchmark[NamingCounts]):
         shares = {name: value for name, value in scores.items() if name != "names"}
         return ScoreReport(
             results={"protocol": "naming", **scores, "scenes": by_scene},
-            table=table_of("Naming", {self.given.method: shares}),
+            table=table_of("Naming", {self.evaluation.method: shares}),
             rows={
                 "names": [{"name": name, **row} for name, row in scores["names"].items()],
                 "scenes": [{name: value for name, value in row.items() if name != "names"} for row in by_scene],

@@ -104,7 +104,7 @@ class Protocol:
     def __post_init__(self) -> None:
         check_limits(self)
 
-    def start(self, given: Evaluation) -> Benchmark[Any]:
+    def start(self, evaluation: Evaluation) -> Benchmark[Any]:
         raise NotImplementedError
 
 
@@ -158,29 +158,29 @@ class PredictedClasses:
         return points if self.class_of is None else points.renamed(self.class_of)
 
 
-def predicted_classes(given: Evaluation, *, instances: bool = False) -> PredictedClasses:
+def predicted_classes(evaluation: Evaluation, *, instances: bool = False) -> PredictedClasses:
     """The classes that an evaluation asks for, all of which its words know."""
-    classes = _classes(given, instances)
+    classes = _classes(evaluation, instances)
     with advised("give words that know all classes, or the classes that they know as classes=FILE"):
-        check_known(given.words, classes.table.names)
+        check_known(evaluation.words, classes.table.names)
     return classes
 
 
-def _classes(given: Evaluation, instances: bool) -> PredictedClasses:
-    if not given.classes:
-        if given.label_map:
+def _classes(evaluation: Evaluation, instances: bool) -> PredictedClasses:
+    if not evaluation.classes:
+        if evaluation.label_map:
             raise InputError(
                 "label_map: leads to the classes of a benchmark; give classes=scannet20, classes=scannet200 or, of "
                 "ScanNet++, classes=top100.txt"
             )
-        names = names_of(given.scenes())
+        names = names_of(evaluation.scenes())
         return PredictedClasses(table=ClassTable(names=tuple(names), ids=tuple(range(1, len(names) + 1))))
-    table = load_classes(given.classes, instances=instances)
-    if not given.label_map:
+    table = load_classes(evaluation.classes, instances=instances)
+    if not evaluation.label_map:
         return PredictedClasses(table=table)
-    name_of, ids = table.name_of, ids_of_raw_names(given.label_map, given.classes)
+    name_of, ids = table.name_of, ids_of_raw_names(evaluation.label_map, evaluation.classes)
     return PredictedClasses(
         table=table,
         class_of={raw: name_of[number] for raw, number in ids.items() if number in name_of},
-        labeled=list(ids) if is_scannetpp_map(given.label_map) else None,
+        labeled=list(ids) if is_scannetpp_map(evaluation.label_map) else None,
     )

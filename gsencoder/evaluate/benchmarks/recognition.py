@@ -125,30 +125,32 @@ class RecognitionProtocol(Protocol):
 
     name: Literal["recognition"] = "recognition"
 
-    def start(self, given: Evaluation) -> "RecognitionBenchmark":
-        return RecognitionBenchmark(given)
+    def start(self, evaluation: Evaluation) -> "RecognitionBenchmark":
+        return RecognitionBenchmark(evaluation)
 
 
 Recognized = tuple[list[NamedInstance], list[RankedNames]]
 
 
 class RecognitionBenchmark(Benchmark[Recognized]):
-    def __init__(self, given: Evaluation) -> None:
-        self.given, self.classes = given, predicted_classes(given)
+    def __init__(self, evaluation: Evaluation) -> None:
+        self.evaluation, self.classes = evaluation, predicted_classes(evaluation)
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> Recognized:
         points = self.classes.points(scene)
         instances = named_instances(points)
-        return instances, predict_recognition(points, features, instances, self.classes.table.names, self.given.words)
+        return instances, predict_recognition(
+            points, features, instances, self.classes.table.names, self.evaluation.words
+        )
 
     def report(self, results: Sequence[SceneResult[Recognized]]) -> ScoreReport:
         """Writes and scores both lists."""
         ordered = sorted(results, key=lambda result: result.scene)
-        labels, predictions = (self.given.file(f"{name}.json") for name in (LABELS, PREDICTIONS))
+        labels, predictions = (self.evaluation.file(f"{name}.json") for name in (LABELS, PREDICTIONS))
         write_recognition_labels(labels, [each for result in ordered for each in result.value[0]])
         write_recognition_predictions(predictions, [each for result in ordered for each in result.value[1]])
-        write_classes(self.given.file(CLASS_IDS), self.classes.table)
-        options = ScoreOptions(method=self.given.method, classes=str(self.given.file(CLASS_IDS)))
+        write_classes(self.evaluation.file(CLASS_IDS), self.classes.table)
+        options = ScoreOptions(method=self.evaluation.method, classes=str(self.evaluation.file(CLASS_IDS)))
         return score(predictions, labels, options)
 
 

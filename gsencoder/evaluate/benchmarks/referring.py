@@ -100,8 +100,8 @@ class ReferringProtocol(Protocol):
         "names", "what of a sentence is looked for: the names of the text table in it, or the whole"
     )
 
-    def start(self, given: Evaluation) -> "ReferringBenchmark":
-        return ReferringBenchmark(self, given)
+    def start(self, evaluation: Evaluation) -> "ReferringBenchmark":
+        return ReferringBenchmark(self, evaluation)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,18 +130,20 @@ Referred = tuple[tuple[Expression, ...], list[PredictedBoxes]]
 
 
 class ReferringBenchmark(Benchmark[Referred]):
-    def __init__(self, protocol: ReferringProtocol, given: Evaluation) -> None:
-        self.protocol, self.given = protocol, given
-        self.raw_ids = read_label_map(Path(given.label_map), COLUMNS["scannet20"]) if given.label_map else None
+    def __init__(self, protocol: ReferringProtocol, evaluation: Evaluation) -> None:
+        self.protocol, self.evaluation = protocol, evaluation
+        self.raw_ids = (
+            read_label_map(Path(evaluation.label_map), COLUMNS["scannet20"]) if evaluation.label_map else None
+        )
         self.sentences: tuple[Expression, ...] = ()
         self.others: list[str] = []
         if protocol.expressions:
             self.sentences = read_expressions(Path(protocol.expressions))
-            self.others = [each.scene for each in self.sentences if each.scene not in given.scene_names]
+            self.others = [each.scene for each in self.sentences if each.scene not in evaluation.scene_names]
         if self.others and len(self.others) == len(self.sentences):
             raise InputError(
                 f"protocol.expressions: none of the {len(self.sentences)} sentences of {protocol.expressions} is about "
-                f"a scene that is evaluated ({listed(sorted(given.scene_names), 3)}); first {self.others[0]}"
+                f"a scene that is evaluated ({listed(sorted(evaluation.scene_names), 3)}); first {self.others[0]}"
             )
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> Referred:
@@ -149,7 +151,7 @@ class ReferringBenchmark(Benchmark[Referred]):
         expressions = self._expressions(scene, mesh)
         # Boxes of a file are in the aligned frame of its scans, those of a scene's objects in its world.
         aligned = mesh.aligned_from_world if mesh is not None and self.sentences else None
-        words, localization = self.given.words, self.given.localization
+        words, localization = self.evaluation.words, self.evaluation.localization
         return expressions, predict_referring(
             scene, features, expressions, words, self.protocol, localization, aligned_from_world=aligned
         )
@@ -164,10 +166,10 @@ class ReferringBenchmark(Benchmark[Referred]):
                 stacklevel=2,
             )
         ordered = sorted(results, key=lambda result: result.scene)
-        labels, predictions = (self.given.file(f"{name}.json") for name in (LABELS, PREDICTIONS))
+        labels, predictions = (self.evaluation.file(f"{name}.json") for name in (LABELS, PREDICTIONS))
         write_scanrefer(labels, [each for result in ordered for each in result.value[0]])
         write_referring_predictions(predictions, [each for result in ordered for each in result.value[1]])
-        report = score(predictions, labels, ScoreOptions(method=self.given.method))
+        report = score(predictions, labels, ScoreOptions(method=self.evaluation.method))
         more = {"other_scenes": len(self.others)} if self.others else {}
         return replace(report, results={**report.results, **more})
 

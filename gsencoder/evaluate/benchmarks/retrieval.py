@@ -90,8 +90,8 @@ class RetrievalProtocol(Protocol):
     pooling: Pooling = option("max", "of the cosines of a view's pixels: max (M3) or mean")
     mode: Mode = option("centered", "cosines less the mean of features and words, or raw as in M3")
 
-    def start(self, given: Evaluation) -> "RetrievalBenchmark":
-        return RetrievalBenchmark(self, given)
+    def start(self, evaluation: Evaluation) -> "RetrievalBenchmark":
+        return RetrievalBenchmark(self, evaluation)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,16 +161,16 @@ class ScoredPairs:
 
 
 class RetrievalBenchmark(Benchmark[Retrieved]):
-    def __init__(self, protocol: RetrievalProtocol, given: Evaluation) -> None:
-        self.protocol, self.given = protocol, given
+    def __init__(self, protocol: RetrievalProtocol, evaluation: Evaluation) -> None:
+        self.protocol, self.evaluation = protocol, evaluation
         if not protocol.captions:
             raise InputError("protocol.captions= is missing: a JSON list of {scene_id, view, caption}")
         self.provided = read_view_captions(Path(protocol.captions))
-        self.captions = [each for name in given.scene_names for each in self.provided if each.scene == name]
+        self.captions = [each for name in evaluation.scene_names for each in self.provided if each.scene == name]
         if not self.captions:
             raise InputError(
                 f"protocol.captions: none of the captions in {protocol.captions} is about a scene that is evaluated "
-                f"({listed(given.scene_names, 3)}); first {self.provided[0].scene}"
+                f"({listed(evaluation.scene_names, 3)}); first {self.provided[0].scene}"
             )
         own = [each.caption for each in self.captions]
         others = read_texts(Path(protocol.distractors)) if protocol.distractors else ()
@@ -180,17 +180,17 @@ class RetrievalBenchmark(Benchmark[Retrieved]):
                 f"protocol.count: {protocol.count:,} distractors are asked for, and protocol.distractors= has "
                 f"{len(others):,}"
             )
-        texts, words = [*own, *others], given.words
+        texts, words = [*own, *others], evaluation.words
         with advised("sentences need the tower that made the words (text=)"):
             check_known(words, texts)
-        for scene in given.scenes():
+        for scene in evaluation.scenes():
             views_of(scene, self._about(scene))
         self.directions = word_directions(words.encode(texts), words.mean, protocol.mode)
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> Retrieved:
         captions = self._about(scene)
-        check_space(features.space, self.given.words.space)
-        memory = self.given.memory_of(scene)
+        check_space(features.space, self.evaluation.words.space)
+        memory = self.evaluation.memory_of(scene)
         rows = views_of(scene, captions)
         return captions, score_views(scene, features, rows, self.directions, self.protocol, memory=memory)
 
@@ -208,10 +208,10 @@ class RetrievalBenchmark(Benchmark[Retrieved]):
             scores=np.concatenate([result.value[1] for result in results]),
             distractors=np.zeros((0, len(self.captions))),
         )
-        predictions, labels = self.given.file(f"{PREDICTIONS}.npz"), self.given.file(f"{LABELS}.json")
+        predictions, labels = self.evaluation.file(f"{PREDICTIONS}.npz"), self.evaluation.file(f"{LABELS}.json")
         write_scored_pairs(predictions, pairs)
         write_view_captions(labels, self.captions)
-        return score(predictions, labels, ScoreOptions(method=self.given.method, distractors=self.protocol.count))
+        return score(predictions, labels, ScoreOptions(method=self.evaluation.method, distractors=self.protocol.count))
 
     def _about(self, scene: Scene) -> tuple[ViewCaption, ...]:
         return tuple(each for each in self.captions if each.scene == scene.name)

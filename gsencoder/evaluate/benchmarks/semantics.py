@@ -79,28 +79,31 @@ class SemanticsProtocol(Protocol):
         ge=1,
     )
 
-    def start(self, given: Evaluation) -> "SemanticsBenchmark":
-        return SemanticsBenchmark(self, given)
+    def start(self, evaluation: Evaluation) -> "SemanticsBenchmark":
+        return SemanticsBenchmark(self, evaluation)
 
 
 class SemanticsBenchmark(Benchmark[None]):
     """Each scene has its own two files, which are written as it is predicted."""
 
-    def __init__(self, protocol: SemanticsProtocol, given: Evaluation) -> None:
-        self.protocol, self.given, self.classes = protocol, given, predicted_classes(given)
+    def __init__(self, protocol: SemanticsProtocol, evaluation: Evaluation) -> None:
+        self.protocol, self.evaluation, self.classes = protocol, evaluation, predicted_classes(evaluation)
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> None:
         assert scene.gaussians is not None
         points, classes = self.classes.points(scene), self.classes.table
-        predicted = predict_semantics(points, scene.gaussians, features, classes, self.given.words, self.protocol)
+        predicted = predict_semantics(points, scene.gaussians, features, classes, self.evaluation.words, self.protocol)
         for name, values in ((LABELS, class_ids(points, classes)), (PREDICTIONS, predicted)):
-            self.given.file(name).mkdir(exist_ok=True)
-            write_whole_numbers(self.given.file(name) / f"{scene.name}.txt", values)
+            self.evaluation.file(name).mkdir(exist_ok=True)
+            write_whole_numbers(self.evaluation.file(name) / f"{scene.name}.txt", values)
 
     def report(self, results: Sequence[SceneResult[None]]) -> ScoreReport:  # noqa: ARG002 - files hold all
-        write_classes(self.given.file(CLASS_IDS), self.classes.table)
+        write_classes(self.evaluation.file(CLASS_IDS), self.classes.table)
         return score_semantics(
-            self.given.file(PREDICTIONS), self.given.file(LABELS), self.classes.table, method=self.given.method
+            self.evaluation.file(PREDICTIONS),
+            self.evaluation.file(LABELS),
+            self.classes.table,
+            method=self.evaluation.method,
         )
 
 
