@@ -17,7 +17,7 @@ from PIL import Image
 from gsencoder import encode, load_scene, load_weights, localize
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.infer.draw import contact_sheet, draw_boxes, fit_pca_colors, pca_picture
-from gsencoder.models.weights import SHIPPED_WEIGHTS
+from gsencoder.models.output_space import SHIPPED_WEIGHTS
 from gsencoder.render import blend
 from gsencoder.text.table import load_text_table
 

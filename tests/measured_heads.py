@@ -5,7 +5,7 @@ import torch
 from torch import nn
 
 from gsencoder.fusion.measured_heads import MeasuredHead
-from gsencoder.teachers.radio import Head, Residual
+from gsencoder.teachers.heads import Head, Residual
 from gsencoder.types import FeatureSpace
 
 SPACE = FeatureSpace(name="radio", channels=6, teacher="radio", weights="abcd", preprocessing="resized")

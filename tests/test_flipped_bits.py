@@ -39,7 +39,7 @@ from gsencoder.memory.index import index_features
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.weights import load_weights, save_weights
 from gsencoder.reconstruct.parameters import RowAdam, State, anchor_at, load_state, parameters_from, save_state
-from gsencoder.teachers.radio import Head
+from gsencoder.teachers.heads import Head
 from gsencoder.text.table import load_text_table, make_text_table, save_text_table
 from gsencoder.train.loop import TrainingState, load_checkpoint, save_checkpoint
 from gsencoder.train.prepare import CLASS_BALANCE_FILE, SPACE_FILE

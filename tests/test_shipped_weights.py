@@ -19,7 +19,8 @@ from gsencoder.fusion.folder import load_tables
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.localize import localize
-from gsencoder.models.weights import SHIPPED_WEIGHTS, load_weights
+from gsencoder.models.output_space import SHIPPED_WEIGHTS
+from gsencoder.models.weights import load_weights
 from gsencoder.text.vocabulary import words_of_table
 from gsencoder.train.loop import CHANGEABLE_ON_RESUME
 from gsencoder.train.samples import Augmentation

@@ -8,7 +8,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.fusion.folder import HEADS_FILE
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, find_head, head_features, load_heads
 from gsencoder.infer.localize import select_features
-from gsencoder.teachers.radio import TEXT_KINDS, Head, text_kind
+from gsencoder.teachers.heads import TEXT_KINDS, Head, text_kind
 from gsencoder.text.models import TransformersTower
 from gsencoder.text.table import TextTable, TextTower, load_text_table
 from gsencoder.text.vocabulary import (

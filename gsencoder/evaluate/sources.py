@@ -33,7 +33,7 @@ from gsencoder.infer.load import Encoder
 from gsencoder.infer.relevancy import relevancy
 from gsencoder.render import blend
 from gsencoder.teachers.build import TeacherConfig, build_teacher
-from gsencoder.teachers.radio import Head
+from gsencoder.teachers.heads import Head
 from gsencoder.text.table import TextEncoder, TextTable, check_space
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import GaussianFeatures, MeshLabels, Scene
@@ -113,7 +113,7 @@ def fused_head_source(
         with Clock().running() as clock:
             fusion = fuse(scene, build_teacher(teacher, scene, None), config)
         start, sample = time.perf_counter(), sample_cells(fusion.teacher, scene.views, fusion.views)
-        heads = measure_heads([head], sample, fusion.features.space, fusion.features.basis)
+        heads = measure_heads([head], sample.vectors(), fusion.features.space, fusion.features.basis)
         through = head_features(fusion.features, heads.heads[0], heads.space, text_encoder=text_encoder)
         return through, {**clock.seconds, "head": time.perf_counter() - start}
 

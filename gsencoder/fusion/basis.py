@@ -13,6 +13,9 @@ from gsencoder.core.archive import Archive
 from gsencoder.core.errors import InputError
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace
 
+WORST = 0.05
+"""Share of the vectors below the cosine that is called the worst."""
+
 
 def distinct_rows(feature_map: FeatureMap) -> Float32[np.ndarray, "n D"]:
     """The vectors of a map that its basis and mean are computed from: of a coded map each row of its table that occurs,

@@ -12,15 +12,13 @@ from jaxtyping import Float, Float32, Float64, Int64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.basis import to_coordinates
+from gsencoder.fusion.basis import WORST, to_coordinates
 from gsencoder.fusion.checkpoint import upright
 from gsencoder.teachers.base import Teacher
 from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Views
 
 BINS = 1000
 """Bins of the histogram of cosines from 0 to 1, from which quantiles are interpolated."""
-WORST = 0.05
-"""Share of the vectors below the cosine that is called the worst."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,17 +21,9 @@ from torch import Tensor, nn
 from gsencoder.core.archive import Archive, open_archive, write_archive
 from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, about
-from gsencoder.fusion.basis import to_coordinates
-from gsencoder.fusion.errors import WORST, CellSample
+from gsencoder.fusion.basis import WORST, to_coordinates
 from gsencoder.fusion.folder import check_heads_space, read_heads_space
-from gsencoder.teachers.radio import (
-    PARTS,
-    TEXT_KINDS,
-    Head,
-    Residual,
-    default_part,
-    split_name,
-)
+from gsencoder.teachers.heads import PARTS, TEXT_KINDS, Head, Residual, default_part, split_name
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 CHUNK = 4096
@@ -103,10 +95,9 @@ class HeadSet:
 
 
 def measure_heads(
-    heads: Sequence[Head], sample: CellSample, space: FeatureSpace, basis: FeatureBasis | None
+    heads: Sequence[Head], vectors: Float32[np.ndarray, "n D"], space: FeatureSpace, basis: FeatureBasis | None
 ) -> HeadSet:
-    """Computes mean and scale of each head's outputs for cells of the teacher's maps, and what a basis costs it."""
-    vectors = sample.vectors()
+    """Computes mean and scale of each head's outputs for vectors of the teacher's maps, and what a basis costs it."""
     projected = vectors
     if basis is not None:
         projected = (to_coordinates(basis, vectors) @ basis.components + basis.mean).astype(np.float32)

@@ -16,8 +16,8 @@ from gsencoder.fusion.folder import load_tables
 from gsencoder.infer.chunks import EncodeConfig, encode_by_chunks
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.grid import SceneCurves, cut_scene_curves
-from gsencoder.models.output_space import OutputSpaces
-from gsencoder.models.weights import find_weights, load_weights
+from gsencoder.models.output_space import OutputSpaces, find_weights
+from gsencoder.models.weights import load_weights
 from gsencoder.text.table import TextTable
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, check_unit
 

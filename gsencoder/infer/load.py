@@ -22,7 +22,7 @@ class _Loads(type(Protocol)):  # type: ignore[misc]
         """The encoder of a file, a folder or a name, such as "house" or "model.onnx", which runs without torch.
 
         Args:
-            weights: a file that `gsencoder export` wrote, else what `gsencoder.models.weights.find_weights` takes.
+            weights: a file that `gsencoder export` wrote, else what `gsencoder.models.output_space.find_weights` takes.
             device: where an exported graph runs; trained weights follow `EncodeConfig.device`.
         """
         if Path(weights).suffix.lower() == SUFFIX:
@@ -85,7 +85,7 @@ def file_of_encoder(weights: str) -> Path:
     """The file of an encoder; what lies beside it belongs to it."""
     if Path(weights).suffix.lower() == SUFFIX:
         return find_file(weights, "weights")
-    from gsencoder.models.weights import find_weights
+    from gsencoder.models.output_space import find_weights
 
     return find_weights(weights)
 

@@ -8,16 +8,21 @@ teacher's vectors themselves.
 """
 
 import math
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
 
-from gsencoder.core.archive import Archive
+from gsencoder.core.archive import Archive, open_archive
 from gsencoder.core.errors import InputError
+from gsencoder.core.files import open_foreign
+from gsencoder.core.pretrained import find_file
 from gsencoder.data.scene_arrays import read_space, space_parts
+from gsencoder.data.scenes import kind_of_path
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 
@@ -250,3 +255,65 @@ def read_output_spaces(file: Archive) -> OutputSpaces:
             raise InputError(f"expected output spaces of distinct teachers, got two of {name[:60]!r}")
         by_teacher[name] = read_output_space(part)
     return OutputSpaces(by_teacher=by_teacher)
+
+
+WEIGHTS_FILE = "encoder.safetensors"
+SHIPPED_WEIGHTS = Path(__file__).resolve().parent.parent / "weights"
+"""Folder of the encoders that come with the package, one folder each."""
+DEFAULT_WEIGHTS = "house_cpu"
+"""The one of them that is taken where none is named."""
+SHIPPED = "shipped:"
+"""What a name of them begins with that cannot be taken for a path."""
+
+
+def find_weights(source: str, option: str = "weights") -> Path:
+    """Finds the file of weights: in a folder that `train` wrote, at a path, or by the name of an encoder that comes
+    with the package. Relative paths are also looked up in GSENCODER_MODELS.
+
+    Args:
+        source: the path or name; `shipped:NAME` is never a path, and "" is DEFAULT_WEIGHTS.
+        option: that gives it, for errors.
+    """
+    names = sorted(path.parent.name for path in SHIPPED_WEIGHTS.glob(f"*/{WEIGHTS_FILE}"))
+    name = (source or SHIPPED + DEFAULT_WEIGHTS).removeprefix(SHIPPED)
+    try:
+        if name in names and (name != source or not os.path.lexists(source)):
+            return SHIPPED_WEIGHTS / name / WEIGHTS_FILE
+        if name in names:
+            raise InputError(
+                f"{option}: {source} is the name of an encoder that comes with gsencoder, and there is "
+                f"{Path(source).absolute()}, too; give {SHIPPED}{source} or ./{source}"
+            )
+        in_folder = Path(source) / WEIGHTS_FILE
+        if in_folder.is_file():
+            return in_folder
+        if Path(source).is_dir():
+            exports = sorted(path.name for path in Path(source).glob("*.onnx"))
+            hint = f"; give its {', '.join(exports)} by its full path" if exports else ""
+            raise InputError(
+                f"{option}: {source} is {kind_of_path(source)}, and holds no {WEIGHTS_FILE}; expected a folder that "
+                f"`gsencoder train` wrote{hint}"
+            )
+        file = find_file(source, option)
+        if file.suffix != Path(WEIGHTS_FILE).suffix and not _begins_as_archive(file):
+            raise InputError(
+                f"{option}: {source} is {kind_of_path(file)}; expected {WEIGHTS_FILE} or its folder, which "
+                "`gsencoder train` writes"
+            )
+        return file
+    except InputError as error:
+        raise InputError(f"{error}; encoders that come with gsencoder: {', '.join(names)}") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{option}: {source[:200]!r} is not a path ({type(error).__name__})") from error
+
+
+def _begins_as_archive(path: Path) -> bool:
+    """Whether a file begins as safetensors do, whatever it is called."""
+    with open_foreign(path) as stream:
+        return stream.read(9)[8:] == b"{"
+
+
+def load_output_spaces(source: str, option: str = "weights") -> OutputSpaces:
+    """Reads the output spaces of an encoder's weights, without the encoder; arguments are those of `find_weights`."""
+    with open_archive(find_weights(source, option)) as file:
+        return read_output_spaces(file)

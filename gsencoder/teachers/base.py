@@ -98,7 +98,7 @@ class TeacherSettings:
         return ()
 
     def read_heads(self, names: Sequence[str]) -> list[Any]:
-        """Adapter heads (`gsencoder.teachers.radio.Head`) by their names."""
+        """Adapter heads (`gsencoder.teachers.heads.Head`) by their names."""
         raise NotImplementedError
 
     def refuse_text(self) -> str:

@@ -88,7 +88,7 @@ def build_teacher(config: TeacherConfig, scene: Scene, words: Words | None) -> T
 
 
 def load_teacher_heads(config: TeacherConfig, names: Sequence[str], option: str = "heads") -> list[Any]:
-    """Adapter heads (`gsencoder.teachers.radio.Head`) of a teacher, by names that `option` gives."""
+    """Adapter heads (`gsencoder.teachers.heads.Head`) of a teacher, by names that `option` gives."""
     for name in names:
         if name.endswith((".safetensors", ".onnx")) or "/" in name or Path(name).is_file():
             raise InputError(

@@ -10,7 +10,7 @@ transformers loads the backbone alone. The heads lie in the same files, under `r
 """
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +27,7 @@ from gsencoder.core.pretrained import check_fetched, digest_files, find_file, lo
 from gsencoder.core.process import Device
 from gsencoder.core.settings import option
 from gsencoder.teachers.base import Teacher, TeacherSettings, check_channels, text_encoder_of
+from gsencoder.teachers.heads import Head, Part, Residual, default_part, split_name, text_kind
 from gsencoder.teachers.pictures import Preprocessing, TorchTeacher
 from gsencoder.text.vocabulary import Words
 from gsencoder.types import FeatureSpace, Scene
@@ -140,37 +141,6 @@ def check_radio(folder: Path) -> int:
     return int(model_config.hidden_size)
 
 
-Part = Literal["summary", "features"]
-PARTS: tuple[Part, Part] = ("summary", "features")
-TEXT_KINDS = ("siglip2", "siglip", "clip")
-"""Kinds of models with a text side, the more special ones first."""
-
-
-def text_kind(*descriptions: str) -> str:
-    """The kind of model with a text side that a description names, such as "open_clip ViT-SO400M-14-SigLIP-384"; empty
-    if none does. The first description that names one decides."""
-    for description in descriptions:
-        for kind in TEXT_KINDS:
-            if kind in description.lower():
-                return kind
-    return ""
-
-
-def split_name(name: str, adapters: Iterable[str]) -> tuple[str, Part | None]:
-    """The adapter that a head's name stands for, and its part if the name says which. The name of an adapter may itself
-    end in a part's name."""
-    adapter, _, last = name.rpartition(".")
-    for part in PARTS:
-        if last == part and adapter and name not in adapters:
-            return adapter, part
-    return name, None
-
-
-def default_part(kind: str) -> Part:
-    """The part that an adapter's name alone stands for, by the kind of its model with a text side."""
-    return "summary" if kind else "features"
-
-
 NORMALIZER = "radio_model.feature_normalizer."
 MODULES: Mapping[Part, str] = {"summary": "head_mlp", "features": "feat_mlp"}
 SECTIONS: Mapping[Part, str] = {"summary": "summary", "features": "feature"}
@@ -178,46 +148,6 @@ SECTIONS: Mapping[Part, str] = {"summary": "summary", "features": "feature"}
 SIZES = ("input_dim", "hidden_dim", "output_dim", "num_inner")
 VERSIONS = ("v1", "v2")
 MAX_SIZE = 1 << 16
-
-
-class Residual(nn.Sequential):
-    """A residual block: x + f(x), where f applies the layers in sequence."""
-
-    def forward(self, x: Float[Tensor, "n C"]) -> Float[Tensor, "n C"]:
-        out: Tensor = x + super().forward(x)
-        return out
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Head:
-    """An adapter head.
-
-    Attributes:
-        name: ADAPTER.summary or ADAPTER.features.
-        body: its layers, from features [n, D] of the backbone to vectors [n, E].
-        text: the kind of model with a text side to whose space the adapter leads (clip, siglip, siglip2); else empty.
-        model: the model to whose space it leads, as the configuration states it; else empty.
-    """
-
-    name: str
-    body: nn.Sequential
-    text: str = ""
-    model: str = ""
-
-    @property
-    def part(self) -> str:
-        """The part of the adapter: summary or features."""
-        return self.name.rpartition(".")[2]
-
-    @property
-    def channels(self) -> int:
-        """E: the number of channels of its outputs."""
-        return next(layer.out_features for layer in reversed(self.body) if isinstance(layer, nn.Linear))
-
-    def describe(self) -> str:
-        """The head and the model to whose space it leads, for messages."""
-        kind = self.model or self.text
-        return f"{self.name} ({kind})" if kind else self.name
 
 
 def read_radio_heads(folder: Path, names: Sequence[str], channels: int) -> list[Head]:

@@ -26,7 +26,7 @@ from gsencoder.fusion.measured_heads import (
 )
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.teachers.build import TeacherConfig, load_teacher_heads
-from gsencoder.teachers.radio import Head
+from gsencoder.teachers.heads import Head
 from gsencoder.train.losses import AdapterHead
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.space import OpenScene, sampled_maps
@@ -113,7 +113,7 @@ def measure_dataset_heads(
     for _, of_scene, feature_map in sampled_maps(scenes, open_scene, views, optional=optional):
         check_heads_space(of_scene.space, outputs.space)
         sample.add(feature_map)
-    measured = measure_heads(heads, sample, outputs.space, outputs.basis)
+    measured = measure_heads(heads, sample.vectors(), outputs.space, outputs.basis)
     save_heads(path, HeadSet(space=outputs.space, heads=(*stored.heads, *measured.heads)))
 
 

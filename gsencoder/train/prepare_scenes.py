@@ -29,8 +29,8 @@ from gsencoder.fusion.folder import TEACHER_NAME
 from gsencoder.models.output_space import check_distinct
 from gsencoder.teachers.base import MissingInput, Teacher
 from gsencoder.teachers.build import TeacherConfig, build_teacher, options_of_member
+from gsencoder.teachers.heads import Head
 from gsencoder.teachers.labels import LabelsConfig
-from gsencoder.teachers.radio import Head
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, closed_table
 from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
 from gsencoder.train.distributed import check_agreement, fail_together

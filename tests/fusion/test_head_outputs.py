@@ -13,7 +13,7 @@ from torch import nn
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.errors import CellSample, sample_cells
 from gsencoder.fusion.measured_heads import equal_rows, head_features, head_space, head_tokens, measure_heads
-from gsencoder.teachers.radio import Head
+from gsencoder.teachers.heads import Head
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
 
 
@@ -41,17 +41,11 @@ def a_basis(rank: int) -> FeatureBasis:
     return FeatureBasis(mean=rng.normal(size=6).astype(np.float32), components=components, energy_kept=0.9, space=SPACE)
 
 
-def a_sample(vectors: np.ndarray) -> CellSample:
-    sample = CellSample(1)
-    sample.add(feature_map(vectors.reshape(1, *vectors.shape)))
-    return sample
-
-
 @pytest.mark.parametrize("rank", [0, 3, 6])
 def test_mean_scale_and_what_a_basis_costs_equal_those_computed_by_hand(rank: int) -> None:
     vectors = np.random.default_rng(1).normal(size=(200, 6)).astype(np.float32)
     head, basis = measured().head, a_basis(rank) if rank else None
-    (one,) = measure_heads([head], a_sample(vectors), SPACE, basis).heads
+    (one,) = measure_heads([head], vectors, SPACE, basis).heads
     full = head.body(torch.from_numpy(vectors)).detach().double().numpy()
     mean = full.mean(axis=0)
     np.testing.assert_allclose(one.mean, mean, atol=1e-5)
@@ -72,10 +66,10 @@ def test_outputs_that_are_all_equal_or_not_finite_are_refused() -> None:
     constant = nn.Sequential(nn.Linear(6, 4))
     nn.init.zeros_(constant[0].weight)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"heads: a\.summary gives the same vector for all 20 cells"):
-        measure_heads([Head(name="a.summary", body=constant)], a_sample(vectors), SPACE, None)
+        measure_heads([Head(name="a.summary", body=constant)], vectors, SPACE, None)
     nn.init.constant_(constant[0].weight, 1e38)  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"heads: outputs of a\.summary are not finite"):
-        measure_heads([Head(name="a.summary", body=constant)], a_sample(vectors * 100), SPACE, None)
+        measure_heads([Head(name="a.summary", body=constant)], vectors * 100, SPACE, None)
 
 
 def fields(n: int = 300, rank: int = 3) -> GaussianFeatures:

@@ -15,8 +15,9 @@ from torch.nn import functional
 
 from gsencoder.core.errors import InputError
 from gsencoder.teachers.build import load_teacher_heads
+from gsencoder.teachers.heads import Head, text_kind
 from gsencoder.teachers.labels import PaletteConfig
-from gsencoder.teachers.radio import Head, RadioConfig, RadioTeacher, read_radio_heads, text_kind
+from gsencoder.teachers.radio import RadioConfig, RadioTeacher, read_radio_heads
 from gsencoder.types import Views
 
 pytest.importorskip("transformers")

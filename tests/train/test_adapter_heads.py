@@ -16,8 +16,9 @@ from gsencoder.fusion.folder import HEADS_FILE
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, load_heads, save_heads
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.teachers.base import MissingInput
+from gsencoder.teachers.heads import Head
 from gsencoder.teachers.labels import PaletteConfig
-from gsencoder.teachers.radio import Head, RadioConfig
+from gsencoder.teachers.radio import RadioConfig
 from gsencoder.train.adapter_heads import (
     FeatureDecoder,
     dataset_heads,

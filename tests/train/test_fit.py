@@ -18,8 +18,9 @@ from gsencoder.core.process import ProcessRank
 from gsencoder.fusion.folder import HEADS_FILE
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, save_heads
 from gsencoder.models.output_space import OutputSpaces
+from gsencoder.teachers.heads import Head
 from gsencoder.teachers.labels import PaletteConfig
-from gsencoder.teachers.radio import Head, RadioConfig
+from gsencoder.teachers.radio import RadioConfig
 from gsencoder.train import run
 from gsencoder.train.loop import ValidationResult
 from gsencoder.train.prepare import PreparedDataset

@@ -36,7 +36,7 @@ from gsencoder.fusion.errors import project_maps, sample_cells
 from gsencoder.fusion.folder import FEATURES_FILE, HEADS_FILE, WORDS_FILE, save_features
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse
 from gsencoder.fusion.measured_heads import measure_heads, save_heads
-from gsencoder.models.output_space import OutputSpaces, name_of_space
+from gsencoder.models.output_space import OutputSpaces, load_output_spaces, name_of_space
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import (
     AutoConfig,
@@ -47,7 +47,7 @@ from gsencoder.teachers.build import (
     stored_words,
     words_of,
 )
-from gsencoder.teachers.radio import Head
+from gsencoder.teachers.heads import Head
 from gsencoder.text.table import TextTable, save_text_table
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import FeatureBasis, FeatureSpace, Scene
@@ -135,7 +135,7 @@ def run(config: FuseCommandConfig, run: Run) -> None:
         if config.teacher.name != "auto":
             words_once(config.teacher, config.text)  # What cannot be read is an error before any scene is.
             heads = load_teacher_heads(config.teacher, config.teacher.stored_heads, "teacher.heads")
-    outputs = load_weights_spaces(config.basis) if config.basis else None
+    outputs = load_output_spaces(config.basis, "basis") if config.basis else None
 
     def one(path: Path, out: Path, run: Run) -> None:
         with run.folder(out) as folder:
@@ -195,13 +195,6 @@ def run(config: FuseCommandConfig, run: Run) -> None:
     run.scenes(paths, "features", one)
 
 
-def load_weights_spaces(weights: str) -> OutputSpaces:
-    """The output spaces of an encoder's weights; torch is imported only for them."""
-    from gsencoder.models.weights import load_weights
-
-    return load_weights(weights, "basis")[1]
-
-
 def basis_for(space: FeatureSpace, outputs: OutputSpaces, weights: str) -> FeatureBasis:
     """The basis in which an encoder gives features of a space."""
     by_name = outputs.by_teacher
@@ -254,7 +247,7 @@ def write_heads(folder: Path, heads: Sequence[Head], scene: Scene, fusion: Fusio
     assert scene.views is not None
     with summary.step("heads"):
         sample = sample_cells(fusion.teacher, scene.views, fusion.views)
-        measured = measure_heads(heads, sample, fusion.features.space, fusion.features.basis)
+        measured = measure_heads(heads, sample.vectors(), fusion.features.space, fusion.features.basis)
         save_heads(folder / HEADS_FILE, measured)
     summary.results.update(heads=measured.figures())
     return measured.describe()

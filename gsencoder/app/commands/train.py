@@ -22,8 +22,8 @@ from gsencoder.fusion.errors import total_fit
 from gsencoder.fusion.folder import HEADS_FILE, save_tables
 from gsencoder.fusion.measured_heads import HeadSet, save_heads
 from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.models.output_space import OutputSpace
-from gsencoder.models.weights import WEIGHTS_FILE, save_weights
+from gsencoder.models.output_space import WEIGHTS_FILE, OutputSpace
+from gsencoder.models.weights import save_weights
 from gsencoder.teachers.build import words_by_teacher
 from gsencoder.train.adapter_heads import dataset_heads, required_heads, teacher_of_heads
 from gsencoder.train.distributed import cpu_share, fail_together

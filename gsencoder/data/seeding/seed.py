@@ -23,6 +23,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import file_of_scene
 from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import check_limits, option
+from gsencoder.data.enclosure import fit_axes
 from gsencoder.data.seeding.depth import depth_samples, read_rgbd, surface_pixels
 from gsencoder.data.seeding.mesh import mesh_bounds, seed_from_mesh, seed_from_tsdf
 from gsencoder.data.seeding.points import flat_gaussians, seed_from_points, typical_spacing
@@ -34,7 +35,6 @@ MAX_SIDE = 240
 """Longer side in pixels of these depth images; of larger ones every second, third … row and column is taken."""
 SAMPLES = 2000  # Normals of each that are used
 STARTS = 4  # Cameras whose axes the search begins at
-STEPS = 40
 
 
 def room_frame(views: Views) -> Float64[np.ndarray, "4 4"] | None:
@@ -74,16 +74,6 @@ def _normals(views: Views) -> Float64[np.ndarray, "n 3"]:
         local = local[even_indices(len(local), SAMPLES)] if len(local) else local
         parts.append(local @ views.cameras.cam_from_world[view, :3, :3])
     return np.concatenate(parts)
-
-
-def fit_axes(normals: Float64[np.ndarray, "n 3"], axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Orthonormal rows with a large Σ (n · axis)⁴, from a first guess. The sum is convex in the axes, so that the
-    orthonormal matrix nearest to its gradient never has a smaller one."""
-    for _ in range(STEPS):
-        cosines = normals @ axes.T
-        left, _, right = np.linalg.svd((cosines * cosines * cosines).T @ normals)
-        axes = left @ right
-    return axes
 
 
 def _nearest_order(axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:

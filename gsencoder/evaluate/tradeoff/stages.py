@@ -91,7 +91,7 @@ class EncoderSettings:
     """Which encoder runs, and how.
 
     Attributes:
-        weights: see `gsencoder.models.weights.find_weights`.
+        weights: see `gsencoder.models.output_space.find_weights`.
         graph: precision of an ONNX graph that is run in place of torch; none = torch.
         voxel: edge of the token grid in metres; 0 = that of the training.
         patch: largest number of tokens of a patch; 0 = that of the training.

@@ -17,7 +17,7 @@ from gsencoder.data.splats.files import read_raw
 from gsencoder.fusion.folder import FEATURES_FILE, MEMORY_FILE, SCENE_FILE, load_features, load_memories
 from gsencoder.fusion.package import PACKAGE_FILE
 from gsencoder.infer.load import load_encoder
-from gsencoder.models.weights import WEIGHTS_FILE
+from gsencoder.models.output_space import WEIGHTS_FILE
 
 WRITTEN = {
     "fuse": (SCENE_FILE, FEATURES_FILE),
