@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.check.agreement import SAMPLES, depth_views
+from gsencoder.data.seeding.points import fit_axes
 from gsencoder.types import Gaussians, Views
 from gsencoder.types.checks import invert_rigid, transform
 from gsencoder.types.scene import unproject_points
@@ -283,16 +284,3 @@ def _entering_again(surface: Bool[np.ndarray, "x y z"], space: Bool[np.ndarray, 
             counted += behind
             ahead = np.where(here, found, inside), np.where(here, found, behind)
     return count
-
-
-AXES_STEPS = 40
-
-
-def fit_axes(normals: Float64[np.ndarray, "n 3"], axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
-    """Orthonormal rows with a large Σ (n · axis)⁴, from a first guess. The sum is convex in the axes, so that the
-    orthonormal matrix nearest to its gradient never has a smaller one."""
-    for _ in range(AXES_STEPS):
-        cosines = normals @ axes.T
-        left, _, right = np.linalg.svd((cosines * cosines * cosines).T @ normals)
-        axes = left @ right
-    return axes

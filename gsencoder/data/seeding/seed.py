@@ -23,10 +23,9 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.files import file_of_scene
 from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import check_limits, option
-from gsencoder.data.enclosure import fit_axes
 from gsencoder.data.seeding.depth import depth_samples, read_rgbd, surface_pixels
 from gsencoder.data.seeding.mesh import mesh_bounds, seed_from_mesh, seed_from_tsdf
-from gsencoder.data.seeding.points import flat_gaussians, seed_from_points, typical_spacing
+from gsencoder.data.seeding.points import fit_axes, flat_gaussians, seed_from_points, typical_spacing
 from gsencoder.types import Gaussians, Scene, Views
 from gsencoder.types.checks import invert_rigid, transform
 

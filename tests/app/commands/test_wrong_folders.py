@@ -9,7 +9,6 @@ from command_runs import refusal
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.app.commands.ask import scene_folders
-from gsencoder.app.commands.fuse import load_weights_spaces
 from gsencoder.app.output import WorkFolder
 from gsencoder.core.errors import InputError
 from gsencoder.data.scenes import find_scenes
@@ -17,7 +16,7 @@ from gsencoder.data.splats.files import read_raw
 from gsencoder.fusion.folder import FEATURES_FILE, MEMORY_FILE, SCENE_FILE, load_features, load_memories
 from gsencoder.fusion.package import PACKAGE_FILE
 from gsencoder.infer.load import load_encoder
-from gsencoder.models.output_space import WEIGHTS_FILE
+from gsencoder.models.output_space import WEIGHTS_FILE, load_output_spaces
 
 WRITTEN = {
     "fuse": (SCENE_FILE, FEATURES_FILE),
@@ -52,7 +51,7 @@ READERS = {
         "expected a folder with a memory, which `gsencoder memory` writes",
     ),
     "weights=": (load_encoder, ("train",), "`gsencoder train` w"),
-    "fuse basis=": (load_weights_spaces, ("train",), "`gsencoder train` w"),
+    "fuse basis=": (load_output_spaces, ("train",), "`gsencoder train` w"),
     "fuse, encode, train, reconstruct, evaluate": (
         lambda path: find_scenes([path]),
         ("scene", "reconstruct", "pack", "fuse", "memory", "missing", "notes.csv"),
