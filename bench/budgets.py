@@ -98,7 +98,7 @@ def measured(scene: Scene, teacher: Teacher, error: float, maps: Path) -> tuple[
 
 def sum_of_maps(made: BudgetFusion, counted: CountedTeacher) -> float:
     """CPU seconds of the maps that were made while choosing."""
-    return len(made.teacher.kept) * counted.seconds / max(counted.made, 1)
+    return len(made.teacher.maps) * counted.seconds / max(counted.made, 1)
 
 
 def main() -> None:
