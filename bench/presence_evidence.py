@@ -12,7 +12,6 @@ if more than half of its Gaussians lie in the box of an object that the word sta
 import argparse
 import csv
 import fnmatch
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +88,7 @@ def evidence_of(
     protocol = AbsentProtocol()
     groups = words_to_ask(scene.objects, names, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
     present, absent = map(set, groups)
-    _, candidates = find_candidates(replace(scene, features={"": features}), list(words), table)
+    _, candidates = find_candidates(scene.gaussians, features, list(words), table)
     rows = []
     for number, (kinds, word) in enumerate(zip(words.values(), candidates, strict=True)):
         state = 1 if present & set(kinds) else 0 if set(kinds) <= absent else -1

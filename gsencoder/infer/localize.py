@@ -82,15 +82,6 @@ class LocalizeConfig:
     def __post_init__(self) -> None:
         check_limits(self)
 
-    @property
-    def follows_gaps(self) -> bool:
-        """Whether clusters are joined (`cluster_by_gaps`): no radius was given."""
-        return self.eps is None and self.eps_spacings is None
-
-    def radius(self, spacing: float) -> float:
-        """The radius of DBSCAN, or the smallest one where clusters are joined, in the unit of the scene's spacing."""
-        return self.eps or (self.eps_spacings or EPS_SPACINGS) * spacing
-
 
 _DEFAULT = LocalizeConfig()
 
@@ -110,12 +101,10 @@ def localize(
     The Gaussians of a word at or above the threshold are clustered (DBSCAN), and clusters that are parts of one thing
     joined (`cluster_by_gaps`); every one becomes a box with a score (`score_clusters`) and a probability
     (`gsencoder.infer.relevancy`). Boxes that are less probable than `config.min_probability` are left out, and a word
-    that has no box is absent. Axis-aligned and oriented boxes are drawn around Gaussian means, unless `config.extent`
-    says "sigma"; one axis of oriented boxes follows the scene's up, where it is known. The scene's origin is added back
-    in float64. A word's boxes do not depend on the other queries, unless `config.contrast` is on.
+    that has no box is absent. One axis of oriented boxes follows the scene's up, where it is known. The scene's origin
+    is added back in float64. A word's boxes do not depend on the other queries, unless `config.contrast` is on.
 
     Args:
-        text: turns words into the features' space.
         space: name of the feature set; None where the scene has only one.
         rivals: words that may fit the Gaussians better than those asked; None = the names that `text` knows, if any.
         spacing: `spacing_of` the Gaussians, for callers that localize in one scene more than once; None = computed.
@@ -123,14 +112,17 @@ def localize(
     Returns:
         Relevancy, thresholds, probabilities, and the boxes best first within each word.
     """
-    gaussians, _ = select_features(scene, space)
-    scores, candidates = find_candidates(scene, queries, text, config, space=space, rivals=rivals, spacing=spacing)
-    probabilities = [[probability(each) for each in candidate.evidence] for candidate in candidates]
-    boxes = []
-    for word, candidate, values in zip(queries, candidates, probabilities, strict=True):
-        ranked = zip(candidate.clusters, values, strict=True)
-        probable = [(each, value) for each, value in ranked if value >= config.min_probability]
-        for rank, (each, value) in enumerate(probable):
+    gaussians, features = select_features(scene, space)
+    scores, candidates = find_candidates(gaussians, features, queries, text, config, rivals=rivals, spacing=spacing)
+    boxes: list[Box] = []
+    probabilities = np.zeros(len(queries), np.float32)
+    for number, (word, candidate) in enumerate(zip(queries, candidates, strict=True)):
+        rank = 0
+        for each, evidence in zip(candidate.clusters, candidate.evidence, strict=True):
+            value = probability(evidence)
+            probabilities[number] = max(probabilities[number], value)
+            if value < config.min_probability:
+                continue
             around = box_around(gaussians, each.rows, extent=config.extent, up=scene.up)
             boxes.append(
                 Box(
@@ -146,26 +138,30 @@ def localize(
                     rows=each.rows,
                 )
             )
+            rank += 1
     localization = Localization(
         queries=tuple(queries),
         relevancy=scores,
         thresholds=np.array([candidate.threshold for candidate in candidates], np.float32),
-        probabilities=np.array([max(values, default=0.0) for values in probabilities], np.float32),
+        probabilities=probabilities,
         boxes=tuple(boxes),
     )
-    _warn_about_absent(scene.name, localization)
+    if absent := localization.absent:
+        more = ", …" if len(absent) > 5 else ""
+        words = ", ".join(map(repr, list(absent)[:5])) + more
+        values = ", ".join(f"{value:.2f}" for value in list(absent.values())[:5]) + more
+        warnings.warn(
+            f"scene {scene.name}: {len(absent)} of {len(queries)} words have no box ({words}): no cluster of Gaussians "
+            f"reaches their threshold and is probable enough (probability {values})",
+            SceneWarning,
+            stacklevel=2,
+        )
     return localization
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class WordCandidates:
-    """The clusters of one word before they are judged.
-
-    Attributes:
-        threshold: the relevancy from which on Gaussians were taken.
-        clusters: best first.
-        evidence: for each cluster, that it is what the word says.
-    """
+    """The clusters of one word, best first, with the evidence for each, before improbable ones are left out."""
 
     threshold: float
     clusters: tuple[Cluster, ...]
@@ -173,27 +169,27 @@ class WordCandidates:
 
 
 def find_candidates(
-    scene: Scene,
+    gaussians: Gaussians,
+    features: GaussianFeatures,
     queries: Sequence[str],
     text: TextEncoder,
     config: LocalizeConfig = _DEFAULT,
     *,
-    space: str | None = None,
     rivals: TextTable | None = None,
     spacing: float | None = None,
 ) -> tuple[Float32[np.ndarray, "Q N"], list[WordCandidates]]:
-    """Relevancy of each word, and its clusters of Gaussians with the evidence for them; arguments are those of
-    `localize`."""
-    gaussians, features = select_features(scene, space)
-    if isinstance(queries, str) or not queries or any(not word.strip() for word in queries):
+    """Relevancy of each word, and its clusters of Gaussians with the evidence for them; see `localize`."""
+    if isinstance(queries, str) or not queries or not all(map(str.strip, queries)):
         raise InputError(f"localize: expected a list of one or more words, got {queries!r}")
+    find_clusters = cluster if config.eps or config.eps_spacings else cluster_by_gaps
+    radius = config.eps or (config.eps_spacings or EPS_SPACINGS) * (spacing or spacing_of(gaussians))
     if rivals is None and isinstance(text, (TextTable, OpenVocabulary)):
         rivals = closed_table(text)
     check_space(features.space, text.space)
     if rivals is not None:
         check_space(features.space, rivals.space)
     vectors = text.encode(list(queries))
-    trained = [None if rivals is None else rivals.is_trained(word) for word in queries]
+    trained = [None] * len(queries) if rivals is None else list(map(rivals.is_trained, queries))
     cosines = scores = relevancy(features, vectors, text.mean)
     if config.contrast or config.mode == "raw":
         negatives = _negatives(text) if config.contrast else None
@@ -201,8 +197,6 @@ def find_candidates(
             features, vectors, text.mean, negatives=negatives, temperature=config.temperature, mode=config.mode
         )
     presence = Presence(features, text.mean, rivals)
-    radius = config.radius(spacing_of(gaussians) if spacing is None and config.eps is None else spacing or 1.0)
-    find_clusters = cluster_by_gaps if config.follows_gaps else cluster
     candidates = []
     for number, vector in enumerate(vectors):
         cutoff = threshold(scores[number], config.threshold)
@@ -231,21 +225,21 @@ def select_features(scene: Scene, space: str | None) -> tuple[Gaussians, Gaussia
     if scene.gaussians is None or not scene.features:
         missing = "Gaussians" if scene.gaussians is None else "features"
         raise InputError(f"scene {scene.name} has no {missing}; run `gsencoder fuse` on it first")
+    listed = list(scene.features.values())
     if space is None:
-        with_words = [each for each in scene.features.values() if each.space.text_encoder]
-        candidates = list(scene.features.values()) if len(scene.features) == 1 else with_words
-        if len(candidates) == 1:
-            return scene.gaussians, candidates[0]
-    for attribute in ("name", "teacher"):
-        fitting = [each for each in scene.features.values() if getattr(each.space, attribute) == space]
-        if space is not None and space not in scene.features and len(fitting) == 1:
-            return scene.gaussians, fitting[0]
-    if space not in scene.features:
+        fitting = listed if len(listed) == 1 else [each for each in listed if each.space.text_encoder]
+    elif space in scene.features:
+        fitting = [scene.features[space]]
+    else:
+        fitting = [each for each in listed if each.space.name == space]
+        if len(fitting) != 1:
+            fitting = [each for each in listed if each.space.teacher == space]
+    if len(fitting) != 1:
         raise InputError(
             f"scene {scene.name} has features of {', '.join(sorted(scene.features))}; "
             + ("name one with space=" if space is None else f"none of {space!r}")
         )
-    return scene.gaussians, scene.features[space]
+    return scene.gaussians, fitting[0]
 
 
 def _negatives(text: TextEncoder) -> Float32[np.ndarray, "M D"]:
@@ -259,28 +253,13 @@ def _negatives(text: TextEncoder) -> Float32[np.ndarray, "M D"]:
     if unknown:
         instead = "" if vectors else "; the mean of its words stands for them"
         warnings.warn(
-            f"{len(unknown)} of {len(NEGATIVES)} negative words are unknown to {text.space.text_encoder} "
-            f"({', '.join(unknown[:5])}) and left out{instead}",
+            f"negative words that {text.space.text_encoder} does not know are left out: {', '.join(unknown)}{instead}",
             SceneWarning,
             stacklevel=4,
         )
-    if unknown and not vectors:
+    if not vectors:
         vectors = [(text.mean / max(float(np.linalg.norm(text.mean)), 1e-12))[None].astype(np.float32)]
-    return np.concatenate(vectors) if vectors else np.zeros((0, text.space.channels), np.float32)
-
-
-def _warn_about_absent(scene: str, localization: Localization) -> None:
-    absent = localization.absent
-    if absent:
-        more = ", …" if len(absent) > 5 else ""
-        words = ", ".join(map(repr, list(absent)[:5])) + more
-        values = ", ".join(f"{value:.2f}" for value in list(absent.values())[:5]) + more
-        warnings.warn(
-            f"scene {scene}: {len(absent)} of {len(localization.queries)} words have no box ({words}): no cluster of "
-            f"Gaussians reaches their threshold and is probable enough (probability {values})",
-            SceneWarning,
-            stacklevel=3,
-        )
+    return np.concatenate(vectors)
 
 
 def describe_absent(probability: float) -> str:

@@ -114,9 +114,7 @@ def relevancy(
     rivals.
 
     Args:
-        features: what the Gaussians have, in a basis or not.
         text: vectors of the queries; their length does not matter.
-        text_mean: mean of the text side.
         negatives: vectors of negative words (there may be none of them), or None for plain cosines.
         temperature: t above; LERF's factor of 10 is 0.1.
 
@@ -173,11 +171,7 @@ def _contrast(
 
 
 class GaussianProducts:
-    """Products of words with the features of Gaussians, less the mean; the lengths of the features are kept.
-
-    Attributes:
-        axes: their axes.
-    """
+    """Products of words with the features of Gaussians, less the mean; the lengths of the features are kept."""
 
     def __init__(self, features: GaussianFeatures, mode: Mode = "centered") -> None:
         self.features, self.axes = features, feature_axes(features, mode)
@@ -225,7 +219,9 @@ class GaussianProducts:
         return values
 
 
-Kind = Literal["adaptive", "fixed", "relative", "quantile", "otsu"]
+Kind = Literal["adaptive", "fixed", "relative", "otsu"]
+NOISE = 2.0
+"""kind=adaptive takes no Gaussian below the median relevancy of the word plus this many times its spread."""
 NORMAL_MAD = 1.4826
 """Standard deviations in a median absolute deviation of a normal distribution."""
 
@@ -237,20 +233,12 @@ class ThresholdConfig:
     kind: Kind = option(
         "adaptive",
         "a share of the word's best, at most the fixed value and at least the noise of the scene (adaptive); or one of "
-        "fixed value, share of the word's best, quantile of the scene, Otsu's split",
+        "fixed value, share of the word's best, Otsu's split",
     )
     fixed: float = option(0.5, "relevancy for kind=fixed, and the most for kind=adaptive", ge=-1, le=1)
     relative: float = option(
         0.7, "share of the word's highest relevancy for kind=adaptive and kind=relative", gt=0, le=1
     )
-    noise: float = option(
-        2.0,
-        "kind=adaptive takes no Gaussian below the median relevancy of the word plus so many times its spread (median "
-        "absolute deviation, as a standard deviation) over the scene",
-        ge=0,
-        lt=math.inf,
-    )
-    quantile: float = option(0.995, "share of the seen Gaussians left out, kind=quantile", ge=0, le=1)
 
     def __post_init__(self) -> None:
         check_limits(self)
@@ -259,7 +247,7 @@ class ThresholdConfig:
 def threshold(scores: Float32[np.ndarray, " N"], config: ThresholdConfig) -> float:
     """The relevancy from which on one word's Gaussians are taken; NaN where no Gaussian was seen.
 
-    The adaptive one is min(fixed, max(relative · best, median + noise · spread)). A word that some Gaussians answer
+    The adaptive one is min(fixed, max(relative · best, median + `NOISE` · spread)). A word that some Gaussians answer
     fully has the fixed threshold. Features of an encoder are shorter of what they stand for, most of all for kinds that
     it was not trained on: then the best Gaussians of the word set the threshold, as long as they stand out.
     """
@@ -268,8 +256,6 @@ def threshold(scores: Float32[np.ndarray, " N"], config: ThresholdConfig) -> flo
         return math.nan
     if config.kind == "fixed":
         return config.fixed
-    if config.kind == "quantile":
-        return float(np.quantile(seen, config.quantile))
     if config.kind == "otsu":
         return otsu(seen)
     share = config.relative * float(seen.max())
@@ -278,17 +264,12 @@ def threshold(scores: Float32[np.ndarray, " N"], config: ThresholdConfig) -> flo
     if share >= config.fixed:
         return config.fixed
     median, spread = background(seen)
-    return min(config.fixed, max(share, median + config.noise * spread))
+    return min(config.fixed, max(share, median + NOISE * spread))
 
 
 def background(seen: Float32[np.ndarray, " n"]) -> tuple[float, float]:
-    """Median and spread of a word's relevancy over a scene, which is background for the most part.
-
-    The spread is the median absolute deviation, as the standard deviation of the normal distribution that has it.
-
-    Args:
-        seen: finite relevancies, at least one.
-    """
+    """Median of a word's finite relevancies over a scene, which is background for the most part, and their spread: the
+    median absolute deviation, as the standard deviation of the normal distribution that has it."""
     median = np.median(seen)
     return float(median), NORMAL_MAD * float(np.median(np.abs(seen - median)))
 
@@ -331,9 +312,8 @@ class Cluster:
 
     Attributes:
         rows: its Gaussians, ascending.
-        score: mean relevancy, weighted by the Gaussians' weights, times the fourth root of its share of the weight of
-            all that was selected for the word.
-        share: of this weight in that of all that was selected for the word.
+        score: mean relevancy, weighted by the Gaussians' weights, times the fourth root of `share`.
+        share: of its weight in that of all that was selected for the word.
     """
 
     rows: Int64[np.ndarray, " n"]
@@ -344,13 +324,8 @@ class Cluster:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """What speaks for a cluster; see the module.
-
-    Attributes:
-        mean, margin, prominence, size, share: as there; margin is None without a vocabulary.
-        trained: whether the encoder of the features was trained on the word; None where that is not stated, as for
-            fused features.
-    """
+    """What speaks for a cluster; see the module. Without a vocabulary there is no margin, and `trained`, whether the
+    encoder of the features was trained on the word, is None where that is not known, as for fused features."""
 
     mean: float
     margin: float | None
@@ -385,26 +360,19 @@ def probability(evidence: Evidence) -> float:
         coefficients = WITHOUT_RIVALS
     else:
         coefficients = {None: WITH_RIVALS, True: TRAINED, False: UNTRAINED}[evidence.trained]
-    logit = coefficients["intercept"]
+    logit = 0.0
     for name, coefficient in coefficients.items():
-        if name != "intercept":
-            logit += coefficient * getattr(evidence, name)
+        logit += coefficient * (1.0 if name == "intercept" else getattr(evidence, name))
     # The tanh form of the logistic function does not overflow.
     return 0.5 * (1 + math.tanh(logit / 2))
 
 
 class Presence:
-    """Collects evidence for clusters of one feature set."""
+    """Collects evidence for clusters of one feature set; words of `vocabulary` may fit them better than those asked."""
 
     def __init__(
-        self,
-        features: GaussianFeatures,
-        text_mean: Float32[np.ndarray, " D"],
-        vocabulary: TextTable | None,
+        self, features: GaussianFeatures, text_mean: Float32[np.ndarray, " D"], vocabulary: TextTable | None
     ) -> None:
-        """Args:
-        text_mean: mean of the text side.
-        vocabulary: words of the features' space that may fit better than the one asked; None where there are none."""
         self._features, self._text_mean = features, text_mean
         self._axes: FeatureAxes = feature_axes(features)
         self._rivals: Float64[np.ndarray, "C D"] | None = None
@@ -420,12 +388,7 @@ class Presence:
         *,
         trained: bool | None = None,
     ) -> list[Evidence]:
-        """The evidence for each cluster of one word.
-
-        Args:
-            cosines: its centered cosine with every Gaussian, NaN where that was never seen.
-            trained: whether the encoder of the features was trained on the word; None where that is not stated.
-        """
+        """The evidence for each cluster of one word, given its centered cosines (NaN for Gaussians never seen)."""
         if not clusters:
             return []
         direction = word_directions(word[None], self._text_mean)

@@ -28,10 +28,9 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import check_limits, option
-from gsencoder.data.seeding.points import scene_spacing
-from gsencoder.fusion.cameras import check_orbits, with_views
-from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize, select_features
-from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.fusion.cameras import with_views
+from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize, select_features, spacing_of
+from gsencoder.render import blend
 from gsencoder.text.table import TextEncoder
 from gsencoder.types import Cameras, GaussianFeatures, Gaussians, Localization, Scene
 
@@ -44,13 +43,6 @@ class SelectConfig:
     grow: bool = option(
         True, "grow to the whole object; false = the Gaussians of the boxes, or above threshold=, alone"
     )
-    probable: float = option(
-        0.5,
-        "without box= those boxes of a word are taken whose probability is at least this share of the most probable "
-        "one's",
-        ge=0,
-        le=1,
-    )
     share: float = option(
         0.5,
         "a Gaussian is taken if its feature is more than this share object and less background; smaller = more of the "
@@ -61,20 +53,18 @@ class SelectConfig:
     reach: float = option(
         4.0, "no Gaussian farther than this from those of a box is taken, in spacings", ge=0, lt=math.inf
     )
-    only: float = option(
-        0.9,
-        "a Gaussian whose feature is partly object is taken if this share of its blending weight over the views falls "
-        "on pixels that the object dominates, and lost if no more than the rest of 1 does",
-        ge=0.5,
-        le=1,
-    )
     views: int = option(48, "number of views, evenly spaced, that are looked at; 0 = none", ge=0)
-    pixels: int = option(100_000, "of views with more pixels every second, third, … in both directions counts", ge=1)
-    orbits: int = option(24, "cameras for a splat without views")
 
     def __post_init__(self) -> None:
         check_limits(self)
-        check_orbits(self.orbits)
+
+
+PROBABLE = 0.5
+"""Without box= those boxes of a word are taken that are at least this share as probable as the most probable one."""
+ORBITS = 24
+"""Cameras for a splat without views."""
+MOST_WORDS = 64
+"""Words that are selected at once; each needs a column of a pixel map and of a table of the Gaussians."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -83,7 +73,7 @@ class Selection:
 
     Attributes:
         seeds: the labels before they grew.
-        views: how many views were looked at.
+        views: number of views that corrected them.
         placed: whether these are cameras that were placed around or inside a splat without views.
     """
 
@@ -103,31 +93,105 @@ class Selection:
         return np.asarray(self.labels == 0)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Votes:
-    """Blending weight of each Gaussian over the pixels of each label, summed over views; pixels of the whole picture.
-
-    Attributes:
-        present: as the scene is.
-        removed: as it is without the Gaussians that have a label; zeros for these. The pixels keep the labels that
-            they had with them.
-    """
-
-    present: Float32[np.ndarray, "N labels"]
-    removed: Float32[np.ndarray, "N labels"]
-
-
 Parts = tuple[tuple[Int64[np.ndarray, " _"], ...], ...]
 """For each word the rows of each of its parts, ascending; a part is a box, or all that is above a threshold."""
 
 
-def box_parts(localization: Localization, ranks: Sequence[int], *, probable: float) -> Parts:
-    """The Gaussians of each word's boxes.
+Labels = Int32[np.ndarray, " N"]
+
+
+def select(
+    scene: Scene,
+    words: Sequence[str],
+    text: TextEncoder,
+    config: SelectConfig = SelectConfig(),
+    *,
+    boxes: Sequence[int] = (),
+    threshold: float | None = None,
+    localization: LocalizeConfig = LocalizeConfig(),
+    track: Track = untracked,
+) -> tuple[Selection, Localization]:
+    """Gives each Gaussian a word or none.
+
+    A selection starts with the Gaussians of the boxes of each word (`gsencoder.infer.localize.localize`), or with all
+    that reach `threshold`. It grows, or shrinks, to the Gaussians around these whose features are more of the object
+    than of its surroundings, and is corrected by the pixels on which the blending weight of Gaussians falls, in the
+    cameras of the scene. A splat without views is looked at by cameras that are placed around or inside it.
 
     Args:
-        ranks: numbers of the boxes of every word, as in boxes.json; empty = the boxes that are at least `probable`
-            times as probable as the most probable box of their word.
+        scene: Gaussians with one feature set, or several of which one is of the space of `text`.
+        boxes: numbers of the boxes of each word, best first from 0; empty = the most probable, and those that are
+            nearly as probable.
+
+    Returns:
+        The selection, and the boxes that it started from.
     """
+    if boxes and threshold is not None:
+        raise InputError("box= and threshold= are two ways to choose where a selection starts; give one of them")
+    if len(words) > MOST_WORDS:
+        raise InputError(f"query: expected at most {MOST_WORDS} words to select, got {len(words)}")
+    localized = localize(scene, words, text, localization)
+    gaussians, features = select_features(scene, None)
+    seen = features.seen
+    _check_distinct(words, text)
+    parts = box_parts(localized, boxes) if threshold is None else threshold_parts(words, localized.relevancy, threshold)
+    seeds = labels = labels_of_parts(parts, localized.relevancy)
+    view_count, placed = 0, False
+    if config.grow and labels.any():
+        # A part keeps what no other word took from it.
+        parts = tuple(
+            tuple(remaining for rows in groups if len(remaining := rows[labels[rows] == number + 1]))
+            for number, groups in enumerate(parts)
+        )
+        spacing = spacing_of(gaussians)
+        candidates = labels_by_features(features, gaussians.means, parts, localized.relevancy, config, spacing)
+        labels, unknown = candidates.labels, ~seen
+        if config.views:
+            placed = scene.views is None
+            cameras = _cameras(scene)
+            samples = sample_views(cameras, config.views)
+            by_pixels = votes(gaussians, cameras, labels, len(parts), samples, spacing=spacing, track=track)
+            labels = labels_by_pixels(candidates, seen, by_pixels, config)
+            unknown = unknown & (by_pixels.present.sum(axis=1) + by_pixels.removed.sum(axis=1) == 0)
+            view_count = len(samples)
+        labels = labels_of_hidden(gaussians.means, labels, candidates.possible, unknown, spacing)
+    if labels.all():
+        raise InputError(
+            f"select: every one of the {len(labels):,} Gaussians of {scene.name} is selected, so nothing is left; give "
+            "a higher threshold= or fewer words"
+        )
+    if not labels.any():
+        listing = ", ".join(f"{word!r} (probability {value:.2f})" for word, value in localized.absent.items())
+        why = f"absent: {listing}" if listing else "lower select.share or give select.grow=false"
+        raise InputError(f"select: no Gaussian of {scene.name} is selected; {why}")
+    return Selection(words=tuple(words), labels=labels, seeds=seeds, views=view_count, placed=placed), localized
+
+
+def _check_distinct(words: Sequence[str], text: TextEncoder) -> None:
+    """Refuses words with one vector, such as "chair" and "Chair": the first would take all Gaussians of both."""
+    first: dict[bytes, str] = {}
+    for word, vector in zip(words, text.encode(words), strict=True):
+        other = first.setdefault(vector.tobytes(), word)
+        if other != word:
+            raise InputError(f"query: {other!r} and {word!r} stand for the same vector; give one of them")
+
+
+def _cameras(scene: Scene) -> Cameras:
+    """The scene's cameras, or some that are placed around or inside a splat without views."""
+    if scene.views is None:
+        warnings.warn(
+            f"scene {scene.name} has no views; the selection is checked from {ORBITS} cameras around or inside it, "
+            "which may not see what real photographs would",
+            SceneWarning,
+            stacklevel=3,
+        )
+        scene = with_views(replace(scene, features={}), ORBITS)
+    assert scene.views is not None
+    return scene.views.cameras
+
+
+def box_parts(localization: Localization, ranks: Sequence[int]) -> Parts:
+    """The Gaussians of each word's boxes of these numbers, or without numbers of the probable ones (`PROBABLE`)."""
     parts = []
     for word in localization.queries:
         boxes = [box for box in localization.boxes if box.query == word]
@@ -137,7 +201,7 @@ def box_parts(localization: Localization, ranks: Sequence[int], *, probable: flo
                 has = "no box" if not boxes else "one box, number 0" if len(boxes) == 1 else several
                 why = "" if boxes else f": {describe_absent(localization.absent[word])}"
                 raise InputError(f"box={rank}: {word!r} has {has}{why}")
-        least = probable * max((box.probability for box in boxes), default=0.0)
+        least = PROBABLE * max((box.probability for box in boxes), default=0.0)
         chosen = [boxes[rank] for rank in dict.fromkeys(ranks)] or [box for box in boxes if box.probability >= least]
         parts.append(tuple(np.sort(box.rows).astype(np.int64) for box in chosen))
     return tuple(parts)
@@ -155,12 +219,7 @@ def threshold_parts(words: Sequence[str], relevancy: Float32[np.ndarray, "Q N"],
 
 
 def labels_of_parts(parts: Parts, relevancy: Float32[np.ndarray, "Q N"]) -> Int32[np.ndarray, " N"]:
-    """The label of each Gaussian: of the words that take it the most relevant one, the first of equal ones; 0 = none.
-
-    The contrast of one word with the others, as in `gsencoder.infer.relevancy.relevancy`, is above one half
-    for the most relevant word alone, so that no Gaussian is given to a word that loses against another one that
-    takes it.
-    """
+    """The label of each Gaussian: of the words that take it the most relevant one, the first of equal ones; or 0."""
     labels = np.zeros(relevancy.shape[1], np.int32)
     best = np.full(relevancy.shape[1], -np.inf, np.float32)
     for number, (groups, scores) in enumerate(zip(parts, relevancy, strict=True)):
@@ -263,41 +322,31 @@ BEHIND = 0.02
 """Share of the depth of a pixel's surface by which an entry may lie behind it, beside one spacing."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Sampling:
-    """Which pixels of a scene are looked at.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Votes:
+    """Blending weight of each Gaussian over the pixels of each label, summed over views; pixels of the whole picture.
 
     Attributes:
-        views: row numbers of the views.
-        pixels: most pixels of a view.
+        present: as the scene is.
+        removed: as it is without the Gaussians that have a label; zeros for these. The pixels keep the labels that
+            they had with them.
     """
 
-    views: tuple[int, ...]
-    pixels: int
-
-    def stride(self, cameras: Cameras, view: int) -> int:
-        """The step between pixels of a view, in both directions."""
-        return max(1, math.ceil(math.sqrt(int(cameras.widths[view]) * int(cameras.heights[view]) / self.pixels)))
-
-    def blend(self, gaussians: Gaussians, cameras: Cameras, view: int, config: BlendConfig = BlendConfig()) -> Blend:
-        """B of a view's pixels."""
-        return blend(gaussians, cameras, view, stride=self.stride(cameras, view), config=config)
+    present: Float32[np.ndarray, "N labels"]
+    removed: Float32[np.ndarray, "N labels"]
 
 
-def sampling(cameras: Cameras, *, views: int, pixels: int) -> Sampling:
-    """`views` views, evenly spaced, with at most about `pixels` pixels each."""
+PIXELS = 100_000
+"""Of views with more pixels every second, third, … in both directions counts."""
+
+
+def sample_views(cameras: Cameras, views: int, pixels: int = PIXELS) -> list[tuple[int, int]]:
+    """The rows of `views` views, evenly spaced, each with the step between its pixels, in both directions, that leaves
+    about `pixels` of them."""
     rows = even_indices(len(cameras), views) if views and len(cameras) else np.zeros(0, np.int64)
-    return Sampling(views=tuple(int(row) for row in rows), pixels=pixels)
-
-
-def pixel_labels(b: Blend, labels: Int32[np.ndarray, " N"], count: int) -> Int32[torch.Tensor, " P"]:
-    """The label, of 1 to `count`, that dominates each pixel of a view; 0 = none of them."""
-    # Gaussians of the label 0 are most of a scene, and have no column.
-    one_hot = torch.zeros(len(labels), count)
-    labeled = np.flatnonzero(labels)
-    one_hot[torch.from_numpy(labeled), torch.from_numpy(labels[labeled].astype(np.int64) - 1)] = 1
-    mass, best = b.render(one_hot).max(dim=1)
-    return torch.where(mass > DOMINANT * b.alpha, best + 1, 0).int()
+    areas = cameras.widths[rows].astype(np.int64) * cameras.heights[rows]
+    strides = np.maximum(1, np.ceil(np.sqrt(areas / pixels))).astype(np.int64)
+    return list(zip(rows.tolist(), strides.tolist(), strict=True))
 
 
 def votes(
@@ -305,46 +354,44 @@ def votes(
     cameras: Cameras,
     labels: Int32[np.ndarray, " N"],
     count: int,
-    chosen: Sampling,
+    samples: Sequence[tuple[int, int]],
     *,
     spacing: float,
     track: Track = untracked,
 ) -> Votes:
-    """Where the blending weight of each Gaussian falls.
+    """Where the blending weight of each Gaussian falls: sums over labels 0 to `count`, zeros for Gaussians that no
+    view shows.
 
     Args:
-        labels: of the Gaussians, 0 to `count`.
-        chosen: which pixels are looked at; a pixel of every second line and column counts four times.
+        samples: of `sample_views`; a pixel of every second line and column counts four times.
         spacing: entries that lie farther behind a pixel's surface than this, and a share of its depth, do not count.
-
-    Returns:
-        Weights over labels 0 to `count`; rows of zeros for Gaussians that no view shows.
     """
-    left = np.flatnonzero(labels == 0)
-    rest = gaussians.select(left)
     present = torch.zeros(len(gaussians), count + 1)
-    removed = torch.zeros(len(rest), count + 1)
-    for view in track(chosen.views, "views of the objects"):
-        b = chosen.blend(gaussians, cameras, view)
+    left, labeled = np.flatnonzero(labels == 0), np.flatnonzero(labels)
+    rest = gaussians.select(left)
+    removed = torch.zeros(len(left), count + 1)
+    # Gaussians of the label 0 are most of a scene, and have no column.
+    one_hot = torch.zeros(len(labels), count)
+    one_hot[torch.from_numpy(labeled), torch.from_numpy(labels[labeled].astype(np.int64) - 1)] = 1
+    for view, stride in track(samples, "views of the objects"):
+        b = blend(gaussians, cameras, view, stride=stride)
         surface = b.median_depth
         farthest = torch.where(surface > 0, surface * (1 + BEHIND) + spacing, torch.inf)
-        codes = pixel_labels(b, labels, count)
-        seen = _lifted(b, farthest, codes, count) * chosen.stride(cameras, view) ** 2
-        present += seen
+        nearest = torch.zeros_like(farthest)
+        mass, best = b.render(one_hot).max(dim=1)
+        codes = torch.where(mass > DOMINANT * b.alpha, best + 1, 0).int()
+        seen = torch.zeros(len(labels), count + 1)
+        b.keep_between(nearest, farthest).lift_codes_into(codes, seen)
+        present += seen * stride**2
         if codes.any():
-            without = chosen.blend(rest, cameras, view)
-            removed += _lifted(without, farthest, codes, count) * chosen.stride(cameras, view) ** 2
+            without = torch.zeros_like(removed)
+            blend(rest, cameras, view, stride=stride).keep_between(nearest, farthest).lift_codes_into(codes, without)
         else:
-            removed += seen[torch.from_numpy(left)]
+            without = seen[torch.from_numpy(left)]
+        removed += without * stride**2
     spread = np.zeros_like(present.numpy())
     spread[left] = removed.numpy()
     return Votes(present=present.numpy(), removed=spread)
-
-
-def _lifted(b: Blend, farthest: torch.Tensor, codes: torch.Tensor, count: int) -> torch.Tensor:
-    sums = torch.zeros(b.gaussians, count + 1)
-    b.keep_between(torch.zeros_like(farthest), farthest).lift_codes_into(codes, sums)
-    return sums
 
 
 OPAQUE = 0.5
@@ -353,10 +400,10 @@ OPAQUE = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hole:
-    """Pixels of one view that are empty after the removal and were not before.
+    """Pixels of one view that are empty after the removal and were not before; numbers are those of the whole view.
 
     Attributes:
-        removed: how many pixels the removed Gaussians dominated.
+        removed: number of pixels that the removed Gaussians dominated.
         area: of the hole at the depth of the surface that was there, in world units².
     """
 
@@ -370,49 +417,42 @@ def find_holes(
     gaussians: Gaussians,
     cameras: Cameras,
     removed: Bool[np.ndarray, " N"],
-    chosen: Sampling,
+    samples: Sequence[tuple[int, int]],
     *,
     track: Track = untracked,
 ) -> list[Hole]:
-    """The hole in each view that shows what is removed.
+    """The hole in each view of `sample_views` that shows what is removed.
 
     A pixel is a part of the hole if more than half of its opacity was of the removed Gaussians, its alpha was one half
     or more, and is less without them. It covers z² / (fx·fy) of a surface at depth z that faces the camera.
-
-    Args:
-        removed: which Gaussians are taken out.
-        chosen: which pixels are looked at; numbers are those of the whole view.
     """
     rest = gaussians.select(~removed)
     values = torch.from_numpy(removed.astype(np.float32))
     holes = []
-    for view in track(chosen.views, "views without the object"):
-        before = chosen.blend(gaussians, cameras, view)
+    for view, stride in track(samples, "views without the object"):
+        before = blend(gaussians, cameras, view, stride=stride)
         gone = (before.render(values) > DOMINANT * before.alpha) & (before.alpha >= OPAQUE)
         if not gone.any():
             continue
-        after = chosen.blend(rest, cameras, view)
-        empty = gone & (after.alpha < OPAQUE)
-        each = chosen.stride(cameras, view) ** 2
+        empty = gone & (blend(rest, cameras, view, stride=stride).alpha < OPAQUE)
         K = cameras.Ks[view].astype(np.float64)
         z = before.median_depth[empty].double()
         holes.append(
             Hole(
                 view=view,
-                pixels=int(empty.sum()) * each,
-                removed=int(gone.sum()) * each,
-                area=float((z**2).sum()) * each / float(K[0, 0] * K[1, 1]),
+                pixels=int(empty.sum()) * stride**2,
+                removed=int(gone.sum()) * stride**2,
+                area=float((z**2).sum()) * stride**2 / float(K[0, 0] * K[1, 1]),
             )
         )
     return holes
 
 
-Labels = Int32[np.ndarray, " N"]
 NO_SHARE = -1e9
 """Stands for the share of a Gaussian without a feature: below that of every other one."""
-PARTLY, GHOST_WEIGHT = 0.7, 1.0
-"""See `labels_by_pixels`. The smaller both are, the less is left of an object that is taken out, and the more of its
-surroundings goes with it."""
+ONLY, PARTLY, GHOST_WEIGHT = 0.9, 0.7, 1.0
+"""See `labels_by_pixels`. The smaller the last two are, the less is left of an object that is taken out, and the more
+of its surroundings goes with it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -432,8 +472,8 @@ class Candidates:
 
 
 def labels_by_features(
-    gaussians: Gaussians,
     features: GaussianFeatures,
+    means: Float32[np.ndarray, "N 3"],
     parts: Parts,
     relevancy: Float32[np.ndarray, "Q N"],
     config: SelectConfig,
@@ -445,28 +485,20 @@ def labels_by_features(
     largest share in its feature, or the first where it has no feature. It has that word if the share is above
     `config.share`.
     """
-    count = len(gaussians)
-    labels, possible = np.zeros(count, np.int32), np.zeros(count, np.int32)
-    best = np.full(count, -np.inf)
+    possible, best = np.zeros(len(means), np.int32), np.full(len(means), -np.inf)
     for number, groups in enumerate(parts):
         same = np.unique(np.concatenate(groups)) if groups else np.zeros(0, np.int64)
         for rows in groups:
             candidates, shares = object_shares(
-                features,
-                gaussians.means,
-                rows,
-                relevancy[number],
-                spacing=spacing,
-                reach=config.reach,
-                same=same,
+                features, means, rows, relevancy[number], spacing=spacing, reach=config.reach, same=same
             )
             shares = np.nan_to_num(shares, nan=NO_SHARE)
             better = shares > best[candidates]
             chosen = candidates[better]
             best[chosen], possible[chosen] = shares[better], number + 1
-    above_share = best > config.share
-    labels[above_share] = possible[above_share]
-    return Candidates(labels=labels, possible=possible, shares=best)
+    return Candidates(
+        labels=np.where(best > config.share, possible, 0).astype(np.int32), possible=possible, shares=best
+    )
 
 
 def labels_by_pixels(
@@ -475,9 +507,9 @@ def labels_by_pixels(
     """Labels by features, corrected by where the blending weight of the Gaussians falls.
 
     A Gaussian with a good part of an object in its feature (`PARTLY` of `config.share` or more) is taken if the share
-    `config.only` of its weight is on pixels that the object dominates. It is also taken if it is a ghost of the object:
+    `ONLY` of its weight is on pixels that the object dominates. It is also taken if it is a ghost of the object:
     if, were the object taken out, it would have most of its weight on these pixels, and `GHOST_WEIGHT` times as much
-    there as Gaussians of the object usually have. One that has the label loses it if less than 1 − `config.only` of its
+    there as Gaussians of the object usually have. One that has the label loses it if less than 1 − `ONLY` of its
     weight is there. A Gaussian without a feature has the label on whose pixels more than half of its weight is, or,
     where no view shows it, would be if the objects were taken out. Gaussians that no view would show keep their label.
     """
@@ -489,10 +521,10 @@ def labels_by_pixels(
     is_in, has_feature = labels[rows] == possible[rows], seen[rows]
     partly = has_feature & (candidates.shares[rows] > PARTLY * config.share)
     ghost = (on_label_removed > 0.5) & (on_label_removed * total_removed >= GHOST_WEIGHT * usual) & (total_removed > 0)
-    confirmed = (total > 0) & (on_label >= config.only)
+    confirmed = (total > 0) & (on_label >= ONLY)
     # What is hidden now is judged by the views in which it would appear.
     featureless = ~has_feature & (np.where(total > 0, on_label, on_label_removed) > 0.5)
-    lost = is_in & (total > 0) & np.where(has_feature, on_label < 1 - config.only, on_label <= 0.5)
+    lost = is_in & (total > 0) & np.where(has_feature, on_label < 1 - ONLY, on_label <= 0.5)
     corrected = labels.copy()
     added = rows[(partly & (confirmed | ghost)) | featureless]
     corrected[added] = possible[added]
@@ -519,7 +551,7 @@ def _weight_on_label(
 
 
 def labels_of_hidden(
-    gaussians: Gaussians, labels: Labels, possible: Labels, unknown: Bool[np.ndarray, " N"], spacing: float
+    means: Float32[np.ndarray, "N 3"], labels: Labels, possible: Labels, unknown: Bool[np.ndarray, " N"], spacing: float
 ) -> Labels:
     """Labels in which Gaussians that have no feature and that no view shows take the label of their neighbors.
 
@@ -532,7 +564,7 @@ def labels_of_hidden(
     labeled = np.flatnonzero(~unknown)
     if not len(rows) or not len(labeled):
         return labels
-    points = gaussians.means.astype(np.float64)
+    points = means.astype(np.float64)
     distances, nearest = cKDTree(points[labeled]).query(points[rows], k=min(NEIGHBORS, len(labeled)))
     distances, nearest = distances.reshape(len(rows), -1), nearest.reshape(len(rows), -1)
     agreeing = (labels[labeled[nearest]] == possible[rows][:, None]).mean(axis=1)
@@ -540,132 +572,3 @@ def labels_of_hidden(
     agrees = (agreeing > 0.5) & (distances[:, 0] <= 2 * spacing)
     corrected[rows] = np.where(agrees, possible[rows], 0)
     return corrected
-
-
-def grow(
-    gaussians: Gaussians,
-    features: GaussianFeatures,
-    cameras: Cameras | None,
-    parts: Parts,
-    relevancy: Float32[np.ndarray, "Q N"],
-    config: SelectConfig,
-    spacing: float,
-    *,
-    track: Track = untracked,
-) -> tuple[Labels, int]:
-    """The labels of all Gaussians, and the number of views that corrected them.
-
-    Args:
-        features: of the space in which the words were asked.
-        cameras: of the views that correct the labels; None = features and positions alone decide.
-        parts: what each word's selection starts with.
-        spacing: of the scene, world units.
-    """
-    candidates = labels_by_features(gaussians, features, parts, relevancy, config, spacing)
-    labels = candidates.labels
-    unknown = ~features.seen
-    view_count = 0
-    if cameras is not None and config.views:
-        chosen = sampling(cameras, views=config.views, pixels=config.pixels)
-        by_pixels = votes(gaussians, cameras, labels, len(parts), chosen, spacing=spacing, track=track)
-        labels = labels_by_pixels(candidates, features.seen, by_pixels, config)
-        unknown = unknown & (by_pixels.present.sum(axis=1) + by_pixels.removed.sum(axis=1) == 0)
-        view_count = len(chosen.views)
-    return labels_of_hidden(gaussians, labels, candidates.possible, unknown, spacing), view_count
-
-
-MOST_WORDS = 64
-"""Words that are selected at once; each needs a column of a pixel map and of a table of the Gaussians."""
-
-
-def select(
-    scene: Scene,
-    words: Sequence[str],
-    text: TextEncoder,
-    config: SelectConfig = SelectConfig(),
-    *,
-    boxes: Sequence[int] = (),
-    threshold: float | None = None,
-    localization: LocalizeConfig = LocalizeConfig(),
-    track: Track = untracked,
-) -> tuple[Selection, Localization]:
-    """Gives each Gaussian a word or none.
-
-    A selection starts with the Gaussians of the boxes of each word (`gsencoder.infer.localize.localize`), or
-    with all that reach `threshold`. It grows, or shrinks, to the Gaussians around these whose features are more of the
-    object than of its surroundings (`gsencoder.infer.select`), and is corrected by the pixels on which the
-    blending weight of Gaussians falls, in the cameras of the scene (`gsencoder.infer.select`). A splat without
-    views is looked at by cameras that are placed around or inside it.
-
-    Args:
-        scene: Gaussians with one feature set, or several of which one is of the space of `text`.
-        text: turns words into the features' space.
-        boxes: numbers of the boxes of each word, best first from 0; empty = the most probable, and those that are
-            nearly as probable.
-
-    Returns:
-        The selection, and the boxes that it started from.
-    """
-    if boxes and threshold is not None:
-        raise InputError("box= and threshold= are two ways to choose where a selection starts; give one of them")
-    if len(words) > MOST_WORDS:
-        raise InputError(f"query: expected at most {MOST_WORDS} words to select, got {len(words)}")
-    localized = localize(scene, words, text, localization)
-    _check_distinct(words, text)
-    gaussians, features = select_features(scene, None)
-    if threshold is None:
-        parts = box_parts(localized, boxes, probable=config.probable)
-    else:
-        parts = threshold_parts(words, localized.relevancy, threshold)
-    seeds = labels = labels_of_parts(parts, localized.relevancy)
-    view_count, placed = 0, False
-    if config.grow and labels.any():
-        # A part keeps what no other word took from it.
-        parts = tuple(
-            tuple(remaining for rows in groups if len(remaining := rows[labels[rows] == number + 1]))
-            for number, groups in enumerate(parts)
-        )
-        seen_by, placed = _with_cameras(scene, config)
-        cameras = None if seen_by.views is None else seen_by.views.cameras
-        spacing = scene_spacing(gaussians.means) or float(np.median(gaussians.scales))
-        labels, view_count = grow(
-            gaussians, features, cameras, parts, localized.relevancy, config, spacing, track=track
-        )
-    _check_some(scene, localized, labels)
-    return Selection(words=tuple(words), labels=labels, seeds=seeds, views=view_count, placed=placed), localized
-
-
-def _check_distinct(words: Sequence[str], text: TextEncoder) -> None:
-    """Refuses words with one vector, such as "chair" and "Chair": the first would take all Gaussians of both."""
-    first: dict[bytes, str] = {}
-    for word, vector in zip(words, text.encode(words), strict=True):
-        other = first.setdefault(vector.tobytes(), word)
-        if other != word:
-            raise InputError(f"query: {other!r} and {word!r} stand for the same vector; give one of them")
-
-
-def _with_cameras(scene: Scene, config: SelectConfig) -> tuple[Scene, bool]:
-    if scene.views is not None or not config.views:
-        return scene, False
-    warnings.warn(
-        f"scene {scene.name} has no views; the selection is checked from {config.orbits} cameras around or inside it, "
-        "which may not see what real photographs would",
-        SceneWarning,
-        stacklevel=4,
-    )
-    return with_views(replace(scene, features={}), config.orbits), True
-
-
-def _check_some(scene: Scene, localized: Localization, labels: np.ndarray) -> None:
-    if labels.all():
-        raise InputError(
-            f"select: every one of the {len(labels):,} Gaussians of {scene.name} is selected, so nothing is left; give "
-            "a higher threshold= or fewer words"
-        )
-    if not labels.any():
-        listing = ", ".join(f"{word!r} (probability {value:.2f})" for word, value in localized.absent.items())
-        raise InputError(
-            f"select: no Gaussian of {scene.name} is selected; absent: {listing}"
-            if listing
-            else f"select: no Gaussian of {scene.name} is selected; lower select.share or give select.grow=false"
-        )

@@ -14,7 +14,7 @@ from gsencoder.infer import localize as module
 from gsencoder.infer.draw import EDGES, box_corners, write_boxes_ply
 from gsencoder.infer.localize import LocalizeConfig, localization_to_json, localize, spacing_of
 from gsencoder.infer.relevancy import ThresholdConfig
-from gsencoder.text.table import TextEncoder, TextTable, make_text_table
+from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import Box, FeatureBasis, GaussianFeatures, Gaussians, Localization, Scene
 
 WORDS = ("mug", "chair", "lamp", "spoon", "rug", "door")
@@ -97,18 +97,7 @@ def test_every_object_of_a_name_has_a_box_and_ranks_count_up(monkeypatch: pytest
 def test_words_asked_together_are_found_as_they_are_one_by_one() -> None:
     together = localize(SCENE, ["mug", "chair", "lamp"], TABLE)
     alone = [box for word in together.queries for box in localize(SCENE, [word], TABLE).boxes]
-    assert localization_to_json(together) == [
-        json.loads(json.dumps(one))
-        for one in localization_to_json(
-            Localization(
-                queries=together.queries,
-                relevancy=together.relevancy,
-                thresholds=together.thresholds,
-                probabilities=together.probabilities,
-                boxes=tuple(alone),
-            )
-        )
-    ]
+    assert localization_to_json(together) == localization_to_json(replace(together, boxes=tuple(alone)))
 
 
 def test_a_spacing_that_was_computed_before_gives_the_same_boxes() -> None:
@@ -166,9 +155,9 @@ def test_a_scene_that_nothing_saw_has_no_boxes() -> None:
     assert np.isnan(localization.thresholds).all()
 
 
-@pytest.mark.parametrize("kind", ["relative", "quantile", "otsu"])
+@pytest.mark.parametrize("kind", ["relative", "otsu"])
 def test_every_kind_of_threshold_finds_the_chairs(kind: str) -> None:
-    config = LocalizeConfig(threshold=ThresholdConfig(kind=kind, quantile=0.9))
+    config = LocalizeConfig(threshold=ThresholdConfig(kind=kind))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", SceneWarning)
         localization = localize(SCENE, ["chair"], TABLE, config)
@@ -179,7 +168,7 @@ def test_contrast_finds_words_and_counts_the_negative_words_that_the_table_lacks
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     config = LocalizeConfig(contrast=True, threshold=ThresholdConfig(kind="fixed", fixed=0.8))
-    with pytest.warns(SceneWarning, match="4 of 4 negative words are unknown to toy .*the mean of its words stands"):
+    with pytest.warns(SceneWarning, match="negative words that toy does not know .*the mean of its words stands"):
         localization = localize(SCENE, ["mug", "lamp"], TABLE, config)
     assert np.linalg.norm(first(localization, "mug").center - PLACES["mug"][0]) < 0.02
     assert np.nanmin(localization.relevancy) >= 0
@@ -222,24 +211,6 @@ def test_of_several_feature_sets_one_must_be_named() -> None:
     with pytest.raises(InputError, match="none of 'c'"):
         localize(both, ["mug"], TABLE, space="c")
     assert len(localize(both, ["mug"], TABLE, space="b").boxes) == 1
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"eps": 0.0},
-        {"eps_spacings": -1.0},
-        {"min_probability": 2.0},
-        {"temperature": 0.0},
-    ],
-)
-def test_settings_out_of_range_are_named(wrong: dict[str, float]) -> None:
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        LocalizeConfig(**wrong)
-
-
-def test_a_text_table_is_a_text_encoder() -> None:
-    assert isinstance(TABLE, TextEncoder)
 
 
 def test_json_holds_what_the_boxes_hold() -> None:

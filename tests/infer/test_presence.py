@@ -13,6 +13,7 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.infer import localize as module
 from gsencoder.infer.localize import (
     LocalizeConfig,
+    WordCandidates,
     find_candidates,
     localization_to_json,
     localize,
@@ -21,7 +22,6 @@ from gsencoder.infer.localize import (
 )
 from gsencoder.infer.relevancy import (
     LEAST_ATTAINABLE,
-    SYNONYM,
     TRAINED,
     UNTRAINED,
     WITH_RIVALS,
@@ -33,7 +33,7 @@ from gsencoder.infer.relevancy import (
     probability,
     relevancy,
 )
-from gsencoder.text.table import TextTable, make_text_table
+from gsencoder.text.table import TextEncoder, TextTable, make_text_table
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, Localization, Scene
 
 WORDS = ("mug", "cup", "chair", "lamp", "spoon")
@@ -104,6 +104,12 @@ def quietly(scene: Scene, words: Sequence[str], *arguments: object, **named: obj
         return localize(scene, words, *arguments, **named)  # type: ignore[arg-type]
 
 
+def candidates_of(
+    words: list[str], text: TextEncoder, config: LocalizeConfig = EVERYTHING, rivals: TextTable | None = None
+) -> list[WordCandidates]:
+    return find_candidates(SCENE.gaussians, SCENE.features["toy"], words, text, config, rivals=rivals)[1]  # type: ignore[arg-type]
+
+
 def plain_evidence(
     features: GaussianFeatures, word: str, rows: np.ndarray, names: Sequence[str]
 ) -> tuple[float, float]:
@@ -136,35 +142,10 @@ def test_the_evidence_equals_that_of_decoded_features(basis: bool) -> None:
     assert (evidence.size, evidence.share) == (pytest.approx(math.log10(125)), 0.25)
 
 
-def test_words_that_mean_nearly_the_same_are_no_rivals() -> None:
-    directions = TABLE.embeddings - TABLE.mean
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    assert directions[0] @ directions[1] > SYNONYM
-    for word in ("mug", "cup"):
-        assert quietly(SCENE, [word], TABLE).boxes[0].probability > 0.5
-
-
 def test_a_word_that_fits_better_than_its_rivals_is_more_probable() -> None:
     evidence = Evidence(mean=0.5, margin=0.0, prominence=2.0, size=2.0, share=1.0)
     values = [probability(replace(evidence, margin=margin)) for margin in (-0.5, -0.1, 0.1, 0.5)]
     assert (np.diff(values) > 0).all()
-
-
-def test_probabilities_stay_in_their_range_whatever_the_evidence() -> None:
-    for value in (-1e300, 1e300):
-        for margin in (None, value):
-            evidence = Evidence(mean=value, margin=margin, prominence=0.0, size=0.0, share=0.0)
-            assert 0 <= probability(evidence) <= 1
-
-
-def test_the_model_is_the_logistic_function_of_its_coefficients() -> None:
-    evidence = Evidence(mean=0.3, margin=0.1, prominence=1.0, size=1.5, share=0.7)
-    for coefficients, margin in ((WITH_RIVALS, 0.1), (WITHOUT_RIVALS, None)):
-        logit = coefficients["intercept"] + sum(
-            coefficients.get(name, 0.0) * getattr(evidence, name)
-            for name in ("mean", "margin", "prominence", "size", "share")
-        )
-        assert probability(replace(evidence, margin=margin)) == pytest.approx(1 / (1 + math.exp(-logit)))
 
 
 def test_a_word_that_another_answers_better_is_absent_and_boxed_only_when_everything_is() -> None:
@@ -190,21 +171,6 @@ def test_the_probability_of_a_word_is_that_of_its_most_probable_box() -> None:
     assert all(0 <= each["probability"] <= 1 for each in localization_to_json(localization))
 
 
-def test_ranks_count_the_boxes_that_are_left() -> None:
-    everything = quietly(SCENE, ["chair"], TABLE, EVERYTHING)
-    values = sorted({box.probability for box in everything.boxes})
-    localization = quietly(SCENE, ["chair"], TABLE, LocalizeConfig(min_probability=float(values[-1])))
-    assert [box.rank for box in localization.boxes] == list(range(len(localization.boxes)))
-    assert len(localization.boxes) < len(everything.boxes) or len(values) == 1
-
-
-def test_a_scene_without_seen_gaussians_has_no_word() -> None:
-    fused = SCENE.features["toy"]
-    blind = replace(SCENE, features={"toy": replace(fused, weights=np.zeros_like(fused.weights))})
-    localization = quietly(blind, ["mug"], TABLE, EVERYTHING)
-    assert localization.absent == {"mug": 0.0}
-
-
 def test_a_text_encoder_without_names_gives_probabilities_too() -> None:
     localization = quietly(SCENE, ["mug", "spoon"], Phrases())
     assert localization.boxes[0].query == "mug"
@@ -224,7 +190,7 @@ def test_evidence_is_of_cosines_however_relevancy_is_scored(monkeypatch: pytest.
     monkeypatch.setattr(module, "NEGATIVES", ("lamp", "chair"))
     fixed = ThresholdConfig(kind="fixed", fixed=0.7)
     plain, contrast = (
-        find_candidates(SCENE, ["mug"], TABLE, LocalizeConfig(contrast=contrast, threshold=fixed))[1][0]
+        candidates_of(["mug"], TABLE, LocalizeConfig(contrast=contrast, threshold=fixed))[0]
         for contrast in (False, True)
     )
     np.testing.assert_array_equal(plain.clusters[0].rows, contrast.clusters[0].rows)
@@ -254,17 +220,23 @@ def test_words_that_an_encoder_was_trained_on_and_others_have_coefficients_of_th
     # What is better called otherwise is absent if it is a name trained on, and else may be there.
     assert values[True] < values[None] < values[False]
     # Without rivals nothing tells trained words from others.
-    assert probability(replace(evidence, margin=None, trained=False)) == probability(replace(evidence, margin=None))
+    alone = replace(evidence, margin=None)
+    assert probability(replace(alone, trained=False)) == probability(alone)
+    logit = WITHOUT_RIVALS["intercept"] + sum(
+        WITHOUT_RIVALS[name] * getattr(alone, name) for name in ("mean", "prominence", "size", "share")
+    )
+    assert probability(alone) == pytest.approx(1 / (1 + math.exp(-logit)))
+    assert 0 <= probability(replace(alone, mean=-1e300)) < probability(replace(alone, mean=1e300)) <= 1
 
 
 def test_the_vocabulary_states_which_words_the_encoder_was_trained_on() -> None:
     trained = replace(TABLE, trained=("mug", "chair"))
     words = ["mugs", "spoon", "chair"]
     for table, stated in ((trained, [True, False, True]), (TABLE, [None, None, None])):
-        candidates = find_candidates(SCENE, words, table, EVERYTHING)[1]
+        candidates = candidates_of(words, table)
         assert [{each.trained for each in word.evidence} for word in candidates] == [{each} for each in stated]
     # Rivals that are given have the last word, as they say what else there is.
-    against_rivals = find_candidates(SCENE, words, Phrases(), EVERYTHING, rivals=trained)[1]
+    against_rivals = candidates_of(words, Phrases(), rivals=trained)
     assert against_rivals[1].evidence[0].trained is False
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from selected_rooms import MUG, SPACE, permuted, selected_room, splat_of, with_more, words
+from selected_rooms import MUG, SPACE, permuted, selected_room, with_more, words
 
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.infer.select import (
@@ -19,7 +19,7 @@ from gsencoder.infer.select import (
     labels_of_hidden,
     select,
 )
-from gsencoder.types import GaussianFeatures, Gaussians, Scene, Views
+from gsencoder.types import GaussianFeatures, Scene, Views
 
 USUAL = (1.0, 10.0, 10.0, 10.0, 100.0)
 """Weight of the Gaussians of an object on its pixels; their median is 10."""
@@ -40,7 +40,7 @@ def label_of(
         removed=np.array([*((0.0, 0.0) for _ in USUAL), removed], np.float32),
     )
     known = np.array([True] * len(USUAL) + [seen])
-    labels = labels_by_pixels(candidates, known, votes, SelectConfig(share=0.5, only=0.9))
+    labels = labels_by_pixels(candidates, known, votes, SelectConfig())
     assert (labels[:-1] == 1).all()
     return int(labels[-1])
 
@@ -94,14 +94,6 @@ def test_without_a_feature_more_than_half_of_the_weight_decides(
     assert label_of(label, NO_SHARE, seen=False, present=present, removed=removed) == expected
 
 
-def test_without_any_label_that_is_possible_pixels_change_nothing() -> None:
-    none = np.zeros(3, np.int32)
-    candidates = Candidates(labels=none, possible=none, shares=np.full(3, -np.inf))
-    weights = np.ones((3, 2), np.float32)
-    made = labels_by_pixels(candidates, np.ones(3, bool), Votes(present=weights, removed=weights), SelectConfig())
-    assert (made == 0).all()
-
-
 def line(count: int) -> np.ndarray:
     return np.arange(count, dtype=np.float64)[:, None] * [1.0, 0.0, 0.0]
 
@@ -110,7 +102,7 @@ def hidden(places: np.ndarray, labels: list[int], possible: list[int], unknown: 
     """Labels of Gaussians with a spacing of 1, of which those of `unknown` are hidden."""
     mask = np.isin(np.arange(len(labels)), unknown)
     made = labels_of_hidden(
-        splat_of(places), np.array(labels, np.int32), np.array(possible, np.int32), mask, spacing=1.0
+        places.astype(np.float32), np.array(labels, np.int32), np.array(possible, np.int32), mask, spacing=1.0
     )
     return [int(label) for label in made]
 
@@ -157,9 +149,9 @@ def features_of(vectors: np.ndarray, seen: np.ndarray | None = None) -> Gaussian
 def by_features(
     places: np.ndarray, features: GaussianFeatures, parts: Parts, relevancy: np.ndarray, **settings: float
 ) -> tuple[Labels, Labels]:
-    gaussians: Gaussians = splat_of(places)
     config = SelectConfig(**settings)  # type: ignore[arg-type]
-    made = labels_by_features(gaussians, features, parts, relevancy.astype(np.float32), config, 1.0)
+    means = places.astype(np.float32)
+    made = labels_by_features(features, means, parts, relevancy.astype(np.float32), config, 1.0)
     return made.labels, made.possible
 
 

@@ -7,7 +7,7 @@ import pytest
 from selected_rooms import selected_room, splat_of
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.select import find_holes, sampling
+from gsencoder.infer.select import find_holes, sample_views
 from gsencoder.types import Cameras, Gaussians
 
 SIDE = np.arange(-0.2, 0.2001, 0.01)
@@ -31,7 +31,7 @@ TAKEN = SQUARE[:, 0] > -0.199
 def test_a_hole_is_what_was_opaque_and_is_not_with_its_area_at_the_depth_that_it_had() -> None:
     wall = np.stack([*np.meshgrid(SIDE * 6, SIDE * 6), np.full((41, 41), -0.5)], axis=-1).reshape(-1, 3)
     camera = above(1.0)
-    every = sampling(camera, views=1, pixels=10_000)
+    every = sample_views(camera, 1)
     (hole,) = find_holes(square_splat(), camera, TAKEN, every)
     # Seen from above, 0.4 × 0.4 units; the Gaussians at the edge reach a little beyond.
     assert hole.area == pytest.approx(0.16, rel=0.1)
@@ -53,15 +53,15 @@ def test_the_area_of_a_hole_does_not_depend_on_the_camera_and_its_pixels_do(heig
     Ks = camera.Ks.copy()
     Ks[:, 1, 1] *= stretch
     camera = replace(camera, Ks=Ks)
-    (hole,) = find_holes(square_splat(), camera, TAKEN, sampling(camera, views=1, pixels=10_000))
+    (hole,) = find_holes(square_splat(), camera, TAKEN, sample_views(camera, 1))
     assert hole.area == pytest.approx(0.16, rel=0.12)
     assert hole.pixels == pytest.approx(1600 / height**2 * stretch, rel=0.12)
 
 
 def test_a_hole_is_as_large_where_every_third_pixel_is_looked_at() -> None:
     camera = above(1.0)
-    sparse = sampling(camera, views=1, pixels=1000)
-    assert sparse.stride(camera, 0) == 3
+    sparse = sample_views(camera, 1, 1000)
+    assert sparse == [(0, 3)]
     (hole,) = find_holes(square_splat(), camera, TAKEN, sparse)
     assert hole.area == pytest.approx(0.16, rel=0.15)
     assert hole.pixels == pytest.approx(1600, rel=0.15)
@@ -76,7 +76,7 @@ def test_holes_have_the_numbers_of_their_views_and_views_without_the_object_have
         widths=np.concatenate([away.widths, down.widths]),
         heights=np.concatenate([away.heights, down.heights]),
     )
-    holes = find_holes(square_splat(), cameras, TAKEN, sampling(cameras, views=3, pixels=10_000))
+    holes = find_holes(square_splat(), cameras, TAKEN, sample_views(cameras, 3))
     assert [hole.view for hole in holes] == [1, 2]
 
 
@@ -88,7 +88,7 @@ def test_a_pixel_is_of_what_more_than_half_of_its_opacity_is_of(
     gaussians = splat_of(np.array([[0.0, 0.0, 0.1], [0.0, 0.0, 0.0]]), np.float32(opacities))
     gaussians = replace(gaussians, scales=np.full((2, 3), (2.0, 2.0, 0.01), np.float32))
     camera = above(1.0)
-    holes = find_holes(gaussians, camera, np.array([True, False]), sampling(camera, views=1, pixels=10_000))
+    holes = find_holes(gaussians, camera, np.array([True, False]), sample_views(camera, 1))
     if opens:
         assert holes[0].pixels > 1000
     else:
@@ -103,7 +103,7 @@ def test_a_mug_on_a_table_that_ends_below_it_leaves_a_hole() -> None:
     assert open_table.views is not None
     assert closed_table.gaussians is not None
     cameras = open_table.views.cameras
-    every = sampling(cameras, views=8, pixels=10_000)
+    every = sample_views(cameras, 8)
     holes = find_holes(open_table.gaussians, cameras, kinds == 0, every)
     assert sum(hole.pixels for hole in holes) > 100
     closed = find_holes(closed_table.gaussians, cameras, closed_kinds == 0, every)

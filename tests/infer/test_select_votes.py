@@ -7,7 +7,7 @@ import pytest
 from selected_rooms import splat_of
 
 from gsencoder.data.orbits import looking_cameras
-from gsencoder.infer.select import Votes, sampling, votes
+from gsencoder.infer.select import Votes, sample_views, votes
 from gsencoder.types import Cameras, Gaussians
 
 
@@ -26,8 +26,8 @@ def sheets(*heights: float, opacities: tuple[float, ...]) -> Gaussians:
 
 def voted(gaussians: Gaussians, labels: list[int], *, spacing: float, pixels: int = 10_000) -> Votes:
     camera = above()
-    chosen = sampling(camera, views=1, pixels=pixels)
-    return votes(gaussians, camera, np.array(labels, np.int32), max(labels), chosen, spacing=spacing)
+    samples = sample_views(camera, 1, pixels)
+    return votes(gaussians, camera, np.array(labels, np.int32), max(labels), samples, spacing=spacing)
 
 
 @pytest.mark.parametrize(
@@ -35,20 +35,12 @@ def voted(gaussians: Gaussians, labels: list[int], *, spacing: float, pixels: in
     [((200, 50), 10_000, 1), ((200, 50), 9_999, 2), ((200, 50), 2_500, 2), ((50, 200), 2_400, 3), ((8, 8), 10**6, 1)],
 )
 def test_no_more_pixels_than_asked_for_are_looked_at(size: tuple[int, int], pixels: int, stride: int) -> None:
-    assert sampling(above(*size), views=1, pixels=pixels).stride(above(*size), 0) == stride
+    assert sample_views(above(*size), 1, pixels) == [(0, stride)]
 
 
-def test_views_are_evenly_spaced_and_all_where_there_are_fewer() -> None:
-    one = above()
-    many = Cameras(
-        cam_from_world=np.repeat(one.cam_from_world, 9, axis=0),
-        Ks=np.repeat(one.Ks, 9, axis=0),
-        widths=np.repeat(one.widths, 9),
-        heights=np.repeat(one.heights, 9),
-    )
-    assert sampling(many, views=3, pixels=1).views == (0, 4, 8)
-    assert sampling(many, views=20, pixels=1).views == tuple(range(9))
-    assert sampling(many, views=0, pixels=1).views == ()
+@pytest.mark.parametrize(("views", "rows"), [(3, [0, 4, 8]), (20, [*range(9)]), (0, [])])
+def test_views_are_evenly_spaced_and_all_where_there_are_fewer(views: int, rows: list[int]) -> None:
+    assert [view for view, _ in sample_views(above().select([0] * 9), views)] == rows
 
 
 def test_a_faint_gaussian_alone_has_its_pixels_and_all_its_weight_on_them() -> None:

@@ -80,7 +80,7 @@ def test_words_of_a_text_tower_are_compared_with_outputs_of_the_summary_head(
         head_scene,
         ["mug"],
         table,
-        LocalizeConfig(min_probability=0.0, threshold=ThresholdConfig(kind="quantile", quantile=0.9)),
+        LocalizeConfig(min_probability=0.0, threshold=ThresholdConfig(kind="relative")),
     )
     np.testing.assert_allclose(made.relevancy[0][features.seen], cosines[features.seen], atol=1e-4)
 

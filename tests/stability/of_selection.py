@@ -13,6 +13,7 @@ from stability.registry import routine
 from gsencoder.infer import localize as clusters_module
 from gsencoder.infer.localize import cluster, score_clusters
 from gsencoder.infer.relevancy import (
+    NOISE,
     SMALLEST_SPREAD,
     WITHOUT_RIVALS,
     Cluster,
@@ -69,7 +70,7 @@ def threshold_error(case: Case) -> float:
     median = np.sort(wide)[[(len(wide) - 1) // 2, len(wide) // 2]].mean()
     away = np.sort(np.abs(wide - median))
     spread = Wide("1.4826") * away[[(len(away) - 1) // 2, len(away) // 2]].mean()
-    want = min(Wide(config.fixed), max(Wide(config.relative) * wide.max(), median + config.noise * spread))
+    want = min(Wide(config.fixed), max(Wide(config.relative) * wide.max(), median + NOISE * spread))
     return float(abs(threshold(scores, config) - want) / np.abs(wide).max())
 
 

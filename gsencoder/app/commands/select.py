@@ -16,7 +16,7 @@ from gsencoder.data.splats.files import save_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, describe_absent, words_to_json
-from gsencoder.infer.select import SelectConfig, Selection, find_holes, sampling, select
+from gsencoder.infer.select import SelectConfig, Selection, find_holes, sample_views, select
 from gsencoder.infer.select_files import LABELS_JSON, LABELS_PLY, file_stems, labels_to_json, write_labels
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Scene
@@ -116,11 +116,11 @@ def _holes(scene: Scene, selection: Selection, config: SelectConfig, track: Prog
     """The holes of each view that has one, and of all views together, as JSON values."""
     assert scene.gaussians is not None
     assert scene.views is not None
-    samples = sampling(scene.views.cameras, views=config.views, pixels=config.pixels)
+    samples = sample_views(scene.views.cameras, config.views)
     holes = find_holes(scene.gaussians, scene.views.cameras, ~selection.rest, samples, track=track)
     rows = [asdict(hole) | {"view": scene.views.names[hole.view]} for hole in holes if hole.pixels]
     return {
-        "views": len(samples.views),
+        "views": len(samples),
         "views_with_objects": len(holes),
         "views_with_holes": len(rows),
         "pixels": sum(hole.pixels for hole in holes),

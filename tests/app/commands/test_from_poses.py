@@ -38,7 +38,7 @@ def asked_scene(count: int = 200) -> Scene:
     [
         LocalizeConfig(mode="raw"),
         LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.99)),
-        LocalizeConfig(threshold=ThresholdConfig(kind="quantile", quantile=0.5)),
+        LocalizeConfig(threshold=ThresholdConfig(kind="otsu")),
     ],
 )
 def test_points_are_those_of_the_mode_and_the_threshold_that_are_asked_for(config: LocalizeConfig) -> None:

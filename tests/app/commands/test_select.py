@@ -118,12 +118,13 @@ def test_packages_and_memories_are_selected_from_like_features(features: Path, t
 
 
 def test_a_bare_splat_is_selected_from_with_a_warning(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bare = tmp_path / "bare"
     save_features(bare, replace(SCENE, views=None), SCENE.features["names"], {})
     save_text_table(bare / WORDS_FILE, words())
-    run(bare, tmp_path / "out", "query=mug", "select.orbits=4")
+    monkeypatch.setattr("gsencoder.infer.select.ORBITS", 4)
+    run(bare, tmp_path / "out", "query=mug")
     assert "has no views" in capsys.readouterr().err
     assert results_of(tmp_path / "out")["placed_cameras"] is True
     assert "holes.json" not in names_in(tmp_path / "out")

@@ -13,7 +13,7 @@ from gsencoder.app import main as cli
 from gsencoder.data.splats.files import load_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
-from gsencoder.infer.select import find_holes, sampling, select
+from gsencoder.infer.select import find_holes, sample_views, select
 from gsencoder.infer.select_files import read_labels
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.types import Scene
@@ -80,7 +80,7 @@ def test_holes_are_those_of_the_objects_in_each_view(
     assert scene.views is not None
     selection, _ = select(scene, ("mug",), words())
     cameras = scene.views.cameras
-    holes = find_holes(scene.gaussians, cameras, selection.labels > 0, sampling(cameras, views=48, pixels=100_000))
+    holes = find_holes(scene.gaussians, cameras, selection.labels > 0, sample_views(cameras, 48))
     removed, pixels = sum(hole.removed for hole in holes), sum(hole.pixels for hole in holes)
     assert made == {
         "views": 8, "views_with_objects": len(holes), "views_with_holes": sum(hole.pixels > 0 for hole in holes),
