@@ -1,8 +1,14 @@
-"""A textured wall and what cameras see of it, that tests of reconstruction stand on."""
+"""A textured wall, what cameras see of it, and optimizations on it, that tests of reconstruction stand on."""
+
+from typing import Any
 
 import numpy as np
 
-from gsencoder.types import Cameras, Views
+from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.seed import seed_from_depth
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import RowAdam, parameters_from
+from gsencoder.types import Cameras, Gaussians, Views
 
 DEPTH, TILT = 3.0, 0.3
 """The wall is z = DEPTH + TILT·x in the world of the first camera."""
@@ -50,3 +56,20 @@ def wall_points(count: int = 40) -> np.ndarray:
     made = np.random.default_rng(1)
     x, y = made.uniform(-2.2, 3.2, count), made.uniform(-1.8, 1.8, count)
     return np.stack([x, y, DEPTH + TILT * x], axis=1).astype(np.float32)
+
+
+NEVER = PruneConfig(at=())
+
+
+def wall_optimizer(
+    config: OptimizeConfig,
+    start: Gaussians | float = 0.1,
+    views: Views | None = None,
+    training: tuple[int, ...] = (0, 1, 3),
+    **options: Any,
+) -> Optimizer:
+    """An optimization before its first step; `start` is a splat, or the voxels of seeds on the wall."""
+    gaussians = seed_from_depth(wall_views(depth=True), voxel=start) if isinstance(start, float) else start
+    photographs = Photographs(views or wall_views(depth=True))
+    adam = RowAdam(parameters_from(gaussians, config.sh_degree))
+    return Optimizer(adam, photographs, training, config, **{"prune": NEVER, **options})

@@ -1,4 +1,4 @@
-"""Optimization of a splat against photographs: L1 + D-SSIM, a depth loss where depth was measured, pruning, no
+"""Optimization of a splat against photographs: L1 + D-SSIM, a depth loss where depth was measured, pruning, and no
 densification.
 """
 
@@ -16,13 +16,17 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.process import defer_signals
 from gsencoder.core.settings import check_limits, option
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
-from gsencoder.reconstruct.exposure import ROUNDS, Exposures, apply_colors, compared_pixels, fitted_colors
 from gsencoder.reconstruct.parameters import (
+    ROUNDS,
     Anchor,
+    Exposures,
     Parameters,
     RowAdam,
     State,
+    apply_colors,
     camera_of,
+    compared_pixels,
+    fitted_colors,
     gaussians_of,
     rows_in_view,
     seen_colors,
@@ -54,14 +58,9 @@ class OptimizeConfig:
     """Settings of the optimization of a splat."""
 
     steps: int = option(1500, "photographs looked at, one a step", ge=0)
-    earlier: tuple[int, ...] = option(
-        (),
-        "numbers of steps that were planned before, each with that of the step until which it was; written "
-        "by budget.seconds, whose splat they reproduce (results.budget in summary.json)",
-    )
     sh_degree: int = option(2, "how colors may depend on the direction, 0 to 3", ge=0, le=3)
     shrinks: tuple[int, ...] = option(
-        (2, 1), "photographs are made smaller so many times, one stage after the other", ge=1
+        (2, 1), "factors by which photographs are made smaller, one stage after the other", ge=1
     )
     shares: tuple[float, ...] = option((0.3, 0.7), "share of the steps of each of these stages")
     empty_weight: float = option(
@@ -69,7 +68,7 @@ class OptimizeConfig:
     )
     anchor_sigmas: float = option(
         0.4,
-        "Gaussians that begin on a measured surface (depth, mesh, tsdf) stay within about so many of their "
+        "Gaussians that begin on a measured surface (depth, mesh, tsdf) stay within about this many of their "
         "first standard deviations of there; 0 = they go where they like",
         ge=0,
         le=1e6,
@@ -83,55 +82,23 @@ class OptimizeConfig:
 
     def __post_init__(self) -> None:
         check_limits(self)
-        ends = (0, *self.earlier[1::2], self.steps)
-        follow = all(until < planned for planned, until in zip(self.earlier[::2], ends[1:], strict=False))
-        if self.earlier and (len(self.earlier) % 2 or not follow or sorted({*ends}) != [*ends]):
-            raise InputError(
-                f"earlier: expected numbers of steps, each with a later step before it, got {self.earlier}"
-            )
         if len(self.shrinks) != len(self.shares) or not self.shrinks:
             raise InputError(f"shrinks and shares: expected as many of each, got {self.shrinks} and {self.shares}")
         if not min(self.shares) >= 0 or not math.isclose(sum(self.shares), 1, abs_tol=1e-6):
             raise InputError(f"shares: expected numbers that add up to 1, got {self.shares}")
 
-    def _plan_at(self, step: int) -> tuple[int, int, float]:
-        """The number of steps that was planned at a step, when that plan began, and the share of the schedule that was
-        done then."""
-        begun, done = 0, 0.0
-        for planned, until in zip(self.earlier[::2], self.earlier[1::2], strict=True):
-            if step < until:
-                return planned, begun, done
-            done += (1 - done) * (until - begun) / (planned - begun)
-            begun = until
-        return self.steps, begun, done
-
-    def _place_of(self, step: int) -> tuple[float, int]:
-        """Where in the schedule of how many steps a step is: a plan stretches what the one before has left over all of
-        its own steps. It depends on the plans until then alone."""
-        planned, begun, done = self._plan_at(step)
-        return planned * (done + (1 - done) * (step - begun) / (planned - begun)) if begun else float(step), planned
-
-    def completes(self, share: float, step: int) -> bool:
-        """Whether a share of the schedule is done after so many steps, and was not before."""
-        planned, begun, done = self._plan_at(step - 1)
-        reached = round(begun + (share - done) / (1 - done) * (planned - begun))
-        return share > done and step == max(begun + 1, reached)
-
     def shrink_at(self, step: int) -> int:
         """Factor by which the photographs of a step are made smaller."""
-        place, steps = self._place_of(step)
-        ends = np.cumsum(self.shares) * steps
-        return self.shrinks[min(int(np.searchsorted(ends, place, side="right")), len(self.shrinks) - 1)]
+        ends = np.cumsum(self.shares) * self.steps
+        return self.shrinks[min(int(np.searchsorted(ends, step, side="right")), len(self.shrinks) - 1)]
 
     def degree_at(self, step: int) -> int:
         """Degree of the color coefficients that a step uses."""
-        place, steps = self._place_of(step)
-        return min(self.sh_degree, int(place / max(1.0, SH_EVERY * steps)))
+        return min(self.sh_degree, int(step / max(1.0, SH_EVERY * self.steps)))
 
     def rates_at(self, step: int, extent: float) -> dict[str, float]:
         """Learning rates of a step; that of the positions falls exponentially."""
-        place, steps = self._place_of(step)
-        return RATES | {"means": RATES["means"] * extent * FINAL_MEANS_RATE ** (place / max(1, steps))}
+        return RATES | {"means": RATES["means"] * extent * FINAL_MEANS_RATE ** (step / max(1, self.steps))}
 
 
 def losses_of(
@@ -143,14 +110,7 @@ def losses_of(
     empty_weight: float = 0.0,
 ) -> dict[str, Float[Tensor, ""]]:
     """(1 − λ)·L1 + λ·(1 − SSIM) over the pixels of the mask, the relative error of depth where it is known, and the
-    opacity where the photograph shows that nothing is there.
-
-    Args:
-        raster: a render of the view.
-        photo: the photograph, with its mask and depth.
-        ssim_weight: λ.
-        depth_weight: of the depth term.
-        empty_weight: of the opacity, which is summed as L1 is, per pixel of the mask.
+    opacity where the photograph shows that nothing is there, per pixel of the mask. `ssim_weight` is λ.
 
     Returns:
         The weighted terms by name; a term of weight 0 is left out, except L1.
@@ -189,15 +149,15 @@ class PruneConfig:
 
     at: tuple[float, ...] = option((0.3, 0.6, 0.9), "shares of the steps after which is pruned", gt=0, le=1)
     opacity: float = option(0.005, "opacities below are taken out", ge=0)
-    screen: float = option(1.0, "wider than so many times the picture's longer side in some view", ge=0)
-    contribution: float = option(0.1, "less than so many pixels' worth in every photograph, at its full size", ge=0)
+    screen: float = option(1.0, "wider than this many times the picture's longer side in some view", ge=0)
+    contribution: float = option(0.1, "less than this many pixels' worth in every photograph, at its full size", ge=0)
 
     def __post_init__(self) -> None:
         check_limits(self)
 
     def due(self, step: int, schedule: OptimizeConfig) -> bool:
-        """Whether is pruned after `step` steps; small shares are of the first step."""
-        return any(schedule.completes(share, step) for share in self.at)
+        """Whether the splat is pruned after `step` steps; small shares are of the first step."""
+        return step in {max(1, round(share * schedule.steps)) for share in self.at}
 
 
 def rows_to_keep(
@@ -215,12 +175,8 @@ def rows_to_keep(
     gradient of the sum of a picture in which every color is 1.
 
     Args:
-        raw: parameters.
-        cameras: of all views.
         views: photographs that count, at any size, gone through once.
-        config: settings.
-        raster: accuracy of rendering.
-        most: so many rows are left at most, those that contribute most to some view; None = no limit.
+        most: the most rows that are left, those that contribute most to some view; None = no limit.
 
     Raises:
         InputError: nothing would be left.
@@ -262,9 +218,9 @@ class PhotographGradients(NamedTuple):
     """Losses and gradients of a splat against one photograph.
 
     Attributes:
-        losses: the terms of the loss by name; none where no Gaussian is in view.
-        rows: rows of the Gaussians that may be visible.
-        grads: gradients of the loss with respect to these rows of each parameter.
+        losses: the terms of the loss; none where no Gaussian is in view.
+        rows: of the Gaussians that may be visible.
+        grads: with respect to these rows of each parameter.
         colors: the updated affine color map of the photograph; None where exposures are not fitted.
     """
 
@@ -318,15 +274,8 @@ class Optimizer:
         adam: the initial parameters, on the device to compute on.
         photographs: those of all views.
         training: numbers of the views that are fitted.
-        config: settings.
-        prune: which Gaussians are removed, and when.
-        raster: accuracy of rendering.
-        anchor: keeps positions near their seeds; None = positions are free.
         exposures: color maps [V, 3, 4] of a run that is continued; None = identities at step 0, no maps later.
         step: number of steps done.
-
-        Raises:
-            InputError: a photograph is too small, or no Gaussian is in view of any.
         """
         self.photographs, self.training, self.config = photographs, tuple(training), config
         self.pruning, self.raster = prune, raster
@@ -350,7 +299,6 @@ class Optimizer:
 
     @property
     def parameters(self) -> Parameters:
-        """The parameters by name, as `RowAdam` holds them."""
         return self.adam.parameters
 
     def view_at(self, step: int) -> int:
@@ -360,11 +308,7 @@ class Optimizer:
         return self.training[int(order[position])]
 
     def advance(self) -> dict[str, float]:
-        """Does one step; returns the terms of its loss.
-
-        Raises:
-            InputError: a loss or gradient is not finite; view and term are named.
-        """
+        """Does one step; returns the terms of its loss."""
         view = self.view_at(self.step)
         terms, rows, grads, colors = self.gradients(view, self.config.shrink_at(self.step))
         # A run cannot be resumed from a state in the middle of a step.
@@ -389,19 +333,19 @@ class Optimizer:
         return terms
 
     def gradients(self, view: int, shrink: int) -> PhotographGradients:
-        """The gradients of the next step if its photograph were that of a view; changes nothing.
-
-        Args:
-            view: number of a fitted photograph.
-            shrink: factor by which the photograph is made smaller.
+        """The gradients of the next step if its photograph were that of a view, made smaller by a factor; changes
+        nothing.
 
         Raises:
             InputError: a loss or gradient is not finite; view and term are named.
         """
-        photo = self.photographs.at_scale(view, shrink)
-        raster, rows, leaves, colors = self._render_exposed(view, photo)
+        photo, colors = self.photographs.at_scale(view, shrink), None
+        raster, rows, leaves = self._render(view, photo, self.config.degree_at(self.step))
         if not len(rows):
-            return PhotographGradients({}, rows, {}, colors)
+            return PhotographGradients({}, rows, {}, None)
+        if self.exposures is not None:
+            colors = self.exposures.moved(view, self._fitted_colors(raster, photo))
+            raster = raster._replace(rgb=apply_colors(raster.rgb, self.exposures.relative(view, colors)))
         losses = losses_of(raster, photo, empty_weight=self.config.empty_weight)
         total = torch.stack([*losses.values()]).sum()
         total.backward()
@@ -422,17 +366,6 @@ class Optimizer:
         raster = rasterize(*shape, seen_colors(leaves, degree, center), pose, K, *size, config=self.raster)
         return raster, rows, leaves
 
-    def _render_exposed(
-        self, view: int, photo: ScaledPhotograph
-    ) -> tuple[Raster, Int64[Tensor, " n"], Parameters, Float[Tensor, "3 4"] | None]:
-        """A view as the next step renders it, in the exposure of its photograph, and the color map of that exposure."""
-        raster, rows, leaves = self._render(view, photo, self.config.degree_at(self.step))
-        if self.exposures is None or not len(rows):
-            return raster, rows, leaves, None
-        colors = self.exposures.moved(view, self._fitted_colors(raster.rgb, raster.alpha, photo))
-        rgb = apply_colors(raster.rgb, self.exposures.relative(view, colors))
-        return raster._replace(rgb=rgb), rows, leaves, colors
-
     def _rows(self, pose: Float[Tensor, "4 4"], photo: ScaledPhotograph) -> Int64[Tensor, " n"]:
         """Rows of the Gaussians that may be visible in a view."""
         K, raster = photo.K.to(self.device), self.raster
@@ -452,11 +385,7 @@ class Optimizer:
                 )
 
     def contributing(self) -> Int64[Tensor, " n"]:
-        """Rows that pruning would leave now.
-
-        Raises:
-            InputError: pruning would leave no row.
-        """
+        """Rows that pruning would leave now."""
         views = ((view, self.photographs.at_scale(view, 2)) for view in self.training)
         return rows_to_keep(self.parameters, self.photographs.cameras, views, self.pruning, self.raster, most=self.most)
 
@@ -484,13 +413,12 @@ class Optimizer:
 
     @staticmethod
     @torch.no_grad()
-    def _fitted_colors(
-        rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W"], photo: ScaledPhotograph
-    ) -> Float[Tensor, "3 4"]:
-        return fitted_colors(rgb, photo.image.to(rgb.device), compared_pixels(alpha, photo.mask))
+    def _fitted_colors(raster: Raster, photo: ScaledPhotograph) -> Float[Tensor, "3 4"]:
+        image = photo.image.to(raster.rgb.device)
+        return fitted_colors(raster.rgb, image, compared_pixels(raster.alpha, photo.mask))
 
     def state(self, seconds: float, facts: Mapping[str, Any]) -> State:
-        """The state between two steps, as `State` has it."""
+        """The state between two steps."""
         return State(
             adam=self.adam,
             anchor=self.anchor,
@@ -506,15 +434,9 @@ class Optimizer:
 
     @torch.no_grad()
     def pictures(self, view: int, photo: ScaledPhotograph, colors: Float[Tensor, "3 4"]) -> Pictures:
-        """Renders of a view of the current splat, in [0, 1].
-
-        Args:
-            view: number of the view.
-            photo: its photograph.
-            colors: the color map of the exposure that it is expected to have.
-        """
+        """Renders of a view of the current splat, in [0, 1]; `colors` is the map of the exposure that is expected."""
         raster = self._render(view, photo, self.config.sh_degree)[0]
-        fitted = self._fitted_colors(raster.rgb, raster.alpha, photo)
+        fitted = self._fitted_colors(raster, photo)
         return Pictures(*(apply_colors(raster.rgb, color_map).clamp(0, 1).cpu() for color_map in (colors, fitted)))
 
     @torch.no_grad()

@@ -1,8 +1,9 @@
-"""The parameters that are optimized: a splat with logarithms of scales and logits of opacities."""
+"""What is optimized: a splat with logarithms of scales and logits of opacities, what holds its positions, the colors of
+each photograph; and their checkpoint."""
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,25 +22,12 @@ from gsencoder.geometry import colors_from_sh, normalize_quats, project_points, 
 from gsencoder.types import Cameras, Gaussians
 
 OPACITY_MARGIN = 1e-3
-"""Opacities begin at least so far from 0 and 1, where a logit has no slope."""
+"""Opacities begin at least this far from 0 and 1, where a logit has no slope."""
 MAX_SIGMAS = 3.33
-"""No splat reaches further than so many standard deviations: √(2 ln 255) at an opacity of 1."""
+"""No splat reaches further than this many standard deviations: √(2 ln 255) at an opacity of 1."""
 
 Parameters = dict[str, Tensor]
 """means [N, 3], quats [N, 4], log_scales [N, 3], logit_opacities [N], sh0 [N, 1, 3], shN [N, K − 1, 3], float32."""
-
-
-def shapes_of(sh_degree: int) -> dict[str, tuple[int, ...]]:
-    """The size of one row of each parameter."""
-    rest = (sh_degree + 1) ** 2 - 1
-    return {
-        "means": (3,),
-        "quats": (4,),
-        "log_scales": (3,),
-        "logit_opacities": (),
-        "sh0": (1, 3),
-        "shN": (rest, 3),
-    }
 
 
 def parameters_from(gaussians: Gaussians, sh_degree: int, device: torch.device | str = "cpu") -> Parameters:
@@ -132,6 +120,7 @@ class RowAdam:
     """Adam (Kingma & Ba 2015) over rows; as torch's SparseAdam, moments of rows that have no gradient do not decay.
 
     Attributes:
+        parameters: float32 tensors of N rows each, stepped in place.
         averages: first moments by parameter.
         squares: second moments by parameter.
         steps: steps that were taken.
@@ -140,9 +129,6 @@ class RowAdam:
     KINDS = ("parameters", "averages", "squares")
 
     def __init__(self, parameters: Mapping[str, Tensor]) -> None:
-        """Args:
-        parameters: float32 tensors of N rows each, stepped in place.
-        """
         self.parameters = dict(parameters)
         self.averages = {name: torch.zeros_like(value) for name, value in parameters.items()}
         self.squares = {name: torch.zeros_like(value) for name, value in parameters.items()}
@@ -150,7 +136,7 @@ class RowAdam:
 
     @classmethod
     def restored(cls, tables: Mapping[str, Mapping[str, Tensor]], steps: int) -> "RowAdam":
-        """One that stands where `tables` of another, and its steps, were taken."""
+        """One that goes on from the `tables` and steps of another."""
         restored = cls(tables["parameters"])
         restored.averages, restored.squares = dict(tables["averages"]), dict(tables["squares"])
         restored.steps = steps
@@ -161,13 +147,7 @@ class RowAdam:
         return dict(zip(self.KINDS, (self.parameters, self.averages, self.squares), strict=True))
 
     def step(self, rows: Int64[Tensor, " n"], grads: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
-        """One step.
-
-        Args:
-            rows: which rows have gradients; distinct.
-            grads: of those rows, by parameter.
-            rates: learning rate by parameter.
-        """
+        """One step of the rows that have gradients, which are distinct; `grads` are of these rows."""
         self.steps += 1
         first, second = (1 - beta**self.steps for beta in BETAS)
         for name, grad in grads.items():
@@ -204,14 +184,96 @@ class RowAdam:
                 table[name] = value[rows].contiguous()
 
 
+RIDGE = 1e-3
+"""Pull toward the identity, as a variance of colors in [0, 1]: what a picture does not vary in is not fitted."""
+STEP = 0.5
+"""Share of the way to the best fit that a map moves at each step of its photograph."""
+OPAQUE = 0.5
+"""Pixels of a render below this alpha show the background, and tell nothing."""
+SAME = 0.03
+"""Photographs of which no color channel differs by more from the mean do not count as differing in exposure."""
+ROUNDS = 3
+"""Number of steps of each photograph after which the maps, now seven eighths of the way to the fits, are judged."""
+
+IDENTITY = torch.eye(3, 4)
+
+
+class Exposures:
+    """An affine map of colors for each fitted photograph, relative to the mean of all: a camera that sets exposure and
+    white balance for every photograph shows one surface in several colors, which must not be explained by geometry or
+    by colors that depend on the direction.
+
+    The maps are not optimized by gradients, since each photograph is rendered too rarely for that: at each of its steps
+    its map moves halfway to the least-squares fit. What all maps have in common, such as the loss of contrast while the
+    splat is still blurred, is left to the splat: only the difference of a map from the mean of all is applied.
+
+    Attributes:
+        training: row numbers of the fitted photographs.
+        maps: of these in their order, [V, 3, 4]: a matrix and an offset.
+    """
+
+    def __init__(self, training: Sequence[int], maps: Float[Tensor, "V 3 4"] | None = None) -> None:
+        self.training = tuple(training)
+        self._rows = {view: row for row, view in enumerate(training)}
+        self.maps = IDENTITY.repeat(len(training), 1, 1) if maps is None else maps
+
+    def moved(self, view: int, fitted: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
+        """The map of a photograph, a step nearer to the one that fits; nothing changes."""
+        return self.maps[self._rows[view]].lerp(fitted, STEP)
+
+    def relative(self, view: int, moved: Float[Tensor, "3 4"]) -> Float[Tensor, "3 4"]:
+        """What is applied to a render of a photograph whose map is `moved`."""
+        current = self.maps[self._rows[view]]
+        return moved - (self.maps.sum(0) + moved - current) / len(self.maps) + IDENTITY
+
+    def set(self, view: int, moved: Float[Tensor, "3 4"]) -> None:
+        self.maps[self._rows[view]] = moved
+
+    def brightness(self) -> Float[Tensor, " V"]:
+        """How bright each photograph is, relative to their mean: what its map makes of a middle grey."""
+        return self._channels().mean(-1)
+
+    def differ(self) -> bool:
+        """Whether photographs differ in exposure or white balance."""
+        return float((self._channels() - 1).abs().max()) > SAME
+
+    def _channels(self) -> Float[Tensor, "V 3"]:
+        relative = self.maps - self.maps.mean(0) + IDENTITY
+        return (0.5 * relative[..., :3].sum(-1) + relative[..., 3]) / 0.5
+
+
+def fitted_colors(
+    render: Float[Tensor, "H W 3"], image: Float[Tensor, "H W 3"], mask: Bool[Tensor, "H W"]
+) -> Float[Tensor, "3 4"]:
+    """The affine map A·c + b of the render's colors that is nearest to the photograph's in a mask, by ridge regression:
+    A in the first three columns and b in the last, on the CPU; the identity where the mask is empty."""
+    weights = mask.unsqueeze(-1).to(render.dtype)
+    inputs = torch.cat((render, torch.ones_like(render[..., :1])), dim=-1) * weights
+    rows, residuals = inputs.flatten(0, 1), ((image - render) * weights).flatten(0, 1)
+    count = float(mask.sum().clamp(min=1))
+    gram, moments = ((rows.T @ other).double().cpu() / count for other in (rows, residuals))
+    change = torch.linalg.solve(gram + RIDGE * torch.eye(4, dtype=torch.float64), moments)
+    return IDENTITY + change.T.float()
+
+
+def apply_colors(colors: Float[Tensor, "H W 3"], affine: Float[Tensor, "3 4"]) -> Float[Tensor, "H W 3"]:
+    """A·c + b for each pixel."""
+    affine = affine.to(colors)
+    return colors @ affine[:, :3].T + affine[:, 3]
+
+
+def compared_pixels(alpha: Float[Tensor, "H W"], mask: Bool[Tensor, "H W"] | None) -> Bool[Tensor, "H W"]:
+    """Pixels whose colors are compared: what the splat covers and the mask leaves."""
+    covered = alpha > OPAQUE
+    return covered if mask is None else covered & mask.to(covered.device)
+
+
 CHECKPOINT_FILE = "reconstruction.safetensors"
 IMAGE_SCALE = "image_scale"
 """The setting that says by which factor a budget made the photographs smaller."""
-PLANNED_DEGREE = "sh_degree_planned"
-"""The fact that says up to which degree colors depend on the direction."""
+PLAN = "plan"
+"""The fact that holds the plan."""
 ANCHOR_SHAPES: dict[str, tuple[int | str, ...]] = {"means": ("N", 3), "reach": ("N",)}
-
-
 MIN_REACH = 1e-30
 """Smallest reach in world units: a reach of 0 would divide a learning rate of 0 by 0."""
 
@@ -258,8 +320,7 @@ class State:
             where photographs do not differ in exposure.
         step: steps that are done.
         seconds: that they took.
-        facts: how it began, as JSON values: number and source of the seeds, what was added to points, and what is
-            planned.
+        facts: how it began, as JSON values: number and source of the seeds, what was added to points, and the plan.
     """
 
     adam: RowAdam
@@ -271,16 +332,7 @@ class State:
 
 
 def save_state(path: Path, state: State, settings: Mapping[str, Any]) -> None:
-    """Writes the state; the one before stays until the new one is whole.
-
-    Args:
-        path: the file.
-        state: to keep.
-        settings: what a run must have in common to go on from here, as JSON values.
-
-    Raises:
-        InputError: the disk is full.
-    """
+    """Writes the state; `settings` are what a run must have in common to go on from here, as JSON values."""
     arrays = {
         f"{kind}.{name}": value.detach().cpu().numpy()
         for kind, table in state.adam.tables().items()
@@ -302,11 +354,7 @@ def save_state(path: Path, state: State, settings: Mapping[str, Any]) -> None:
 
 def image_scale_of(path: Path) -> float | None:
     """The factor by which an unfinished run makes photographs smaller; None where there is no such run, or its
-    checkpoint does not say so or is damaged, which `load_state` says.
-
-    Args:
-        path: the file.
-    """
+    checkpoint does not say so or is damaged, which `load_state` says."""
     if not os.path.lexists(path):
         return None
     with suppress(InputError), open_archive(path) as file:
@@ -316,13 +364,7 @@ def image_scale_of(path: Path) -> float | None:
 
 
 def load_state(path: Path, settings: Mapping[str, Any], *, sh_degree: int, device: torch.device | str = "cpu") -> State:
-    """The state that a run has left.
-
-    Args:
-        path: the file.
-        settings: of this run.
-        sh_degree: of its colors, unless `facts` have another one under `PLANNED_DEGREE`.
-        device: where it computes.
+    """The state that a run has left; the colors are of `sh_degree`, or of the degree of the plan in its facts.
 
     Raises:
         InputError: damaged, or of a run with other settings; the first that differs is named.
@@ -335,13 +377,15 @@ def load_state(path: Path, settings: Mapping[str, Any], *, sh_degree: int, devic
         seconds, facts = float(file.value("seconds", float, int)), file.value("facts", dict)
         if not (0 <= adam_steps <= step and 0 <= seconds < math.inf):
             raise InputError(f"a state that no run was in (step {step})")
-        degree = facts.get(PLANNED_DEGREE, sh_degree)
+        degree = facts.get(PLAN, {}).get("sh_degree", sh_degree)
         if degree not in range(sh_degree + 1):
             raise InputError(f"colors of a degree that no run has ({degree!r})")
+        shapes: dict[str, tuple[int, ...]] = {"means": (3,), "quats": (4,), "log_scales": (3,), "logit_opacities": ()}
+        shapes |= {"sh0": (1, 3), "shN": ((degree + 1) ** 2 - 1, 3)}
         tables = {
             kind: {
                 name: torch.from_numpy(file.array(f"{kind}.{name}", "float32", ("N", *shape)).copy()).to(device)
-                for name, shape in shapes_of(degree).items()
+                for name, shape in shapes.items()
             }
             for kind in RowAdam.KINDS
         }

@@ -5,10 +5,10 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +19,8 @@ from gsencoder.core.device import choose_device
 from gsencoder.core.errors import InputError, SceneWarning, advised
 from gsencoder.core.files import plain
 from gsencoder.core.logs import LOG_FILE, Log, read_log
-from gsencoder.core.process import Clock, Device, Track, untracked
+from gsencoder.core.process import Clock, Device, Track, defer_signals, untracked
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.from_photographs import (
     MAX_DENSE_SPACING,
@@ -30,10 +31,10 @@ from gsencoder.data.seeding.from_photographs import (
 )
 from gsencoder.data.seeding.points import colors_or_grey, seed_from_points
 from gsencoder.data.seeding.seed import SeedConfig, choose_source, seed
-from gsencoder.reconstruct.exposure import predict_exposures
 from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
 from gsencoder.reconstruct.parameters import (
     CHECKPOINT_FILE,
+    PLAN,
     RowAdam,
     State,
     anchor_at,
@@ -41,7 +42,7 @@ from gsencoder.reconstruct.parameters import (
     parameters_from,
     save_state,
 )
-from gsencoder.reconstruct.plan import PLAN, Pacing, Plan, ReconstructBudget, refusing_late
+from gsencoder.reconstruct.plan import Plan, ReconstructBudget, apply_plan, make_plan, refusing_late
 from gsencoder.reconstruct.score import (
     Comparison,
     LogRow,
@@ -50,6 +51,7 @@ from gsencoder.reconstruct.score import (
     describe,
     describe_exposure,
     describe_plan,
+    predict_exposures,
     score,
     split,
 )
@@ -65,9 +67,9 @@ Report = Callable[[str], None]
 class ReconstructConfig:
     """How photographs become Gaussians, and how the result is judged."""
 
-    holdout: int = field(default=8, metadata={"help": "hold out every n-th photograph for validation; 0 = none"})
-    validate_every: int = field(default=500, metadata={"help": "steps between validations; 0 = at the end alone"})
-    checkpoint_every: float = field(default=60.0, metadata={"help": "seconds between checkpoints"})
+    holdout: int = option(8, "hold out every n-th photograph for validation; 0 = none", ge=0)
+    validate_every: int = option(500, "steps between validations; 0 = at the end alone", ge=0)
+    checkpoint_every: float = option(60.0, "seconds between checkpoints", ge=0)
     seeds: SeedConfig = field(default_factory=SeedConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
     optimize: OptimizeConfig = field(default_factory=OptimizeConfig)
@@ -76,13 +78,11 @@ class ReconstructConfig:
     raster: RasterConfig = field(default_factory=RasterConfig)
 
     def __post_init__(self) -> None:
-        if self.holdout < 0 or self.holdout == 1:
-            raise InputError(f"holdout: expected 0 (none) or 2 and more, got {self.holdout}")
-        for name in ("validate_every", "checkpoint_every"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+        check_limits(self)
+        if self.holdout == 1:
+            raise InputError("holdout: expected 0 (none) or 2 and more, got 1")
         of_steps = replace(self.budget, megabytes=None)
-        reject_options_set_by_budget(of_steps, self.optimize, OptimizeConfig(), ("steps", "earlier"), "optimize")
+        reject_options_set_by_budget(of_steps, self.optimize, OptimizeConfig(), ("steps",), "optimize")
         if self.budget.megabytes is not None and not (self.prune.at and self.optimize.steps):
             never = "optimize.steps=0" if self.prune.at else "prune.at=[]"
             raise InputError(
@@ -91,7 +91,7 @@ class ReconstructConfig:
             )
 
     def validates_at(self, step: int, steps: int) -> bool:
-        """Whether is validated after `step` of `steps`."""
+        """Whether the splat is validated after `step` of `steps`."""
         return step in (0, steps) or bool(self.validate_every and step % self.validate_every == 0)
 
     def identity(self) -> dict[str, Any]:
@@ -100,16 +100,10 @@ class ReconstructConfig:
         return {name: plain(getattr(self, name)) for name in names}
 
 
-MEASURED_SOURCES = ("depth", "mesh", "tsdf")
-"""Sources of seeds that were measured on surfaces; points of photographs are estimates, and a splat was optimized."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Start:
+class Start(NamedTuple):
     """The first Gaussians.
 
     Attributes:
-        gaussians: to be optimized.
         source: splat, depth, points, photographs, mesh or tsdf.
         dense: what was added to structure-from-motion or triangulated points; None where nothing was.
         triangulated: number of points that were triangulated, for the source photographs.
@@ -119,11 +113,6 @@ class Start:
     source: str
     dense: DenseSeeds | None = None
     triangulated: int | None = None
-
-    @property
-    def measured(self) -> bool:
-        """Whether the Gaussians lie on measured surfaces."""
-        return self.source in MEASURED_SOURCES
 
 
 def initial_gaussians(
@@ -138,60 +127,89 @@ def initial_gaussians(
     """The first Gaussians of a scene: its own splat, else seeds from what its training views hold.
 
     Args:
-        scene: with views.
         photographs: of all its views.
         training: the views that may be looked at.
-        seeds: which source, and how large the grid is.
         dense: when points are added to those of structure from motion.
-        track: progress.
-
-    Raises:
-        InputError: there is nothing to begin with.
     """
     if scene.gaussians is not None:
-        return Start(gaussians=scene.gaussians, source="splat")
+        return Start(scene.gaussians, "splat")
     assert scene.views is not None
     views = scene.views.select(training)
     seen = replace(scene, views=views)
     source = choose_source(seen, seeds)
+    added: DenseSeeds | None = None
+    triangulated = None
     if source == "photographs":
         from_photographs = seeds_of_photographs(photographs, views, dense, training=training, track=track)
-        added: DenseSeeds | None = from_photographs.dense
-        triangulated = len(from_photographs.triangulation.points)
+        added, triangulated = from_photographs.dense, len(from_photographs.triangulation.points)
     elif source == "points" and scene.sfm_points is not None and dense.enough > 0:
         colors = colors_or_grey(scene.sfm_points, scene.sfm_colors)
         added = densify(photographs, training, scene.sfm_points, colors, dense, track=track)
-        seen, triangulated = replace(seen, sfm_colors=colors), None
-    else:
-        added = triangulated = None
+        seen = replace(seen, sfm_colors=colors)
     if added is None:
-        return Start(gaussians=seed(seen, replace(seeds, source=source), track=track), source=source)
+        return Start(seed(seen, replace(seeds, source=source), track=track), source)
     gaussians = seed_from_points(added.points, added.colors, views=views, largest_spacing=MAX_DENSE_SPACING)
-    return Start(gaussians=gaussians, source=source, dense=added, triangulated=triangulated)
+    return Start(gaussians, source, added, triangulated)
+
+
+def initial_state(
+    scene: Scene,
+    photographs: Photographs,
+    training: Sequence[int],
+    config: ReconstructConfig,
+    device: torch.device,
+    track: Track,
+    report: Report,
+) -> State:
+    """The state before the first step: seeds as parameters, and how they came about."""
+    start = initial_gaussians(scene, photographs, training, config.seeds, config.dense, track=track)
+    seeding: dict[str, Any] = {"seeds": len(start.gaussians), "source": start.source}
+    if (dense := start.dense) is not None:
+        seeding |= {"swept": dense.swept, "filled": dense.filled, "coverage": list(dense.coverage)}
+        if start.triangulated is not None:
+            seeding["triangulated"] = start.triangulated
+            report(f"the scene has no points; {start.triangulated:,} were triangulated from matches, poses held")
+        report(
+            f"points reach {dense.coverage[0]:.0%} of the pictures' cells: {dense.swept:,} were added from plane "
+            f"sweeps and {dense.filled:,} between them, which reach {dense.coverage[1]:.0%}"
+        )
+        if not dense.swept:
+            warnings.warn(
+                f"plane sweeps found no surface, and points reach {dense.coverage[0]:.0%} of the pictures alone; what "
+                "they leave bare stays empty: a smaller dense.spacing or dense.samples may find more",
+                SceneWarning,
+                stacklevel=3,
+            )
+    adam, anchor = RowAdam(parameters_from(start.gaussians, config.optimize.sh_degree, device)), None
+    # Points of photographs are estimates, and a splat was optimized: neither holds what begins there.
+    if start.source in ("depth", "mesh", "tsdf") and config.optimize.anchor_sigmas:
+        anchor = anchor_at(adam.parameters, config.optimize.anchor_sigmas)
+    return State(adam=adam, anchor=anchor, step=0, seconds=0.0, facts=seeding)
 
 
 class Validation:
-    """Scores of held-out photographs at the steps of the settings: rows of the log, and lines for people.
+    """Scores of held-out photographs: rows of the log, and lines for people.
 
     Attributes:
         rows: oldest first, those of the runs that this one continues among them.
     """
 
-    def __init__(
-        self, optimizer: Optimizer, held_out: Sequence[int], config: ReconstructConfig, work: Path, report: Report
-    ) -> None:
+    def __init__(self, optimizer: Optimizer, held_out: Sequence[int], work: Path, report: Report) -> None:
         with advised(START_AGAIN):
             self._log = Log(work, done=optimizer.step, events=False, begun=bool(held_out and optimizer.step))
-            self.rows = read_rows(work / LOG_FILE)
-        self._optimizer, self._held_out, self._config, self._report = optimizer, held_out, config, report
+            try:
+                rows = read_log(work / LOG_FILE)
+                self.rows: list[LogRow] = [{name: float(cell) for name, cell in row.items()} for row in rows]
+            except ValueError as error:
+                raise InputError(f"{work / LOG_FILE}: damaged: {error}") from error
+        self._optimizer, self._held_out, self._report = optimizer, held_out, report
         self._seen = covisible_pixels(optimizer.photographs, held_out, optimizer.training)
 
     def __call__(self, seconds: float) -> None:
-        """Validates where a step is due; `seconds` have gone since the first step."""
-        one, steps = self._optimizer, self._optimizer.config.steps
-        due = self._config.validates_at(one.step, steps)
+        """Validates the splat as it is; `seconds` have gone since the first step."""
+        one = self._optimizer
         # A continued run may begin at a step whose validation was cut off, or whose row is in the log already.
-        if not self._held_out or not due or (self.rows and self.rows[-1]["step"] == one.step):
+        if not self._held_out or (self.rows and self.rows[-1]["step"] == one.step):
             return
         scores = score(one, self._held_out, self._seen)._asdict().items()
         row: LogRow = {"seconds": seconds, "gaussians": len(one.parameters["means"])}
@@ -199,7 +217,8 @@ class Validation:
         self._log.add(one.step, row)
         self.rows.append({"step": one.step, **row})
         self._report(
-            f"step {one.step} of {steps}: {describe(row)}, {row['gaussians']:,} Gaussians, {row['seconds']:.0f} s"
+            f"step {one.step} of {one.config.steps}: {describe(row)}, {row['gaussians']:,} Gaussians, "
+            f"{row['seconds']:.0f} s"
         )
 
 
@@ -207,8 +226,8 @@ class Validation:
 def checkpointed(
     optimizer: Optimizer, every: float, save: Callable[[], None], now: Callable[[], float]
 ) -> Iterator[Callable[[], None]]:
-    """Saves the state between two steps: every so many seconds, when the function that this gives is called, and as the
-    block ends, whatever ends it."""
+    """Saves the state between two steps: after this many seconds, when the function that this gives is called, and as
+    the block ends, whatever ends it."""
     saved_at, saved_step = now(), optimizer.step
 
     def save_if_due() -> None:
@@ -225,18 +244,6 @@ def checkpointed(
             save()
 
 
-def read_rows(path: Path) -> list[LogRow]:
-    """The rows of a log as numbers.
-
-    Raises:
-        InputError: a cell that is not a number.
-    """
-    try:
-        return [{name: float(cell) for name, cell in row.items()} for row in read_log(path)]
-    except ValueError as error:
-        raise InputError(f"{path}: damaged: {error}") from error
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reconstruction:
     """A splat that was fitted to photographs, and how well it predicts those that were held out.
@@ -248,7 +255,7 @@ class Reconstruction:
         training: row numbers of the views that were fitted.
         held_out: row numbers of the views that were not.
         log: one row a validation, oldest first; empty without held-out views.
-        comparisons: up to four held-out photographs beside renders of them.
+        comparisons: up to four held-out photographs with renders of their views.
         exposure: brightness of each fitted photograph, relative to their mean, from the affine maps of colors; None
             where photographs are fitted as they are.
         exposure_source: what those of held-out photographs were predicted from, see `ExposurePrediction`.
@@ -293,7 +300,6 @@ def reconstruct(
 
     Args:
         scene: with photographs and poses; depth and masks are used where it has them.
-        config: settings.
         device: where to compute; on CUDA gsplat renders.
         work: an existing folder for the checkpoint and the log. A run that was interrupted is continued from the
             checkpoint in it, with the same result; None = a temporary folder.
@@ -301,7 +307,6 @@ def reconstruct(
             reading options of the scene.
         spent: seconds that reading the scene took, which count to a limit of seconds.
         now: the clock.
-        track: progress of long loops.
         report: receives a line after seeding and after each validation.
 
     Raises:
@@ -313,7 +318,7 @@ def reconstruct(
     """
     if scene.views is None:
         raise InputError(f"reconstruct: scene {scene.name} has no photographs to fit a splat to")
-    clock, budget, began = Clock(), config.budget, now() - spent
+    clock, budget, began, target = Clock(), config.budget, now() - spent, choose_device(device)
     with ExitStack() as stack:
         folder = work or Path(stack.enter_context(TemporaryDirectory()))
         checkpoint = folder / CHECKPOINT_FILE
@@ -325,14 +330,11 @@ def reconstruct(
         identity = {**made_from, **config.identity(), "photographs": photographs.digest()}
         with clock("seeds"):
             if continued:
-                state = load_state(
-                    checkpoint, identity, sh_degree=config.optimize.sh_degree, device=choose_device(device)
-                )
+                state = load_state(checkpoint, identity, sh_degree=config.optimize.sh_degree, device=target)
+                # What is repeated does not count.
+                began = now() - state.facts[PLAN]["spent"] - state.seconds
             else:
-                state = initial_state(scene, photographs, training, config, choose_device(device), in_time, report)
-        if continued:
-            # What is repeated does not count.
-            began = now() - state.facts[PLAN]["spent"] - state.seconds
+                state = initial_state(scene, photographs, training, config, target, in_time, report)
         optimizer = Optimizer(
             state.adam,
             photographs,
@@ -345,26 +347,43 @@ def reconstruct(
             step=state.step,
         )
         with clock("plan"):
-            pacing = Pacing(optimizer, held_out, budget, config.validates_at, lambda: now() - began)
-            plan = pacing.begin(state.facts, double_means=bool(scene.origin.any()))
+            if continued:
+                plan = Plan.of(state.facts[PLAN])
+            else:
+                plan = make_plan(
+                    optimizer,
+                    held_out,
+                    budget,
+                    lambda steps: sum(config.validates_at(step, steps) for step in range(steps + 1)),
+                    double_means=bool(scene.origin.any()),
+                    spent=lambda: now() - began,
+                )
+            apply_plan(optimizer, plan)
         option = "budget.minutes" if budget.seconds is None else "budget.seconds"
         for line in (describe_plan(optimizer, config.optimize.steps, option), *plan.notes):
             report(line)
-        start = now() - state.seconds
+        start, facts = now() - state.seconds, {**state.facts, PLAN: asdict(plan)}
 
         def save() -> None:
-            facts = {**state.facts, **pacing.plan.facts()}
             save_state(checkpoint, optimizer.state(now() - start, facts), identity)
 
         if not continued:
             save()
-        validate = Validation(optimizer, held_out, config, folder, report)
+        validate = Validation(optimizer, held_out, folder, report)
         with clock("optimise"), checkpointed(optimizer, config.checkpoint_every, save, now) as save_if_due:
-            validate(now() - start)
-            for _ in pacing.steps(track):
+            for step in track(range(optimizer.step, plan.steps), "optimising"):
+                if plan.until is not None and now() - began >= plan.until:
+                    report(f"the time is over after {step:,} of {plan.steps:,} steps (budget.seconds)")
+                    break
+                if config.validates_at(step, plan.steps):
+                    validate(now() - start)
                 optimizer.advance()
-                validate(now() - start)
                 save_if_due()
+            if plan.most is not None and len(optimizer.parameters["means"]) > plan.most:
+                # The time was over before the first pruning.
+                with defer_signals():
+                    optimizer.prune()
+            validate(now() - start)
         exposure = differing = source = None
         predicted = predict_exposures(optimizer.exposures, photographs.cameras, held_out)
         if optimizer.exposures is not None:
@@ -373,10 +392,9 @@ def reconstruct(
         if differing is not None:
             report(differing)
         comparisons = compare(optimizer, held_out, matched=differing is not None and source == "mean")
-        plan = pacing.plan
         return Reconstruction(
             gaussians=optimizer.gaussians(),
-            seeding={name: value for name, value in {**state.facts, **plan.facts()}.items() if name != PLAN},
+            seeding={name: value for name, value in state.facts.items() if name != PLAN},
             steps=optimizer.step,
             training=optimizer.training,
             held_out=tuple(held_out),
@@ -389,41 +407,3 @@ def reconstruct(
             plan=plan,
             elapsed=now() - began,
         )
-
-
-def initial_state(
-    scene: Scene,
-    photographs: Photographs,
-    training: Sequence[int],
-    config: ReconstructConfig,
-    device: torch.device,
-    track: Track,
-    report: Report,
-) -> State:
-    """The state before the first step: seeds as parameters, and how they came about."""
-    start = initial_gaussians(scene, photographs, training, config.seeds, config.dense, track=track)
-    seeding: dict[str, Any] = {"seeds": len(start.gaussians), "source": start.source}
-    if start.dense is not None:
-        dense = start.dense
-        seeding |= {"swept": dense.swept, "filled": dense.filled, "coverage": list(dense.coverage)}
-        if start.triangulated is not None:
-            seeding["triangulated"] = start.triangulated
-            report(f"the scene has no points; {start.triangulated:,} were triangulated from matches, poses held")
-        report(
-            f"points reach {dense.coverage[0]:.0%} of the pictures' cells: {dense.swept:,} were added from plane "
-            f"sweeps and {dense.filled:,} between them, which reach {dense.coverage[1]:.0%}"
-        )
-        if not dense.swept:
-            warnings.warn(
-                f"plane sweeps found no surface, and points reach {dense.coverage[0]:.0%} of the pictures alone; what "
-                "they leave bare stays empty: a smaller dense.spacing or dense.samples may find more",
-                SceneWarning,
-                stacklevel=3,
-            )
-    adam = RowAdam(parameters_from(start.gaussians, config.optimize.sh_degree, device))
-    anchor = (
-        anchor_at(adam.parameters, config.optimize.anchor_sigmas)
-        if start.measured and config.optimize.anchor_sigmas
-        else None
-    )
-    return State(adam=adam, anchor=anchor, step=0, seconds=0.0, facts=seeding)

@@ -32,9 +32,9 @@ PLACED_FILE = "placed.json"
 BYTES_PER_FEATURE, TYPICAL_FEATURES = 160, 8192
 """In the database: descriptor and place. Photographs seldom have more, whatever is allowed."""
 MAX_EXHAUSTIVE = 150
-"""Up to so many photographs all pairs are compared."""
+"""Up to this many photographs all pairs are compared."""
 MAX_THOROUGH, ENOUGH_PLACED = 30, 0.8
-"""Up to so many photographs, of which less than this share could be placed, are looked at once more: thoroughly."""
+"""Up to this many photographs, of which less than this share could be placed, are looked at once more: thoroughly."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,8 +60,8 @@ class Placed:
     Attributes:
         model: folder of the COLMAP model.
         placed: names of the photographs that have a pose.
-        missing: names of those that have none.
-        points: points of the model.
+        missing: names of the others.
+        points: their number.
         error: mean reprojection error in pixels.
     """
 
@@ -90,17 +90,13 @@ def register_photographs(
     single_camera: bool = False,
     in_time: Callable[[], None] = lambda: None,
 ) -> Placed:
-    """Finds poses and intrinsics. Every photograph is decoded before. Few photographs that do not fit together are
+    """Finds poses and intrinsics, once every photograph was decoded. Few photographs that do not fit together are
     looked at a second time, for features that match from farther aside.
 
     Args:
         work: an existing folder for COLMAP's database; the model is written to `sparse/0` in it.
         single_camera: whether one camera took them all with one focal length, as the frames of a video.
         in_time: is called before each part of the work, and may end it.
-
-    Raises:
-        InputError: fewer than three photographs, one that cannot be decoded or has a name that is no UTF-8, no two
-            that fit together, or pycolmap refuses.
 
     Warns:
         SceneWarning: files that look like photographs or films, and cannot be used.
@@ -157,12 +153,7 @@ def register_photographs(
 
 def load_placement(folder: Path, work: Path, config: SfmConfig = SfmConfig()) -> Placed | None:
     """The result of an earlier call in `work`, if it was completed for the same photographs and settings, and its files
-    have their checksums. A second run of structure from motion with several threads need not give the same poses.
-
-    Args:
-        work: that the call was given.
-        config: that it was given.
-    """
+    have their checksums. A second run of structure from motion with several threads need not give the same poses."""
     model = work / "sparse" / "0"
     try:
         record = json.loads(read_foreign_text(work / PLACED_FILE))
@@ -216,16 +207,9 @@ def _check(folder: Path, names: list[str]) -> None:
         check_picture(folder / name)
 
 
-def _placed(model: Path, summary: Mapping[str, Any]) -> Placed:
-    if not isinstance(summary["placed"], list) or not isinstance(summary["missing"], list):
-        raise TypeError("expected lists of names")
-    return Placed(
-        model=model,
-        placed=tuple(summary["placed"]),
-        missing=tuple(summary["missing"]),
-        points=summary["points"],
-        error=summary["error"],
-    )
+def _placed(model: Path, found: Mapping[str, Any]) -> Placed:
+    names = {kind: tuple(found[kind]) for kind in ("placed", "missing")}
+    return Placed(model=model, **names, points=found["points"], error=found["error"])
 
 
 def _map(
@@ -238,25 +222,8 @@ def _map(
     in_time: Callable[[], None],
     thorough: bool,
 ) -> list[Any]:
-    """The models that COLMAP makes of the photographs, in a folder of their own."""
-    database = work / "database.db"
-    _find_features(pycolmap, database, folder, names, config, single_camera, thorough)
-    in_time()
-    _match(pycolmap, database, len(names), config, thorough)
-    in_time()
-    models = pycolmap.incremental_mapping(database, folder, work, options=_mapping(pycolmap, thorough))
-    return list(models.values())
-
-
-def _find_features(
-    pycolmap: Any,
-    database: Path,
-    folder: Path,
-    names: list[str],
-    config: SfmConfig,
-    single_camera: bool,
-    thorough: bool,
-) -> None:
+    """The models that COLMAP makes of the photographs, in a folder of their own: features, matches, poses."""
+    database, cpu = work / "database.db", pycolmap.Device.cpu
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = config.size
     extraction.use_gpu = False
@@ -265,41 +232,30 @@ def _find_features(
     extraction.sift.estimate_affine_shape = extraction.sift.domain_size_pooling = thorough
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = CAMERA
-    pycolmap.extract_features(
-        database,
-        folder,
-        image_names=names,
-        camera_mode=pycolmap.CameraMode.SINGLE if single_camera else pycolmap.CameraMode.AUTO,
-        reader_options=reader,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
-    )
-
-
-def _match(pycolmap: Any, database: Path, count: int, config: SfmConfig, thorough: bool) -> None:
+    mode = pycolmap.CameraMode.SINGLE if single_camera else pycolmap.CameraMode.AUTO
+    options = {"camera_mode": mode, "reader_options": reader, "extraction_options": extraction, "device": cpu}
+    pycolmap.extract_features(database, folder, image_names=names, **options)
+    in_time()
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.guided_matching = thorough
-    every = config.pairs == "exhaustive" or (config.pairs == "auto" and count <= MAX_EXHAUSTIVE)
-    if every:
-        pycolmap.match_exhaustive(database, matching_options=matching, device=pycolmap.Device.cpu)
-        return
-    # Neighbors by name, and those 2, 4, 8, … places away.
-    pairing = pycolmap.SequentialPairingOptions()
-    pairing.overlap = max(10, math.ceil(math.log2(count)))
-    pairing.quadratic_overlap = True
-    pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu)
-
-
-def _mapping(pycolmap: Any, thorough: bool) -> Any:
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = 0
-    options.ba_refine_principal_point = False
+    if config.pairs == "exhaustive" or (config.pairs == "auto" and len(names) <= MAX_EXHAUSTIVE):
+        pycolmap.match_exhaustive(database, matching_options=matching, device=cpu)
+    else:
+        # Neighbors by name, and those 2, 4, 8, … places away.
+        pairing = pycolmap.SequentialPairingOptions()
+        pairing.overlap = max(10, math.ceil(math.log2(len(names))))
+        pairing.quadratic_overlap = True
+        pycolmap.match_sequential(database, matching_options=matching, pairing_options=pairing, device=cpu)
+    in_time()
+    mapping = pycolmap.IncrementalPipelineOptions()
+    mapping.random_seed = 0
+    mapping.ba_refine_principal_point = False
     if thorough:
         # Half of COLMAP's own: few photographs have few matches in common.
-        options.mapper.abs_pose_min_num_inliers, options.mapper.init_min_num_inliers = 15, 50
-        options.mapper.abs_pose_min_inlier_ratio = 0.15
-    return options
+        mapping.mapper.abs_pose_min_num_inliers, mapping.mapper.init_min_num_inliers = 15, 50
+        mapping.mapper.abs_pose_min_inlier_ratio = 0.15
+    return list(pycolmap.incremental_mapping(database, folder, work, options=mapping).values())
 
 
 START_AGAIN = "give resume=false to begin anew"
@@ -328,21 +284,20 @@ class OpenedScene:
 
 
 def find_photographed(paths: Sequence[str]) -> tuple[Path, ...]:
-    """What can be reconstructed at paths: scenes, folders of photographs alone, videos, those in folders of such, and
-    those that a list (.txt) names.
-
-    Raises:
-        InputError: a path does not exist, holds nothing of the kind, or is given twice.
-    """
+    """What can be reconstructed at paths: scenes, folders of photographs alone, videos, folders of these, and lists
+    (.txt) of them."""
     chosen: list[Path] = []
     for path in listed_paths(paths):
         if not path.exists():
-            # Not when its turn comes, after hours of others.
             raise InputError(f"{path}: no such file or folder")
         scenes = [path]
         if path.is_dir() and not is_scene(path) and _pictures_of(path) is None:
             entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
-            scenes = [entry for entry in entries if is_video(entry) or (entry.is_dir() and _is_photographed(entry))]
+            scenes = [
+                entry
+                for entry in entries
+                if is_video(entry) or (entry.is_dir() and (is_scene(entry) or _pictures_of(entry) is not None))
+            ]
         # Of a path that holds nothing `find_scenes` says what was expected.
         chosen += scenes or find_scenes([path])
     return distinct_paths(chosen)
@@ -351,10 +306,6 @@ def find_photographed(paths: Sequence[str]) -> tuple[Path, ...]:
 def _pictures_of(path: Path) -> Path | None:
     """The folder of the photographs of a scene: itself, or its folder images."""
     return next((folder for folder in (path, path / "images") if folder.is_dir() and photographs_in(folder)), None)
-
-
-def _is_photographed(folder: Path) -> bool:
-    return is_scene(folder) or _pictures_of(folder) is not None
 
 
 def open_scene(
@@ -371,17 +322,10 @@ def open_scene(
     """Reads a scene; photographs alone, or frames of a video, are registered by structure from motion first.
 
     Args:
-        path: a scene, a folder of photographs, or a video.
         work: an existing folder for the COLMAP model; one that an interrupted run completed there is used again.
         splat: file of Gaussians to refine; empty = none.
-        data: how the scene is read.
-        sfm: how photographs are placed.
         video: which frames of a video are taken; they are written to `images` in `work`.
-        track: progress of decoding a video.
         in_time: is called while photographs are registered, and may end it.
-
-    Raises:
-        InputError: no photographs, several scenes, a video that cannot be used, or structure from motion fails.
 
     Warns:
         SceneWarning: photographs that could not be placed.

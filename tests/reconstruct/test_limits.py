@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from archives import header_of, rewrite
+from PIL import Image
 from reconstructions import cut_at, refusal, summary_of
 
 from gsencoder.app import main as cli
@@ -14,10 +15,10 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.seeding.seed import SeedConfig, seed
 from gsencoder.data.splats.files import save_splat
 from gsencoder.reconstruct import plan as planning
-from gsencoder.reconstruct import reconstruct
-from gsencoder.reconstruct.optimize import OptimizeConfig, PruneConfig
-from gsencoder.reconstruct.parameters import CHECKPOINT_FILE, PLANNED_DEGREE
-from gsencoder.reconstruct.plan import ReconstructBudget
+from gsencoder.reconstruct import reconstruct, sfm
+from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig
+from gsencoder.reconstruct.parameters import CHECKPOINT_FILE, PLAN
+from gsencoder.reconstruct.plan import Costs, ReconstructBudget
 from gsencoder.reconstruct.run import ReconstructConfig
 from gsencoder.types import Scene
 
@@ -105,7 +106,8 @@ def test_a_run_of_another_limit_and_one_of_impossible_colors_do_not_go_on(scene:
         reconstruct(scene, short(megabytes=1.0), work=tmp_path)
 
     header = header_of(tmp_path / CHECKPOINT_FILE)
-    impossible = {**header, "facts": {**header["facts"], PLANNED_DEGREE: 3}}
+    facts = header["facts"]
+    impossible = {**header, "facts": {**facts, PLAN: {**facts[PLAN], "sh_degree": 3}}}
     rewrite(tmp_path / CHECKPOINT_FILE, header=impossible)
     with pytest.raises(InputError, match=r"colors of a degree that no run has \(3\)"):
         reconstruct(scene, short(), work=tmp_path)
@@ -130,6 +132,79 @@ def test_limits_and_what_became_of_them_are_printed_and_recorded(
     assert "budget.seconds: limit 500, measured" in printed.out
 
 
-def test_a_limit_beside_an_option_that_it_chooses_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_limit_with_an_option_that_it_chooses_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     problem = refusal(capsys, str(folder), "budget.seconds=60", "preset=exact")
     assert "optimize.steps=3000: is chosen by budget.seconds; leave it (or the preset that sets it) out" in problem
+
+
+class Wall:
+    """A clock on which each step takes some seconds, and by trial steps 4."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+        self.now = 1000.0
+        advance = Optimizer.advance
+
+        def timed(one: Optimizer) -> dict[str, float]:
+            self.now += seconds
+            return advance(one)
+
+        monkeypatch.setattr(Optimizer, "advance", timed)
+        costs = Costs(steps={1: 4.0, 2: 4.0}, pruning=0.0, validation=0.0, picture=0.0)
+        monkeypatch.setattr(planning, "measured_costs", lambda *_: costs)
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.mark.parametrize(("seconds", "steps", "elapsed"), [(4.0, 21, 84), (8.0, 13, 104), (2.5, 21, 52.5)])
+def test_the_planned_steps_are_done_and_end_early_where_the_clock_runs_out(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, seconds: float, steps: int, elapsed: float
+) -> None:
+    lines: list[str] = []
+    result = reconstruct(scene, limited(seconds=100.0), now=Wall(monkeypatch, seconds), report=lines.append)
+    assert (result.steps, result.plan.steps, result.elapsed) == (steps, 21, elapsed)
+    assert result.log[-1]["step"] == steps
+    assert ("the time is over after 13 of 21 steps (budget.seconds)" in lines) == (steps < 21)
+    if steps == result.plan.steps:
+        again = replace(limited(minutes=0.0), optimize=OptimizeConfig(steps=steps))
+        np.testing.assert_array_equal(reconstruct(scene, again).gaussians.means, result.gaussians.means)
+
+
+def test_a_run_that_was_cut_goes_on_by_the_clock_and_what_is_too_large_is_taken_out(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    clock, config = Wall(monkeypatch, 40.0), limited(seconds=100.0, megabytes=0.02)
+    with cut_at(1):
+        reconstruct(scene, config, now=clock, work=tmp_path)
+    clock.now += 500
+    result = reconstruct(scene, config, now=clock, work=tmp_path)
+    # Before the first pruning.
+    assert (result.steps, result.elapsed) == (3, 120)
+    assert result.plan.most is not None
+    assert len(result.gaussians) == result.plan.most
+
+
+@pytest.mark.usefixtures("no_gpu")
+def test_a_run_that_was_cut_goes_on_with_the_steps_that_it_planned(
+    scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also on a machine that would have planned other ones."""
+    monkeypatch.setattr(planning, "LEAST_STEPS", 20)
+    with cut_at(7):
+        reconstruct(scene, limited(minutes=0.01), work=tmp_path)
+    monkeypatch.setattr(planning, "LEAST_STEPS", 900)
+    lines: list[str] = []
+    result = reconstruct(scene, limited(minutes=0.01), work=tmp_path, report=lines.append)
+    assert result.steps == 20
+    assert "13 more of 20 steps instead of 1,500 (budget.minutes)" in lines[0]
+
+
+def test_a_limit_that_registering_alone_exceeds_is_refused_in_the_midst_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in "abc":
+        Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.jpg")
+    monkeypatch.setattr(sfm, "_map", lambda *arguments: arguments[-2]())
+    problem = refusal(capsys, str(tmp_path), "budget.seconds=0.001", f"out={tmp_path / 'out'}")
+    assert "budget.seconds=0.001: is over before the first step: " in problem
+    assert "s went into registering the photographs; give more seconds, fewer photographs" in problem

@@ -10,15 +10,19 @@ import numpy as np
 import pytest
 import torch
 from splats import front_camera, random_gaussians
-from walls import wall_views
+from walls import NEVER, wall_optimizer, wall_views
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.photographs import Photographs
+from gsencoder.data.photographs import Photographs, ScaledPhotograph
 from gsencoder.data.seeding.seed import seed_from_depth
-from gsencoder.reconstruct.optimize import OptimizeConfig, Optimizer, PruneConfig, rows_to_keep
+from gsencoder.reconstruct.optimize import RATES, OptimizeConfig, Optimizer, PruneConfig, rows_to_keep
 from gsencoder.reconstruct.parameters import (
+    BETAS,
+    EPS,
+    Anchor,
     RowAdam,
     State,
+    anchor_at,
     camera_of,
     gaussians_of,
     load_state,
@@ -27,25 +31,19 @@ from gsencoder.reconstruct.parameters import (
     save_state,
 )
 from gsencoder.reconstruct.score import score
+from gsencoder.render import blend
 from gsencoder.render.rasterize import RasterConfig
-from gsencoder.types import Gaussians, Views
+from gsencoder.types import Cameras, Gaussians
 
 QUICK = OptimizeConfig(steps=40, sh_degree=1, shrinks=(2, 1), shares=(0.5, 0.5))
-NEVER = PruneConfig(at=())
 
 
 def seeds() -> Gaussians:
     return seed_from_depth(wall_views(depth=True), voxel=0.06)
 
 
-def adam_of(start: Gaussians, config: OptimizeConfig) -> RowAdam:
-    return RowAdam(parameters_from(start, config.sh_degree))
-
-
-def optimizer(config: OptimizeConfig = QUICK, start: Gaussians | None = None, **changes: object) -> Optimizer:
-    photographs = Photographs(wall_views(depth=True))
-    adam = adam_of(start or seeds(), config)
-    return Optimizer(adam, photographs, [0, 1, 3], config, **{"prune": NEVER, **changes})
+def optimizer(config: OptimizeConfig = QUICK, **changes: Any) -> Optimizer:
+    return wall_optimizer(config, **{"start": 0.06, **changes})
 
 
 def test_parameters_give_back_the_splat() -> None:
@@ -76,20 +74,15 @@ def test_rows_in_view_are_all_that_a_picture_shows(log_scale: float) -> None:
 
 @pytest.mark.slow
 def test_a_splat_gets_nearer_to_photographs_that_it_was_not_fitted_to() -> None:
-    one = optimizer(replace(QUICK, steps=60))
+    one = optimizer(replace(QUICK, steps=40))
+    assert sorted(one.view_at(3 + step) for step in range(3)) == [0, 1, 3]
     before = score(one, [2])
-    terms = [one.advance() for _ in range(60)]
+    terms = [one.advance() for _ in range(40)]
     after = score(one, [2])
-    assert after.psnr > before.psnr + 1.5
+    assert after.psnr > before.psnr + 1
     assert after.ssim > before.ssim
     assert set(terms[0]) == {"l1", "ssim", "depth"}
     assert len(one.gaussians()) == len(seeds())
-
-
-def test_each_round_shows_every_photograph_once() -> None:
-    one = optimizer()
-    for turn in range(3):
-        assert sorted(one.view_at(3 * turn + step) for step in range(3)) == [0, 1, 3]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
@@ -114,7 +107,7 @@ def test_a_signal_within_a_step_is_heard_after_it() -> None:
 @pytest.mark.slow
 def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     whole, cut = optimizer(), optimizer()
-    for _ in range(20):
+    for _ in range(12):
         whole.advance()
     for _ in range(8):
         cut.advance()
@@ -127,7 +120,7 @@ def test_a_state_that_was_saved_goes_on_to_the_same_bits(tmp_path: Path) -> None
     assert (read_state.step, read_state.seconds, read_state.facts) == (8, 1.5, {"seeds": 7})
     carried_on = {"exposures": read_state.exposures, "step": read_state.step}
     again = Optimizer(read_state.adam, cut.photographs, cut.training, QUICK, prune=NEVER, **carried_on)
-    for _ in range(12):
+    for _ in range(4):
         again.advance()
     for name, value in whole.parameters.items():
         assert torch.equal(value, again.parameters[name]), name
@@ -154,20 +147,6 @@ def test_what_does_nothing_is_taken_out_and_nothing_else() -> None:
     assert len(rows) > 0.8 * len(splat)
 
 
-@pytest.mark.slow
-def test_pruning_happens_when_it_is_due() -> None:
-    start = seeds()
-    start.opacities[:20] = 0.001
-    one = optimizer(start=start, prune=PruneConfig(at=(0.5,), opacity=0.01, contribution=0.0, screen=0.0))
-    counts = []
-    for _ in range(40):
-        one.advance()
-        counts.append(len(one.parameters["means"]))
-    assert counts[18] == len(start)
-    assert counts[20] < len(start)
-    assert all(len(moments["means"]) == counts[-1] for moments in (one.adam.averages, one.adam.squares))
-
-
 @pytest.mark.usefixtures("no_jaxtyping")
 @pytest.mark.slow
 def test_nothing_becomes_infinite_from_the_worst_of_starts() -> None:
@@ -184,10 +163,10 @@ def test_nothing_becomes_infinite_from_the_worst_of_starts() -> None:
     views = wall_views()
     images = [np.array(image) for image in views.images or ()]
     images[0][:], images[1][:] = 0, 255
-    photographs = Photographs(replace(views, images=images))
-    config = OptimizeConfig(steps=240, sh_degree=3, shrinks=(3,), shares=(1.0,))
-    one = Optimizer(adam_of(start, config), photographs, range(4), config, prune=PruneConfig(at=(0.5,)))
-    for _ in range(240):
+    config = OptimizeConfig(steps=120, sh_degree=3, shrinks=(3,), shares=(1.0,))
+    views = replace(views, images=images)
+    one = wall_optimizer(config, start, views, (0, 1, 2, 3), prune=PruneConfig(at=(0.5,)))
+    for _ in range(120):
         one.advance()
     assert all(bool(torch.isfinite(value).all()) for value in one.parameters.values())
     assert len(one.gaussians()) > 0
@@ -209,9 +188,8 @@ def test_masked_pixels_do_not_count() -> None:
     spoilt = [np.where(mask[..., None], image, 255).astype(np.uint8) for image in views.images or ()]
     raws = []
     for images in (views.images, spoilt):
-        photographs = Photographs(replace(views, images=images, masks=[mask] * 4))
-        config = replace(QUICK, shrinks=(1,), shares=(1.0,))
-        one = Optimizer(adam_of(seeds(), config), photographs, range(4), config, prune=NEVER)
+        masked = replace(views, images=images, masks=[mask] * 4)
+        one = optimizer(replace(QUICK, shrinks=(1,), shares=(1.0,)), views=masked)
         for _ in range(4):
             one.advance()
         raws.append(one.parameters)
@@ -219,38 +197,10 @@ def test_masked_pixels_do_not_count() -> None:
         torch.testing.assert_close(value, raws[1][name], rtol=1e-4, atol=1e-5)
 
 
-def test_smaller_photographs_keep_their_rays() -> None:
-    photographs = Photographs(wall_views(depth=True))
-    whole, half = photographs.at_scale(1), photographs.at_scale(1, 2)
-    assert (half.width, half.height) == (48, 36)
-    torch.testing.assert_close(half.image[3, 4], whole.image[6:8, 8:10].mean(dim=(0, 1)))
-    assert half.depth is not None
-    assert whole.depth is not None
-    torch.testing.assert_close(half.depth[3, 4], whole.depth[6:8, 8:10].mean(), rtol=1e-2, atol=0)
-    ray = (5.0 - half.K[0, 2]) / half.K[0, 0]
-    torch.testing.assert_close(ray, (10.0 - whole.K[0, 2]) / whole.K[0, 0])
-
-
-def test_a_scene_without_photographs_is_refused() -> None:
-    with pytest.raises(InputError, match="no photographs"):
-        Photographs(replace(wall_views(), images=None))
-
-
 @pytest.mark.parametrize(
-    "changes",
-    [
-        {"steps": -1},
-        {"sh_degree": 4},
-        {"shrinks": (0,), "shares": (1.0,)},
-        {"shares": (1.0,)},
-        {"shrinks": (2, 1), "shares": (0.7, 0.7)},
-        {"shares": (0.5, float("nan"))},
-        {"empty_weight": float("nan")},
-        {"anchor_sigmas": -1.0},
-        {"seed": -1},
-    ],
+    "changes", [{"shares": (1.0,)}, {"shrinks": (2, 1), "shares": (0.7, 0.7)}, {"shares": (0.5, float("nan"))}]
 )
-def test_settings_that_mean_nothing_are_refused(changes: dict[str, object]) -> None:
+def test_stages_that_mean_nothing_are_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="expected"):
         OptimizeConfig(**changes)
 
@@ -283,18 +233,198 @@ def test_the_stages_follow_the_shares() -> None:
 
 
 def test_a_camera_that_is_astray_does_not_make_steps_larger() -> None:
-    views = wall_views(depth=True)
-    poses = np.concatenate([views.cameras.cam_from_world] * 5)
-    cameras = views.cameras.select([0, 1, 2, 3] * 5)
-    astray = poses.copy()
+    views = wall_views(20, depth=True)
+    astray = views.cameras.cam_from_world.copy()
     astray[2, :3, 3] += 1e5
-    extents = []
-    for some in (poses, astray):
-        photographs = Photographs(replace(views, cameras=replace(cameras, cam_from_world=some), **_five_times(views)))
-        extents.append(Optimizer(adam_of(seeds(), QUICK), photographs, range(20), QUICK, prune=NEVER).extent)
+    far = replace(views, cameras=replace(views.cameras, cam_from_world=astray))
+    extents = [wall_optimizer(QUICK, 0.3, some).extent for some in (views, far)]
     assert extents[1] < 2 * extents[0]
 
 
-def _five_times(views: Views) -> dict[str, object]:
-    lists = {name: list(getattr(views, name) or ()) * 5 for name in ("images", "depths")}
-    return {"names": tuple(f"{i}.png" for i in range(20)), **lists}
+NOTHING = PruneConfig(opacity=0.0, screen=0.0, contribution=0.0)
+
+
+def two_cameras() -> Cameras:
+    """One looks along +z, the other stands two units to its left."""
+    one = front_camera(64, 48, 50.0)
+    poses = np.repeat(one.cam_from_world, 2, axis=0)
+    poses[1, 0, 3] = 2
+    repeated = {name: np.repeat(getattr(one, name), 2, axis=0) for name in ("Ks", "widths", "heights")}
+    return Cameras(cam_from_world=poses, **repeated)
+
+
+def photos(cameras: Cameras, shrink: int) -> list[tuple[int, ScaledPhotograph]]:
+    scale = torch.diag(torch.tensor([1 / shrink, 1 / shrink, 1]))
+    return [
+        (
+            view,
+            ScaledPhotograph(
+                image=torch.zeros(48 // shrink, 64 // shrink, 3), mask=None, depth=None, K=scale @ torch.from_numpy(K)
+            ),
+        )
+        for view, K in enumerate(cameras.Ks)
+    ]
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_a_contribution_is_counted_in_pixels_of_the_photograph_whatever_size_it_is_looked_at(shrink: int) -> None:
+    splat, cameras = random_gaussians(150, log_scale=-1.5), two_cameras()
+    columns = [torch.bincount(b.col.long(), b.weight, 150) for b in (blend(splat, cameras, view) for view in range(2))]
+    pixels = torch.maximum(*columns).numpy()
+    least = float(np.median(pixels))
+    config = replace(NOTHING, contribution=least)
+    rows = rows_to_keep(parameters_from(splat, 0), cameras, photos(cameras, shrink), config, RasterConfig()).numpy()
+    # Coarser pixels round.
+    slack = 1.02 if shrink == 1 else 1.5
+    clear = (pixels > slack * least) | (pixels < least / slack)
+    assert clear.mean() > 0.6
+    np.testing.assert_array_equal(np.isin(np.arange(150), rows)[clear], pixels[clear] > least)
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_what_is_wider_than_a_share_of_some_picture_is_taken_out(shrink: int) -> None:
+    """Spheres whose radius of three standard deviations (3.3 are drawn) is so many widths of the first picture."""
+    radii = np.array([0.05, 0.2, 0.8, 1.1, 3.0])
+    one = random_gaussians(5)
+    depth = 100.0
+    splat = replace(
+        one,
+        means=np.tile(np.float32([0, 0, depth]), (5, 1)),
+        scales=np.repeat(radii[:, None] * 64 / 50 * depth / 3, 3, axis=1).astype(np.float32),
+        opacities=np.full(5, 0.99, np.float32),
+    )
+    cameras = two_cameras()
+    raw, some = parameters_from(splat, 0), photos(cameras, shrink)
+    everything = rows_to_keep(raw, cameras, some, NOTHING, RasterConfig())
+    assert everything.tolist() == list(range(5))
+    for screen, count in ((0.5, 2), (1.0, 3), (4.0, 5)):
+        rows = rows_to_keep(raw, cameras, some, replace(NOTHING, screen=screen), RasterConfig())
+        assert rows.tolist() == list(range(count))
+
+
+def test_pruning_is_due_once_for_each_share_of_the_steps() -> None:
+    config = PruneConfig(at=(0.25, 0.5, 1.0))
+    assert [step for step in range(41) if config.due(step, OptimizeConfig(steps=40))] == [10, 20, 40]
+    # A share of less than a step is due after the first.
+    assert [step for step in range(41) if PruneConfig(at=(0.01,)).due(step, OptimizeConfig(steps=40))] == [1]
+
+
+ALL = OptimizeConfig(steps=30, sh_degree=0, shrinks=(2, 1), shares=(0.5, 0.5))
+PRUNED = PruneConfig(at=(0.3,))
+
+
+def held(length: float) -> Optimizer:
+    one = wall_optimizer(ALL, 0.1, prune=PRUNED)
+    one.parameters["logit_opacities"][::7] = -9
+    one.anchor = anchor_at(one.parameters, length)
+    return one
+
+
+@pytest.mark.usefixtures("no_jaxtyping")
+@pytest.mark.parametrize("rate", [1e-3, 1e-2, 10.0])
+@pytest.mark.parametrize("reach", [1e-6, 0.3])
+@pytest.mark.slow
+def test_what_pulls_forever_moves_no_further_than_the_reach(rate: float, reach: float) -> None:
+    means = torch.zeros(3, 3)
+    adam = RowAdam({"means": means})
+    anchor = Anchor(means=torch.zeros(3, 3), reach=torch.full((3,), reach))
+    rows = torch.tensor([0, 2])
+    grads = {"means": torch.tensor([[1.0, 0, 0], [0, -1e6, 0]])}
+    # Four times the steps that a pull takes to come within 1/e of its end.
+    for _ in range(int(4 * max(5.0, reach / rate))):
+        adam.step(rows, grads, {"means": rate})
+        anchor.pull(means, rows, rate)
+    assert (means[rows].norm(dim=1) <= 1.001 * reach).all()
+    if rate < reach:
+        assert means[0, 0] < -0.9 * reach
+        assert means[2, 1] > 0.9 * reach
+    assert not means[1].any()
+
+
+@pytest.mark.slow
+def test_an_anchor_holds_positions_and_is_pruned_with_its_gaussians_and_taken_up_with_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(RATES, "means", 0.03)
+    whole, cut = held(0.3), held(0.3)
+    for _ in range(16):
+        whole.advance()
+    for _ in range(12):
+        cut.advance()
+    assert cut.anchor is not None
+    assert len(cut.parameters["means"]) == len(cut.anchor.means) < len(held(0.3).parameters["means"])
+    assert all(len(moments["means"]) == len(cut.anchor.means) for moments in (cut.adam.averages, cut.adam.squares))
+    strayed = (cut.parameters["means"] - cut.anchor.means).norm(dim=1) / cut.anchor.reach
+    # Adam's first steps on a row may be a little longer than the rate, and three coordinates each have their own.
+    assert 0.1 < strayed.max() < 3**0.5
+    exposures = None if cut.exposures is None else cut.exposures.maps
+    state = State(adam=cut.adam, anchor=cut.anchor, exposures=exposures, step=12, seconds=0.0, facts={})
+    save_state(tmp_path / "state", state, {})
+    read_state = load_state(tmp_path / "state", {}, sh_degree=0)
+    held_back = {"anchor": read_state.anchor, "exposures": read_state.exposures}
+    again = Optimizer(read_state.adam, cut.photographs, cut.training, ALL, prune=PRUNED, step=12, **held_back)
+    for _ in range(4):
+        again.advance()
+    for name, value in whole.parameters.items():
+        assert torch.equal(value, again.parameters[name]), name
+
+
+RATE = {"means": 0.1, "logits": 0.1, "sh": 0.1}
+
+
+def parameters() -> dict[str, torch.Tensor]:
+    torch.manual_seed(0)
+    return {"means": torch.randn(50, 3), "logits": torch.randn(50), "sh": torch.randn(50, 4, 3)}
+
+
+def test_with_all_rows_it_is_adam() -> None:
+    ours = RowAdam({name: value.clone() for name, value in parameters().items()})
+    theirs = {name: value.clone().requires_grad_() for name, value in parameters().items()}
+    rates = {"means": 1e-2, "logits": 1e-1, "sh": 1e-3}
+    groups = [{"params": [value], "lr": rates[name]} for name, value in theirs.items()]
+    adam = torch.optim.Adam(groups, betas=BETAS, eps=EPS)
+    for _ in range(20):
+        grads = {name: torch.randn_like(value) for name, value in theirs.items()}
+        ours.step(torch.arange(50), grads, rates)
+        for name, value in theirs.items():
+            value.grad = grads[name].clone()
+        adam.step()
+    for name, value in theirs.items():
+        torch.testing.assert_close(ours.parameters[name], value.detach(), rtol=1e-5, atol=1e-6)
+
+
+def test_rows_without_a_gradient_stay_as_they_are() -> None:
+    adam = RowAdam(parameters())
+    before = {name: value.clone() for name, value in adam.parameters.items()}
+    rows = torch.tensor([3, 7, 20])
+    adam.step(rows, {name: torch.ones_like(value[rows]) for name, value in before.items()}, dict.fromkeys(before, 0.1))
+    for name, value in adam.parameters.items():
+        changed = (value != before[name]).flatten(1).any(dim=1) if value.ndim > 1 else value != before[name]
+        assert changed.nonzero().squeeze(1).tolist() == rows.tolist()
+        for moments in (adam.averages, adam.squares):
+            assert moments[name].flatten(1).any(dim=1).sum() == 3 if value.ndim > 1 else True
+
+
+def test_kept_rows_keep_their_moments() -> None:
+    adam = RowAdam(parameters())
+    adam.step(torch.arange(50), {name: torch.randn_like(value) for name, value in adam.parameters.items()}, RATE)
+    before = {name: value.clone() for name, value in adam.averages.items()}
+    adam.keep(torch.tensor([1, 4]))
+    for name, value in adam.averages.items():
+        assert len(adam.parameters[name]) == len(value) == 2
+        assert torch.equal(value, before[name][[1, 4]])
+
+
+def test_kernel_and_plain_twin_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    fast, plain = RowAdam(parameters()), RowAdam(parameters())
+    made = np.random.default_rng(0)
+    for _ in range(10):
+        rows = torch.from_numpy(np.sort(made.permutation(50)[:20]))
+        grads = {name: torch.randn_like(value[rows]) for name, value in fast.parameters.items()}
+        rates = dict.fromkeys(grads, 1e-2)
+        fast.step(rows, grads, rates)
+        with monkeypatch.context() as patched:
+            patched.setattr(RowAdam, "_on_cpu", staticmethod(RowAdam._plain))
+            plain.step(rows, grads, rates)
+    for name, value in fast.parameters.items():
+        torch.testing.assert_close(value, plain.parameters[name], rtol=1e-5, atol=1e-6)

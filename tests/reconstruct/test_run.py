@@ -1,17 +1,21 @@
-"""`reconstruct()` as a Python call: what it returns, and how it continues an interrupted run."""
+"""Python's `reconstruct()`: where it begins, what it returns, and how it continues an interrupted run."""
 
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from reconstructions import cut_at
+from walls import DEPTH, TILT, wall_points, wall_views
 
-from gsencoder.core.errors import InputError
-from gsencoder.data.seeding.seed import SeedConfig
+from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.data.photographs import Photographs
+from gsencoder.data.seeding.from_photographs import DenseConfig
+from gsencoder.data.seeding.seed import SeedConfig, seed_from_depth
 from gsencoder.reconstruct import Reconstruction, reconstruct
 from gsencoder.reconstruct.optimize import OptimizeConfig
-from gsencoder.reconstruct.run import ReconstructConfig
+from gsencoder.reconstruct.run import ReconstructConfig, Start, initial_gaussians
 from gsencoder.types import Scene
 
 QUICK = ReconstructConfig(
@@ -71,6 +75,53 @@ def test_a_folder_of_other_settings_is_refused(scene: Scene, tmp_path: Path) -> 
         reconstruct(scene, QUICK, work=tmp_path, made_from={"author": "another"})
 
 
-def test_a_scene_without_views_is_refused(scene: Scene) -> None:
-    with pytest.raises(InputError, match="no photographs"):
-        reconstruct(replace(scene, views=None), QUICK)
+NEVER = DenseConfig(enough=0.0)
+
+
+def wall(**parts: object) -> Scene:
+    return Scene(**{"name": "wall", "views": wall_views(depth=True), "metres_per_unit": 1.0, **parts})
+
+
+def begun(made: Scene, seeds: SeedConfig = SeedConfig(), dense: DenseConfig = NEVER) -> Start:
+    assert made.views is not None
+    return initial_gaussians(made, Photographs(made.views), [0, 1, 3], seeds, dense)
+
+
+def test_a_splat_is_taken_as_it_is() -> None:
+    splat = seed_from_depth(wall_views(depth=True), voxel=0.1)
+    start = begun(wall(gaussians=splat))
+    assert (start.source, start.dense) == ("splat", None)
+    assert start.gaussians is splat
+
+
+def test_depth_of_the_photographs_that_are_kept_is_not_looked_at() -> None:
+    made = wall()
+    assert made.views is not None
+    assert made.views.depths is not None
+    spoilt = [depth if view != 2 else depth * 0.5 for view, depth in enumerate(made.views.depths)]
+    one, other = (begun(wall(views=replace(made.views, depths=depths))) for depths in (made.views.depths, spoilt))
+    assert one.source == "depth"
+    np.testing.assert_array_equal(one.gaussians.means, other.gaussians.means)
+
+
+def test_gaussians_stand_on_a_mesh(tmp_path: Path) -> None:
+    corners = np.array([[x, y, DEPTH + TILT * x] for x in (-2.0, 3.0) for y in (-1.8, 1.8)])
+    trimesh.Trimesh(corners, [[0, 1, 2], [1, 3, 2]]).export(tmp_path / "wall.ply")
+    config = SeedConfig(source="mesh", mesh=str(tmp_path / "wall.ply"), voxel=0.1)
+    start = begun(wall(), config)
+    assert start.source == "mesh"
+    assert len(start.gaussians) > 1000
+    means = start.gaussians.means
+    np.testing.assert_allclose(means[:, 2], DEPTH + TILT * means[:, 0], atol=1e-3)
+
+
+def test_points_without_colors_are_grey_and_it_is_said_once() -> None:
+    points = wall_points()
+    bare = wall(views=wall_views(), sfm_points=points)
+    for dense in (NEVER, DenseConfig(size=96, sources=3, samples=1)):
+        with pytest.warns(SceneWarning, match="40 points without colors are made mid-grey") as warned:
+            start = begun(bare, dense=dense)
+        assert len(warned) == 1
+        grey = np.abs(start.gaussians.sh[:, 0]).max(axis=1) < 0.02
+        assert 40 <= grey.sum() < 45 + 0.02 * len(grey)
+        assert (len(start.gaussians) > 300) == (dense is not NEVER)

@@ -168,8 +168,7 @@ def _report_budget(
         return []
     image_scale = scale * config.data.image_scale
     chosen = {"image_scale": image_scale, "steps": result.steps, "sh_degree": plan.sh_degree}
-    options = [f"data.image_scale={image_scale!r}", f"optimize.steps={result.steps}"]
-    options += [f"optimize.earlier={[*plan.earlier]}".replace(" ", ""), f"optimize.sh_degree={plan.sh_degree}"]
+    options = [f"data.image_scale={image_scale!r}", f"optimize.steps={plan.steps}"]
     if plan.most is not None:
         chosen["most_gaussians"] = plan.most
     report_choice(
@@ -179,7 +178,7 @@ def _report_budget(
         predicted={name: value for name in budget.limits if (value := getattr(plan, name)) is not None},
         notes=plan.notes,
         quiet=config.quiet,
-        options=[*options, "budget.minutes=0"],
+        options=[*options, f"optimize.sh_degree={plan.sh_degree}", "budget.minutes=0"],
     )
     return report_budget(summary, budget, {"seconds": seconds, "megabytes": file.stat().st_size / MEGABYTE})
 

@@ -52,7 +52,7 @@ from gsencoder.infer.views.pictures import view_pictures
 from gsencoder.infer.views.scores import score_views
 from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, target_of, targets_of
 from gsencoder.memory.index import IndexConfig, index_features
-from gsencoder.reconstruct.exposure import apply_colors
+from gsencoder.reconstruct.parameters import apply_colors
 from gsencoder.reconstruct.plan import ReconstructBudget
 from gsencoder.reconstruct.run import ReconstructConfig, Reconstruction, reconstruct
 from gsencoder.render import BlendConfig
