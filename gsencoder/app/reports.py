@@ -16,7 +16,7 @@ from gsencoder.infer.draw import color_bar, depth_picture, fit_pca_colors, pca_p
 from gsencoder.infer.page.report import HtmlReport
 from gsencoder.infer.pictures import relevancy_pictures
 from gsencoder.render import blend
-from gsencoder.render.images import depth_image, render_image
+from gsencoder.render.images import render_image
 from gsencoder.types import GaussianFeatures, Localization, Scene
 from gsencoder.types.orientation import upright_views
 
@@ -41,7 +41,7 @@ def add_views(report: HtmlReport, scene: Scene, features: Mapping[str, GaussianF
     for view in numbers:
         b = blend(gaussians, views.cameras, view)
         rendered.append(render_image(gaussians, views.cameras, view, blended=b))
-        depths.append(depth_picture(depth_image(b)))
+        depths.append(depth_picture(b.depth_map()))
         alpha = b.alpha.reshape(b.shape).numpy()
         for title, rows in stored.items():
             values = b.render(rows).reshape(*b.shape, -1).numpy()

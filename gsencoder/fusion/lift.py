@@ -1,5 +1,6 @@
-"""Lifting one view: the matrix that carries its map to the Gaussians, and the sums over all views."""
+"""Lifting: the matrix that carries a view's map to the Gaussians, sums over all views, and which views show most."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, no_type_check
@@ -8,13 +9,13 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int32, Int64
 
+from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import timed
 from gsencoder.core.settings import check_limits, option
-from gsencoder.core.threads import kernel
+from gsencoder.core.threads import kernel, parallel
 from gsencoder.fusion.basis import Moments, distinct_rows, to_coordinates
 from gsencoder.render import Blend, BlendConfig, blend
-from gsencoder.render.images import depth_image
 from gsencoder.render.rays import Lattice, grid_lattice
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Gaussians, Views
 
@@ -86,7 +87,10 @@ def depth_interval(
     the row's rays meet, widened by the tolerances, in all of the maps."""
     least, most = np.full(lattice.rows, -np.inf, np.float32), np.full(lattice.rows, np.inf, np.float32)
     for depth in depths:
-        low, high = _interval(*_row_range(depth, lattice), config)
+        y, x = ray_pixels(lattice, depth.shape[1], depth.shape[0])
+        nearest, farthest = np.empty(lattice.rows, np.float32), np.empty(lattice.rows, np.float32)
+        _measured_range(depth, y, x, lattice.width, lattice.side, nearest, farthest)
+        low, high = _interval(nearest, farthest, config)
         least, most = np.maximum(least, low), np.minimum(most, high)
     return least, most
 
@@ -104,19 +108,10 @@ def ray_pixels(lattice: Lattice, width: int, height: int) -> tuple[Int32[np.ndar
     return y.astype(np.int32), x.astype(np.int32)
 
 
-def _row_range(
-    depth: Float32[np.ndarray, "H W"], lattice: Lattice
-) -> tuple[Float32[np.ndarray, " P"], Float32[np.ndarray, " P"]]:
-    """The nearest and the farthest depth that was measured on the rays of each row; 0 where none was."""
-    y, x = ray_pixels(lattice, depth.shape[1], depth.shape[0])
-    low, high = np.empty(lattice.rows, np.float32), np.empty(lattice.rows, np.float32)
-    _measured_range(depth, y, x, lattice.width, lattice.side, low, high)
-    return low, high
-
-
 @kernel
 @no_type_check
 def _measured_range(depth, y, x, width, side, low, high):
+    """The nearest and the farthest depth that was measured on the rays of each row; 0 where none was."""
     for row in range(len(low)):
         first_y, first_x = row // width * side, row % width * side
         nearest, farthest = np.float32(np.inf), np.float32(0)
@@ -136,9 +131,7 @@ def row_mask(mask: Bool[np.ndarray, "H W"], lattice: Lattice) -> Float32[np.ndar
 
 
 MAX_CODES = 256
-"""Up to so many codes are summed by code, however few coordinates there are."""
-BLOCK_VALUES = 1 << 27
-"""Values of a map that are made at once from its codes, 0.5 GiB."""
+"""Up to this many codes are summed by code, however few coordinates there are."""
 
 
 class FeatureSums:
@@ -165,7 +158,6 @@ class FeatureSums:
     ) -> None:
         """Args:
         gaussians: number of rows.
-        space: of the maps.
         basis: whose coordinates are summed; None = channels.
         table: that all maps share; None = dense maps, or maps with a table each. Sums are by its rows, unless it
             has so many that sums of vectors are far narrower.
@@ -173,7 +165,7 @@ class FeatureSums:
         with_mean: whether the mean of the maps' vectors is computed on the way.
         """
         columns = space.channels if basis is None else len(basis.components)
-        self.basis, self.views, self._shared, self.device = basis, 0, table, device
+        self.basis, self.views, self.device = basis, 0, device
         self.table = table if table is not None and _few_codes(len(table), columns) else None
         self.moments = Moments(space.channels, second=False) if with_mean else None
         width = columns if self.table is None else len(self.table)
@@ -228,64 +220,43 @@ class FeatureSums:
         if self.moments is not None:
             self.moments.add(distinct_rows(feature_map))
         share = row_mask(mask, b.lattice) if mask is not None else None
+        own = feature_map.table
         if self.table is not None:
             _lift_shares_into(b, feature_map, share, self._sums)
-            return
-        if feature_map.codes is not None:
-            self._add_coded(b, feature_map, share)
-            return
-        if feature_map.shares is not None and self._shared is not None:
-            self._add_mixed(b, feature_map, share)
-            return
+        elif feature_map.codes is not None and own is not None and _few_codes(len(own), self._sums.shape[1]):
+            if len(own):
+                sums = self._zeros(len(self._weights), len(own))
+                _lift_shares_into(b, feature_map, share, sums)
+                self._sums += self._product(sums, self._in_columns(own))
+                self._weights += sums.sum(dim=1, keepdim=True)
+        else:
+            maps, scale = self._vectors(feature_map, share)
+            b.lift_into(self._tensor(maps), self._sums)
+            b.lift_into(self._tensor(scale[:, None]), self._weights)
+
+    def _vectors(
+        self, feature_map: FeatureMap, share: Float32[np.ndarray, " P"] | None
+    ) -> tuple[Float32[np.ndarray, "P columns"], Float32[np.ndarray, " P"]]:
+        """What each row gives, and with which weight."""
+        table = feature_map.table
+        if feature_map.codes is not None and table is not None:
+            codes = _codes_in_mask(feature_map, share)
+            # The row behind the last one is what code −1 takes.
+            padded = self._in_columns(np.concatenate([table, np.zeros_like(table[:1])]))
+            padded[-1] = 0
+            return padded[codes], (codes >= 0).astype(np.float32)
+        if feature_map.shares is not None and table is not None:
+            shares = feature_map.shares.reshape(-1, len(table))
+            shares = shares if share is None else shares * share[:, None]
+            return shares @ self._in_columns(table), shares.sum(axis=1)
         vectors = feature_map.rows()
         scale = np.isfinite(vectors[:, 0]).astype(np.float32)
         if not scale.all():
             vectors = np.where(scale[:, None] > 0, vectors, np.float32(0))
         if share is not None:
             scale *= share
-        maps = to_coordinates(self.basis, vectors) if self.basis is not None else vectors
-        if scale.min() < 1:
-            maps = maps * scale[:, None]
-        b.lift_into(self._tensor(maps), self._sums)
-        b.lift_into(self._tensor(scale[:, None]), self._weights)
-
-    def _add_coded(self, b: Blend, feature_map: FeatureMap, share: Float32[np.ndarray, " P"] | None) -> None:
-        """Adds a coded map with a table of its own: as one of a shared table, and turned into vectors at once."""
-        table = feature_map.table
-        assert table is not None
-        if not len(table):
-            return
-        vectors = self._in_columns(table)
-        if not _few_codes(len(table), self.sums.shape[1]):
-            self._add_vectors(b, _codes_in_mask(feature_map, share), vectors)
-            return
-        sums = self._zeros(len(self._weights), len(table))
-        _lift_shares_into(b, feature_map, share, sums)
-        self._sums += self._product(sums, vectors)
-        self._weights += sums.sum(dim=1, keepdim=True)
-
-    def _add_vectors(self, b: Blend, codes: Int32[np.ndarray, " P"], vectors: Float32[np.ndarray, "C columns"]) -> None:
-        """Adds the vectors of codes, a few coordinates at a time: sums by code would be wider than those of vectors."""
-        has_vector = (codes >= 0).astype(np.float32)
-        b.lift_into(self._tensor(has_vector[:, None]), self._weights)
-        # The row behind the last one is what code −1 takes.
-        padded = np.concatenate([vectors, np.zeros_like(vectors[:1])])
-        width = max(1, BLOCK_VALUES // len(codes))
-        for start in range(0, vectors.shape[1], width):
-            maps = np.ascontiguousarray(padded[:, start : start + width])[codes]
-            sums = self._zeros(len(self._sums), maps.shape[1])
-            b.lift_into(self._tensor(maps), sums)
-            self._sums[:, start : start + width] += sums
-
-    def _add_mixed(self, b: Blend, feature_map: FeatureMap, share: Float32[np.ndarray, " P"] | None) -> None:
-        """Adds shares of a table that has too many rows for sums by code."""
-        assert feature_map.shares is not None
-        assert self._shared is not None
-        shares = feature_map.shares.reshape(-1, len(self._shared))
-        if share is not None:
-            shares = shares * share[:, None]
-        b.lift_into(self._tensor(shares @ self._in_columns(self._shared)), self._sums)
-        b.lift_into(self._tensor(shares.sum(axis=1, keepdims=True)), self._weights)
+        maps = self._in_columns(vectors)
+        return maps if scale.min() == 1 else maps * scale[:, None], scale
 
     def _in_columns(self, table: Float32[np.ndarray, "C D"]) -> Float32[np.ndarray, "C columns"]:
         return to_coordinates(self.basis, table) if self.basis is not None else table
@@ -347,8 +318,6 @@ def view_matrix(
     """The matrix that a view's map is lifted with: B of its cells, or one entry for each visible center.
 
     Args:
-        views: cameras, and sensor depth where it is tested against.
-        feature_map: its cells are the rows.
         visibility: what hides an entry, resolved (`resolve`).
         device: where B is made and held against depth maps; centers are tested on the CPU, and go there as a matrix.
     """
@@ -385,7 +354,7 @@ def depth_maps(
             assert views.depths is not None
             maps.append(views.depths[view])
         else:
-            maps.append(depth_image(blend(gaussians, views.cameras, view, config=config, device=device)))
+            maps.append(blend(gaussians, views.cameras, view, config=config, device=device).depth_map())
     return maps
 
 
@@ -421,3 +390,64 @@ def center_matrix(
         lattice,
         config,
     )
+
+
+RAYS = 8000
+"""About the number of rays of a view that are followed; projecting and sorting Gaussians costs as much as these."""
+SAMPLE = 20_000
+"""Gaussians by which views are ordered."""
+
+
+def sample_view(
+    gaussians: Gaussians, views: Views, view: int, visibility: VisibilityConfig, config: BlendConfig
+) -> Blend:
+    """B of every k-th pixel of a view in both directions, one ray a row, with `visibility` resolved."""
+    width, height = int(views.cameras.widths[view]), int(views.cameras.heights[view])
+    # Odd, so that rays pass through the centers of pixels.
+    step = 2 * max(round((math.sqrt(width * height / RAYS) - 1) / 2), 0) + 1
+    cells = FeatureMap(
+        features=np.zeros((max(height // step, 1), max(width // step, 1), 1), np.float32),
+        grid_from_image=np.array([[1 / step, 0, 0], [0, 1 / step, 0]]),
+        space=FeatureSpace(name="rays", channels=1),
+    )
+    one_ray = replace(config, rays_per_patch=1)
+    b = view_matrix(gaussians, views, view, cells, lift="blend", visibility=visibility, config=one_ray)
+    if views.masks is not None:
+        share = np.repeat(row_mask(views.masks[view], b.lattice), np.diff(b.crow.numpy()))
+        b.weight.numpy()[:] *= share
+    return b
+
+
+def coverage_order(seen: Bool[np.ndarray, "V n"], first: Sequence[int] = ()) -> Int64[np.ndarray, " V"]:
+    """All views, those of `first` before any other, each the one that shows most Gaussians that those before it do not;
+    of equal ones the first. Once all are seen, it is counted which are seen a second time, and so on."""
+    order, left = list[int](), list(range(len(seen)))
+    missing = np.ones(seen.shape[1], bool)
+    while left:
+        gains = seen[:, missing].sum(axis=1)
+        if not gains[left].any() and not missing.all():
+            missing[:] = True
+            continue
+        view = first[len(order)] if len(order) < len(first) else max(left, key=lambda each: gains[each])
+        order.append(view)
+        left.remove(view)
+        missing &= ~seen[view]
+    return np.array(order, np.int64)
+
+
+def covering_views(
+    gaussians: Gaussians, views: Views, visibility: VisibilityConfig, config: BlendConfig, count: int
+) -> tuple[int, ...]:
+    """Row numbers of `count` views, ascending, each of which shows most of what those before it do not; a test against
+    rendered depth does not count. `visibility` is resolved."""
+    if count >= len(views):
+        return tuple(range(len(views)))
+    against = replace(visibility, against=tuple(source for source in visibility.against if source == "sensor"))
+    sample = even_indices(len(gaussians), SAMPLE)
+
+    def seen(view: int) -> Bool[np.ndarray, " n"]:
+        b = sample_view(gaussians, views, view, against, config)
+        return np.bincount(b.col.numpy(), b.weight.numpy(), len(gaussians))[sample] > 0
+
+    order = coverage_order(np.stack(parallel(seen, range(len(views)))))
+    return tuple(int(view) for view in np.sort(order[:count]))

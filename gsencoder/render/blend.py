@@ -16,7 +16,7 @@ from torch import Tensor
 from gsencoder import geometry
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import check_limits, option
-from gsencoder.render import blend_torch, reference
+from gsencoder.render import blend_cpu, blend_torch
 from gsencoder.render.rays import Lattice, grid_lattice, patch_lattice, strided_lattice
 from gsencoder.types import Cameras, FeatureMap, Gaussians
 
@@ -25,17 +25,8 @@ Backend = Literal["auto", "cpu", "torch", "reference"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BlendConfig:
-    """The accuracy knobs of B, each an explicit bound.
-
-    Attributes:
-        rays_per_patch: rays averaged into a patch row: 1, 4, 9, 16, …
-        min_weight: entries below this are dropped; a row loses at most (entries dropped) × min_weight.
-        stop_transmittance: a ray ends where less than this share of it is left.
-        near: smallest depth, world units.
-        eps2d: low-pass variance added to every projected Gaussian, pixels².
-        backend: "cpu" (numba), "torch" (batches of tiles, any device and float type), "reference" (its plain twin, tile
-            by tile), or "auto": "cpu" on a CPU in float32, else "torch".
-    """
+    """The accuracy knobs of B, each an explicit bound: a row loses at most (entries dropped) × min_weight. The backend
+    "auto" is "cpu" on a CPU in float32, else "torch"."""
 
     rays_per_patch: int = option(64, "rays averaged into one patch: 1, 4, 9, 16, …")
     min_weight: float = option(0.0, "smallest blending weight that is stored", ge=0, lt=1)
@@ -91,12 +82,10 @@ class Blend:
     def transposed(self) -> tuple[Int64[Tensor, " M"], Int64[Tensor, " M_plus_1"], Int32[Tensor, " nnz"], Tensor]:
         """The M columns that occur, and Bᵀ restricted to them: (columns, crow, row, weight)."""
         if self._on_numba:
-            from gsencoder.render import blend_cpu as products
-
             arrays = (self.crow.numpy(), self.col.numpy(), self.weight.numpy())
-            columns, crow, row, weight = map(torch.from_numpy, products.transpose(*arrays, self.gaussians))
+            columns, crow, row, weight = map(torch.from_numpy, blend_cpu.transpose(*arrays, self.gaussians))
             return columns, crow, row, weight
-        return reference.transpose(self.crow, self.col, self.weight)
+        return blend_torch.transpose(self.crow, self.col, self.weight)
 
     @property
     def _on_numba(self) -> bool:
@@ -122,6 +111,10 @@ class Blend:
     def depth(self) -> Float[Tensor, " P"]:
         """Expected depth Σ w·z / Σ w in world units; 0 where nothing is hit."""
         return self.render(self.depths) / self.alpha.clamp(min=torch.finfo(self.alpha.dtype).tiny)
+
+    def depth_map(self, min_alpha: float = 0.5) -> Float32[np.ndarray, "H W"]:
+        """Expected depth as a map; 0 = none, where alpha is below `min_alpha`."""
+        return torch.where(self.alpha >= min_alpha, self.depth, 0).reshape(self.shape).float().cpu().numpy()
 
     @cached_property
     def median_depth(self) -> Float[Tensor, " P"]:
@@ -161,45 +154,35 @@ class Blend:
         Rows of code −1 give nothing. By linearity `sums @ table` is what lifting `table[codes]` would have given.
         """
         if self._on_numba:
-            from gsencoder.render import blend_cpu as products
-
-            products.add_codes(*(part.numpy() for part in (self.crow, self.col, self.weight, codes, sums)))
+            blend_cpu.add_codes(*(part.numpy() for part in (self.crow, self.col, self.weight, codes, sums)))
         else:
             columns, crow, row, weight = self.transposed
-            reference.count_codes(crow, row, weight, codes, columns, sums)
-
-    def keep(self, entries: Tensor) -> "Blend":
-        """The same blend with only the entries where the boolean mask `entries` is True."""
-        row = torch.repeat_interleave(torch.arange(self.rows, device=self.crow.device), self.crow.diff())[entries]
-        crow = torch.zeros_like(self.crow)
-        crow[1:] = torch.bincount(row, minlength=self.rows).cumsum(0)
-        return Blend(crow, self.col[entries], self.weight[entries], self.depths, self.lattice, self.config)
+            blend_torch.count_codes(crow, row, weight, codes, columns, sums)
 
     def keep_between(self, least: Float[Tensor, " P"], most: Float[Tensor, " P"]) -> "Blend":
         """The same blend with only the Gaussians whose depth lies from `least` to `most` of their row."""
         if self._on_numba:
-            from gsencoder.render import blend_cpu as products
-
             arrays = (self.crow, self.col, self.weight, self.depths, least, most)
-            selected = products.keep_between(*(array.numpy() for array in arrays))
+            selected = blend_cpu.keep_between(*(array.numpy() for array in arrays))
             crow, col, weight = (torch.from_numpy(array) for array in selected)
-            return Blend(crow, col, weight, self.depths, self.lattice, self.config)
-        row = torch.repeat_interleave(torch.arange(self.rows, device=self.crow.device), self.crow.diff())
-        z = self.depths[self.col.long()]
-        return self.keep((z >= least[row]) & (z <= most[row]))
+        else:
+            row = torch.repeat_interleave(torch.arange(self.rows, device=self.crow.device), self.crow.diff())
+            z = self.depths[self.col.long()]
+            kept = (z >= least[row]) & (z <= most[row])
+            col, weight, crow = self.col[kept], self.weight[kept], torch.zeros_like(self.crow)
+            crow[1:] = torch.bincount(row[kept], minlength=self.rows).cumsum(0)
+        return Blend(crow, col, weight, self.depths, self.lattice, self.config)
 
 
 def _multiply_into(
     crow: Tensor, col: Tensor, weight: Tensor, values: Tensor, targets: Tensor, out: Tensor, *, on_numba: bool
 ) -> None:
     if on_numba and values.dtype in (torch.float32, torch.float64):
-        from gsencoder.render import blend_cpu as products
-
         arrays = (crow, col, weight, values.detach().contiguous(), targets, out)
-        products.product(*(array.numpy() for array in arrays))
+        blend_cpu.product(*(array.numpy() for array in arrays))
     else:
         # Targets are distinct: no two terms meet, so the order of additions does not depend on the device.
-        out.index_add_(0, targets, reference.product(crow, col, weight, values.detach()))
+        out.index_add_(0, targets, blend_torch.product(crow, col, weight, values.detach()))
 
 
 class _Render(torch.autograd.Function):
@@ -252,9 +235,6 @@ def blend(
             same, and what lies behind is not composited at all.
         device: where the result is made and lives; the numba backend computes on a CPU alone.
         dtype: float type of the torch backends; the numba backend computes in float64 and stores float32.
-
-    Raises:
-        InputError: no such view, knobs out of range, or the numba backend for another device.
     """
     if not -len(cameras) <= view < len(cameras):
         raise InputError(f"view: expected 0 to {len(cameras) - 1}, got {view}")
@@ -272,58 +252,50 @@ def blend(
     if backend == "cpu":
         if not on_cpu:
             raise InputError(f"blend.backend: cpu computes on a CPU alone, got device {device}; use auto or torch")
-        return _blend_cpu(gaussians, cameras, view, lattice, between, config)
+        pose, K = cameras.cam_from_world[view], cameras.Ks[view]
+        return _blend_cpu(gaussians, pose, K, (width, height), lattice, between, config)
+
+    def tensor(array: np.ndarray, dtype: torch.dtype = dtype) -> Tensor:
+        return torch.as_tensor(array, device=device).to(dtype)
+
     # A projection costs little, so that float64 is affordable also where a GPU is slow in it; see `blend_torch`.
     precise = dtype if backend == "reference" else torch.float64
-    projected = _project(gaussians, cameras, view, config, device, precise)
-    opacities = torch.as_tensor(gaussians.opacities, device=device, dtype=dtype)
-    make = reference.blend_weights if backend == "reference" else blend_torch.blend_weights
-    crow, col, weight = make(projected, opacities, lattice, stop=config.stop_transmittance, keep=config.min_weight)
+    projected = geometry.project(
+        tensor(gaussians.means, precise),
+        tensor(gaussians.quats, precise),
+        tensor(gaussians.scales, precise),
+        tensor(gaussians.opacities, precise),
+        tensor(cameras.cam_from_world[view], precise),
+        tensor(cameras.Ks[view], precise),
+        width,
+        height,
+        eps2d=config.eps2d,
+        near=config.near,
+    )
+    make = blend_torch.reference_weights if backend == "reference" else blend_torch.blend_weights
+    knobs = {"stop": config.stop_transmittance, "keep": config.min_weight}
+    crow, col, weight = make(projected, tensor(gaussians.opacities), lattice, **knobs)
     b = Blend(crow, col, weight, projected.depths.to(dtype), lattice, config)
     if between is None:
         return b
     return b.keep_between(*(torch.from_numpy(depths).to(b.depths) for depths in between))
 
 
-def _project(
-    gaussians: Gaussians, cameras: Cameras, view: int, config: BlendConfig, device: Any, dtype: torch.dtype
-) -> geometry.Projected:
-    def tensor(array: np.ndarray) -> Tensor:
-        return torch.as_tensor(array, device=device).to(dtype)
-
-    return geometry.project(
-        tensor(gaussians.means),
-        tensor(gaussians.quats),
-        tensor(gaussians.scales),
-        tensor(gaussians.opacities),
-        tensor(cameras.cam_from_world[view]),
-        tensor(cameras.Ks[view]),
-        int(cameras.widths[view]),
-        int(cameras.heights[view]),
-        eps2d=config.eps2d,
-        near=config.near,
-    )
-
-
 def _blend_cpu(
     gaussians: Gaussians,
-    cameras: Cameras,
-    view: int,
+    pose: np.ndarray,
+    K: np.ndarray,
+    size: tuple[int, int],
     lattice: Lattice,
     between: tuple[np.ndarray, np.ndarray] | None,
     config: BlendConfig,
 ) -> Blend:
-    from gsencoder.render import blend_cpu as cpu
-
-    size = int(cameras.widths[view]), int(cameras.heights[view])
-    projected, index, z = cpu.project(
-        gaussians, cameras.cam_from_world[view], cameras.Ks[view], *size, lattice, eps2d=config.eps2d, near=config.near
-    )
+    projected, index, z = blend_cpu.project(gaussians, pose, K, *size, lattice, eps2d=config.eps2d, near=config.near)
     depths = np.zeros(len(gaussians), np.float32)
     depths[index] = z
     if between is None:
         between = np.full(lattice.rows, -np.inf, np.float32), np.full(lattice.rows, np.inf, np.float32)
     keep, stop = config.min_weight, config.stop_transmittance
-    arrays = cpu.blend_weights(lattice, projected, index, z, depths, between, stop=stop, keep=keep)
-    crow, col, weight = map(torch.from_numpy, arrays)
+    made = blend_cpu.blend_weights(lattice, projected, index, z, depths, between, stop=stop, keep=keep)
+    crow, col, weight = map(torch.from_numpy, made)
     return Blend(crow, col, weight, torch.from_numpy(depths), lattice, config)

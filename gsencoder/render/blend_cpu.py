@@ -1,7 +1,7 @@
-"""Blending weights on a CPU: numba kernels that project, bin and composite; the plain twin is reference.py."""
+"""Blending weights on a CPU: numba kernels that project, bin, composite and multiply."""
 
 import math
-from typing import Protocol, no_type_check, runtime_checkable
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -9,27 +9,13 @@ from jaxtyping import Float32, Float64, Int32, Int64
 from gsencoder.core.threads import PIECES, even_cuts, kernel, parallel
 from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
 from gsencoder.render.rays import Lattice
+from gsencoder.types import Gaussians
 
 _ENTRIES = 48
-"""Room for so many entries a row is set aside; memory that is not touched costs nothing."""
+"""Room for this many entries a row is set aside; memory that is not touched costs nothing."""
 
 _SCRATCH_KEPT = 1 << 24
-"""Rooms of up to so many entries (200 MB) are kept for the next call."""
-
-
-@runtime_checkable
-class Shapes(Protocol):
-    """What is projected, such as `Gaussians`: attributes as there."""
-
-    @property
-    def means(self) -> Float32[np.ndarray, "N 3"]: ...
-    @property
-    def quats(self) -> Float32[np.ndarray, "N 4"]: ...
-    @property
-    def scales(self) -> Float32[np.ndarray, "N 3"]: ...
-    @property
-    def opacities(self) -> Float32[np.ndarray, " N"]: ...
-    def __len__(self) -> int: ...
+"""Rooms of up to this many entries (200 MB) are kept for the next call."""
 
 
 @kernel
@@ -89,7 +75,7 @@ def _project(first, last, means, quats, scales, opacities, pose, K, size, eps2d,
 
 
 def project(
-    gaussians: Shapes,
+    gaussians: Gaussians,
     pose: np.ndarray,
     K: np.ndarray,
     width: int,
@@ -123,37 +109,50 @@ def project(
 
 @kernel
 @no_type_check
-def _bin_tiles(gaussians, index, order, tile, tiles_x, tiles_y):
-    """Counting sort of (tile, Gaussian) pairs that keeps the depth order within a tile."""
+def bin_tiles(splats, index, order, tile, tiles_x, tiles_y, offset, last_u, last_v):
+    """Counting sort of (tile, splat) pairs that keeps the depth order within a tile.
+
+    Ray i is at i + offset. Splats (u, v, half width, half height, …) are rows `index`, front to back in `order`.
+
+    Returns:
+        The first entry of each tile in `members`, and the number of all; the splats of each tile; the first entry of
+        each splat in `entries`, and the number of all; where in `members` each splat stands.
+    """
     n = len(order)
     bounds = np.empty((n, 4), np.int32)
     starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
-    last_u, last_v = tiles_x * tile - 1, tiles_y * tile - 1
+    owners = np.zeros(n + 1, np.int64)
     for k in range(n):
-        line = gaussians[index[k]]
+        line = splats[index[k]]
         u, v, hu, hv = line[0], line[1], line[2], line[3]
-        # Bounds are clipped as floats: a Gaussian far outside the image overflows an integer.
-        u0, u1 = max(np.ceil(u - hu), 0.0), min(np.floor(u + hu), float(last_u))
-        v0, v1 = max(np.ceil(v - hv), 0.0), min(np.floor(v + hv), float(last_v))
-        if u0 > u1 or v0 > v1:
+        # Bounds are clipped as floats: a splat far outside the image overflows an integer.
+        u0, u1 = max(np.ceil(u - hu - offset), 0.0), min(np.floor(u + hu - offset), last_u)
+        v0, v1 = max(np.ceil(v - hv - offset), 0.0), min(np.floor(v + hv - offset), last_v)
+        if not (u0 <= u1 and v0 <= v1):
             bounds[k, 0], bounds[k, 1], bounds[k, 2], bounds[k, 3] = 0, -1, 0, -1
             continue
         bounds[k, 0], bounds[k, 1] = int(u0) // tile, int(u1) // tile
         bounds[k, 2], bounds[k, 3] = int(v0) // tile, int(v1) // tile
+        owners[k + 1] = (bounds[k, 1] - bounds[k, 0] + 1) * (bounds[k, 3] - bounds[k, 2] + 1)
         for ty in range(bounds[k, 2], bounds[k, 3] + 1):
             for tx in range(bounds[k, 0], bounds[k, 1] + 1):
                 starts[ty * tiles_x + tx + 1] += 1
     for t in range(tiles_x * tiles_y):
         starts[t + 1] += starts[t]
+    for k in range(n):
+        owners[k + 1] += owners[k]
     where = starts[:-1].copy()
-    members = np.empty(starts[-1], np.int32)
+    members, entries = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
     for k in order:
+        at = owners[k]
         for ty in range(bounds[k, 2], bounds[k, 3] + 1):
             for tx in range(bounds[k, 0], bounds[k, 1] + 1):
                 t = ty * tiles_x + tx
                 members[where[t]] = index[k]
+                entries[at] = where[t]
                 where[t] += 1
-    return starts, members
+                at += 1
+    return starts, members, owners, entries
 
 
 @kernel
@@ -314,17 +313,16 @@ def blend_weights(
     """CSR (crow, col, weight) of B.
 
     Args:
-        lattice: where the rays are.
         gaussians: on the image plane, from `project`.
         index: which of them touch the image.
         z: their depths, which order them.
         depths: of all Gaussians, which are held against `between`.
         between: smallest and largest depth of the entries that each row stores.
-        stop: transmittance at which a ray ends.
     """
     tile = lattice.tile
     tiles_x, tiles_y = -(-lattice.width * lattice.side // tile), -(-lattice.height * lattice.side // tile)
-    starts, members = _bin_tiles(gaussians, index, _stable_order(z), tile, tiles_x, tiles_y)
+    last_u, last_v = float(tiles_x * tile - 1), float(tiles_y * tile - 1)
+    starts, members, _, _ = bin_tiles(gaussians, index, _stable_order(z), tile, tiles_x, tiles_y, 0.0, last_u, last_v)
     shape = (lattice.height, lattice.width, lattice.side, tile, tiles_x)
     cuts = even_cuts(starts)
     room = np.concatenate(([0], np.cumsum(_ENTRIES * (tile // lattice.side) ** 2 * np.diff(cuts))))

@@ -1,10 +1,5 @@
-"""Rendered images of a splat: colors from SH, composited by a Blend, depth maps, and their PSNR and SSIM.
-
-How much of each view some Gaussians fill, roughly: discs in a small depth buffer instead of blended ellipses.
-
-A hundred views of a million Gaussians take a second, where blending them takes half a minute. It is good enough to tell
-which views are worth a closer look.
-"""
+"""Rendered images of a splat: colors from SH, composited by a Blend, their PSNR and SSIM, and how much of a view some
+Gaussians fill, roughly."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +7,7 @@ from typing import no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Float64, Integer, UInt8
+from jaxtyping import Bool, Float, Float64, Integer, UInt8
 from torch import Tensor
 
 from gsencoder.core.errors import InputError
@@ -41,21 +36,10 @@ def render_image(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     config: BlendConfig = BlendConfig(),
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """One view in color.
-
-    Args:
-        blended: this view's pixel blend, where it has been made already.
-        background: RGB in [0, 1] behind everything.
-        config: accuracy knobs, where the blend must be made.
-    """
+    """One view in color, over a background of RGB in [0, 1]; `blended` is its pixel blend, where there is one."""
     b = blended if blended is not None else blend(gaussians, cameras, view, config=config)
     rgb = b.render(view_colors(gaussians, cameras, view)) + (1 - b.alpha).unsqueeze(1) * torch.tensor(background)
     return (rgb.clamp(0, 1) * 255 + 0.5).to(torch.uint8).reshape(*b.shape, 3).numpy()
-
-
-def depth_image(b: Blend, min_alpha: float = 0.5) -> Float32[np.ndarray, "H W"]:
-    """Expected depth as a map in world units; 0 = none, where alpha is below `min_alpha`."""
-    return torch.where(b.alpha >= min_alpha, b.depth, 0).reshape(b.shape).float().cpu().numpy()
 
 
 class RenderedImages(Sequence[UInt8[np.ndarray, "H W 3"]]):
@@ -134,11 +118,11 @@ OPAQUE = 0.3
 RADIUS = 1.5
 """Radius of a disc in standard deviations along the Gaussian's middle axis."""
 MAX_RADIUS = 8.0
-"""… and at most so many pixels."""
+"""… and at most this many pixels."""
 BEHIND = 1.03
 """What lies behind the nearest disc of a pixel by less than this factor is seen there."""
 MAX_HIDING = 250_000
-"""Of more Gaussians, a random choice of so many hides what is behind them."""
+"""Of more Gaussians, a random choice of this many hides what is behind them."""
 NEAR = 1e-3
 """Share of the median distance from cameras to Gaussians within which nothing is drawn."""
 
@@ -146,10 +130,11 @@ NEAR = 1e-3
 def visible_shares(
     gaussians: Gaussians, cameras: Cameras, groups: Sequence[Integer[np.ndarray, "_n"]]
 ) -> Float64[np.ndarray, "V Q"]:
-    """The share of the pixels of each view in which a Gaussian of each group is the nearest, or nearly.
+    """The share of the pixels of each view in which a Gaussian of each group is the nearest, or nearly, by discs in a
+    small depth buffer instead of blended ellipses.
 
-    Args:
-        cameras: small pictures; the cost is one pass over all Gaussians for each.
+    A hundred views of a million Gaussians take a second, where blending them takes half a minute. It is good enough to
+    tell which views are worth a closer look.
     """
     radii = (RADIUS * np.median(gaussians.scales, axis=1)).astype(np.float32)
     opaque = gaussians.opacities >= OPAQUE

@@ -1,9 +1,7 @@
 """The rasterizer that is differentiable in the geometry, for photometric reconstruction.
 
 Projection is plain torch (geometry.project), so autograd differentiates it; compositing has a backward of its own:
-numba kernels on a CPU, gsplat on CUDA, and torch operations in any float type as their twin.
-
-Compositing that is differentiable in the geometry, on a CPU: numba kernels; the plain twin is in reference.py.
+numba kernels on a CPU, gsplat on CUDA, and torch operations in any float type as their twin (`blend_torch.composite`).
 
 Unlike a Blend, nothing is stored a pixel: the backward pass walks the same tiles front to back again. With
 v_i = Σ_c ∂L/∂out_c · value_ic and S = Σ_i w_i v_i over a ray, the color that comes from behind Gaussian i is
@@ -20,15 +18,16 @@ from typing import Any, Literal, NamedTuple, no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int32, Int64
+from jaxtyping import Float, Int32, Int64
 from torch import Tensor
 
 from gsencoder import geometry
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import check_limits, option
 from gsencoder.core.threads import PIECES, even_cuts, kernel, parallel
-from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN, Projected
-from gsencoder.render import reference
+from gsencoder.geometry import ALPHA_MAX, ALPHA_MIN
+from gsencoder.render import blend_torch
+from gsencoder.render.blend_cpu import bin_tiles
 from gsencoder.render.rays import pixel_lattice
 
 RasterBackend = Literal["auto", "cpu", "reference", "gsplat"]
@@ -81,30 +80,26 @@ def rasterize(
     """One view, differentiable in everything but the camera.
 
     Args:
-        means: centers, world units.
-        quats: rotations wxyz, normalized here.
+        quats: wxyz, normalized here.
         scales: standard deviations, world units.
         opacities: in [0, 1].
         colors: as seen from this camera.
-        K: intrinsics in pixels.
-        width: image width in pixels.
-        height: image height in pixels.
-        config: accuracy knobs and backend.
     """
     backend = _backend(config.backend, means)
     if backend == "gsplat":
-        splat = (means, quats, scales, opacities, colors)
-        stop = config.stop_transmittance
-        return Raster(
-            *rasterize_gsplat(
-                *splat, cam_from_world, K, width, height, near=config.near, eps2d=config.eps2d, stop_transmittance=stop
-            )
-        )
-    knobs = {"eps2d": config.eps2d, "near": config.near}
+        return rasterize_gsplat(means, quats, scales, opacities, colors, cam_from_world, K, width, height, config)
+    knobs, stop = {"eps2d": config.eps2d, "near": config.near}, config.stop_transmittance
     projected = geometry.project(means, quats, scales, opacities, cam_from_world, K, width, height, **knobs)
-    composite = _composite_cpu if backend == "cpu" else _composite_reference
     values = torch.cat((colors, projected.depths.unsqueeze(1)), dim=1)
-    out = composite(projected, opacities, values, width, height, config.stop_transmittance)
+    if backend == "cpu":
+        rows = projected.valid.nonzero().squeeze(1)
+        extents, limit = projected.extents.detach()[rows], projected.mahalanobis2.detach()[rows]
+        shapes = (projected.means2d[rows], projected.conics[rows], opacities[rows], values[rows])
+        out = _Composite.apply(*shapes, extents, limit, projected.depths.detach()[rows], width, height, stop)
+    else:
+        values = torch.cat((values, torch.ones_like(values[:, :1])), dim=1)
+        flat = blend_torch.composite(projected, opacities, values, pixel_lattice(width, height), stop=stop)
+        out = flat.unflatten(0, (height, width))
     radii = torch.where(projected.valid, projected.extents.detach().amax(dim=1), 0)
     return Raster(out[..., :3], out[..., 4], out[..., 3], projected.means2d, radii)
 
@@ -116,23 +111,6 @@ def _backend(requested: RasterBackend, tensor: Tensor) -> RasterBackend:
     if (requested == "cpu") != (device == "cpu") and requested != "reference":
         raise InputError(f"backend: {requested} cannot render tensors on {device}; use auto or reference")
     return requested
-
-
-def _composite_reference(
-    projected: Projected, opacities: Tensor, values: Tensor, width: int, height: int, stop: float
-) -> Float[Tensor, "H W 5"]:
-    values = torch.cat((values, torch.ones_like(values[:, :1])), dim=1)
-    flat = reference.composite(projected, opacities, values, pixel_lattice(width, height), stop=stop)
-    return flat.unflatten(0, (height, width))
-
-
-def _composite_cpu(
-    projected: Projected, opacities: Tensor, values: Tensor, width: int, height: int, stop: float
-) -> Float[Tensor, "H W 5"]:
-    rows = projected.valid.nonzero().squeeze(1)
-    extents, limit = projected.extents.detach()[rows], projected.mahalanobis2.detach()[rows]
-    shapes = (projected.means2d[rows], projected.conics[rows], opacities[rows], values[rows])
-    return _Composite.apply(*shapes, extents, limit, projected.depths.detach()[rows], width, height, stop)
 
 
 class _Composite(torch.autograd.Function):
@@ -153,24 +131,32 @@ class _Composite(torch.autograd.Function):
         stop: float,
     ) -> Float[Tensor, "H W 5"]:
         splats = torch.cat((means2d, extents, conics, limit.unsqueeze(1), opacities.unsqueeze(1)), dim=1).numpy()
-        tiles = bin_splats(splats, depths.numpy(), width, height)
-        colors = np.ascontiguousarray(values.numpy())
-        out = composite(tiles, splats, colors, width, height, stop)
-        ctx.saved = (tiles, splats, colors, stop, out)
+        # Equal depths keep their order.
+        order = np.argsort(depths.numpy(), kind="stable").astype(np.int32)
+        tiles_x, tiles_y, everything = -(-width // TILE), -(-height // TILE), np.arange(len(splats), dtype=np.int32)
+        # Pixel i is hit at i + ½.
+        last = (float(width - 1), float(height - 1))
+        tiles = Tiles(*bin_tiles(splats, everything, order, TILE, tiles_x, tiles_y, 0.5, *last))
+        colors, out = np.ascontiguousarray(values.numpy()), np.empty((height, width, CHANNELS), np.float64)
+        cuts, size = even_cuts(tiles.starts), (width, height, tiles_x)
+        arrays = (tiles.starts, tiles.members, splats, colors, size, stop, out)
+        parallel(lambda piece: _composite(cuts[piece], cuts[piece + 1], *arrays), range(PIECES))
+        ctx.saved = (tiles, cuts, arrays)
         return torch.from_numpy(out).to(values.dtype)
 
     @staticmethod
     def backward(ctx: Any, grads: Float[Tensor, "H W 5"]) -> tuple[Tensor | None, ...]:
-        tiles, splats, colors, stop, out = ctx.saved
-        slopes = differentiate(tiles, splats, colors, stop, out, grads.contiguous().numpy())
-        gradients = torch.from_numpy(slopes)
-        return (
-            gradients[:, :2],
-            gradients[:, 2:5],
-            gradients[:, 5],
-            gradients[:, 6:],
-            *(None,) * 6,
-        )
+        """Partial sums are kept for each tile that a splat touches, and added in one order, so that a rerun gives the
+        same bits however many threads there are."""
+        tiles, cuts, arrays = ctx.saved
+        splats, slopes = arrays[2], grads.contiguous().numpy()
+        partials = np.empty((len(tiles.members), PARTIAL), splats.dtype)
+        parallel(lambda piece: _differentiate(cuts[piece], cuts[piece + 1], *arrays, slopes, partials), range(PIECES))
+        sums, parts = np.empty((len(splats), PARTIAL), splats.dtype), even_cuts(tiles.owners)
+        entries = (tiles.owners, tiles.entries, partials, sums)
+        parallel(lambda piece: _gather(parts[piece], parts[piece + 1], *entries), range(PIECES))
+        by_splat = torch.from_numpy(sums)
+        return by_splat[:, :2], by_splat[:, 2:5], by_splat[:, 5], by_splat[:, 6:], *(None,) * 6
 
 
 TILE = 16
@@ -196,52 +182,6 @@ class Tiles(NamedTuple):
     members: Int32[np.ndarray, " entries"]
     owners: Int64[np.ndarray, " M_plus_1"]
     entries: Int64[np.ndarray, " entries"]
-
-
-@kernel
-@no_type_check
-def _bin_splats(splats, order, tiles_x, tiles_y, width, height):
-    n = len(order)
-    bounds = np.empty((n, 4), np.int32)
-    starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
-    owners = np.zeros(n + 1, np.int64)
-    for g in range(n):
-        u, v, hu, hv = splats[g, 0], splats[g, 1], splats[g, 2], splats[g, 3]
-        # Pixel i is hit at i + ½. Bounds are clipped as floats: what lies far outside overflows an integer.
-        u0, u1 = max(np.ceil(u - hu - 0.5), 0.0), min(np.floor(u + hu - 0.5), width - 1.0)
-        v0, v1 = max(np.ceil(v - hv - 0.5), 0.0), min(np.floor(v + hv - 0.5), height - 1.0)
-        if not (u0 <= u1 and v0 <= v1):
-            bounds[g, 0], bounds[g, 1], bounds[g, 2], bounds[g, 3] = 0, -1, 0, -1
-            continue
-        bounds[g, 0], bounds[g, 1] = int(u0) // TILE, int(u1) // TILE
-        bounds[g, 2], bounds[g, 3] = int(v0) // TILE, int(v1) // TILE
-        owners[g + 1] = (bounds[g, 1] - bounds[g, 0] + 1) * (bounds[g, 3] - bounds[g, 2] + 1)
-        for y in range(bounds[g, 2], bounds[g, 3] + 1):
-            for x in range(bounds[g, 0], bounds[g, 1] + 1):
-                starts[y * tiles_x + x + 1] += 1
-    for t in range(tiles_x * tiles_y):
-        starts[t + 1] += starts[t]
-    for g in range(n):
-        owners[g + 1] += owners[g]
-    where = starts[:-1].copy()
-    members, entries = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int64)
-    for k in range(n):
-        g = order[k]
-        at = owners[g]
-        for y in range(bounds[g, 2], bounds[g, 3] + 1):
-            for x in range(bounds[g, 0], bounds[g, 1] + 1):
-                t = y * tiles_x + x
-                members[where[t]] = g
-                entries[at] = where[t]
-                where[t] += 1
-                at += 1
-    return starts, members, owners, entries
-
-
-def bin_splats(splats: Float[np.ndarray, "M 9"], depths: Float[np.ndarray, " M"], width: int, height: int) -> Tiles:
-    """Sorts splats into the tiles that their ellipses may touch; equal depths keep their order."""
-    order = np.argsort(depths, kind="stable").astype(np.int32)
-    return Tiles(*_bin_splats(splats, order, -(-width // TILE), -(-height // TILE), float(width), float(height)))
 
 
 @kernel
@@ -315,23 +255,6 @@ def _composite(first, last, starts, members, splats, values, size, stop, out):
             for i in range(end_u):
                 for k in range(CHANNELS):
                     out[top + j, left + i, k] = sums[j, i, k]
-
-
-def composite(
-    tiles: Tiles,
-    splats: Float[np.ndarray, "M 9"],
-    values: Float[np.ndarray, "M 4"],
-    width: int,
-    height: int,
-    stop: float,
-) -> Float64[np.ndarray, "H W 5"]:
-    """Σ w·value for each of the four values of the splats, and Σ w, at every pixel."""
-    out = np.empty((height, width, CHANNELS), np.float64)
-    cuts = even_cuts(tiles.starts)
-    size = (width, height, -(-width // TILE))
-    arrays = (tiles.starts, tiles.members, splats, values, size, stop, out)
-    parallel(lambda piece: _composite(cuts[piece], cuts[piece + 1], *arrays), range(PIECES))
-    return out
 
 
 @kernel
@@ -429,38 +352,6 @@ def _gather(first, last, owners, entries, partials, sums):
                 line[k] += part[k]
 
 
-def differentiate(
-    tiles: Tiles,
-    splats: Float[np.ndarray, "M 9"],
-    values: Float[np.ndarray, "M 4"],
-    stop: float,
-    out: Float64[np.ndarray, "H W 5"],
-    grads: Float[np.ndarray, "H W 5"],
-) -> Float[np.ndarray, "M 10"]:
-    """Derivatives of a loss by u, v, a, b, c, opacity and the four values of each splat.
-
-    Partial sums are kept for each tile that a splat touches, and added in one order, so that a rerun gives the same
-    bits however many threads there are.
-
-    Args:
-        tiles: as `composite` had them.
-        grads: derivatives of the loss by `out`.
-    """
-    height, width = out.shape[:2]
-    partials = np.empty((len(tiles.members), PARTIAL), splats.dtype)
-    cuts = even_cuts(tiles.starts)
-    size = (width, height, -(-width // TILE))
-    arrays = (tiles.starts, tiles.members, splats, values, size, stop, out, grads, partials)
-    parallel(lambda piece: _differentiate(cuts[piece], cuts[piece + 1], *arrays), range(PIECES))
-    sums = np.empty((len(splats), PARTIAL), splats.dtype)
-    parts = even_cuts(tiles.owners)
-    parallel(
-        lambda piece: _gather(parts[piece], parts[piece + 1], tiles.owners, tiles.entries, partials, sums),
-        range(PIECES),
-    )
-    return sums
-
-
 STOP_TRANSMITTANCE = 1e-4
 """Compiled into gsplat's kernels."""
 
@@ -475,16 +366,13 @@ def rasterize_gsplat(
     K: Float[Tensor, "3 3"],
     width: int,
     height: int,
-    *,
-    near: float,
-    eps2d: float,
-    stop_transmittance: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """The fields of a Raster; the arguments are those of `rasterize` and of `RasterConfig`."""
-    if stop_transmittance != STOP_TRANSMITTANCE:
+    config: RasterConfig,
+) -> Raster:
+    """`rasterize` on CUDA."""
+    if config.stop_transmittance != STOP_TRANSMITTANCE:
         raise InputError(
             f"stop_transmittance: gsplat ends rays at {STOP_TRANSMITTANCE:g} and takes no other value, "
-            f"got {stop_transmittance:g}; leave it, or use device=cpu"
+            f"got {config.stop_transmittance:g}; leave it, or use device=cpu"
         )
     try:
         from gsplat import rasterization  # type: ignore[import-not-found]
@@ -495,11 +383,11 @@ def rasterize_gsplat(
         ) from error
     rendered, alphas, info = rasterization(
         *(means, quats, scales, opacities, colors, cam_from_world[None], K[None], width, height),
-        near_plane=near,
-        eps2d=eps2d,
+        near_plane=config.near,
+        eps2d=config.eps2d,
         packed=False,
         render_mode="RGB+D",
     )
     radii = info["radii"][0].to(means.dtype)
     radii = radii.amax(dim=-1) if radii.ndim == 2 else radii
-    return rendered[0, ..., :3], alphas[0, ..., 0], rendered[0, ..., 3], info["means2d"][0], radii
+    return Raster(rendered[0, ..., :3], alphas[0, ..., 0], rendered[0, ..., 3], info["means2d"][0], radii)

@@ -1,14 +1,22 @@
-"""The matrix of a view and the sums over views, against what they are defined by."""
+"""Lifting a view: masks, codes and shares, occlusion tests, centers."""
 
 import numpy as np
 import pytest
 import torch
 from splats import front_camera, random_gaussians
 
+from gsencoder.core.errors import InputError
 from gsencoder.fusion import lift
-from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, center_matrix, keep_visible, limit_rays, view_matrix
-from gsencoder.render import BlendConfig, blend
-from gsencoder.render.images import depth_image
+from gsencoder.fusion.lift import (
+    FeatureSums,
+    VisibilityConfig,
+    center_matrix,
+    keep_visible,
+    limit_rays,
+    row_mask,
+    view_matrix,
+)
+from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Views
 
 WIDTH, HEIGHT, STRIDE = 32, 24, 4
@@ -87,9 +95,8 @@ def test_many_codes_are_lifted_as_vectors_with_the_same_result(
         return sums.finish()
 
     features, weights = lifted()
-    # Each table has now more rows than are summed by code, and the vectors are made three coordinates at a time.
+    # Each table has now more rows than are summed by code.
     monkeypatch.setattr(lift, "MAX_CODES", 0)
-    monkeypatch.setattr(lift, "BLOCK_VALUES", 3 * codes.size)
     assert FeatureSums(100, space, basis, table).table is None
     for one, other in zip(lifted(), (features, weights), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
@@ -116,7 +123,7 @@ def test_rendered_depth_is_that_of_pixels_whatever_cells_are_lifted() -> None:
     b = view_matrix(gaussians, VIEWS, 0, feature_map, lift="blend", visibility=visibility, config=config)
     plain = blend(gaussians, CAMERA, like=feature_map, config=config)
     assert plain.lattice.side == 1
-    expected = keep_visible(plain, depth_image(blend(gaussians, CAMERA, config=config)), visibility)
+    expected = keep_visible(plain, blend(gaussians, CAMERA, config=config).depth_map(), visibility)
     assert 0 < len(expected.col) < len(plain.col)
     assert torch.equal(b.crow, expected.crow)
     assert torch.equal(b.col, expected.col)
@@ -145,7 +152,7 @@ def test_a_center_is_lifted_from_the_cell_that_it_projects_into() -> None:
 
 @pytest.mark.parametrize(
     ("across", "down", "rays", "most"),
-    [(4, 4, 64, 16), (4, 4, 16, 16), (4, 4, 9, 9), (4, 9, 100, 36), (1, 1, 16, 1), (0.5, 0.5, 16, 1), (1, 1, 1, 1)],
+    [(4, 4, 64, 16), (4, 4, 9, 9), (4, 9, 100, 36), (0.5, 0.5, 16, 1)],
 )
 def test_a_cell_has_no_more_rays_than_pixels(across: float, down: float, rays: int, most: int) -> None:
     feature_map = FeatureMap(
@@ -155,13 +162,6 @@ def test_a_cell_has_no_more_rays_than_pixels(across: float, down: float, rays: i
     )
     config = BlendConfig(rays_per_patch=rays, near=0.5)
     assert limit_rays(config, feature_map) == BlendConfig(rays_per_patch=most, near=0.5)
-
-
-def test_a_coded_map_has_the_rows_of_its_table_and_none_where_there_is_no_code(rng: np.random.Generator) -> None:
-    table, codes = rng.normal(size=(3, 2)).astype(np.float32), np.array([[0, 2], [-1, 1]], np.int32)
-    space = FeatureSpace(name="s", channels=2)
-    feature_map = FeatureMap(codes=codes, table=table, grid_from_image=np.eye(2, 3), space=space)
-    np.testing.assert_array_equal(feature_map.rows(), [table[0], table[2], [np.nan, np.nan], table[1]])
 
 
 @pytest.mark.parametrize("coded", [False, True])
@@ -179,3 +179,61 @@ def test_sums_are_divided_by_their_weights_and_rows_of_hardly_any_weight_are_zer
     np.testing.assert_allclose(weights, [6, 0, 0, 0.75])
     np.testing.assert_allclose(features[[0, 3]], (shares @ table)[[0, 3]] / [[6], [0.75]], rtol=1e-5)
     assert (features[[1, 2]] == 0).all()
+
+
+ACROSS, DOWN, PATCH, SIDE = 30, 22, 8, 2
+"""Patches reach over the right and lower border of the image; their rays there meet its last pixels."""
+
+
+def patches(n: int = 200) -> Blend:
+    config = BlendConfig(rays_per_patch=SIDE**2)
+    return blend(random_gaussians(n), front_camera(ACROSS, DOWN, 25.0), patch=PATCH, config=config)
+
+
+def pixels_of(row: int) -> list[tuple[int, int]]:
+    """Line and column of the pixel that each ray of a row meets."""
+    line, column = divmod(row, -(-ACROSS // PATCH))
+    step = PATCH / SIDE
+    centers = [(line * PATCH + (i + 0.5) * step, column * PATCH + (j + 0.5) * step) for i in range(2) for j in range(2)]
+    return [(min(int(y), DOWN - 1), min(int(x), ACROSS - 1)) for y, x in centers]
+
+
+def entries(b: Blend) -> set[tuple[int, int]]:
+    rows = np.repeat(np.arange(b.rows), b.crow.diff().numpy())
+    return set(zip(rows.tolist(), b.col.tolist(), strict=True))
+
+
+@pytest.mark.parametrize(("relative", "absolute"), [(0.1, 0.0), (0.0, 0.3), (0.1, 0.2), (1.0, 0.0), (0.0, 9.0)])
+def test_an_entry_stays_if_its_depth_is_among_those_that_its_rows_rays_meet(
+    rng: np.random.Generator, relative: float, absolute: float
+) -> None:
+    b = patches()
+    depth = rng.uniform(2, 4, (DOWN, ACROSS)).astype(np.float32)
+    # Rays without depth, and a row of them alone, which lets nothing pass whatever the tolerance.
+    depth[rng.random(depth.shape) < 0.3] = 0
+    depth[:PATCH, PATCH : 2 * PATCH] = 0
+    expected = set()
+    for row, gaussian in entries(b):
+        measured = [float(depth[pixel]) for pixel in pixels_of(row) if depth[pixel] > 0]
+        if not measured:
+            continue
+        z, near, far = float(b.depths[gaussian]), min(measured), max(measured)
+        passes = not relative or near * (1 - relative) <= z <= far * (1 + relative)
+        if passes and (not absolute or near - absolute <= z <= far + absolute):
+            expected.add((row, gaussian))
+    assert 0 < len(expected) < len(entries(b))
+    visibility = VisibilityConfig(against=("sensor",), relative=relative, absolute=absolute)
+    assert entries(keep_visible(b, depth, visibility)) == expected
+
+
+def test_a_row_counts_by_the_share_of_its_rays_that_a_mask_lets_through(rng: np.random.Generator) -> None:
+    b, mask = patches(1), rng.random((DOWN, ACROSS)) < 0.5
+    expected = [np.mean([mask[pixel] for pixel in pixels_of(row)]) for row in range(b.rows)]
+    np.testing.assert_array_equal(row_mask(mask, b.lattice), np.array(expected, np.float32))
+
+
+def test_a_test_needs_a_tolerance_and_no_test_needs_none() -> None:
+    nothing = {"relative": 0.0, "absolute": 0.0}
+    assert VisibilityConfig(against=(), **nothing).against == ()
+    with pytest.raises(InputError, match="needs relative or absolute"):
+        VisibilityConfig(against=("rendered",), **nothing)

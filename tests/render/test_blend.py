@@ -9,7 +9,7 @@ from dense_blends import EXTREMES, dense
 from splats import front_camera, one_gaussian, random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.render import BlendConfig, blend
+from gsencoder.render import BlendConfig, blend, blend_torch
 from gsencoder.render.blend_cpu import _stable_order
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians
 
@@ -66,8 +66,7 @@ FAST = ["cpu", "torch"]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("log_scale", [-4.0, -2.5, -0.5])
+@pytest.mark.parametrize(("seed", "log_scale"), [(0, -4.0), (1, -2.5), (2, -0.5)])
 def test_weights_colors_and_depths_agree_with_the_definition(backend: str, seed: int, log_scale: float) -> None:
     g, camera = random_gaussians(300, seed, log_scale=log_scale), front_camera()
     expected, depths, doubt = brute_force(g, camera)
@@ -86,7 +85,7 @@ def test_weights_colors_and_depths_agree_with_the_definition(backend: str, seed:
 
 
 @pytest.mark.parametrize("backend", FAST)
-@pytest.mark.parametrize("rays", [1, 4, 9, 49])
+@pytest.mark.parametrize("rays", [1, 9])
 def test_the_fast_backends_agree_with_their_float64_twin_on_patches(rays: int, backend: str) -> None:
     g, camera = random_gaussians(400, 5), front_camera(90, 70)
     config = BlendConfig(rays_per_patch=rays, backend=backend)
@@ -96,8 +95,7 @@ def test_the_fast_backends_agree_with_their_float64_twin_on_patches(rays: int, b
 
 
 @pytest.mark.parametrize("backend", FAST)
-@pytest.mark.parametrize("side", [1, 2, 4])
-@pytest.mark.parametrize("stop", [1e-4, 0.1])
+@pytest.mark.parametrize(("side", "stop"), [(1, 1e-4), (2, 0.1), (4, 1e-4)])
 def test_rays_that_stop_in_any_order_agree_with_the_twin(side: int, stop: float, backend: str) -> None:
     """Opaque Gaussians no larger than a tile: its rays end one after the other, at its borders and inside."""
     g = random_gaussians(500, 8, log_scale=-2.0)
@@ -140,10 +138,8 @@ def test_a_reference_blend_multiplies_like_the_fast_one() -> None:
     g, camera = random_gaussians(150, 4), front_camera(20, 16)
     b = blend(g, camera, config=BlendConfig(backend="reference"), dtype=torch.float64)
     values = torch.randn(150, 20)
-    from gsencoder.render import reference
-
-    torch.testing.assert_close(reference.product(b.crow, b.col, b.weight, values.double()), b.render(values.double()))
-    columns, crow, row, weight = reference.transpose(b.crow, b.col, b.weight)
+    torch.testing.assert_close(blend_torch.product(b.crow, b.col, b.weight, values.double()), b.render(values.double()))
+    columns, crow, row, weight = blend_torch.transpose(b.crow, b.col, b.weight)
     for mine, twin in zip(b.transposed, (columns, crow, row, weight), strict=True):
         torch.testing.assert_close(mine, twin)
 
@@ -180,7 +176,3 @@ def test_wrong_knobs_and_views_are_refused_by_name() -> None:
         blend(g, camera, 5)
     with pytest.raises(InputError, match="rays_per_patch: expected a square"):
         blend(g, camera, patch=4, config=BlendConfig(rays_per_patch=5))
-    with pytest.raises(InputError, match="min_weight"):
-        BlendConfig(min_weight=1.5)
-    with pytest.raises(InputError, match="stop_transmittance"):
-        BlendConfig(stop_transmittance=0.0)

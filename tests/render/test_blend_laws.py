@@ -157,17 +157,18 @@ def test_keeping_a_range_of_depths_is_keeping_the_entries_inside_it(rng: np.rand
     most = least + torch.from_numpy(rng.uniform(-0.5, 2, b.rows).astype(np.float32))
     row = torch.repeat_interleave(torch.arange(b.rows), b.crow.diff())
     z = b.depths[b.col.long()]
-    expected, part = b.keep((z >= least[row]) & (z <= most[row])), b.keep_between(least, most)
+    kept, part = (z >= least[row]) & (z <= most[row]), b.keep_between(least, most)
     assert 0 < len(part.col) < len(b.col)
-    for name in ("crow", "col", "weight"):
-        assert torch.equal(getattr(part, name), getattr(expected, name))
+    assert torch.equal(part.col, b.col[kept])
+    assert torch.equal(part.weight, b.weight[kept])
+    assert torch.equal(part.crow.diff(), torch.bincount(row[kept], minlength=b.rows))
     nothing = b.keep_between(torch.full((b.rows,), torch.inf), torch.zeros(b.rows))
     assert len(nothing.col) == 0
     assert nothing.crow.tolist() == [0] * (b.rows + 1)
 
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
-@pytest.mark.parametrize(("patch", "rays"), [(None, 1), (4, 1), (4, 9), (7, 16)])
+@pytest.mark.parametrize(("patch", "rays"), [(None, 1), (7, 16)])
 def test_a_blend_of_a_range_of_depths_is_the_whole_one_with_the_entries_inside_it(
     backend: Any, patch: int | None, rays: int, rng: np.random.Generator
 ) -> None:

@@ -43,8 +43,7 @@ def both(config: RasterConfig) -> tuple[Raster, Raster]:
     torch.manual_seed(0)
     inputs = [*map(torch.from_numpy, (g.means, g.quats, g.scales, g.opacities)), torch.rand(len(g), 3)]
     view = (torch.from_numpy(camera.cam_from_world[0]), torch.from_numpy(camera.Ks[0]), 61, 43)
-    knobs = {"near": config.near, "eps2d": config.eps2d, "stop_transmittance": config.stop_transmittance}
-    return Raster(*rasterize_gsplat(*inputs, *view, **knobs)), rasterize(*inputs, *view, config=config)
+    return rasterize_gsplat(*inputs, *view, config), rasterize(*inputs, *view, config=config)
 
 
 @pytest.fixture
