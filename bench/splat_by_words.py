@@ -61,7 +61,7 @@ def main() -> None:
     stated = None if options.up is None else np.array([float(value) for value in options.up.split(",")])
     level, up = with_up(replace(scene, views=None, up=stated))
     print(f"up {'unknown' if up is None else up.describe()}")
-    bare = with_views(level, options.orbits)
+    bare = with_views(level, options.orbits)[0]
     assert bare.views is not None
     assert bare.views.images is not None
     print(f"{len(bare.views)} cameras, {bare.views.names[0]} …")

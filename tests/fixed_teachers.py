@@ -10,7 +10,7 @@ from gsencoder.fusion.lift import VisibilityConfig
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene, Views
 
 SPACE = FeatureSpace(name="s", channels=6)
-EXACT = FuseConfig(energy=1.0, narrow=0, visibility=VisibilityConfig(against=()))
+EXACT = FuseConfig(energy=1.0, visibility=VisibilityConfig(against=()))
 
 
 class FixedTeacher:

@@ -8,7 +8,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.data.check.scene_check import warn_of_faults
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
-from gsencoder.fusion.cameras import INSIDE, CamerasOfSplat, with_explained_views
+from gsencoder.fusion.cameras import INSIDE, CamerasOfSplat, with_views
 from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.render import BlendConfig
 from gsencoder.types import Scene
@@ -56,7 +56,7 @@ def load_fusable(
     if scene.views is not None:
         return scene
     with run.step("cameras"):
-        scene, reason = with_explained_views(scene, orbits, blend, cameras=cameras)
+        scene, reason = with_views(scene, orbits, blend, cameras=cameras)
     assert scene.views is not None
     where = "inside" if scene.views.names[0].startswith(INSIDE) else "around"
     run.results["cameras"] = where

@@ -304,7 +304,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "fusion.blend.rays_per_patch": 196,
         "fusion.blend.stop_transmittance": 1e-6,
         "fusion.energy": 1.0,
-        "fusion.table_energy": 1.0,
         "fusion.max_rank": 0,
         "prepare.fusion.blend.rays_per_patch": 196,
         "prepare.fusion.blend.stop_transmittance": 1e-6,

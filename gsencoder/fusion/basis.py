@@ -1,4 +1,4 @@
-"""The affine subspace that a scene's features live in: the smallest rank that keeps a stated share of the energy.
+"""The affine subspace that a scene's features live in: the smallest rank that keeps a share of the energy.
 
 Lifting and rendering are linear, so features may be fused, stored and rendered as R coordinates in place of D
 channels. Because rows of B sum to alpha and not to 1, a rendered map decodes as `(B @ z) @ components + alpha·mean`.
@@ -40,7 +40,6 @@ class Moments:
         self._shift: Float32[np.ndarray, " D"] | None = None
 
     def add(self, vectors: Float[np.ndarray, "n D"]) -> None:
-        """Takes more vectors into account."""
         if len(vectors) == 0:
             return
         if self._shift is None:
@@ -58,12 +57,7 @@ class Moments:
             self.outer += gram
 
     def merge(self, other: "Moments") -> None:
-        """Takes all into account that was added to other moments of as many channels.
-
-        The sums depend on the order of merging within rounding, as they do on the order of `add`; the same order gives
-        the same bits.
-        """
-        assert self.second == other.second, "Moments: of both, or of neither, the second moments are needed"
+        """Takes all into account that was added to others; the same order of merging gives the same bits."""
         if other._shift is None:
             return
         if self._shift is None:
@@ -96,14 +90,12 @@ class Moments:
 
     @property
     def mean(self) -> Float64[np.ndarray, " D"]:
-        """Mean of everything added."""
         if self._shift is None or self.count == 0:
             raise InputError("features: no view has any cell with features; nothing to fit a basis to")
         return self._shift + self.sum / self.count
 
     def covariance(self) -> Float64[np.ndarray, "D D"]:
         """Second moment about the mean."""
-        assert self.second, "Moments: made without second moments"
         offset = self.sum / max(self.count, 1.0)
         return self.outer / max(self.count, 1.0) - np.outer(offset, offset)
 
@@ -116,18 +108,8 @@ def fit_basis(
     energy: float,
     max_rank: int = 0,
 ) -> FeatureBasis:
-    """The leading eigenvectors of a covariance.
-
-    Args:
-        covariance: second moment about that mean.
-        space: what the vectors are.
-        energy: share of the trace to keep, in (0, 1].
-        max_rank: at most so many components; 0 = no limit. `energy_kept` of the result tells what it cost.
-    """
-    if not 0 < energy <= 1:
-        raise InputError(f"energy: expected a share in (0, 1], got {energy}")
-    if max_rank < 0:
-        raise InputError(f"max_rank: expected 0 (no limit) or more, got {max_rank}")
+    """The leading eigenvectors of a covariance, which keep a share of its trace; at most `max_rank` of them, 0 = no
+    limit. `energy_kept` of the result says what that cost."""
     values, vectors = np.linalg.eigh(covariance)
     return _leading(mean, np.maximum(values[::-1], 0), vectors[:, ::-1].T, space, energy=energy, max_rank=max_rank)
 

@@ -38,8 +38,7 @@ from gsencoder.fusion.checkpoint import CachedTeacher, WrappedTeacher, open_chec
 from gsencoder.fusion.coordinates import reduce_to_fit
 from gsencoder.fusion.errors import FieldError, judge, row_cosines
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse, validate_scene
-from gsencoder.fusion.lift import VisibilityConfig, resolve
-from gsencoder.fusion.view_coverage import SAMPLE, coverage_order, sample_view
+from gsencoder.fusion.lift import SAMPLE, VisibilityConfig, coverage_order, resolve, sample_view
 from gsencoder.render import BlendConfig
 from gsencoder.render.rays import Lattice
 from gsencoder.teachers.base import Teacher
@@ -52,7 +51,6 @@ OPTIONS_SET_BY_BUDGET = (
     "basis",
     "max_rank",
     "energy",
-    "table_energy",
     "blend.rays_per_patch",
     "blend.stop_transmittance",
     "blend.min_weight",
@@ -123,7 +121,7 @@ def check_budget(budget: FusionBudget, config: FuseConfig, *, basis: bool = Fals
 def exact_config(config: FuseConfig) -> FuseConfig:
     """The fusion that errors are measured against: the values of `preset=exact`."""
     blend = replace(config.blend, rays_per_patch=196, stop_transmittance=1e-6, min_weight=0.0)
-    return replace(config, blend=blend, energy=1.0, table_energy=1.0, max_rank=0, basis=True, views=0, view_share=1.0)
+    return replace(config, blend=blend, energy=1.0, max_rank=0, basis=True, views=0, view_share=1.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -59,16 +59,11 @@ class InteriorViews(NamedTuple):
 def interior_views(
     gaussians: Gaussians, count: int, *, up: Float64[np.ndarray, "3"] | None = None
 ) -> InteriorViews | None:
-    """The cameras in a splat's free space that cover most of it, among those whose pictures are filled.
+    """Up to `count` cameras in a splat's free space that cover most of it, among those whose pictures are filled; None
+    where no camera stands free with its picture filled, as around an object.
 
-    Args:
-        gaussians: of a room or of anything else.
-        count: largest number of cameras.
-        up: if known, cameras are level and look between 35° and 5° down; else in all directions, and -y is upward
-            in the pictures, as in COLMAP's worlds.
-
-    Returns:
-        None where no camera stands free with its picture filled, as around an object.
+    With `up`, cameras are level and look between 35° and 5° down; else in all directions, and -y is upward in the
+    pictures, as in COLMAP's worlds.
     """
     rows = np.flatnonzero(gaussians.opacities >= OPAQUE)
     if not len(rows):
@@ -163,23 +158,13 @@ def check_orbits(count: int) -> None:
 
 def with_views(
     scene: Scene, count: int, config: BlendConfig = BlendConfig(), *, cameras: CamerasOfSplat = "auto"
-) -> Scene:
-    """The scene; a bare splat is seen by up to `count` cameras, whose pictures are rendered when asked for.
-
-    Args:
-        scene: with Gaussians, where it has no views.
-        count: largest number of cameras.
-        config: accuracy of the rendering.
-        cameras: around the splat, inside it, or "auto": inside if it is a room (`gsencoder.data.enclosure`) and that
-            shows most of it.
-    """
-    return with_explained_views(scene, count, config, cameras=cameras)[0]
-
-
-def with_explained_views(
-    scene: Scene, count: int, config: BlendConfig = BlendConfig(), *, cameras: CamerasOfSplat = "auto"
 ) -> tuple[Scene, str]:
-    """`with_views`, and why the cameras stand where they do."""
+    """The scene, and why its cameras stand where they do; a bare splat is seen by up to `count` cameras, whose pictures
+    are rendered when asked for.
+
+    They stand around the splat, inside it, or "auto": inside if it is a room (`gsencoder.data.enclosure`) and that
+    shows most of it.
+    """
     if scene.views is not None:
         return scene, "the scene has views"
     assert scene.gaussians is not None

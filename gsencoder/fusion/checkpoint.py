@@ -29,10 +29,8 @@ SMALLEST_SCALE = 1e-30
 def write_map(path: Path, feature_map: FeatureMap, *, with_table: bool = False) -> None:
     """Writes a dense or mixed map as float16, each channel divided by its largest magnitude: float16 holds values up to
     65,504 with three digits, and backbones have channels that are a hundred times larger than others. Cells that are
-    not finite are no part of the map, and are marked as such. Codes are written as they are.
-
-    Args:
-        with_table: write the table of a coded or mixed map, too, because it is that of no other map.
+    not finite are no part of the map, and are marked as such. Codes are written as they are; the table of a coded or
+    mixed map where no other map has it.
     """
     arrays = {"grid": feature_map.grid_from_image}
     if with_table:
@@ -52,11 +50,8 @@ def write_map(path: Path, feature_map: FeatureMap, *, with_table: bool = False) 
 
 
 def read_map(path: Path, space: FeatureSpace, table: Float32[np.ndarray, "C D"] | None = None) -> FeatureMap:
-    """The map of a file; cells of a dense map that had none are NaN.
-
-    Args:
-        table: of a mixed map whose file does not hold it.
-    """
+    """The map of a file; cells of a dense map that had none are NaN. `table` is that of a mixed map whose file does not
+    hold it."""
     with open_archive(path) as file:
         grid = file.array("grid", "float64", (2, 3))
         if "table" in file:
@@ -75,11 +70,7 @@ def read_map(path: Path, space: FeatureSpace, table: Float32[np.ndarray, "C D"] 
 
 
 class WrappedTeacher:
-    """A teacher that gives another one's maps in its own way; all else is as the other has it.
-
-    Attributes:
-        teacher: the other one.
-    """
+    """A teacher that gives another one's maps in its own way; all else is as the other has it."""
 
     def __init__(self, teacher: Teacher) -> None:
         self.teacher = teacher
@@ -98,7 +89,6 @@ class UprightTeacher(WrappedTeacher):
         self._last: tuple[Views, Views] | None = None
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The map of a view, on its stored pixels."""
         if views.orientations is None:
             return self.teacher.feature_map(views, view)
         last = self._last
@@ -125,17 +115,12 @@ class CachedTeacher(WrappedTeacher):
     def __init__(
         self, teacher: Teacher, folder: Path, *, before_write: Callable[[], None] = lambda: None, advice: str = ""
     ) -> None:
-        """Args:
-        teacher: whose maps.
-        folder: must hold the maps of one scene by this teacher alone, which is not checked.
-        before_write: called before a file is written.
-        advice: what to do about a damaged file, for the error.
-        """
+        """`folder` must hold the maps of one scene by this teacher alone, which is not checked; `advice` is for the
+        error about a damaged file."""
         super().__init__(teacher)
         self._folder, self._before_write, self._advice = folder, before_write, advice
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The map of a view, from its file where there is one."""
         if self.cheap:
             return self.teacher.feature_map(views, view)
         path = self._folder / f"map_{view:05d}.safetensors"
@@ -156,7 +141,7 @@ SAVE_EVERY = 20.0
 
 @runtime_checkable
 class Sums(Protocol):
-    """Sums over views, such as `gsencoder.fusion.lift.FeatureSums`, which needs torch."""
+    """`gsencoder.fusion.lift.FeatureSums`, which needs torch."""
 
     views: int
 
@@ -173,11 +158,8 @@ class FusionCheckpoint:
         ends earlier, because its settings are wrong, must not leave a folder that refuses the next run.
 
         Maps and sums without settings are what a run left that was killed while it removed its checkpoint. Nobody knows
-        what they were made from, and they are removed.
-
-        Args:
-            folder: of the maps and the sums.
-            settings: all that maps and sums depend on, the scene included, as JSON values.
+        what they were made from, and they are removed. `settings` are all that maps and sums depend on, the scene
+        included, as JSON values.
         """
         self.folder, self._saved_at, self._advice = folder, time.monotonic(), f"delete {folder} to start again"
         self._settings = json.loads(json.dumps(settings))
@@ -238,9 +220,7 @@ def open_checkpoint(
     """Opens the checkpoint in a folder, which belongs to one scene, one teacher, one set of settings and one basis.
 
     Args:
-        folder: of the maps and the sums.
         config: settings of the fusion, as JSON values.
-        gaussians: what is lifted onto.
         views: of the scene; photographs count by their names alone.
         rows: the views that are lifted, in this order.
         basis: one that was given to the fusion; one that it fits itself depends on nothing else.

@@ -106,9 +106,6 @@ def reduce_to_fit(
     Args:
         header: the settings that `save_features` writes with them, which take bytes.
         error: what features may lose where the budget limits the error.
-
-    Raises:
-        InputError: not even one coordinate fits, and no error is limited.
     """
     limit = budget.limit("megabytes") * MEGABYTE
 

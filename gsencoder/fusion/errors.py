@@ -29,7 +29,6 @@ class BasisFit:
         energy: share of the sum of squared distances from the mean that the projections keep.
         cosine: mean cosine, about the mean, of vectors with their projections.
         worst: the cosine below which the worst 5 % of the vectors are.
-        vectors: their number.
     """
 
     energy: float
@@ -38,7 +37,7 @@ class BasisFit:
     vectors: int
 
     def figures(self) -> dict[str, float]:
-        """The figures by name, as summaries and weights state them: of other vectors than the basis was fitted to."""
+        """As summaries and weights name them: of other vectors than the basis was fitted to."""
         return {"other_energy": self.energy, "other_cosine": self.cosine, "other_worst": self.worst}
 
 
@@ -71,7 +70,6 @@ class ProjectionSums:
         self.sums += [(explained * count).sum(), (total * count).sum(), (cosines * count).sum()]
 
     def add_map(self, basis: FeatureBasis, feature_map: FeatureMap) -> None:
-        """Adds the cells of a map that have a vector."""
         if feature_map.codes is not None:
             assert feature_map.table is not None
             codes = feature_map.codes[feature_map.codes >= 0]
@@ -81,7 +79,6 @@ class ProjectionSums:
         self.add(basis, rows[np.isfinite(rows[:, 0])])
 
     def fit(self) -> BasisFit:
-        """The figures of all vectors that were added."""
         vectors = float(self.histogram.sum())
         explained, total, cosines = self.sums.tolist()
         if not vectors:
@@ -96,7 +93,6 @@ class ProjectionSums:
 
 
 def total_fit(sums: Iterable[ProjectionSums]) -> BasisFit:
-    """The figures over the vectors of several sums."""
     total = ProjectionSums()
     for each in sums:
         total.histogram += each.histogram
@@ -105,7 +101,6 @@ def total_fit(sums: Iterable[ProjectionSums]) -> BasisFit:
 
 
 def project_maps(basis: FeatureBasis, teacher: Teacher, views: Views, rows: Iterable[int]) -> ProjectionSums:
-    """The sums over a teacher's maps of some views."""
     if teacher.space != basis.space:
         raise InputError(f"basis: is of ({basis.space.describe()}), the maps of ({teacher.space.describe()})")
     sums, teacher = ProjectionSums(), upright(teacher)
@@ -119,31 +114,24 @@ MAX_CELLS = 32_768
 
 
 class CellSample:
-    """Vectors of evenly spaced cells of maps."""
+    """Vectors of evenly spaced cells of a number of maps."""
 
     def __init__(self, maps: int, limit: int = MAX_CELLS) -> None:
-        """Args:
-        maps: number of the maps that will be added.
-        limit: approximate limit of the cells of all maps.
-        """
         self._per_map = max(1, limit // max(1, maps))
         self._parts: list[np.ndarray] = []
 
     def add(self, feature_map: FeatureMap) -> None:
-        """Adds cells of a map that have a vector."""
         rows = feature_map.rows()
         rows = rows[np.isfinite(rows).all(axis=1)]
         self._parts.append(rows[:: -(-len(rows) // self._per_map)] if len(rows) else rows)
 
     def vectors(self) -> Float32[np.ndarray, "n D"]:
-        """The vectors of all cells of the sample."""
         if not sum(len(part) for part in self._parts):
             raise InputError("heads: no view has a cell with a vector; check the teacher's maps")
         return np.concatenate(self._parts).astype(np.float32, copy=False)
 
 
 def sample_cells(teacher: Teacher, views: Views, rows: Sequence[int]) -> CellSample:
-    """Cells of a teacher's maps of some views."""
     sample, teacher = CellSample(len(rows)), upright(teacher)
     for view in rows:
         sample.add(teacher.feature_map(views, view))
@@ -153,7 +141,7 @@ def sample_cells(teacher: Teacher, views: Views, rows: Sequence[int]) -> CellSam
 DEFAULT_SAMPLE = 20_000
 CHUNK = 4096
 JUDGED = 0.1
-"""Share of the seen Gaussians on which a promised error is measured."""
+"""Share of the seen Gaussians on which the error of a budget is measured."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,8 +175,8 @@ def field_error(
 
     Args:
         reference: what is taken for right.
-        sample: at most so many Gaussians, evenly spaced over those that the reference saw; 0 = all.
-        rows: the Gaussians that are compared, of those that the reference saw; None = a sample.
+        sample: the most Gaussians, evenly spaced over all that the reference saw; 0 = all.
+        rows: the Gaussians that are compared, which the reference saw; None = a sample.
     """
     if len(features) != len(reference) or features.space != reference.space:
         raise InputError(

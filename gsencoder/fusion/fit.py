@@ -38,16 +38,14 @@ class SplatFrame:
     """A similarity from the world of a splat's file to that of the cameras: x_world = scale · rotation @ x + shift.
 
     Attributes:
-        name: what it is, for messages.
-        stated: whether a file of the scene says so.
-        rotation: float64 [3, 3], determinant 1.
-        shift: float64 [3], world units of the cameras.
-        scale: positive.
+        name: for messages.
+        from_file: whether a file of the scene says so.
+        shift: world units of the cameras.
         intrinsics_factor: factor of K with which the photographs fit, in place of a similarity.
     """
 
     name: str
-    stated: bool = False
+    from_file: bool = False
     rotation: Float64[np.ndarray, "3 3"]
     shift: Float64[np.ndarray, "3"]
     scale: float = 1.0
@@ -60,12 +58,11 @@ class SplatFrame:
 
 
 def identity_frame() -> SplatFrame:
-    """The world of the cameras."""
     return SplatFrame(name="the world of the cameras", rotation=np.eye(3), shift=np.zeros(3))
 
 
-def stated_frames(folder: Path | None, splat: Path) -> list[SplatFrame]:
-    """The frames that files beside a splat, or in the scene's folder, say it may be in.
+def frames_of_files(folder: Path | None, splat: Path) -> list[SplatFrame]:
+    """The frames that files in the folders of a splat and of its scene say it may be in.
 
     `dataparser_transforms.json` leads from the world before `applied_transform` of transforms.json, as nerfstudio
     writes it, or from that of its matrices, as where there is none."""
@@ -93,11 +90,10 @@ def stated_frames(folder: Path | None, splat: Path) -> list[SplatFrame]:
 
 
 def _frame(name: str, pose: Float64[np.ndarray, "4 4"], scale: float) -> SplatFrame:
-    return SplatFrame(name=name, stated=True, rotation=pose[:3, :3], shift=pose[:3, 3], scale=scale)
+    return SplatFrame(name=name, from_file=True, rotation=pose[:3, :3], shift=pose[:3, 3], scale=scale)
 
 
 def _pose(value: object, where: str) -> Float64[np.ndarray, "4 4"]:
-    """The pose of three rows of four numbers."""
     try:
         rows = np.array(value, np.float64)[:3]
         return rigid_pose(np.vstack((rows, (0, 0, 0, 1))), where)
@@ -122,12 +118,7 @@ def usual_frames() -> Iterator[SplatFrame]:
 
 
 def moved(gaussians: Gaussians, frame: SplatFrame, origin: Float64[np.ndarray, "3"]) -> Gaussians:
-    """A splat in the world of the cameras.
-
-    Args:
-        gaussians: relative to `origin` of their file's world.
-        origin: that positions are relative to, before and after.
-    """
+    """A splat in the world of the cameras; positions are relative to `origin`, before and after."""
     from gsencoder.geometry import sh_basis  # with torch
 
     means = frame.scale * (gaussians.means + origin) @ frame.rotation.T + frame.shift - origin
@@ -173,12 +164,7 @@ COVERED, CONTRAST = 0.04, 0.01
 
 
 class Agreement(NamedTuple):
-    """How renderings and photographs correlate.
-
-    Attributes:
-        correlation: median of the views; 0 where none can be compared.
-        compared: number of views.
-    """
+    """How renderings and photographs correlate: the median of the views that can be compared, 0 where none can."""
 
     correlation: float
     compared: int
@@ -188,7 +174,6 @@ def with_fitting_splat(scene: Scene, splat: str, options: SceneConfig) -> Scene:
     """The scene with its splat in the world of its cameras: as it is, or moved into it as a file says.
 
     Args:
-        scene: as `load_scene` reads it.
         splat: the file of its Gaussians, as `load_scene` takes it; empty = none, and nothing is checked.
         options: how it was read; `check_fit` = whether a splat that does not fit is refused.
 
@@ -205,8 +190,8 @@ def with_fitting_splat(scene: Scene, splat: str, options: SceneConfig) -> Scene:
     if given.correlation >= FITS:
         return scene
     best, found = identity_frame(), given
-    for frame in (*stated_frames(scene.folder, file), *usual_frames()):
-        if best.stated and not frame.stated and found.correlation >= CLEAR:
+    for frame in (*frames_of_files(scene.folder, file), *usual_frames()):
+        if best.from_file and not frame.from_file and found.correlation >= CLEAR:
             break
         fit = agreement(gaussians, small, frame, scene.origin)
         if fit.correlation > found.correlation:
@@ -222,7 +207,7 @@ def with_fitting_splat(scene: Scene, splat: str, options: SceneConfig) -> Scene:
         )
         return scene
     fits = f"{here}); with {best.name} it does ({found.correlation:.2f})"
-    if best.stated:
+    if best.from_file:
         warnings.warn(f"{fits}, and is moved into the world of the cameras", SceneWarning, stacklevel=2)
         return replace(scene, gaussians=moved(scene.gaussians, best, scene.origin))
     if not options.check_fit:
@@ -243,9 +228,6 @@ class SmallViews:
     """Some views, evenly spaced, at low size."""
 
     def __init__(self, views: Views) -> None:
-        """Args:
-        views: with photographs.
-        """
         self._views, self._rows = views, even_indices(len(views), POOL)
         self.cameras = views.cameras.select(self._rows).resized(PIXELS)
         self.picture = cache(self._picture)
@@ -278,12 +260,8 @@ def _thinned(gaussians: Gaussians) -> Gaussians:
 def agreement(
     gaussians: Gaussians, views: SmallViews, frame: SplatFrame, origin: Float64[np.ndarray, "3"]
 ) -> Agreement:
-    """How a splat agrees with photographs, if its world is that of a frame.
-
-    Args:
-        frame: the world of the splat.
-        origin: that Gaussians and cameras are relative to.
-    """
+    """How a splat agrees with photographs, if its world is that of a frame; Gaussians and cameras are relative to
+    `origin`."""
     cameras, scale = _cameras_in(views.cameras, frame, origin), np.float32(frame.scale)
     gaussians = replace(gaussians, means=gaussians.means * scale, scales=gaussians.scales * scale)
     colors = colors_from_sh(torch.as_tensor(gaussians.sh), torch.zeros(1, 3).expand(len(gaussians), 3), torch.ones(3))

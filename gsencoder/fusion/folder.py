@@ -3,11 +3,8 @@
 Features of one teacher are in `features.safetensors`, those of several in a file each, `features.TEACHER.safetensors`.
 Memories, which are decoded to features when they are read, are in `memory.safetensors` or `memory.TEACHER.safetensors`.
 Arrays are safetensors files, memory-mapped on load; features are float16 for seen rows only. The folder is all that
-localization needs: no photographs, no teacher.
-
-The file of adapter heads beside features and weights: where it lies, and for which features it is.
-
-Its layers are read by `gsencoder.fusion.measured_heads`, which needs torch.
+localization needs: no photographs, no teacher. Next to them may lie text tables, and adapter heads, whose layers
+`gsencoder.fusion.measured_heads` reads with torch.
 """
 
 import re
@@ -53,13 +50,8 @@ MEMORY_FILE = "memory.safetensors"
 
 
 def write_memory(path: Path, memory: QueryMemory, gaussians: Gaussians, more: Mapping[str, Any] = {}) -> None:
-    """Writes a memory: queries of seen Gaussians and components as float16, each channel divided by its largest
-    magnitude.
-
-    Args:
-        gaussians: that the queries belong to.
-        more: further entries of the header, as JSON values.
-    """
+    """Writes a memory of Gaussians: queries of seen ones and components as float16, each channel divided by its largest
+    magnitude. `more` are further entries of the header, as JSON values."""
     if len(memory) != len(gaussians):
         raise InputError(f"{path}: {len(memory):,} queries need as many Gaussians, got {len(gaussians):,}")
     rows, bank = np.flatnonzero(memory.weights > 0), memory.bank
@@ -86,7 +78,6 @@ def write_memory(path: Path, memory: QueryMemory, gaussians: Gaussians, more: Ma
 
 
 def read_memory(file: Archive, gaussians: Gaussians) -> QueryMemory:
-    """Reads a memory."""
     check_splat(file, gaussians, "make the memory of this splat again")
     space, mean, basis = read_space(file)
     rows, count = file.array("rows", "int32", ("n",)), len(gaussians)
@@ -121,7 +112,7 @@ SCENE_FILE, FEATURES_FILE = "scene.safetensors", "features.safetensors"
 BLOCK = 16_384
 """Rows that are turned into half precision at a time."""
 WORDS_FILE = "words.safetensors"
-"""The text table whose words lead into the features, beside them where there is one."""
+"""The text table whose words lead into the features, where there is one."""
 TEACHER_NAME = r"[A-Za-z0-9_][A-Za-z0-9_-]*"
 """Form of the names of teachers, which are parts of names of files."""
 
@@ -155,9 +146,6 @@ def save_features(
         scene: the Gaussians, cameras and names are written; photographs are not.
         features: of the scene's Gaussians; by teacher where there are several.
         settings: what made the features, as JSON values.
-
-    Raises:
-        InputError: features of another number of Gaussians, or not finite, or a folder that cannot be written.
     """
     folder, gaussians = Path(folder), scene.gaussians
     if isinstance(features, GaussianFeatures):
@@ -175,13 +163,7 @@ def save_features(
 def save_memories(
     folder: str | Path, scene: Scene, memories: Mapping[str, QueryMemory], settings: Mapping[str, Any] = {}
 ) -> None:
-    """Writes a scene and its memories, which every command that takes features reads as features.
-
-    Args:
-        folder: made if it does not exist, as in `save_features`.
-        scene: with the Gaussians that the queries belong to.
-        settings: what made them, as JSON values.
-    """
+    """Writes a scene and its memories as `save_features` writes features; every command reads them as such."""
     folder, gaussians = Path(folder), scene.gaussians
     if gaussians is None:
         raise InputError(f"save_memories: scene {scene.name} has no Gaussians")
@@ -202,7 +184,6 @@ def _write_scene(folder: Path, scene: Scene, gaussians: Gaussians) -> None:
 
 
 def _write_rows(path: Path, features: GaussianFeatures, settings: Mapping[str, Any], fingerprint: str) -> None:
-    """Writes the features of seen rows."""
     rows = np.flatnonzero(features.weights > 0)
     # By blocks: a million rows of many channels are gigabytes, and no second copy of them is made.
     blocks = [rows[start : start + BLOCK] for start in range(0, len(rows), BLOCK)]
@@ -258,13 +239,8 @@ def _contents(
 def features_bytes(
     space: FeatureSpace, rows: int, rank: int, settings: Mapping[str, Any] = {}, *, basis: bool = True
 ) -> int:
-    """The size of the file that `save_features` would write.
-
-    Args:
-        rows: number of Gaussians that were seen.
-        settings: as `save_features` takes them.
-        basis: whether the coordinates are in a basis.
-    """
+    """The size of the file that `save_features` would write for a number of seen Gaussians; `basis` is whether the
+    coordinates are in one."""
     mean, components = (shape_only("float32", shape) for shape in ((space.channels,), (rank, space.channels)))
     arrays, header = _contents(
         space,
@@ -287,11 +263,7 @@ def holds_features(folder: Path) -> bool:
 
 def load_features(folder: str | Path) -> Scene:
     """The scene and its features from a folder that `save_features`, `save_memories` or `save_package` wrote: by the
-    name of their space, or, where there are those of several teachers, by teacher.
-
-    Raises:
-        InputError: not such a folder, damaged, of another version, or features of another splat.
-    """
+    name of their space, or, where there are those of several teachers, by teacher."""
     folder = Path(folder)
     if not holds_features(folder):
         raise InputError(
@@ -386,12 +358,8 @@ def save_tables(
     *,
     dtype: Literal["float32", "float16"] = "float32",
 ) -> None:
-    """Writes text tables beside features or weights.
-
-    Args:
-        tables: by the teacher in whose space they are.
-        teachers: all teachers of the features or the encoder, with tables or not; a single one is not named in files.
-    """
+    """Writes text tables, by the teacher in whose space they are, next to features or weights. `teachers` are all of
+    the features or the encoder, with tables or not; a single one is not named in files."""
     single = len(list(teachers)) == 1
     for teacher, table in tables.items():
         save_text_table(folder / file_of_teacher(WORDS_FILE, None if single else teacher), table, dtype=dtype)
@@ -405,14 +373,8 @@ def load_tables(folder: Path, teachers: Iterable[str]) -> dict[str, TextTable]:
 
 
 def table_path(folder: Path, text_encoder: str) -> Path | None:
-    """The file in a folder of features whose words lead into the features of one space; None where there is none.
-
-    Args:
-        text_encoder: of the space of these features.
-
-    Raises:
-        InputError: a file is damaged, or there are files, but of other spaces.
-    """
+    """The file in a folder of features whose words lead into the features of a space with this text encoder; None where
+    there is none, and an InputError where there are only those of other spaces."""
     if (folder / WORDS_FILE).is_file():
         return folder / WORDS_FILE
     if not text_encoder:
@@ -430,12 +392,12 @@ def table_path(folder: Path, text_encoder: str) -> Path | None:
 
 
 HEADS_FILE = "heads.safetensors"
-"""The adapter heads that take the features, beside them where there are some."""
+"""The adapter heads that take the features, where there are some."""
 
 
-def heads_beside(weights: Path) -> Path | None:
-    """The file of adapter heads beside the file of an encoder, or None: heads.safetensors in its folder, and for an
-    exported graph `heads_of_graph`."""
+def find_heads(weights: Path) -> Path | None:
+    """The file of adapter heads of an encoder's file, or None: heads.safetensors in its folder, and for an exported
+    graph `heads_of_graph`."""
     path = heads_of_graph(weights) if weights.suffix.lower() == ".onnx" else weights.with_name(HEADS_FILE)
     return path if path.is_file() else None
 
@@ -448,12 +410,11 @@ def heads_of_graph(graph: Path) -> Path:
 def copy_heads(
     source: Path, target: Path, spaces: Sequence[FeatureSpace], *, left_out: Sequence[FeatureSpace] = ()
 ) -> None:
-    """Copies a file of adapter heads beside features or weights; an earlier one is replaced once the copy is whole.
+    """Copies a file of adapter heads; an earlier one is replaced once the copy is whole.
 
     Args:
         spaces: of the features or the weights, one for each teacher; the heads take features of one of them.
-        left_out: spaces of the other teachers of the source, whose features are not written; heads that take these are
-            not copied.
+        left_out: spaces of the other teachers of the source; heads that take features of these are not copied.
     """
     with open_archive(source) as file:
         heads = read_heads_space(file)
@@ -473,7 +434,6 @@ def read_heads_space(file: Archive) -> FeatureSpace:
 
 
 def check_heads_space(heads: FeatureSpace, features: FeatureSpace) -> None:
-    """Checks that heads take features of a space."""
     if heads != features:
         raise InputError(
             f"the heads take features of ({heads.describe()}), and these are of ({features.describe()}); expected "

@@ -25,15 +25,16 @@ from gsencoder.core.settings import check_limits, option
 from gsencoder.core.threads import ahead, thread_count
 from gsencoder.fusion.basis import Moments, distinct_rows, fit_basis, table_basis
 from gsencoder.fusion.checkpoint import open_checkpoint, upright
-from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, resolve, view_matrix
-from gsencoder.fusion.view_coverage import covering_views
+from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, covering_views, resolve, view_matrix
 from gsencoder.render import Blend, BlendConfig
 from gsencoder.teachers.base import Teacher
-from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Gaussians, Scene, Views
+from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, Scene, Views
 
 VIEWS_AT_ONCE = 4
 """Largest number of views whose matrices are made at the same time, each on threads of its own: steps that have one
 thread, such as sorting, run side by side. Each holds a matrix in memory."""
+NARROW = 64
+"""Teachers with no more channels than this keep all of them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,11 +46,15 @@ class FuseConfig:
     )
     visibility: VisibilityConfig = field(default_factory=VisibilityConfig)
     blend: BlendConfig = field(default_factory=BlendConfig)
-    energy: float = option(0.999, "share of the energy of a teacher's vectors that the basis keeps", gt=0, le=1)
-    table_energy: float = option(0.9999, "the same for maps that share a table (labels, captions)", gt=0, le=1)
+    energy: float = option(
+        0.999,
+        "share of the energy of a teacher's vectors that the basis keeps; maps that share a table (labels, captions) "
+        "lose a tenth as much",
+        gt=0,
+        le=1,
+    )
     max_rank: int = option(128, "largest rank of the basis; 0 = as many as the energy asks", ge=0)
     basis: bool = option(True, "fuse in a low-rank basis; false = in all channels")
-    narrow: int = option(64, "teachers with no more channels than this keep all of them", ge=0)
     views: int = option(0, "views used; 0 = all", ge=0)
     view_share: float = option(1.0, "share of the views used; with views= the fewer of both", gt=0, le=1)
     view_choice: Literal["even", "coverage"] = option(
@@ -59,16 +64,23 @@ class FuseConfig:
     def __post_init__(self) -> None:
         check_limits(self)
 
+    @property
+    def table_energy(self) -> float:
+        """Share of the energy of a table that the basis keeps."""
+        return 1 - (1 - self.energy) / 10
+
+    def wants_basis(self, space: FeatureSpace) -> bool:
+        return self.basis and space.channels > NARROW
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fusion:
     """The result of `fuse`.
 
     Attributes:
-        features: on the scene's Gaussians.
         views: row numbers of the views that were used.
         depth_sources: the depth maps that visibility was tested against.
-        config: the settings as they were given.
+        config: as it was given.
         teacher: as its maps were read: upright, and from files with `work`.
     """
 
@@ -103,8 +115,6 @@ def fuse(
     enough.
 
     Args:
-        scene: with Gaussians and views.
-        teacher: whose maps are lifted.
         basis: fuse in the coordinates of this basis, which scenes that are trained on together share; None = one of the
             scene's own, where `config` asks for one.
         rows: numbers of the views that are lifted, in this order; None = those that `config` chooses.
@@ -112,11 +122,9 @@ def fuse(
             more than reading them, and sums are saved: an interrupted run continues from it with the same bits.
         device: where B is made, held against depth maps, and multiplied; "auto" = a GPU if torch sees one. Features of
             two devices are equal within rounding, so that `work` may be continued on another one.
-        track: wraps the loops over views to show progress.
 
     Raises:
-        InputError: nothing to lift or to lift onto, a basis of another space, no view sees anything, no such device, or
-            `work` holds another run.
+        InputError: nothing to lift or to lift onto, no view sees anything, or `work` holds another run.
     """
     gaussians, views = validate_scene(scene)
     rows = select_views(gaussians, views, config) if rows is None else tuple(rows)
@@ -206,7 +214,7 @@ def find_basis(
     space, table, mean = teacher.space, teacher.table, teacher.mean
     if mean is None and table is not None:
         mean = table.mean(axis=0)
-    if not config.basis or space.channels <= config.narrow:
+    if not config.wants_basis(space):
         return None, mean
     if table is not None:
         assert mean is not None

@@ -35,7 +35,6 @@ class MeasuredHead:
     """An adapter head with the statistics of its outputs over a data set, and what the basis of the features costs it.
 
     Attributes:
-        head: its layers and its name.
         mean: of the outputs.
         scale: root mean square distance of the outputs from their mean.
         cells: number of the vectors that were measured.
@@ -59,11 +58,9 @@ class MeasuredHead:
         return len(self.mean)
 
     def figures(self) -> dict[str, int | float]:
-        """For summaries: channels, scale, and what the basis costs."""
         return {"channels": self.channels, **{name: getattr(self, name) for name in FIGURES}}
 
     def describe(self) -> str:
-        """The figures in a line."""
         return (
             f"head {self.head.describe()}: {self.channels} channels; behind the basis its outputs keep cosine "
             f"{self.cosine:.3f}, worst 5 % below {self.worst:.3f} in {self.cells:,} cells"
@@ -86,11 +83,9 @@ class HeadSet:
         return tuple(head.name for head in self.heads)
 
     def figures(self) -> dict[str, dict[str, int | float]]:
-        """For summaries: the figures of each head by its name."""
         return {head.name: head.figures() for head in self.heads}
 
     def describe(self) -> list[str]:
-        """One line for each head."""
         return [head.describe() for head in self.heads]
 
 
@@ -98,27 +93,22 @@ def measure_heads(
     heads: Sequence[Head], vectors: Float32[np.ndarray, "n D"], space: FeatureSpace, basis: FeatureBasis | None
 ) -> HeadSet:
     """Computes mean and scale of each head's outputs for vectors of the teacher's maps, and what a basis costs it."""
-    projected = vectors
-    if basis is not None:
-        projected = (to_coordinates(basis, vectors) @ basis.components + basis.mean).astype(np.float32)
-    return HeadSet(space=space, heads=tuple(_measure(head, vectors, projected) for head in heads))
-
-
-def _measure(head: Head, vectors: Float32[np.ndarray, "n D"], projected: Float32[np.ndarray, "n D"]) -> MeasuredHead:
-    full = head_outputs(head, vectors)
-    mean = full.mean(axis=0, dtype=np.float64).astype(np.float32)
-    scale = float(np.sqrt(np.square(full - mean, dtype=np.float64).sum(axis=1).mean()))
-    if not scale > 0:
-        raise InputError(f"heads: {head.name} gives the same vector for all {len(vectors):,} cells; check the pictures")
-    cosines = np.ones(len(full)) if projected is vectors else _cosines(full, head_outputs(head, projected), mean)
-    return MeasuredHead(
-        head=head,
-        mean=mean,
-        scale=scale,
-        cells=len(full),
-        cosine=float(cosines.mean()),
-        worst=float(np.quantile(cosines, WORST)),
-    )
+    measured = []
+    for head in heads:
+        full = head_outputs(head, vectors)
+        mean = full.mean(axis=0, dtype=np.float64).astype(np.float32)
+        scale = float(np.sqrt(np.square(full - mean, dtype=np.float64).sum(axis=1).mean()))
+        if not scale > 0:
+            raise InputError(
+                f"heads: {head.name} gives the same vector for all {len(vectors):,} cells; check the pictures"
+            )
+        cosines = np.ones(len(full))
+        if basis is not None:
+            projected = (to_coordinates(basis, vectors) @ basis.components + basis.mean).astype(np.float32)
+            cosines = _cosines(full, head_outputs(head, projected), mean)
+        cosine, worst = float(cosines.mean()), float(np.quantile(cosines, WORST))
+        measured.append(MeasuredHead(head=head, mean=mean, scale=scale, cells=len(full), cosine=cosine, worst=worst))
+    return HeadSet(space=space, heads=tuple(measured))
 
 
 def head_outputs(head: Head, vectors: Float32[np.ndarray, "n D"]) -> Float32[np.ndarray, "n E"]:
@@ -159,17 +149,12 @@ def head_features(
 ) -> GaussianFeatures:
     """Applies a head to the vector of every Gaussian that was seen.
 
-    Rows that are equal are computed once: an encoder gives all Gaussians of a voxel one vector. The outputs take
-    4 · E bytes a Gaussian.
+    Rows that are equal are computed once: an encoder gives all Gaussians of a voxel one vector. The outputs have all E
+    channels and the weights of the given features; their mean is the head's.
 
     Args:
-        features: of the space `backbone`, in a basis or not.
-        head: which.
-        backbone: the space whose features the head takes.
+        features: of the space `backbone`, which the head takes, in a basis or not.
         text_encoder: what turns words into the head's space.
-
-    Returns:
-        Features of all E channels with the weights of the given ones; their mean is the head's.
     """
     with about(head.name):
         check_heads_space(backbone, features.space)
@@ -272,7 +257,6 @@ def read_layers(file: Archive, layer_types: Sequence[Any], name: str, width: int
 
 
 def save_heads(path: Path, heads: HeadSet) -> None:
-    """Writes adapter heads to a file."""
     arrays: dict[str, np.ndarray] = {}
     entries = [_describe(head, arrays) for head in heads.heads]
     space = {name: getattr(heads.space, name) for name in heads.space.__dataclass_fields__}
@@ -293,7 +277,6 @@ def _describe(measured: MeasuredHead, arrays: dict[str, np.ndarray]) -> dict[str
 
 
 def load_heads(path: Path) -> HeadSet:
-    """Loads the adapter heads of a file."""
     with open_archive(path) as file:
         space = read_heads_space(file)
         heads = tuple(_read(file, entry, space.channels) for entry in file.value("heads", list))

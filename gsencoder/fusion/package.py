@@ -1,4 +1,4 @@
-"""Scene packages: a splat that any viewer opens, and the features of its Gaussians beside it.
+"""Scene packages: a splat that any viewer opens, and the features of its Gaussians.
 
 Three forms are for other programs: an .npz, a safetensors file, or properties of the .ply itself. The compact one is
 for gsencoder: codes of a few bytes (`compact`), memory-mapped, checked by a sum, bound to its splat by a fingerprint.
@@ -38,18 +38,7 @@ INDEX_FORM = 2
 
 
 def write_index(path: Path, scene: Scene, features: GaussianFeatures, *, fingerprint: str, error: float) -> None:
-    """Writes an index and its table. Weights are not written: those of Gaussians that were seen are read as 1.
-
-    Args:
-        path: the file.
-        scene: of the features.
-        features: with an index.
-        fingerprint: of the splat beside the file.
-        error: 1 − mean centered cosine with the features that the table was made from.
-
-    Raises:
-        InputError: the table has more rows than two bytes can number, or the disk is full.
-    """
+    """Writes an index and its table. Weights are not written: those of Gaussians that were seen are read as 1."""
     assert features.index is not None
     rows = len(features.features)
     dtype = _index_dtype(rows)
@@ -92,13 +81,7 @@ def _index_contents(
 
 
 def index_bytes(scene: Scene, features: GaussianFeatures, rows: int) -> int:
-    """The size of the file that `write_index` would write, with a table of so many rows.
-
-    Args:
-        scene: of the features.
-        features: without an index.
-        rows: of the table.
-    """
+    """The size of the file that `write_index` would write, with a table of `rows`; the features have no index."""
     columns = features.features.shape[1]
     arrays, header = _index_contents(
         scene,
@@ -113,11 +96,7 @@ def index_bytes(scene: Scene, features: GaussianFeatures, rows: int) -> int:
 
 
 def read_index(file: Archive) -> GaussianFeatures:
-    """Reads an index and its table.
-
-    Raises:
-        InputError: damaged, or numbers beyond the table.
-    """
+    """Reads an index and its table."""
     space, mean, basis = read_space(file)
     columns = space.channels if basis is None else basis.rank
     scale = file.array("channel_scale", "float32", (columns,))
@@ -145,26 +124,13 @@ NUMBERS = ("lightest", "heaviest", "error", "lowest")
 
 
 def save_package(folder: Path, scene: Scene, features: GaussianFeatures, *, error: float) -> CompactFeatures:
-    """Writes splat and compact features into an existing folder, which the caller makes appear whole or not at all.
-
-    Args:
-        folder: where.
-        scene: of the features.
-        features: fused or encoded.
-        error: budget of 1 − mean centered cosine.
-
-    Raises:
-        InputError: no Gaussians, or a budget that cannot be met.
-    """
+    """Writes splat and compact features, within an error of 1 − mean centered cosine, into an existing folder, which
+    the caller makes appear whole or not at all."""
     return _save_compact(folder, scene, compact(features, error=error))
 
 
 def save_package_within(folder: Path, scene: Scene, features: GaussianFeatures, budget: Budget) -> CompactFeatures:
-    """Writes the most exact package whose file of features keeps a limit of megabytes, as `save_package` does.
-
-    Raises:
-        InputError: no Gaussians, or nothing is so small.
-    """
+    """Writes the most exact package whose file of features keeps a limit of megabytes, as `save_package` does."""
     space, seen = features.space, int(features.seen.sum())
 
     def bytes_of(bits: Int64[np.ndarray, " R"]) -> int:
@@ -202,16 +168,8 @@ def _contents(
     *,
     fingerprint: str,
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and the header of a compact package.
-
-    Args:
-        scene: of the features.
-        seen: which Gaussians have features.
-        basis: of the coordinates.
-        coded: the arrays bits, levels, codes and weight_codes of `CompactFeatures`.
-        numbers: its `NUMBERS`.
-        fingerprint: of the splat.
-    """
+    """The arrays and the header of a compact package; `coded` are bits, levels, codes and weight_codes of
+    `CompactFeatures`, `numbers` its `NUMBERS`."""
     arrays, header = scene_parts(scene)
     space_arrays, space_header = space_parts(basis.space, basis.mean, basis)
     arrays |= {**coded, "seen": np.packbits(seen), **space_arrays}
@@ -220,27 +178,14 @@ def _contents(
 
 
 def save_index_package(folder: Path, scene: Scene, features: GaussianFeatures, *, error: float) -> None:
-    """Writes splat and features that share the rows of a table into an existing folder, as `save_package` does.
-
-    Args:
-        folder: where.
-        scene: of the features.
-        features: with an index (`gsencoder.memory.index.index_features`).
-        error: 1 − mean centered cosine with the features that the table was made from.
-
-    Raises:
-        InputError: no Gaussians, or more rows than two bytes can number.
-    """
+    """Writes splat and features that share the rows of a table (`gsencoder.memory.index.index_features`) into an
+    existing folder. `error` is 1 − mean centered cosine with the features that the table was made from."""
     written = _save_splat(folder, scene)
     write_index(folder / PACKAGE_FILE, scene, features, fingerprint=written, error=error)
 
 
 def open_package(file: Path) -> CompactFeatures:
-    """The features of a package, its codes memory-mapped.
-
-    Raises:
-        InputError: missing, damaged, or of another version.
-    """
+    """The features of a package, its codes memory-mapped."""
     with open_archive(file) as archive:
         form = archive.value("form", int)
         if form != FORMAT:
@@ -271,11 +216,7 @@ def open_package(file: Path) -> CompactFeatures:
 
 
 def load_package(folder: Path) -> Scene:
-    """The scene and its features from a folder of `save_package` or `save_index_package`.
-
-    Raises:
-        InputError: damaged, of another version, or features of another splat.
-    """
+    """The scene and its features from a folder of `save_package` or `save_index_package`."""
     file = folder / PACKAGE_FILE
     with open_archive(file) as archive:
         indexed = archive.value("form", int) == INDEX_FORM
@@ -292,11 +233,7 @@ def save_arrays(
     folder: Path, scene: Scene, features: GaussianFeatures, form: Literal["npz", "safetensors"], *, decoded: bool
 ) -> None:
     """Writes the splat, and plain arrays that other programs read: features [N, R] float32, or [N, D] float16 where
-    decoded; weights [N]; mean [D]; components [R, D] (a vector is mean + features @ components); about, as JSON.
-
-    Raises:
-        InputError: no Gaussians, or vectors that float16 does not hold.
-    """
+    decoded; weights [N]; mean [D]; components [R, D] (a vector is mean + features @ components); about, as JSON."""
     arrays = _plain(features, decoded="float16" if decoded else "")
     about = _about(features, _save_splat(folder, scene), decoded=decoded)
     if form == "npz":
@@ -307,12 +244,8 @@ def save_arrays(
 
 
 def save_ply(folder: Path, scene: Scene, features: GaussianFeatures, *, decoded: bool) -> None:
-    """Writes the splat with properties feature_0, feature_1, … and feature_weight, float32, and what they mean beside
-    it: `basis.npz`, as `save_arrays` has it.
-
-    Raises:
-        InputError: no Gaussians.
-    """
+    """Writes the splat with properties feature_0, feature_1, … and feature_weight, float32, and what they mean in
+    `basis.npz`, as `save_arrays` has it."""
     arrays = _plain(features, decoded="float32" if decoded else "")
     columns = np.ascontiguousarray(arrays.pop("features").T)
     further = {f"feature_{number}": column for number, column in enumerate(columns)}
@@ -360,7 +293,6 @@ FUSION_KNOBS = (
     Knob(name="stop_transmittance", key="blend.stop_transmittance", values=(1e-3, 1e-2, 0.1), exact=1e-6),
     Knob(name="tolerance", key="visibility.relative", values=(0.005, 0.01, 0.05, 0.1)),
     Knob(name="energy", key="energy", values=(0.95, 0.99, 0.995)),
-    Knob(name="table_energy", key="table_energy", values=(0.9, 0.99, 0.999)),
     Knob(name="max_rank", key="max_rank", values=(8, 16, 32, 64)),
     Knob(name="basis", key="basis", values=(False,), exact=False),
 )

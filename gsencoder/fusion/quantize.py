@@ -145,10 +145,7 @@ class CompactFeatures:
         bits: of each coordinate.
         levels: what the codes of each coordinate stand for, 2ᵇ values each.
         weight_codes: of the seen rows; 0 = `lightest`, 255 = `heaviest`, and each step between is the same factor.
-        lightest: the smallest weight of a seen row.
-        heaviest: the largest weight.
-        rows: which Gaussians were seen, ascending.
-        total: Gaussians.
+        rows: which Gaussians were seen, ascending, of `total`.
         basis: what the coordinates stand for.
         error: 1 − mean centered cosine to what was compacted: over the seen rows, or over their kinds (a sample where
             each row counts by how few are like it), whichever is larger. Features at the space's mean have no cosine.
@@ -168,27 +165,21 @@ class CompactFeatures:
     lowest: float
 
     def __post_init__(self) -> None:
-        counts = self.bits.astype(np.int64)
-        fits = self.codes.shape[1] == -(-int(counts.sum()) // 8) and len(self.levels) == int((1 << counts).sum())
-        some = len(counts) == self.basis.rank > 0 and 1 <= counts.min() <= counts.max() <= MAX_BITS
-        if not fits or not some:
-            raise InputError(
-                f"CompactFeatures: {self.codes.shape[1]} bytes a row and {len(self.levels)} levels do not go with bits "
-                f"{counts.tolist()[:20]} of {self.basis.rank} coordinates"
-            )
-        if not len(self.codes) == len(self.weight_codes) == len(self.rows) > 0:
-            raise InputError(
-                f"CompactFeatures: {len(self.rows)} seen rows, {len(self.codes)} codes and {len(self.weight_codes)} "
-                "weights; expected as many of each"
-            )
-        if not rise_within(self.rows, self.total):
-            raise InputError(f"CompactFeatures: expected rows that rise from 0 to at most {self.total - 1}")
+        """Refuses codes that no `compact` makes."""
+        counts, rows = self.bits.astype(np.int64), len(self.rows)
         tiny, largest = np.finfo(np.float32).tiny, np.finfo(np.float32).max
-        if not tiny <= self.lightest <= self.heaviest <= largest or not 0 <= self.error <= 2:
-            raise InputError(
-                f"CompactFeatures: expected weights in float32's range and an error from 0, got {self.lightest} to "
-                f"{self.heaviest} and {self.error}"
-            )
+        whole = (
+            len(counts) == self.basis.rank > 0
+            and 1 <= counts.min() <= counts.max() <= MAX_BITS
+            and self.codes.shape == (rows, -(-int(counts.sum()) // 8))
+            and len(self.levels) == int((1 << counts).sum())
+            and len(self.weight_codes) == rows > 0
+            and rise_within(self.rows, self.total)
+            and tiny <= self.lightest <= self.heaviest <= largest
+            and 0 <= self.error <= 2
+        )
+        if not whole:
+            raise InputError("compact features: bits, levels, codes, weights and rows do not go together")
 
     def __len__(self) -> int:
         return self.total
@@ -209,7 +200,6 @@ class CompactFeatures:
         return compacted
 
     def features(self) -> GaussianFeatures:
-        """All of them, as other stages take them."""
         values = np.zeros((self.total, self.basis.rank), np.float32)
         weights = np.zeros(self.total, np.float32)
         values[self.rows] = self.coordinates()
@@ -221,7 +211,6 @@ class CompactFeatures:
 
     @property
     def space(self) -> FeatureSpace:
-        """What decoded features are."""
         return self.basis.space
 
     @property
@@ -231,15 +220,7 @@ class CompactFeatures:
 
 
 def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatures:
-    """The fewest bytes a row whose features come within a budget.
-
-    Args:
-        features: fused or encoded.
-        error: budget of `CompactFeatures.error`.
-
-    Raises:
-        InputError: a budget out of range, or below what 8 bits a coordinate reach; nothing seen.
-    """
+    """The fewest bytes a row whose features come within a budget of `CompactFeatures.error`."""
     if not 0 < error < 1:
         raise InputError(f"error: expected a budget between 0 and 1, got {error}")
 
@@ -263,15 +244,8 @@ def compact(features: GaussianFeatures, *, error: float = 0.01) -> CompactFeatur
 def compact_within(
     features: GaussianFeatures, budget: Budget, bytes_of: Callable[[Int64[np.ndarray, " R"]], int]
 ) -> CompactFeatures:
-    """The most exact codes that keep a limit of megabytes; no more exact than `EXACT_ERROR`.
-
-    Args:
-        features: fused or encoded.
-        bytes_of: what a package takes, given the bits of each of its coordinates.
-
-    Raises:
-        InputError: nothing is so small, or nothing was seen.
-    """
+    """The most exact codes that keep a limit of megabytes; no more exact than `EXACT_ERROR`. `bytes_of` is what a
+    package takes, given the bits of each of its coordinates."""
 
     def most_exact(allocation: BitAllocation, encode: _Encode) -> tuple[CompactFeatures, Float64[np.ndarray, " n"]]:
         while not allocation.bits.any() or (allocation.can_grow and max(allocation.errors()) > EXACT_ERROR):

@@ -185,7 +185,7 @@ def _cameras(scene: Scene) -> Cameras:
             SceneWarning,
             stacklevel=3,
         )
-        scene = with_views(replace(scene, features={}), ORBITS)
+        scene = with_views(replace(scene, features={}), ORBITS)[0]
     assert scene.views is not None
     return scene.views.cameras
 

@@ -144,7 +144,7 @@ class SceneReader:
         scene = load_scene(path, splat=config.splat or None, options=config.data)
         scene = with_fitting_splat(scene, config.splat, config.data)
         if scene.views is None:
-            scene = with_views(scene, config.orbits, config.prepare.fusion.blend, cameras=config.cameras)
+            scene = with_views(scene, config.orbits, config.prepare.fusion.blend, cameras=config.cameras)[0]
         return scene
 
 

@@ -180,7 +180,7 @@ def dataset_space(
     space = spaces[min(spaces)]
     for number in sorted(spaces):
         check_space(space, spaces[number], scenes[number])
-    use_basis = config.basis and space.channels > config.narrow
+    use_basis = config.wants_basis(space)
     tables = [share.table for share in shares if share.table is not None]
     if tables:
         table = np.unique(np.concatenate(tables), axis=0)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from gsencoder.data.enclosure import MIN_GAUSSIANS, Enclosure, enclosure_of
 from gsencoder.data.seeding.points import flat_gaussians
 from gsencoder.data.up import with_up
-from gsencoder.fusion.cameras import with_explained_views
+from gsencoder.fusion.cameras import with_views
 from gsencoder.types import Gaussians, Scene
 
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -138,7 +138,7 @@ def test_few_gaussians_show_no_room():
 def test_what_was_decided_is_said_and_an_object_has_no_up_of_its_own():
     scene, up = with_up(Scene(name="chair", gaussians=made_object("chair")))
     assert up is None
-    seen, reason = with_explained_views(scene, 12)
+    seen, reason = with_views(scene, 12)
     assert seen.views.names[0] == "orbit_000"
     assert "no free space borders most of its surfaces" in reason
     # No direction is up, so that cameras surround it on all sides.

@@ -19,6 +19,11 @@ from gsencoder.types import Cameras, FeatureMap, Scene, Views
 BASE = FuseConfig(visibility=VisibilityConfig(against=()))
 
 
+@pytest.fixture(autouse=True)
+def _narrow() -> None:
+    """Teachers of few channels need no basis here."""
+
+
 def alike(count: int, noise: float, rng: np.random.Generator) -> list[np.ndarray]:
     """Maps that show much the same everywhere, and differ from view to view."""
     common = rng.normal(size=(6, 8, 6)).astype(np.float32)

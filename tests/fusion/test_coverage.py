@@ -7,11 +7,10 @@ import pytest
 from fixed_teachers import EXACT, FixedTeacher, make_scene
 from scipy.sparse import csr_array
 
-from gsencoder.fusion import view_coverage
+from gsencoder.fusion import lift
 from gsencoder.fusion.budget import bisection_order, map_at_rays, mean_turn
 from gsencoder.fusion.fuse import fuse
-from gsencoder.fusion.lift import VisibilityConfig, keep_visible
-from gsencoder.fusion.view_coverage import coverage_order, covering_views, sample_view
+from gsencoder.fusion.lift import VisibilityConfig, coverage_order, covering_views, keep_visible, sample_view
 from gsencoder.render import BlendConfig, blend
 from gsencoder.render.rays import strided_lattice
 
@@ -22,7 +21,7 @@ OPEN = VisibilityConfig(against=())
 def test_sampled_rays_have_the_weights_of_b_at_their_pixels(
     depth: bool, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(view_coverage, "RAYS", 100)
+    monkeypatch.setattr(lift, "RAYS", 100)
     depths = [rng.uniform(1.5, 3.0, (24, 33)).astype(np.float32) for _ in range(5)]
     masks = [rng.uniform(size=(24, 33)) > 0.3 for _ in range(5)]
     scene = make_scene(n=400, masks=masks, **({"depths": depths} if depth else {}))

@@ -21,9 +21,9 @@ from gsencoder.fusion.fit import (
     SmallViews,
     SplatFrame,
     agreement,
+    frames_of_files,
     identity_frame,
     moved,
-    stated_frames,
     usual_frames,
     with_fitting_splat,
 )
@@ -104,7 +104,7 @@ def test_moving_the_cameras_shows_what_moving_the_splat_does(scene: Scene) -> No
     assert agreement(there, views, world, origin).correlation > FITS
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_a_moved_splat_has_the_colors_that_it_had_from_there(degree: int) -> None:
     rng = np.random.default_rng(degree)
     count = 20
@@ -130,7 +130,7 @@ def test_a_moved_splat_has_the_colors_that_it_had_from_there(degree: int) -> Non
     assert np.abs((back.quats * splat.quats).sum(axis=1)) == pytest.approx(1, abs=1e-6)
 
 
-@pytest.mark.parametrize("number", [7, 28, 30])
+@pytest.mark.parametrize("number", [7, 30])
 def test_a_usual_frame_is_refused_and_its_advice_mends_it(
     scene: Scene, field_room: FieldRoom, tmp_path: Path, number: int
 ) -> None:
@@ -161,19 +161,15 @@ def test_a_usual_frame_is_refused_and_its_advice_mends_it(
     assert len(messages) == 1
 
 
-@pytest.mark.parametrize("applied", [False, True])
 def test_a_splat_in_the_world_of_nerfstudio_is_moved_as_its_file_says(
-    scene: Scene, field_room: FieldRoom, tmp_path: Path, applied: bool
+    scene: Scene, field_room: FieldRoom, tmp_path: Path
 ) -> None:
     """nerfstudio's transform leads from the world before `applied_transform`, which that of the cameras is after."""
     turn = SplatFrame(name="t", rotation=np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), shift=np.zeros(3))
-    content = {"applied_transform": turn.rotation[:, [0, 1, 2, 2]] * [1, 1, 1, 0]} if applied else {}
-    frame = NERFSTUDIO
-    if applied:
-        rotation, shift = turn.rotation @ frame.rotation, turn.rotation @ frame.shift
-        frame = replace(frame, rotation=rotation, shift=shift)
-    lists = {key: np.asarray(value).tolist() for key, value in content.items()}
-    other, splat = capture(field_room, tmp_path, frame, **lists)
+    applied = (turn.rotation[:, [0, 1, 2, 2]] * [1, 1, 1, 0]).tolist()
+    rotation, shift = turn.rotation @ NERFSTUDIO.rotation, turn.rotation @ NERFSTUDIO.shift
+    frame = replace(NERFSTUDIO, rotation=rotation, shift=shift)
+    other, splat = capture(field_room, tmp_path, frame, applied_transform=applied)
     (tmp_path / DATAPARSER).write_text(json.dumps(NERFSTUDIO.as_dataparser()))
     result, messages = checked(other, splat)
     assert [DATAPARSER in message and "is moved" in message for message in messages] == [True]
@@ -198,33 +194,16 @@ def test_files_that_state_no_frame_are_refused_by_name(tmp_path: Path) -> None:
     ):
         (tmp_path / DATAPARSER).write_text(json.dumps(content))
         with pytest.raises(InputError, match=match) as caught:
-            stated_frames(None, tmp_path / "splat.ply")
+            frames_of_files(None, tmp_path / "splat.ply")
         assert DATAPARSER in str(caught.value)
-
-
-def test_parts_thinned_splats_and_other_exposures_are_never_refused(scene: Scene, field_room: FieldRoom) -> None:
-    splat, rng = gaussians_of(scene), np.random.default_rng(0)
-    distances = np.linalg.norm(splat.means - splat.means[100], axis=1)
-    dark = replace(splat, sh=(splat.sh * np.float32(0.3) - np.float32(0.6)))
-    for name, other in (
-        ("a part", splat.select(distances < 0.8)),
-        ("a crumb", splat.select(distances < 0.1)),
-        ("thinned", splat.select(rng.random(len(splat)) < 0.05)),
-        ("dark", dark),
-        ("plain", replace(splat, sh=np.zeros_like(splat.sh))),
-        ("transparent", replace(splat, opacities=splat.opacities * np.float32(0.01))),
-        ("one", splat.select(np.array([0]))),
-    ):
-        result, messages = checked(replace(scene, gaussians=other), field_room.splat)
-        assert gaussians_of(result) is other, name
-        assert len(messages) <= 1
-        if name in ("dark", "a part"):
-            assert messages == [], name
 
 
 def test_what_cannot_be_told_is_a_warning(scene: Scene, field_room: FieldRoom) -> None:
     assert scene.views is not None
     assert scene.views.images is not None
+    # Another exposure is no other world.
+    dark = replace(scene, gaussians=replace(gaussians_of(scene), sh=gaussians_of(scene).sh * np.float32(0.3) - 0.6))
+    assert checked(dark, field_room.splat) == (dark, [])
     grey = tuple(np.full_like(image, 128) for image in scene.views.images)
     plain = replace(scene, views=replace(scene.views, images=grey))
     far = replace(gaussians_of(scene), means=gaussians_of(scene).means + np.float32(500))

@@ -1,8 +1,6 @@
-"""Adapter heads on disk: written and read, named, copied beside weights, and files that are refused."""
+"""Adapter heads: measured, applied to features and tokens, written and read, and files that are refused."""
 
 import copy
-import errno
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,19 +9,28 @@ import numpy as np
 import pytest
 import torch
 from measured_heads import SPACE, measured
+from torch import nn
 
 from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.folder import copy_heads, heads_beside
+from gsencoder.fusion.errors import CellSample, sample_cells
+from gsencoder.fusion.folder import copy_heads, find_heads
 from gsencoder.fusion.measured_heads import (
     HeadSet,
     choose_heads,
+    equal_rows,
     find_head,
     has_head,
+    head_features,
+    head_space,
+    head_tokens,
     heads_digest,
     load_heads,
+    measure_heads,
     save_heads,
 )
+from gsencoder.teachers.heads import Head
+from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures
 
 
 def head_set() -> HeadSet:
@@ -70,12 +77,8 @@ GOOD = {
     ("change", "message"),
     [
         ({"layers": []}, "expected heads with name, text"),
-        ({"name": 3}, "expected heads with name, text"),
         ({"name": "a"}, r"expected a head called NAME\.summary or NAME\.features"),
-        ({"text": "dino"}, r"expected a head called NAME\.summary or NAME\.features"),
-        ({"scale": 0.0}, "expected heads with name, text"),
         ({"scale": float("inf")}, "expected heads with name, text"),
-        ({"cells": "many"}, "expected heads with name, text"),
         ({"layers": ["tanh"]}, r"a\.summary\.0: expected linear, layernorm"),
         ({"layers": [["linear"]]}, r"a\.summary\.0\.0\.weight"),
         ({}, r"expected a\.summary\.0\.weight float32\[.*6\], got float32\[4, 9\]"),
@@ -99,21 +102,7 @@ def test_a_file_that_names_no_space_or_a_head_twice_is_refused(tmp_path: Path) -
         load_heads(tmp_path / "h")
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("siglip", "siglip.summary"),
-        ("siglip.summary", "siglip.summary"),
-        ("siglip.features", "siglip.features"),
-        ("sam", "sam.features"),
-    ],
-)
-def test_a_name_finds_its_head(name: str, expected: str) -> None:
-    assert find_head(head_set(), name).name == expected
-    assert has_head(head_set(), name)
-
-
-@pytest.mark.parametrize("name", ["sam.summary", "dino", "siglip.tokens", ""])
+@pytest.mark.parametrize("name", ["sam.summary", "dino", ""])
 def test_a_head_that_is_not_there_is_refused_and_the_others_are_named(name: str) -> None:
     assert not has_head(head_set(), name)
     listed = r"siglip\.summary, sam\.features, siglip\.features"
@@ -122,15 +111,17 @@ def test_a_head_that_is_not_there_is_refused_and_the_others_are_named(name: str)
 
 
 def test_heads_are_chosen_in_the_order_of_their_names_each_once() -> None:
+    assert find_head(head_set(), "siglip.features").name == "siglip.features"
+    assert has_head(head_set(), "siglip")
     assert choose_heads(head_set(), ["sam", "siglip", "siglip.summary"]).names == ("sam.features", "siglip.summary")
 
 
 def test_the_file_of_heads_lies_beside_weights_and_graphs_and_is_copied_for_its_space_only(tmp_path: Path) -> None:
     save_heads(tmp_path / "heads.safetensors", head_set())
-    assert heads_beside(tmp_path / "encoder.safetensors") == tmp_path / "heads.safetensors"
-    assert heads_beside(tmp_path / "e.onnx") is None
+    assert find_heads(tmp_path / "encoder.safetensors") == tmp_path / "heads.safetensors"
+    assert find_heads(tmp_path / "e.onnx") is None
     copy_heads(tmp_path / "heads.safetensors", tmp_path / "e.onnx.heads.safetensors", [SPACE])
-    assert heads_beside(tmp_path / "e.onnx") == tmp_path / "e.onnx.heads.safetensors"
+    assert find_heads(tmp_path / "e.onnx") == tmp_path / "e.onnx.heads.safetensors"
     assert load_heads(tmp_path / "e.onnx.heads.safetensors").names == head_set().names
     with pytest.raises(InputError, match="heads take features of"):
         copy_heads(tmp_path / "heads.safetensors", tmp_path / "x", [replace(SPACE, channels=7)])
@@ -142,17 +133,151 @@ def test_the_file_of_heads_lies_beside_weights_and_graphs_and_is_copied_for_its_
     assert not (tmp_path / "x").exists()
 
 
-def test_earlier_heads_beside_a_graph_stand_until_their_copy_is_on_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    save_heads(tmp_path / "heads.safetensors", head_set())
-    target = tmp_path / "e.onnx.heads.safetensors"
-    target.write_bytes(b"earlier")
+def feature_map(values: np.ndarray) -> FeatureMap:
+    return FeatureMap(features=values, grid_from_image=np.array([[1.0, 0, 0], [0, 1.0, 0]]), space=SPACE)
 
-    def full(_: int) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(InputError, match=r"e\.onnx\.heads\.safetensors: no space left"):
-        copy_heads(tmp_path / "heads.safetensors", target, [SPACE])
-    assert target.read_bytes() == b"earlier"
+def test_a_sample_holds_evenly_spaced_cells_that_have_a_vector() -> None:
+    values = np.arange(10 * 10 * 6, dtype=np.float32).reshape(10, 10, 6)
+    values[0, 0] = np.nan
+    sample = CellSample(maps=2, limit=20)
+    sample.add(feature_map(values))
+    np.testing.assert_array_equal(sample.vectors(), values.reshape(-1, 6)[1::10])
+    with pytest.raises(InputError, match="no view has a cell with a vector"):
+        CellSample(1).vectors()
+    empty = CellSample(1)
+    empty.add(feature_map(np.full((2, 2, 6), np.nan, np.float32)))
+    with pytest.raises(InputError, match="no view has a cell with a vector"):
+        empty.vectors()
+
+
+def a_basis(rank: int) -> FeatureBasis:
+    rng = np.random.default_rng(0)
+    components = np.linalg.qr(rng.normal(size=(6, 6)))[0][:rank].astype(np.float32)
+    return FeatureBasis(mean=rng.normal(size=6).astype(np.float32), components=components, energy_kept=0.9, space=SPACE)
+
+
+@pytest.mark.parametrize("rank", [0, 3, 6])
+def test_mean_scale_and_what_a_basis_costs_equal_those_computed_by_hand(rank: int) -> None:
+    vectors = np.random.default_rng(1).normal(size=(200, 6)).astype(np.float32)
+    head, basis = measured().head, a_basis(rank) if rank else None
+    (one,) = measure_heads([head], vectors, SPACE, basis).heads
+    full = head.body(torch.from_numpy(vectors)).detach().double().numpy()
+    mean = full.mean(axis=0)
+    np.testing.assert_allclose(one.mean, mean, atol=1e-5)
+    assert one.scale == pytest.approx(np.sqrt(((full - mean) ** 2).sum(axis=1).mean()), rel=1e-5)
+    projected = vectors
+    if basis is not None:
+        projected = ((vectors - basis.mean) @ basis.components.T) @ basis.components + basis.mean
+    outputs_of_basis = head.body(torch.from_numpy(projected)).detach().double().numpy()
+    lengths = np.linalg.norm(full - mean, axis=1) * np.linalg.norm(outputs_of_basis - mean, axis=1)
+    cosines = ((full - mean) * (outputs_of_basis - mean)).sum(axis=1) / lengths
+    assert one.cosine == pytest.approx(cosines.mean(), abs=1e-5)
+    assert one.worst == pytest.approx(np.quantile(cosines, 0.05), abs=1e-5)
+    assert (one.cosine > 0.9999) == (rank != 3)
+
+
+def test_outputs_that_are_all_equal_or_not_finite_are_refused() -> None:
+    vectors = np.random.default_rng(1).normal(size=(20, 6)).astype(np.float32)
+    constant = nn.Sequential(nn.Linear(6, 4))
+    nn.init.zeros_(constant[0].weight)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"heads: a\.summary gives the same vector for all 20 cells"):
+        measure_heads([Head(name="a.summary", body=constant)], vectors, SPACE, None)
+    nn.init.constant_(constant[0].weight, 1e38)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"heads: outputs of a\.summary are not finite"):
+        measure_heads([Head(name="a.summary", body=constant)], vectors * 100, SPACE, None)
+
+
+def fields(n: int = 300, rank: int = 3) -> GaussianFeatures:
+    """Features of which many rows are equal, and some were never seen."""
+    rng = np.random.default_rng(2)
+    distinct = rng.normal(size=(11, rank or 6)).astype(np.float32)
+    values, weights = distinct[rng.integers(0, 11, n)], rng.uniform(0.1, 1, n).astype(np.float32)
+    values[::7], weights[::7] = 0, 0
+    basis = a_basis(rank) if rank else None
+    mean = basis.mean if basis is not None else np.ones(6, np.float32)
+    return GaussianFeatures(features=values, weights=weights, mean=mean, space=SPACE, basis=basis)
+
+
+@pytest.mark.parametrize("rank", [0, 3])
+def test_features_through_a_head_are_its_outputs_for_the_decoded_vectors(rank: int) -> None:
+    features, head = fields(rank=rank), measured()
+    made = head_features(features, head, SPACE, text_encoder="tower")
+    with torch.no_grad():
+        expected = head.head.body(torch.from_numpy(features.decode())).numpy()
+    seen = features.seen
+    np.testing.assert_allclose(made.features[seen], expected[seen], rtol=1e-5, atol=1e-5)
+    assert not made.features[~seen].any()
+    np.testing.assert_array_equal(made.weights, features.weights)
+    np.testing.assert_array_equal(made.mean, head.mean)
+    assert made.space == FeatureSpace(
+        name="radio/siglip.summary",
+        channels=4,
+        teacher="radio",
+        weights="abcd",
+        layer="siglip.summary",
+        preprocessing="resized",
+        text_encoder="tower",
+    )
+
+
+def test_rows_that_are_equal_are_computed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    from gsencoder.fusion import measured_heads as apply
+
+    computed = []
+    original = apply.head_outputs
+    monkeypatch.setattr(apply, "head_outputs", lambda head, x: computed.append(len(x)) or original(head, x))
+    head_features(fields(), measured(), SPACE)
+    assert sum(computed) == 11
+
+
+@pytest.mark.parametrize("rows", [0, 500])
+def test_groups_of_equal_rows_give_the_rows_back(rows: int) -> None:
+    values = np.random.default_rng(0).integers(0, 3, (rows, 3)).astype(np.float32)
+    first, inverse = equal_rows(values)
+    np.testing.assert_array_equal(values[first][inverse], values)
+    assert len(first) == len(np.unique(values, axis=0))
+
+
+def test_features_of_another_backbone_are_refused() -> None:
+    with pytest.raises(InputError, match=r"siglip\.summary: the heads take features of \(radio.*other.*radio · 6 chan"):
+        head_features(fields(), measured(), replace(SPACE, weights="other"))
+
+
+def test_a_scene_in_which_nothing_was_seen_has_no_outputs() -> None:
+    features = fields()
+    unseen = replace(features, features=np.zeros_like(features.features), weights=np.zeros_like(features.weights))
+    assert not head_features(unseen, measured(), SPACE).features.any()
+
+
+def test_tokens_go_through_a_head_one_by_one() -> None:
+    tokens, head = torch.randn(2, 5, 6), measured()
+    made = head_tokens(tokens, head)
+    for view, rows in enumerate(made):
+        torch.testing.assert_close(rows, head.head.body(tokens[view]).detach(), rtol=1e-4, atol=1e-4)
+    assert head_space(SPACE, head).text_encoder == ""
+
+
+def test_a_fusion_that_continues_from_its_cache_samples_the_cells_of_all_views(tmp_path: Path) -> None:
+    from training_scenes import DenseSideTeacher
+    from training_scenes import scene as a_scene
+
+    from gsencoder.fusion.fuse import FuseConfig, fuse
+
+    class Expensive(DenseSideTeacher):
+        cheap = False
+        calls = 0
+
+        def feature_map(self, views: Any, view: int) -> FeatureMap:
+            Expensive.calls += 1
+            return super().feature_map(views, view)
+
+    scene, config = a_scene(0), FuseConfig(basis=False)
+    assert scene.views is not None
+    plain = sample_cells(Expensive(), scene.views, range(len(scene.views)))
+    fuse(scene, Expensive(), config, work=tmp_path / "work")
+    Expensive.calls = 0
+    fusion = fuse(scene, Expensive(), config, work=tmp_path / "work")
+    continued = sample_cells(fusion.teacher, scene.views, fusion.views)
+    assert Expensive.calls == 0
+    np.testing.assert_allclose(continued.vectors(), plain.vectors(), rtol=1e-3, atol=1e-3)

@@ -85,18 +85,11 @@ def test_fusing_codes_with_tables_of_their_own_equals_fusing_their_vectors(
     np.testing.assert_allclose(coded.features, dense.features, rtol=1e-3, atol=1e-5)
 
 
-def test_a_complete_basis_changes_nothing(rng: np.random.Generator) -> None:
-    teacher = OwnTables(rng, dense=False)
-    plain = fuse(scene_of(), teacher, FuseConfig(basis=False)).features
-    by_basis = fuse(scene_of(), teacher, FuseConfig(energy=1.0, narrow=0)).features
-    np.testing.assert_allclose(by_basis.decode()[plain.seen], plain.features[plain.seen], atol=1e-4)
-
-
 def test_each_region_counts_once_however_many_pixels_it_has(rng: np.random.Generator) -> None:
     teacher = OwnTables(rng, dense=False)
     rows = np.concatenate([each.table[np.unique(each.codes[each.codes >= 0])] for each in teacher.maps])  # type: ignore[index]
     np.testing.assert_array_equal(np.concatenate([distinct_rows(each) for each in teacher.maps]), rows)
-    fused = fuse(scene_of(), teacher, FuseConfig(energy=1.0, narrow=0)).features
+    fused = fuse(scene_of(), teacher, FuseConfig(energy=1.0)).features
     np.testing.assert_allclose(fused.mean, rows.mean(axis=0), atol=1e-5)
 
 

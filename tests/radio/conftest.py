@@ -1,6 +1,8 @@
 """SplatDistill's way with a small random RADIO: what its commands wrote, one after the other."""
 
 from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,14 @@ def few_nouns() -> Iterator[None]:
         yield
 
 
+@contextmanager
+def narrower() -> Iterator[None]:
+    """A small RADIO has few channels, and is fused in a basis for all that."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(import_module("gsencoder.fusion.fuse"), "NARROW", 8)
+        yield
+
+
 @pytest.fixture(scope="session")
 def world(tmp_path_factory: pytest.TempPathFactory) -> World:
     return World(tmp_path_factory.mktemp("world"))
@@ -26,17 +36,18 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> World:
 @pytest.fixture(scope="session")
 def fused(world: World) -> Path:
     out = world.folder / "fused"
-    basis = ("fusion.narrow=8", "fusion.max_rank=6")
     heads = "teacher.heads=[siglip, siglip.features,sam]"
-    run("fuse", world.room(0), *world.teacher, heads, *basis, *SEEDS, f"out={out}")
+    with narrower():
+        run("fuse", world.room(0), *world.teacher, heads, "fusion.max_rank=6", *SEEDS, f"out={out}")
     return out
 
 
 @pytest.fixture(scope="session")
 def trained(world: World) -> Path:
     out = world.folder / "encoder"
-    basis = ("prepare.fusion.narrow=8", "prepare.fusion.max_rank=6")
     heads = ("heads=[siglip,sam]", "teacher.heads=siglip.features")
     scenes = (world.room(0), world.room(1), "holdout=room_1")
-    assert cli.main(["train", *scenes, *world.teacher, *heads, *basis, *SEEDS, *QUICK, f"out={out}"]) == 0
+    words = ["train", *scenes, *world.teacher, *heads, "prepare.fusion.max_rank=6", *SEEDS, *QUICK, f"out={out}"]
+    with narrower():
+        assert cli.main(words) == 0
     return out

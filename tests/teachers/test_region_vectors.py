@@ -50,7 +50,7 @@ def test_each_region_has_the_mean_of_the_dense_teachers_map(tmp_path: Path) -> N
         np.testing.assert_array_equal(one.codes, np.searchsorted(np.r_[0, regions], labels_of(view)) - 1)
         means = region_means(dense.feature_map(scene.views, view), labels_of(view).astype(np.int32), regions.tolist())
         np.testing.assert_allclose(one.table, means, rtol=1e-6)
-    fused = fuse(scene, teacher, FuseConfig(narrow=0, energy=1.0)).features
+    fused = fuse(scene, teacher, FuseConfig(energy=1.0)).features
     tables = np.concatenate([np.asarray(made(teacher, view).table) for view in range(2)])
     seen = fused.decode()[fused.seen]
     assert len(seen)

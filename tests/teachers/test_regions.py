@@ -79,7 +79,7 @@ def test_instances_with_the_names_of_objects_are_what_the_labels_teacher_gives()
     labels = build_teacher(LabelsConfig(), scene, WORDS)
     for view in range(2):
         np.testing.assert_array_equal(rows_of(regions, scene, view), rows_of(labels, scene, view))
-    ours, theirs = (fuse(scene, teacher, FuseConfig(narrow=0)).features for teacher in (regions, labels))
+    ours, theirs = (fuse(scene, teacher, FuseConfig()).features for teacher in (regions, labels))
     assert ours.seen.any()
     np.testing.assert_array_equal(ours.seen, theirs.seen)
     np.testing.assert_allclose(ours.decode(), theirs.decode(), atol=1e-5)

@@ -4,6 +4,7 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -263,10 +264,9 @@ def test_scenes_of_two_spaces_are_refused() -> None:
         dataset_space([], lambda path: (scene(0), SideTeacher()), FuseConfig(), views=2)
 
 
-def test_the_space_of_a_dense_teacher_has_the_moments_of_its_maps() -> None:
-    space = dataset_space(
-        [Path("a"), Path("b")], lambda path: (scene(0), DenseSideTeacher()), FuseConfig(narrow=0), views=4
-    )
+def test_the_space_of_a_dense_teacher_has_the_moments_of_its_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(import_module("gsencoder.fusion.fuse"), "NARROW", 0)
+    space = dataset_space([Path("a"), Path("b")], lambda path: (scene(0), DenseSideTeacher()), FuseConfig(), views=4)
     assert space.codebook is None
     outputs = space.outputs
     np.testing.assert_allclose(outputs.mean, (TABLE[1] + TABLE[2]) / 2, atol=1e-5)

@@ -28,7 +28,7 @@ from gsencoder.fusion.folder import (
     HEADS_FILE,
     copy_heads,
     file_of_teacher,
-    heads_beside,
+    find_heads,
     save_features,
     save_tables,
 )
@@ -136,7 +136,7 @@ def run(config: EncodeCommandConfig, run: Run) -> None:
     paths = find_scenes(config.paths)
     with run.step("weights"):
         encoder, file = load_encoder(config.weights, config.encode.device), file_of_encoder(config.weights)
-        heads = heads_beside(file)
+        heads = find_heads(file)
         _warn_of_missing(encoder, file, heads, config.spaces)
     made_with = {"weights": str(file), "weights_digest": digest_files(file)}
 

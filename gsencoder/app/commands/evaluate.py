@@ -34,7 +34,7 @@ from gsencoder.evaluate.sources import (
     load_scenes,
     space_of_words,
 )
-from gsencoder.fusion.folder import heads_beside, load_features
+from gsencoder.fusion.folder import find_heads, load_features
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.measured_heads import find_head, load_heads
 from gsencoder.infer.chunks import EncodeConfig
@@ -183,7 +183,7 @@ def source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
         (measured_head,) = load_teacher_heads(config.teacher, [config.head], "head")
         words = words_of_head(measured_head, table, config.text)
         return fused_head_source(config.teacher, measured_head, words.space.text_encoder, config.fusion), words
-    path = heads_beside(file_of_encoder(config.weights))
+    path = find_heads(file_of_encoder(config.weights))
     if path is None:
         raise InputError(
             f"head={config.head}: no adapter heads lie beside the weights {config.weights}; train with "

@@ -15,7 +15,7 @@ from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
-from gsencoder.fusion.folder import copy_heads, heads_beside, heads_of_graph, load_memories
+from gsencoder.fusion.folder import copy_heads, find_heads, heads_of_graph, load_memories
 from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.load import file_of_encoder
 from gsencoder.infer.onnx.export import (
@@ -107,7 +107,7 @@ def run(config: ExportConfig, run: Run) -> None:
         return
     with run.step("load"):
         encoder = TorchEncoder(config.weights)
-        heads = heads_beside(file_of_encoder(config.weights))
+        heads = find_heads(file_of_encoder(config.weights))
         clouds = [Cloud(f"{size} random Gaussians", random_cloud(size, encoder.voxel)) for size in config.sizes]
         scenes = _scenes(config, encoder.voxel, run.track)
     run.print("translating the graph, which takes about a minute")
