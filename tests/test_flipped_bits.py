@@ -9,7 +9,6 @@ from dataclasses import is_dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -22,7 +21,7 @@ from training_scenes import DenseSideTeacher, prepared, scene, small_encoder
 
 from gsencoder.core.archive import open_archive
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.checkpoint import SUMS_FILE, FusionCheckpoint, read_map, write_map
+from gsencoder.fusion.checkpoint import read_map, write_map
 from gsencoder.fusion.folder import (
     FEATURES_FILE,
     MEMORY_FILE,
@@ -32,7 +31,6 @@ from gsencoder.fusion.folder import (
     save_features,
     save_memories,
 )
-from gsencoder.fusion.lift import FeatureSums
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, load_heads, save_heads
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_package, save_package
 from gsencoder.memory.index import index_features
@@ -170,21 +168,6 @@ def reconstruction(folder: Path) -> Made:
     return folder / "r", read
 
 
-def sums(folder: Path) -> Made:
-    def empty() -> FeatureSums:
-        return FeatureSums(50, FeatureSpace(name="s", channels=3), None, None)
-
-    def read() -> Any:
-        restored = empty()
-        return FusionCheckpoint(folder, {}).resume(restored), restored.state()
-
-    rng, made = np.random.default_rng(0), empty()
-    made.restore(2, {name: rng.random(each.shape).astype(each.dtype) for name, each in made.state().items()})
-    with mock.patch("gsencoder.fusion.checkpoint.SAVE_EVERY", 0.0):
-        FusionCheckpoint(folder, {}).save_if_due(made)
-    return folder / SUMS_FILE, read
-
-
 def teacher_map(folder: Path) -> Made:
     views = scene(0).views
     assert views is not None
@@ -208,7 +191,6 @@ KINDS: dict[str, Callable[[Path], Made]] = {
     "counts of prepared scenes": lambda folder: prepared_file(folder, CLASS_BALANCE_FILE),
     "training": training,
     "reconstruction": reconstruction,
-    "sums of a fusion": sums,
     "map of a teacher": teacher_map,
 }
 

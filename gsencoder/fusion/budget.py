@@ -34,7 +34,7 @@ from gsencoder.core.process import Device, Track, untracked
 from gsencoder.core.settings import option
 from gsencoder.core.threads import parallel
 from gsencoder.fusion.basis import distinct_rows
-from gsencoder.fusion.checkpoint import CachedTeacher, WrappedTeacher, open_checkpoint, upright
+from gsencoder.fusion.checkpoint import CachedTeacher, WrappedTeacher, cached_maps, upright
 from gsencoder.fusion.coordinates import reduce_to_fit
 from gsencoder.fusion.errors import FieldError, judge, row_cosines
 from gsencoder.fusion.fuse import FuseConfig, Fusion, fuse, validate_scene
@@ -173,7 +173,7 @@ def fuse_within(
     visibility, exact = resolve(config.visibility, views, config.lift), exact_config(config)
     if work is not None and not teacher.cheap:
         settings = {"budget": "maps", "lift": config.lift}
-        teacher = open_checkpoint(work, settings, teacher, gaussians, views, range(len(views)), None).cached(teacher)
+        teacher = cached_maps(work, settings, teacher, gaussians, views, range(len(views)), None)
     maps, count = KeptMaps(teacher), len(views)
     order, sampled = bisection_order(count), None
     if budget.error is not None:

@@ -1,4 +1,4 @@
-"""Teachers that are wrapped: upright pictures, maps cached in files; and the checkpoint of an unfinished fusion.
+"""Teachers that are wrapped: upright pictures, and maps cached in files, from which an unfinished fusion continues.
 
 Fusing asks for a dense map twice (for the basis and for the sums), preparing a scene three times, a sweep of settings
 as often as it has settings; making a map takes far longer than reading it. What is given is always what the file
@@ -7,10 +7,9 @@ holds, so all of them see the same values.
 
 import hashlib
 import json
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -112,13 +111,20 @@ class CachedTeacher(WrappedTeacher):
     """A teacher with its maps cached as files; those of cheap teachers, and codes into a table that all its maps share,
     are made each time."""
 
-    def __init__(
-        self, teacher: Teacher, folder: Path, *, before_write: Callable[[], None] = lambda: None, advice: str = ""
-    ) -> None:
-        """`folder` must hold the maps of one scene by this teacher alone, which is not checked; `advice` is for the
-        error about a damaged file."""
+    def __init__(self, teacher: Teacher, folder: Path, settings: Mapping[str, Any] | None = None) -> None:
+        """Opens the cache of one scene and one teacher.
+
+        Args:
+            settings: all that the maps depend on, as JSON values: with the first map they are written to the folder,
+                and those of an earlier run must be the same. None = what the maps are of is not checked.
+        """
         super().__init__(teacher)
-        self._folder, self._before_write, self._advice = folder, before_write, advice
+        self._folder, self._settings, self._advice = folder, settings, ""
+        if settings is not None:
+            self._advice = f"delete {folder} to start again"
+            with advised(self._advice):
+                # As JSON gives them back.
+                self._check_settings(json.loads(json.dumps(settings)))
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         if self.cheap:
@@ -128,87 +134,41 @@ class CachedTeacher(WrappedTeacher):
             feature_map = self.teacher.feature_map(views, view)
             if feature_map.codes is not None and self.table is not None:
                 return feature_map
-            self._before_write()
+            # Not earlier: a run that ends before, because its settings are wrong, leaves no folder that refuses the
+            # next one.
+            if self._settings is not None and not (self._folder / SETTINGS_FILE).is_file():
+                try:
+                    self._folder.mkdir(parents=True, exist_ok=True)
+                except OSError as error:
+                    raise InputError(f"{self._folder}: cannot be made: {error.strerror or error}") from error
+                with atomic_file(self._folder / SETTINGS_FILE) as stream:
+                    stream.write(json.dumps(self._settings).encode())
             write_map(path, feature_map, with_table=feature_map.table is not None and self.table is None)
         with advised(self._advice or f"remove {path}, and it is made again"):
             return read_map(path, self.space, self.table)
 
-
-SETTINGS_FILE, SUMS_FILE = "settings.json", "sums.safetensors"
-SAVE_EVERY = 20.0
-"""Seconds between two checkpoints of the sums."""
-
-
-@runtime_checkable
-class Sums(Protocol):
-    """`gsencoder.fusion.lift.FeatureSums`, which needs torch."""
-
-    views: int
-
-    def state(self) -> dict[str, np.ndarray]: ...
-
-    def restore(self, views: int, state: Mapping[str, np.ndarray]) -> None: ...
-
-
-class FusionCheckpoint:
-    """The folder of a fusion that is not finished: the teacher's maps, and the sums over the views so far."""
-
-    def __init__(self, folder: Path, settings: dict[str, Any]) -> None:
-        """Opens the checkpoint of an earlier run. The folder is made when the first map or sum is written: a run that
-        ends earlier, because its settings are wrong, must not leave a folder that refuses the next run.
-
-        Maps and sums without settings are what a run left that was killed while it removed its checkpoint. Nobody knows
-        what they were made from, and they are removed. `settings` are all that maps and sums depend on, the scene
-        included, as JSON values.
-        """
-        self.folder, self._saved_at, self._advice = folder, time.monotonic(), f"delete {folder} to start again"
-        self._settings = json.loads(json.dumps(settings))
-        self._exists = (folder / SETTINGS_FILE).is_file()
-        if self._exists:
-            with advised(self._advice):
-                earlier = _read_settings(folder / SETTINGS_FILE)
-                if earlier != self._settings:
-                    raise InputError(f"{folder}: holds a fusion begun with {first_difference(earlier, self._settings)}")
-            return
+    def _check_settings(self, settings: Mapping[str, Any]) -> None:
+        """Maps without settings are what a run left that was killed while it removed its cache. Nobody knows what they
+        were made from, and they are removed."""
+        path = self._folder / SETTINGS_FILE
         try:
-            for path in (folder / SUMS_FILE, *folder.glob("map_*.safetensors")):
-                path.unlink(missing_ok=True)
-        except OSError as error:
-            raise InputError(f"{folder}: cannot be used: {error.strerror or error}; delete it") from error
-
-    def cached(self, teacher: Teacher) -> CachedTeacher:
-        """The teacher with its maps cached in this folder."""
-        return CachedTeacher(teacher, self.folder, before_write=self._make_folder, advice=self._advice)
-
-    def resume(self, sums: Sums) -> int:
-        """Restores the sums of an interrupted run, if there are any; the number of views that they are over."""
-        if (self.folder / SUMS_FILE).is_file():
-            with advised(self._advice), open_archive(self.folder / SUMS_FILE) as file:
-                state = {name: file.array(name, each.dtype.name, each.shape) for name, each in sums.state().items()}
-                sums.restore(file.value("done", int), state)
-        return sums.views
-
-    def save_if_due(self, sums: Sums) -> None:
-        """Saves the sums from time to time; to be called after each view."""
-        if time.monotonic() - self._saved_at >= SAVE_EVERY:
-            self._make_folder()
-            write_archive(self.folder / SUMS_FILE, sums.state(), {"done": sums.views})
-            self._saved_at = time.monotonic()
-
-    def _make_folder(self) -> None:
-        """Makes the folder and writes its settings."""
-        if self._exists:
-            return
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{self.folder}: cannot be made: {error.strerror or error}") from error
-        with atomic_file(self.folder / SETTINGS_FILE) as stream:
-            stream.write(json.dumps(self._settings).encode())
-        self._exists = True
+            if path.is_file():
+                earlier = dict(json.loads(read_foreign_text(path)))
+                if earlier != settings:
+                    raise InputError(f"{self._folder}: holds a fusion begun with {first_difference(earlier, settings)}")
+                return
+            for each in self._folder.glob("map_*.safetensors"):
+                each.unlink(missing_ok=True)
+        except InputError:
+            raise
+        except (OSError, ValueError, TypeError, RecursionError) as error:
+            raise InputError(f"{self._folder}: cannot be used: {error}") from error
 
 
-def open_checkpoint(
+SETTINGS_FILE = "settings.json"
+
+
+def cached_maps(
     folder: Path,
     config: Mapping[str, Any],
     teacher: Teacher,
@@ -216,8 +176,9 @@ def open_checkpoint(
     views: Views,
     rows: Sequence[int],
     basis: FeatureBasis | None,
-) -> FusionCheckpoint:
-    """Opens the checkpoint in a folder, which belongs to one scene, one teacher, one set of settings and one basis.
+) -> CachedTeacher:
+    """The teacher with its maps cached in the folder of a fusion, which belongs to one scene, one teacher, one set of
+    settings and one basis.
 
     Args:
         config: settings of the fusion, as JSON values.
@@ -233,7 +194,7 @@ def open_checkpoint(
     names = np.frombuffer(repr(views.names).encode("utf-8", "backslashreplace"), np.uint8)
     settings["scene"] = {"gaussians": _digest(*splat), "views": _digest(names, *cameras)}
     settings["scene"]["depth"] = views.depths is not None
-    return FusionCheckpoint(folder, settings)
+    return CachedTeacher(teacher, folder, settings)
 
 
 def _digest(*arrays: np.ndarray) -> str:
@@ -242,13 +203,3 @@ def _digest(*arrays: np.ndarray) -> str:
         digest.update(f"{array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]
-
-
-def _read_settings(path: Path) -> dict[str, Any]:
-    try:
-        settings = json.loads(read_foreign_text(path))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: cannot be read ({error})") from error
-    if not isinstance(settings, dict):
-        raise InputError(f"{path}: expected an object")
-    return settings

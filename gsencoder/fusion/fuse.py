@@ -24,7 +24,7 @@ from gsencoder.core.process import Device, Track, timed, untracked
 from gsencoder.core.settings import check_limits, option
 from gsencoder.core.threads import ahead, thread_count
 from gsencoder.fusion.basis import Moments, distinct_rows, fit_basis, table_basis
-from gsencoder.fusion.checkpoint import open_checkpoint, upright
+from gsencoder.fusion.checkpoint import cached_maps, upright
 from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, covering_views, resolve, view_matrix
 from gsencoder.render import Blend, BlendConfig
 from gsencoder.teachers.base import Teacher
@@ -119,7 +119,7 @@ def fuse(
             scene's own, where `config` asks for one.
         rows: numbers of the views that are lifted, in this order; None = those that `config` chooses.
         work: folder where maps of a costly teacher are cached as float16 files, because computing them again costs far
-            more than reading them, and sums are saved: an interrupted run continues from it with the same bits.
+            more than reading them: an interrupted run continues from it with the same bits.
         device: where B is made, held against depth maps, and multiplied; "auto" = a GPU if torch sees one. Features of
             two devices are equal within rounding, so that `work` may be continued on another one.
 
@@ -128,10 +128,9 @@ def fuse(
     """
     gaussians, views = validate_scene(scene)
     rows = select_views(gaussians, views, config) if rows is None else tuple(rows)
-    teacher, checkpoint = upright(teacher), None
+    teacher = upright(teacher)
     if work is not None:
-        checkpoint = open_checkpoint(work, asdict(config), teacher, gaussians, views, rows, basis)
-        teacher = checkpoint.cached(teacher)
+        teacher = cached_maps(work, asdict(config), teacher, gaussians, views, rows, basis)
     maps = timed("teacher")(partial(teacher.feature_map, views))
     target = choose_device(device) if isinstance(device, str) else device
 
@@ -143,7 +142,6 @@ def fuse(
         mean = basis.mean
     visibility = resolve(config.visibility, views, config.lift)
     sums = FeatureSums(len(gaussians), teacher.space, basis, teacher.table, target, with_mean=mean is None)
-    remaining = rows if checkpoint is None else rows[checkpoint.resume(sums) :]
 
     def prepare(view: int) -> tuple[FeatureMap, Blend]:
         feature_map = maps(view)
@@ -161,13 +159,9 @@ def fuse(
 
     # A costly teacher has threads of its own and may have large maps: its views are prepared one after the other.
     side_by_side = teacher.cheap and target.type == "cpu"
-    prepared = (
-        ahead(prepare, remaining, min(thread_count(), VIEWS_AT_ONCE)) if side_by_side else map(prepare, remaining)
-    )
-    for view, (feature_map, matrix) in zip(track(remaining, "lifting views"), prepared, strict=True):
+    prepared = ahead(prepare, rows, min(thread_count(), VIEWS_AT_ONCE)) if side_by_side else map(prepare, rows)
+    for view, (feature_map, matrix) in zip(track(rows, "lifting views"), prepared, strict=True):
         sums.add(matrix, feature_map, views.masks[view] if views.masks is not None else None)
-        if checkpoint is not None:
-            checkpoint.save_if_due(sums)
     features, weights = sums.finish()
     if not (weights > 0).any():
         none = f"none of {len(rows)} views of {scene.name} sees any Gaussian"

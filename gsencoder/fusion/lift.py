@@ -1,7 +1,7 @@
 """Lifting: the matrix that carries a view's map to the Gaussians, sums over all views, and which views show most."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, no_type_check
 
@@ -143,7 +143,6 @@ class FeatureSums:
             shares of a code are one_hot(code).
         weights: Σ Bᵀ @ 1; zero where sums are by rows of a table, since their weights are the row sums.
         table: by whose rows maps are summed; None where sums are of vectors.
-        views: how many views were added.
     """
 
     def __init__(
@@ -165,7 +164,7 @@ class FeatureSums:
         with_mean: whether the mean of the maps' vectors is computed on the way.
         """
         columns = space.channels if basis is None else len(basis.components)
-        self.basis, self.views, self.device = basis, 0, device
+        self.basis, self.device = basis, device
         self.table = table if table is not None and _few_codes(len(table), columns) else None
         self.moments = Moments(space.channels, second=False) if with_mean else None
         width = columns if self.table is None else len(self.table)
@@ -184,18 +183,6 @@ class FeatureSums:
         """Mean of the vectors of all maps, with `with_mean`."""
         assert self.moments is not None
         return self.moments.mean.astype(np.float32)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """The arrays from which `restore` continues."""
-        moments = {} if self.moments is None else self.moments.state()
-        return {"sums": self.sums, "weights": self.weights} | moments
-
-    def restore(self, views: int, state: Mapping[str, np.ndarray]) -> None:
-        """Continues from the arrays of sums over the first `views` views."""
-        self.views, self._sums = views, self._tensor(state["sums"])
-        self._weights = self._tensor(state["weights"][:, None])
-        if self.moments is not None:
-            self.moments.restore(state)
 
     def _zeros(self, rows: int, columns: int) -> torch.Tensor:
         """Zeros on the device; on a CPU allocated by numpy, whose large arrays lie in huge pages that fill many times
@@ -216,7 +203,6 @@ class FeatureSums:
     @timed("lift")
     def add(self, b: Blend, feature_map: FeatureMap, mask: Bool[np.ndarray, "H W"] | None) -> None:
         """Adds a view: sums += Bᵀ @ (share · maps), weights += Bᵀ @ share, with the share of each row in the mask."""
-        self.views += 1
         if self.moments is not None:
             self.moments.add(distinct_rows(feature_map))
         share = row_mask(mask, b.lattice) if mask is not None else None

@@ -80,7 +80,7 @@ class Blend:
 
     @cached_property
     def transposed(self) -> tuple[Int64[Tensor, " M"], Int64[Tensor, " M_plus_1"], Int32[Tensor, " nnz"], Tensor]:
-        """The M columns that occur, and Bᵀ restricted to them: (columns, crow, row, weight)."""
+        """The M Gaussians that this view sees, ascending, and Bᵀ restricted to them: (columns, crow, row, weight)."""
         if self._on_numba:
             arrays = (self.crow.numpy(), self.col.numpy(), self.weight.numpy())
             columns, crow, row, weight = map(torch.from_numpy, blend_cpu.transpose(*arrays, self.gaussians))
@@ -96,11 +96,6 @@ class Blend:
         """The blend with its tensors on a device."""
         crow, col, weight, depths = (each.to(device) for each in (self.crow, self.col, self.weight, self.depths))
         return Blend(crow, col, weight, depths, self.lattice, self.config)
-
-    @property
-    def columns(self) -> Int64[Tensor, " M"]:
-        """The Gaussians that this view sees, ascending."""
-        return self.transposed[0]
 
     @cached_property
     def alpha(self) -> Float[Tensor, " P"]:

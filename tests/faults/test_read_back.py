@@ -20,6 +20,7 @@ import pytest
 from archives import flip_bit
 from scene_files import write_transforms
 from splats import random_gaussians
+from training_scenes import DenseSideTeacher
 from tuning_pairs import png
 
 from gsencoder.app.options import SharedScenesConfig
@@ -33,7 +34,7 @@ from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.data.video import RECORD_FILE, _taken
 from gsencoder.evaluate.tradeoff.measure import IDENTITY_FILE, RECORDS_FILE, Records
-from gsencoder.fusion.checkpoint import SETTINGS_FILE, FusionCheckpoint
+from gsencoder.fusion.checkpoint import SETTINGS_FILE, CachedTeacher
 from gsencoder.infer.ask.batch import ANSWERS, _answered
 from gsencoder.infer.ask.questions import read_answers
 from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PreparedDataset
@@ -65,8 +66,8 @@ def answers(folder: Path) -> Made:
 
 
 def fusion(folder: Path) -> Made:
-    FusionCheckpoint(folder, SETTINGS)._make_folder()
-    return folder / SETTINGS_FILE, lambda: FusionCheckpoint(folder, SETTINGS)._settings
+    write_json(folder / SETTINGS_FILE, SETTINGS)
+    return folder / SETTINGS_FILE, lambda: CachedTeacher(DenseSideTeacher(), folder, SETTINGS)._settings
 
 
 def dataset(folder: Path) -> Made:

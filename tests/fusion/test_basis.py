@@ -77,14 +77,6 @@ def test_components_are_orthonormal_and_the_same_on_a_rerun(rng: np.random.Gener
     assert (basis.components.max(axis=1) == np.abs(basis.components).max(axis=1)).all()
 
 
-def test_a_constant_feature_has_a_basis_of_rank_one_that_reproduces_it() -> None:
-    x = np.full((10, 24), 2.5, np.float32)
-    moments = moments_of(x)
-    basis = fit_basis(moments.mean, moments.covariance(), SPACE, energy=0.9)
-    assert basis.rank == 1
-    np.testing.assert_allclose(to_coordinates(basis, x) @ basis.components + basis.mean, x)
-
-
 def test_rendering_coordinates_then_decoding_equals_rendering_features(rng: np.random.Generator) -> None:
     """decode(B @ z) = (B @ z) @ components + alpha · mean, because rows of B sum to alpha."""
     x = low_rank(rng, n=200, mean=4.0)
@@ -176,15 +168,6 @@ def test_sums_of_parts_are_the_sums_of_the_whole_and_counts_repeat_vectors(rng: 
     whole = ProjectionSums()
     whole.add(basis, np.concatenate((vectors, vectors[30:])))
     assert asdict(total_fit(parts)) == pytest.approx(asdict(whole.fit()))
-
-
-def test_a_quantile_among_equal_cosines_is_where_the_vectors_are() -> None:
-    basis = FeatureBasis(
-        mean=np.zeros(12, np.float32), components=np.eye(1, 12, dtype=np.float32), energy_kept=1.0, space=WIDE
-    )
-    sums = ProjectionSums()
-    sums.add(basis, np.eye(1, 12, dtype=np.float32))
-    assert sums.fit().worst == pytest.approx(1.0, abs=1e-3)
 
 
 def test_coded_and_dense_maps_of_the_same_vectors_give_the_same_figures() -> None:

@@ -45,10 +45,14 @@ def inverse(frame: SplatFrame) -> SplatFrame:
     return replace(frame, rotation=rotation, scale=scale, shift=-scale * rotation @ frame.shift)
 
 
+FRAMES = [list(usual_frames())[number] for number in (7, 20, 30)]
+
+
 @pytest.fixture(autouse=True)
 def fewer_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fifth of the room's Gaussians are rendered: a search looks at a hundred pictures."""
+    """A fifth of the room's Gaussians are rendered, in three of the usual frames: a search looks at ten pictures."""
     monkeypatch.setattr(fit, "MAX_GAUSSIANS", 8000)
+    monkeypatch.setattr(fit, "usual_frames", lambda: iter(FRAMES))
 
 
 @pytest.fixture(scope="module")
@@ -130,11 +134,11 @@ def test_a_moved_splat_has_the_colors_that_it_had_from_there(degree: int) -> Non
     assert np.abs((back.quats * splat.quats).sum(axis=1)) == pytest.approx(1, abs=1e-6)
 
 
-@pytest.mark.parametrize("number", [7, 30])
+@pytest.mark.parametrize("number", [0, 2])
 def test_a_usual_frame_is_refused_and_its_advice_mends_it(
     scene: Scene, field_room: FieldRoom, tmp_path: Path, number: int
 ) -> None:
-    frame = list(usual_frames())[number]
+    frame = FRAMES[number]
     if frame.intrinsics_factor != 1:
         content = field_room.transforms()
         keys = {key: content[key] / frame.intrinsics_factor for key in ("fl_x", "fl_y", "cx", "cy")}

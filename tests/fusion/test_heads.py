@@ -13,12 +13,11 @@ from torch import nn
 
 from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
-from gsencoder.fusion.errors import CellSample, sample_cells
+from gsencoder.fusion.errors import CellSample
 from gsencoder.fusion.folder import copy_heads, find_heads
 from gsencoder.fusion.measured_heads import (
     HeadSet,
     choose_heads,
-    equal_rows,
     find_head,
     has_head,
     head_features,
@@ -231,14 +230,6 @@ def test_rows_that_are_equal_are_computed_once(monkeypatch: pytest.MonkeyPatch) 
     assert sum(computed) == 11
 
 
-@pytest.mark.parametrize("rows", [0, 500])
-def test_groups_of_equal_rows_give_the_rows_back(rows: int) -> None:
-    values = np.random.default_rng(0).integers(0, 3, (rows, 3)).astype(np.float32)
-    first, inverse = equal_rows(values)
-    np.testing.assert_array_equal(values[first][inverse], values)
-    assert len(first) == len(np.unique(values, axis=0))
-
-
 def test_features_of_another_backbone_are_refused() -> None:
     with pytest.raises(InputError, match=r"siglip\.summary: the heads take features of \(radio.*other.*radio · 6 chan"):
         head_features(fields(), measured(), replace(SPACE, weights="other"))
@@ -256,28 +247,3 @@ def test_tokens_go_through_a_head_one_by_one() -> None:
     for view, rows in enumerate(made):
         torch.testing.assert_close(rows, head.head.body(tokens[view]).detach(), rtol=1e-4, atol=1e-4)
     assert head_space(SPACE, head).text_encoder == ""
-
-
-def test_a_fusion_that_continues_from_its_cache_samples_the_cells_of_all_views(tmp_path: Path) -> None:
-    from training_scenes import DenseSideTeacher
-    from training_scenes import scene as a_scene
-
-    from gsencoder.fusion.fuse import FuseConfig, fuse
-
-    class Expensive(DenseSideTeacher):
-        cheap = False
-        calls = 0
-
-        def feature_map(self, views: Any, view: int) -> FeatureMap:
-            Expensive.calls += 1
-            return super().feature_map(views, view)
-
-    scene, config = a_scene(0), FuseConfig(basis=False)
-    assert scene.views is not None
-    plain = sample_cells(Expensive(), scene.views, range(len(scene.views)))
-    fuse(scene, Expensive(), config, work=tmp_path / "work")
-    Expensive.calls = 0
-    fusion = fuse(scene, Expensive(), config, work=tmp_path / "work")
-    continued = sample_cells(fusion.teacher, scene.views, fusion.views)
-    assert Expensive.calls == 0
-    np.testing.assert_allclose(continued.vectors(), plain.vectors(), rtol=1e-3, atol=1e-3)

@@ -12,11 +12,9 @@ from training_scenes import SPACE as SIDES
 from training_scenes import scene as side_scene
 
 from gsencoder.fusion.basis import distinct_rows
-from gsencoder.fusion.checkpoint import CachedTeacher, read_map, write_map
+from gsencoder.fusion.checkpoint import CachedTeacher
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import VisibilityConfig
-from gsencoder.models.output_space import OutputSpace
-from gsencoder.train.prepare import _pool_map
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Scene, Views
 
 SPACE = FeatureSpace(name="s", channels=6)
@@ -108,17 +106,6 @@ def test_maps_with_tables_of_their_own_are_made_once_and_read_as_they_were(
     assert teacher.calls == len(REGIONS)
 
 
-def test_a_mixed_map_with_its_own_table_is_read_as_it_was(tmp_path: Path, rng: np.random.Generator) -> None:
-    table = rng.normal(size=(3, 6)).astype(np.float32)
-    made = FeatureMap(
-        shares=rng.random((4, 5, 3)).astype(np.float32), table=table, grid_from_image=IDENTITY, space=SPACE
-    )
-    write_map(tmp_path / "m", made, with_table=True)
-    read = read_map(tmp_path / "m", SPACE)
-    np.testing.assert_array_equal(read.table, table)
-    np.testing.assert_allclose(read.shares, made.shares, atol=1e-3)
-
-
 class SideRegions:
     """The halves of the picture as two regions, with vectors of each view's own; the second view has no region."""
 
@@ -149,14 +136,3 @@ def test_scenes_are_prepared_for_training_from_tables_of_their_views(tmp_path: P
     fused = fuse(side_scene(0), SideRegions(), replace(PREPARE.fusion, basis=False)).features
     rows = np.flatnonzero(fused.seen)
     np.testing.assert_allclose(outputs.restore(one.targets(rows)), fused.features[rows], atol=5e-3)
-
-
-def test_cells_of_a_view_without_regions_have_no_vector() -> None:
-    views = side_scene(0).views
-    assert views is not None
-    outputs = OutputSpace(space=SIDES, mean=np.zeros(4, np.float32), scale=1.0, basis=None)
-    for view, expected in ((0, True), (1, False)):
-        vectors, valid, _ = _pool_map(SideRegions().feature_map(views, view), outputs, 4)
-        assert valid.all() == expected
-        assert valid.any() == expected
-        assert np.isfinite(vectors).all()

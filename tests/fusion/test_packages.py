@@ -212,16 +212,6 @@ def test_settings_that_cannot_be_are_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_vectors_beyond_half_precision_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "features"
-    folder.mkdir()
-    save_features(folder, make_scene(0.0), make_features(n=N, magnitude=1e6), {})
-    words = ["decoded=true", f"out={tmp_path / 'out'}"]
-    assert cli.main(["pack", str(folder), "form=npz", *words]) == 2
-    assert "do not fit into float16" in capsys.readouterr().err
-    assert cli.main(["pack", str(folder), "form=ply", *words]) == 0
-
-
 def test_a_package_loads_without_torch(package: Path) -> None:
     program = (
         "import sys; from pathlib import Path; from gsencoder.fusion.folder import load_features; "

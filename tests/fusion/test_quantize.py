@@ -104,18 +104,6 @@ def test_weights_of_any_range_come_back_within_their_step(low: float, high: floa
     assert (decoded >= weights / step / 1.001).all()
 
 
-def test_any_rows_decode_to_what_all_decode_to(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = compact(make_features(), error=0.01)
-    whole = made.coordinates()
-    places = np.array([5, 5, 0, 2399])
-    np.testing.assert_array_equal(made.coordinates(places), whole[places])
-    np.testing.assert_array_equal(made.coordinates(slice(10, 20)), whole[10:20])
-    monkeypatch.setattr(module, "BLOCK", 100)
-    np.testing.assert_array_equal(made.coordinates(), whole)
-    again = compact(make_features(), error=0.01)
-    np.testing.assert_array_equal(again.codes, made.codes)
-
-
 def test_codes_lie_as_the_format_says() -> None:
     """Read bit by bit, without numpy's unpacking."""
     made = compact(make_features(n=200), error=0.01)

@@ -68,7 +68,7 @@ def test_rows_in_view_are_all_that_a_picture_shows(log_scale: float) -> None:
     rows = set(rows_in_view(raw, pose, K, 61, 43, near=0.01, eps2d=0.3).tolist())
     from gsencoder.render import blend
 
-    assert set(blend(splat, camera).columns.tolist()) <= rows
+    assert set(blend(splat, camera).transposed[0].tolist()) <= rows
     assert len(rows) < 600
 
 

@@ -10,7 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 from textured_box import box_cameras, box_views, write_box
 
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError
 from gsencoder.data.readers.colmap import read_colmap
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.reconstruct import sfm as opening
@@ -88,16 +88,6 @@ def test_photographs_are_placed_by_several_cameras_and_frames_of_a_video_by_one(
     assert (opened.sfm, opened.photographs, opened.is_video) == (placing.placed, work / FRAMES_FOLDER, True)
     assert set(opened.seconds) == {"frames", "place"}
     assert placing.calls == [(photographs, False), (work / FRAMES_FOLDER, True)]
-
-
-def test_photographs_that_were_placed_before_are_not_placed_again(
-    photographs: Path, work: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    placing = Placing(monkeypatch, missing=("c.jpg",))
-    placing.earlier = placing.placed
-    with pytest.warns(SceneWarning, match="1 of 3 photographs could not be placed and are not used: c.jpg"):
-        assert open_scene(photographs, work).seconds == {}
-    assert placing.calls == []
 
 
 def test_links_that_lead_out_of_the_folder_are_refused_before_photographs_are_placed(
