@@ -308,7 +308,8 @@ def main() -> None:
         options.views, options.runs = 6, 2
     problem = prepare(options.scene, options.voxel, options.views)
     n, channels, views = len(problem.gaussians), problem.mean.size, len(problem.maps)
-    mean_columns = [round(float(np.mean([len(b.transposed[0]) for b in some]))) for some in (problem.blends, problem.centers)]
+    both = (problem.blends, problem.centers)
+    mean_columns = [round(float(np.mean([len(b.transposed[0]) for b in some]))) for some in both]
     print(f"{n:,} Gaussians, {views} views of 24 × 32 cells, {channels} channels, {torch.get_num_threads()} threads")
     print(f"a view reaches {mean_columns[0]:,} Gaussians by blending, {mean_columns[1]:,} by visible centers")
     for name, value in problem.seconds.items():
