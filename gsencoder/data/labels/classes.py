@@ -1,24 +1,16 @@
-"""Classes of benchmarks: names, ids in files, and groups such as head, common and tail.
+"""Classes of benchmarks, and how raw names of annotations become their ids.
 
-Classes of ScanNet's benchmarks, and how raw names of annotations become their ids.
+scannet_classes.csv holds ScanNet's 20 and 200 classes, and of the 200 whether a class is head, common or tail, as
+BenchmarkScripts/ScanNet200/scannet200_constants.py and scannet200_splits.py have them (Rozenberszki et al.,
+Language-Grounded Indoor 3D Semantic Segmentation in the Wild, 2022). Ids of the 20 are nyu40id, ids of the 200 are id,
+both columns of scannetv2-labels.combined.tsv, which comes with ScanNet and maps raw names to them.
 
-scannet_classes.csv holds the 20 and the 200 classes with ids and names, and of the 200 whether a class is head, common
-or tail, as ScanNet's BenchmarkScripts/ScanNet200/scannet200_constants.py and scannet200_splits.py have them
-(Rozenberszki et al., Language-Grounded Indoor 3D Semantic Segmentation in the Wild, 2022). Ids of the 20 are nyu40id,
-ids of the 200 are id, both columns of scannetv2-labels.combined.tsv, which comes with ScanNet and maps raw names to
-them.
-
-Classes of ScanNet++'s benchmark, in its own files below metadata/semantic_benchmark/.
-
-top100.txt has one class a line, whose ids count the lines from 0; top100_instance.txt has those of them that have
-instances (wall, ceiling and floor have none). map_benchmark.csv leads raw names of annotations to classes: its column
+ScanNet++ has its classes in metadata/semantic_benchmark/: top100.txt has one a line, whose ids count the lines from 0;
+top100_instance.txt has those of them that have instances. map_benchmark.csv leads raw names to classes: its column
 semantic_map_to has the class of the name in the column class, nothing where the name is a class itself, and None where
-it has none. Its column instance_map_to is not read: the toolkit maps instances by semantic_map_to, too
-(semantic/transforms/mesh.py, MapLabelToIndex), and then keeps those of top100_instance.txt.
+it has none. The toolkit maps instances by this column, too (semantic/transforms/mesh.py, MapLabelToIndex).
 """
 
-import csv
-import io
 import warnings
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -31,38 +23,23 @@ from jaxtyping import Int32, Int64
 from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, SceneWarning, about
 from gsencoder.core.files import csv_text, write_bytes
-from gsencoder.data.labels.files import read_checked_text
+from gsencoder.data.labels.files import read_checked_text, read_rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClassTable:
-    """Classes that are scored. Whatever truth has beside them is ignored.
-
-    Attributes:
-        names: of the classes, each once.
-        ids: of the classes in files, each once and 0 or more.
-        groups: names of classes by the name of a group, such as ScanNet200's head, common and tail.
-    """
+    """Classes that are scored. Whatever truth has beside them is ignored."""
 
     names: tuple[str, ...]
-    ids: tuple[int, ...]
-    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    ids: tuple[int, ...]  # of the names, in files; 0 or more
+    groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # names of classes, such as head, common, tail
 
     def __post_init__(self) -> None:
-        if not self.names or len(self.names) != len(self.ids):
-            raise InputError(
-                f"classes: expected one id for each of one or more names, got {len(self.names)} names and "
-                f"{len(self.ids)} ids"
-            )
+        if not self.names:
+            raise InputError("classes: expected one or more")
         for kind, values in (("name", self.names), ("id", self.ids)):
             if repeated := first_repeated(values):
                 raise InputError(f"classes: the {kind} {repeated[0]!r} is there twice")
-        if min(self.ids) < 0:
-            raise InputError(f"classes: expected ids of 0 or more, got {min(self.ids)}")
-        for group, names in self.groups.items():
-            unknown = [name for name in names if name not in self.names]
-            if unknown:
-                raise InputError(f"classes: {unknown[0]!r} of the group {group!r} is no class")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -76,15 +53,6 @@ class ClassTable:
     def id_of(self) -> dict[str, int]:
         """The id of each name."""
         return dict(zip(self.names, self.ids, strict=True))
-
-    def check_instance_ids(self) -> None:
-        """Checks that files of instances can hold all ids: class id · 1000 + number, below 1000 = no instance."""
-        if 0 in self.ids:
-            raise InputError(
-                f"classes: {self.name_of[0]!r} has the id 0, which files of instances cannot hold: a vertex has "
-                "class id · 1000 + number of the instance, and below 1000 it has none; give the class another id, here "
-                "and in the files, or leave it out of classes="
-            )
 
     def without(self, names: Collection[str]) -> "ClassTable":
         """The table without some names, of which those that it does not have are passed over."""
@@ -107,11 +75,8 @@ class ClassTable:
 
 CLASSES = Path(__file__).parent / "scannet_classes.csv"
 COLUMNS = {"scannet20": "nyu40id", "scannet200": "id"}
-"""The column of the label map that holds the ids of a set."""
-DEFAULT_COLUMN = "id"
-"""That of other classes."""
-MAX_MAP_BYTES = 16 << 20
-MAX_CLASS_LIST_BYTES = 4 << 20
+"""The column of the label map that holds the ids of a set; of other classes it is id."""
+MAX_BYTES = 16 << 20
 STUFF = ("wall", "floor")
 """Classes of ScanNet's benchmarks that have labels and no instances."""
 IDS_PER_CLASS = 1000
@@ -121,59 +86,48 @@ IDS_PER_CLASS = 1000
 @cache
 def scannet_classes(name: str) -> ClassTable:
     """The classes of scannet20 or scannet200."""
-    with CLASSES.open(encoding="utf-8", newline="") as stream:
-        rows = [row for row in csv.DictReader(stream) if row["set"] == name]
-    if not rows:
-        raise InputError(f"classes {name[:40]!r}: expected {' or '.join(COLUMNS)}")
+    rows = [row for row, _ in read_rows(CLASSES, ("set", "id", "name", "group"), max_bytes=MAX_BYTES)]
+    return _table(row for row in rows if row["set"] == name)
+
+
+def _table(rows: Iterable[Mapping[str, str]]) -> ClassTable:
+    rows, groups = list(rows), dict[str, tuple[str, ...]]()
+    for row in rows:
+        if group := row.get("group"):
+            groups[group] = (*groups.get(group, ()), row["name"].strip())
     return ClassTable(
-        ids=tuple(int(row["id"]) for row in rows),
-        names=tuple(row["name"] for row in rows),
-        groups={
-            group: tuple(row["name"] for row in rows if row["group"] == group)
-            for group in dict.fromkeys(row["group"] for row in rows if row["group"])
-        },
+        names=tuple(row["name"].strip() for row in rows), ids=tuple(int(row["id"]) for row in rows), groups=groups
     )
 
 
 def read_class_list(path: Path) -> ClassTable:
     """The classes of a text file with one name a line, such as ScanNet++'s top100.txt; ids count the lines from 0."""
-    lines = [line.strip() for line in read_checked_text(path, max_bytes=MAX_CLASS_LIST_BYTES).splitlines()]
-    names = [line for line in lines if line]
-    if not names:
-        raise InputError(f"{path}: lists no class; expected one name a line")
+    lines = [line.strip() for line in read_checked_text(path, max_bytes=MAX_BYTES).splitlines()]
+    names = tuple(line for line in lines if line)
     with about(path):
-        return ClassTable(names=tuple(names), ids=tuple(range(len(names))))
+        return ClassTable(names=names, ids=tuple(range(len(names))))
 
 
 def read_label_map(path: Path, column: str) -> dict[str, int]:
     """The ids of raw names in scannetv2-labels.combined.tsv.
 
     Args:
-        path: of that file, which comes with ScanNet.
         column: which ids, such as nyu40id or id; see `COLUMNS`.
     """
     mapping: dict[str, int] = {}
-    text = read_checked_text(path, max_bytes=MAX_MAP_BYTES)
-    rows = csv.DictReader(io.StringIO(text, newline=""), delimiter="\t")
-    try:
-        missing = [name for name in ("raw_category", column) if name not in (rows.fieldnames or ())]
-        if missing:
-            raise InputError(
-                f"{path}: has no column {missing[0]!r}; expected scannetv2-labels.combined.tsv, with tabs between"
-            )
-        for row in rows:
-            name, word = row["raw_category"], (row[column] or "").strip()
-            if name is None or not word.isascii() or not word.isdigit() or len(word) > 9:
-                raise InputError(f"{path}: line {rows.line_num}: {column} must be a whole number, got {word[:40]!r}")
-            if mapping.setdefault(name, int(word)) != int(word):
-                raise InputError(
-                    f"{path}: line {rows.line_num}: {name[:40]!r} has {column} {word}, and {mapping[name]} before"
-                )
-    except csv.Error as error:
-        raise InputError(f"{path}: not a readable label map ({' '.join(str(error).split())[:120]})") from error
+    for row, where in read_rows(path, ("raw_category", column), max_bytes=MAX_BYTES, delimiter="\t"):
+        name, number = row["raw_category"], _id(row[column].strip(), where, column)
+        if mapping.setdefault(name, number) != number:
+            raise InputError(f"{where}: {name[:40]!r} has {column} {number}, and {mapping[name]} before")
     if not mapping:
         raise InputError(f"{path}: maps no name; expected scannetv2-labels.combined.tsv")
     return mapping
+
+
+def _id(word: str, where: str, column: str) -> int:
+    if not word.isascii() or not word.isdigit() or len(word) > 9:
+        raise InputError(f"{where}: {column} must be a whole number, got {word[:40]!r}")
+    return int(word)
 
 
 def ids_of_names(names: Iterable[str], mapping: Mapping[str, int], classes: ClassTable | None = None) -> dict[str, int]:
@@ -182,7 +136,6 @@ def ids_of_names(names: Iterable[str], mapping: Mapping[str, int], classes: Clas
     Names are compared as they are written, as ScanNet's scripts do.
 
     Args:
-        mapping: of `read_label_map`, or `ClassTable.id_of` for names that are those of classes.
         classes: where given, ids that are not among its own become 0, as in ScanNet200's script; without it they
             stay, as in the script of the 20 classes, whose evaluation leaves them out.
 
@@ -221,57 +174,30 @@ def vertex_classes(
     return np.array(ids, np.int32)[codes]
 
 
-RAW, TARGET = "class", "semantic_map_to"
-NO_TARGET = "None"
-
-
 def read_instance_classes(path: Path) -> ClassTable:
     """Those classes of a list that NAME_instance.txt beside NAME.txt names too, with the ids of the list."""
-    every, beside = read_class_list(path), path.with_name(f"{path.stem}_instance.txt")
-    if not beside.is_file():
-        raise InputError(
-            f"{beside}: no such file; expected the classes of {path.name} that have instances, one a line, as "
-            f"ScanNet++ "
-            "has them"
-        )
-    names = read_class_list(beside).names
+    every, instance_list = read_class_list(path), path.with_name(f"{path.stem}_instance.txt")
+    names = read_class_list(instance_list).names
     foreign = [name for name in names if name not in every.names]
     if foreign:
-        raise InputError(f"{beside}: {foreign[0][:40]!r} is no class of {path.name}")
+        raise InputError(f"{instance_list}: {foreign[0][:40]!r} is no class of {path.name}")
     return ClassTable(names=names, ids=tuple(every.id_of[name] for name in names))
 
 
-def read_benchmark_map(path: Path) -> dict[str, str]:
-    """The class of each raw name in map_benchmark.csv; names without a class are left out.
+def ids_of_benchmark(path: Path, classes: ClassTable) -> dict[str, int]:
+    """The class id of each raw name in map_benchmark.csv that leads to a class of a table.
 
     Of a name that is there several times the last line with a class counts, as in the toolkit.
     """
-    rows = csv.DictReader(io.StringIO(read_checked_text(path, max_bytes=MAX_MAP_BYTES), newline=""), strict=True)
-    try:
-        lines = list(rows)
-    except csv.Error as error:
-        raise InputError(f"{path}: not a readable CSV file ({' '.join(str(error).split())[:120]})") from error
-    missing = [name for name in (RAW, TARGET) if name not in (rows.fieldnames or ())]
-    if missing:
-        raise InputError(
-            f"{path}: has no column {missing[0]!r}; expected ScanNet++'s map_benchmark.csv, with {RAW} and {TARGET}"
-        )
+    raw, target = "class", "semantic_map_to"
     mapping: dict[str, str] = {}
-    for row in lines:
-        raw, target = row[RAW] or "", row[TARGET] or ""
-        if raw and not target:
-            mapping.setdefault(raw, raw)
-        elif raw and target != NO_TARGET:
-            mapping[raw] = target
-    if not mapping:
-        raise InputError(f"{path}: maps no name; expected ScanNet++'s map_benchmark.csv")
-    return mapping
-
-
-def ids_of_benchmark(path: Path, classes: ClassTable) -> dict[str, int]:
-    """The class id of each raw name in map_benchmark.csv that leads to a class of a table."""
+    for row, _ in read_rows(path, (raw, target), max_bytes=MAX_BYTES):
+        if row[raw] and not row[target]:
+            mapping.setdefault(row[raw], row[raw])
+        elif row[raw] and row[target] != "None":
+            mapping[row[raw]] = row[target]
     id_of = classes.id_of
-    ids = {raw: id_of[target] for raw, target in read_benchmark_map(path).items() if target in id_of}
+    ids = {name: id_of[leads_to] for name, leads_to in mapping.items() if leads_to in id_of}
     if not ids:
         raise InputError(f"{path}: no name leads to one of the {len(classes)} classes; compare it with classes=")
     return ids
@@ -286,7 +212,7 @@ def ids_of_raw_names(label_map: str, classes: str) -> dict[str, int]:
     """Class id of each raw name of ScanNet's or ScanNet++'s objects, by a label map and `classes` of `load_classes`."""
     if is_scannetpp_map(label_map):
         return ids_of_benchmark(Path(label_map), load_classes(classes))
-    return read_label_map(Path(label_map), COLUMNS.get(classes, DEFAULT_COLUMN))
+    return read_label_map(Path(label_map), COLUMNS.get(classes, "id"))
 
 
 def load_classes(classes: str, *, instances: bool = False) -> ClassTable:
@@ -298,56 +224,30 @@ def load_classes(classes: str, *, instances: bool = False) -> ClassTable:
         instances: whether instances are scored: the benchmarks then leave out wall and floor, so that 18 and 198
             classes remain. Of a list those in NAME_instance.txt beside it; those of a CSV file are all scored.
     """
-    table = _table(classes, instances)
-    if instances:
-        table.check_instance_ids()
-    return table
-
-
-def _table(classes: str, instances: bool) -> ClassTable:
-    if classes in COLUMNS:
-        every = scannet_classes(classes)
-        return every.without(STUFF) if instances else every
     path = Path(classes)
-    if not path.is_file():
+    if classes in COLUMNS:
+        table = scannet_classes(classes).without(STUFF if instances else ())
+    elif not path.is_file():
         raise InputError(
             f"classes: {classes} is no file; expected {', '.join(COLUMNS)}, a CSV file with the columns id and name, "
             "or a list of names (.txt)"
         )
-    if path.suffix.lower() == ".txt":
-        return read_instance_classes(path) if instances else read_class_list(path)
-    return _read_table(path)
-
-
-def _read_table(path: Path) -> ClassTable:
-    """The classes of a CSV file with the columns id, name and group."""
-    text = read_checked_text(path, max_bytes=MAX_CLASS_LIST_BYTES)
-    reader = csv.DictReader(io.StringIO(text, newline=""), strict=True)
-    try:
-        rows = list(reader)
-    except csv.Error as error:
-        raise InputError(f"{path}: not a readable CSV file ({error})") from error
-    if not {"id", "name"} <= set(reader.fieldnames or ()):
+    elif path.suffix.lower() == ".txt":
+        table = read_instance_classes(path) if instances else read_class_list(path)
+    else:
+        rows = read_rows(path, ("id", "name"), max_bytes=MAX_BYTES)
+        for row, where in rows:
+            _id(row["id"], where, "id")
+            if not row["name"].strip():
+                raise InputError(f"{where}: name is empty")
+        with about(path):
+            table = _table(row for row, _ in rows)
+    if instances and 0 in table.ids:
         raise InputError(
-            f"{path}: expected the columns id and name, got {', '.join(reader.fieldnames or ()) or 'none'}"
+            f"classes: {table.name_of[0]!r} has the id 0, which files of instances cannot hold: a vertex has class id "
+            "· 1000 + number of the instance, and below 1000 it has none; give the class another id, or leave it out"
         )
-    ids: list[int] = []
-    names: list[str] = []
-    groups: dict[str, list[str]] = {}
-    for number, row in enumerate(rows, start=2):
-        word, name = row["id"] or "", row["name"] or ""
-        if not (word.isascii() and word.isdigit() and len(word) <= 9 and name.strip()):
-            raise InputError(
-                f"{path}: line {number}: expected a whole number and a name, got {word[:40]!r}, {name[:40]!r}"
-            )
-        ids.append(int(word))
-        names.append(name.strip())
-        if row.get("group"):
-            groups.setdefault(row["group"], []).append(name.strip())
-    with about(path):
-        return ClassTable(
-            names=tuple(names), ids=tuple(ids), groups={group: tuple(members) for group, members in groups.items()}
-        )
+    return table
 
 
 def write_classes(path: Path, classes: ClassTable) -> None:
@@ -366,10 +266,7 @@ def instance_ids(
     another class, objects are numbered from 1 within their class, in the order of their ids: scores are the same. An
     object without a class has its number alone, which evaluation takes for a region that does not count.
 
-    Args:
-        instances: the object of each vertex, 0 = none.
-        names: the name of each object, such as `dict(MeshLabels.objects)`.
-        class_of: class id of each name, as `ids_of_names` gives it.
+    The arguments are those of `vertex_classes`.
     """
     classes = vertex_classes(instances, names, class_of).astype(np.int64)
     objects, first, codes = np.unique(instances, return_index=True, return_inverse=True)

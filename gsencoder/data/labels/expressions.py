@@ -13,8 +13,6 @@ ScanRefer's own files have no boxes. Its scripts take that of an object's vertic
 """
 
 import ast
-import csv
-import io
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +33,7 @@ from gsencoder.data.labels.files import (
     id_value,
     object_id,
     read_benchmark_json,
-    read_checked_text,
+    read_rows,
     refuse_repeated,
     scene_name,
     shown,
@@ -54,28 +52,17 @@ PREDICTED = ("answer_top10", "pred_answers_at10", "caption", "aabb", "boxes", "b
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Expression:
-    """What one annotator wrote of one object.
-
-    Attributes:
-        object_id: `objectId` of ScanNet's aggregation file, from 0.
-        object_name: as the file writes it; ScanRefer has underscores between words.
-        annotation: id of the expression among those of the object.
-        tokens: the words of the text as the data set cuts it, lower case in ScanRefer.
-        aabb: lower and upper corner of the object's box, in the axes of the aligned scan and its unit; None where the
-            file has none.
-        multiple: whether the scene has several objects of its class; None where the file does not say.
-        others: whether its class is none of ScanRefer's named ones; None where the file does not say.
-    """
+    """What one annotator wrote of one object; None where the file does not say."""
 
     scene: str
-    object_id: int
-    object_name: str
-    annotation: str
+    object_id: int  # `objectId` of ScanNet's aggregation file, from 0
+    object_name: str  # as the file writes it; ScanRefer has underscores between words
+    annotation: str  # id of the expression among those of the object
     text: str
-    tokens: tuple[str, ...]
-    aabb: tuple[Corner, Corner] | None = None
-    multiple: bool | None = None
-    others: bool | None = None
+    tokens: tuple[str, ...]  # the words of the text as the data set cuts it, lower case in ScanRefer
+    aabb: tuple[Corner, Corner] | None = None  # of the object, in the axes of the aligned scan and its unit
+    multiple: bool | None = None  # whether the scene has several objects of its class
+    others: bool | None = None  # whether its class is none of ScanRefer's named ones
 
     @property
     def key(self) -> tuple[str, int, str]:
@@ -121,7 +108,7 @@ def write_scanrefer(path: str | Path, expressions: Sequence[Expression]) -> None
 def read_nr3d(path: str | Path) -> tuple[Expression, ...]:
     """Reads Nr3D's CSV."""
     file = Path(path)
-    expressions = tuple(_nr3d(row, where) for row, where in _csv_rows(file, NR3D_COLUMNS))
+    expressions = tuple(_nr3d(row, where) for row, where in read_rows(file, NR3D_COLUMNS, max_bytes=LIST_BYTES))
     _refuse_repeated(file, expressions)
     return expressions
 
@@ -164,23 +151,6 @@ def _nr3d(row: Mapping[str, str], where: str) -> Expression:
     )
 
 
-def _csv_rows(path: Path, columns: Sequence[str]) -> Iterable[tuple[dict[str, str], str]]:
-    reader = csv.reader(io.StringIO(read_checked_text(path, max_bytes=LIST_BYTES), newline=""), strict=True)
-    try:
-        lines = [(line, reader.line_num) for line in reader if line]
-    except csv.Error as error:
-        raise InputError(f"{path}: not a readable CSV file ({' '.join(str(error).split())[:120]})") from error
-    header = lines[0][0] if lines else []
-    missing = [column for column in columns if column not in header]
-    if missing or len(set(header)) < len(header):
-        wrong = f"lacks {', '.join(missing)}" if missing else "has a column twice"
-        raise InputError(f"{path}: expected a CSV with the columns {', '.join(columns)}; its first line {wrong}")
-    for line, number in lines[1:]:
-        if len(line) != len(header):
-            raise InputError(f"{path}: line {number} has {len(line)} cells and the first line {len(header)}")
-        yield dict(zip(header, line, strict=True)), f"{path}: line {number}"
-
-
 def _literal_tokens(text: str, where: str) -> tuple[str, ...]:
     """A list of words as Python writes it, which is what the file has; nothing is executed."""
     if len(text) > MAX_TEXT:
@@ -214,14 +184,7 @@ def _check_objects(expressions: Sequence[Expression], path: Path) -> None:
 
 
 def boxes_from_scans(expressions: Sequence[Expression], scans: Path) -> tuple[Expression, ...]:
-    """Gives expressions without a box that of their object; one scan is in memory at a time.
-
-    Args:
-        scans: folder with a folder of each scene, which has the label files of its scan.
-
-    Returns:
-        The expressions, in order.
-    """
+    """Gives expressions, in order, without a box that of their object, from label files in SCANS/SCENE."""
     lacking: dict[str, list[int]] = {}
     for row, each in enumerate(expressions):
         if each.aabb is None:

@@ -1,12 +1,12 @@
 """Files that others wrote: of a limited size, and never a pickle, which runs code when it is read."""
 
+import csv
+import io
 import math
 import os
 import re
-import warnings
 from codecs import BOM_UTF8
-from collections.abc import Callable, Hashable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -65,13 +65,13 @@ def read_checked_text(path: Path, *, max_bytes: int = SCENE_BYTES) -> str:
 
 
 LARGEST = 2**31 - 1
-"""Largest number, and negative of the smallest."""
 CHUNK = 1 << 20
 """Numbers that become text at once."""
+NO_NUMBER = re.compile(rb"^(?![ \t]*[+-]?[0-9]+[ \t]*\r?$)", re.MULTILINE)
 
 
 def read_whole_numbers(path: Path, *, hint: str = "") -> Int64[np.ndarray, " n"]:
-    """The numbers of a file with one a line.
+    """The numbers of a file with one a line, from -LARGEST to LARGEST.
 
     Args:
         hint: appended to the message about a line that is no whole number.
@@ -90,6 +90,20 @@ def read_mask(path: Path) -> Bool[np.ndarray, " n"]:
     return _parsed(path, data, "") != 0
 
 
+def _parsed(path: Path, data: bytes, hint: str) -> Int64[np.ndarray, " n"]:
+    if not data:
+        return np.zeros(0, np.int64)
+    lines = data.removesuffix(b"\n")
+    other = NO_NUMBER.search(lines)
+    values = np.zeros(0, np.int64) if other else np.fromstring(lines, np.int64, sep="\n")
+    large = np.flatnonzero((values > LARGEST) | (values < -LARGEST))
+    if other or len(large):
+        row = lines.count(b"\n", 0, other.start()) if other else int(large[0])
+        word = lines.split(b"\n")[row].strip()[:40].decode("utf-8", "replace")
+        raise InputError(f"{path}: line {row + 1}: expected one whole number, got {word!r}{hint}")
+    return values
+
+
 def write_whole_numbers(path: Path, values: Int[np.ndarray, " n"]) -> None:
     """Writes one number a line, atomically."""
     with atomic_file(path) as stream:
@@ -104,37 +118,28 @@ def mask_bytes(mask: Bool[np.ndarray, " n"]) -> bytes:
     return codes.tobytes()
 
 
-def _parsed(path: Path, data: bytes, hint: str) -> Int64[np.ndarray, " n"]:
-    lines, values = data.count(b"\n") + (not data.endswith(b"\n") and bool(data)), np.zeros(0, np.int64)
-    with warnings.catch_warnings(), suppress(ValueError):
-        # At what it cannot read, numpy warns and stops, or from 2.3 on raises.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        values = np.fromstring(data, np.int64, sep="\n") if data.strip() else values
-    if len(values) == lines and (not lines or max(values.max(), -values.min()) <= LARGEST) and _plain(data):
-        return values
-    for number, line in enumerate(data.splitlines(), start=1):
-        word = line.strip()
-        digits = word[1:] if word[:1] in (b"-", b"+") else word
-        # Of thousands of digits Python makes no number.
-        short = digits.lstrip(b"0") or b"0"
-        if not digits.isdigit() or len(short) > 10 or int(short) > LARGEST:
-            start = word[:40].decode("utf-8", "replace")
-            raise InputError(f"{path}: line {number}: expected one whole number, got {start!r}{hint}")
-    raise InputError(f"{path}: expected one whole number a line")
-
-
-def _plain(data: bytes) -> bool:
-    """Whether a file has digits, signs before digits, and blanks alone."""
-    if data.translate(None, b"0123456789+- \t\r\n"):
-        return False
-    # numpy reads a sign alone as 0.
-    return not ((b"+" in data or b"-" in data) and re.search(rb"[+-](?![0-9])", data))
+def read_rows(
+    path: Path, columns: Sequence[str], *, max_bytes: int, delimiter: str = ","
+) -> list[tuple[dict[str, str], str]]:
+    """The rows of a table with these columns, each with its place for messages; cells that a row lacks are empty."""
+    text = read_checked_text(path, max_bytes=max_bytes)
+    reader = csv.DictReader(io.StringIO(text, newline=""), delimiter=delimiter, restval="", strict=delimiter == ",")
+    try:
+        rows = [(row, f"{path}: line {reader.line_num}") for row in reader]
+    except csv.Error as error:
+        raise InputError(f"{path}: not a readable table ({' '.join(str(error).split())[:120]})") from error
+    header = reader.fieldnames or ()
+    missing = [column for column in columns if column not in header]
+    if missing or len(set(header)) < len(header):
+        wrong = f"lacks {', '.join(missing)}" if missing else "has a column twice"
+        raise InputError(f"{path}: expected a table with the columns {', '.join(columns)}; its first line {wrong}")
+    return rows
 
 
 MAX_TEXT = 20_000
-"""Largest number of characters of a question, an answer or a caption; the longest published ones have some hundred."""
+"""Characters of a question, an answer or a caption; the longest published ones have some hundred."""
 MAX_ID = 200
-"""Largest number of characters of an id or of the name of a class."""
+"""Characters of an id or of the name of a class."""
 MAX_COORDINATE = 1e9
 """Larger coordinates are no places."""
 
@@ -154,7 +159,6 @@ def entries_of(rows: Any, path: Path, expected: str, *, key: str = "") -> tuple[
     """The entries of a list of JSON objects, each with its place for messages.
 
     Args:
-        rows: the content of the file, or of one key of it.
         expected: the keys of an entry.
         key: under which the list stands in the file; empty = the file is the list.
     """
@@ -166,11 +170,7 @@ def entries_of(rows: Any, path: Path, expected: str, *, key: str = "") -> tuple[
 
 
 def refuse_repeated(path: Path, keys: Iterable[Hashable], name: Callable[[Any], str], *, what: str = "id") -> None:
-    """Raises an error if two entries of a file have one key.
-
-    Args:
-        keys: of the entries, in order.
-    """
+    """Raises an error if two entries of a file, in order, have one key."""
     if repeated := first_repeated(keys):
         key, first, second = repeated
         raise InputError(f"{path}: entries {first} and {second} have one {what}: {name(key)}; expected each once")
@@ -191,11 +191,7 @@ def object_of(value: Any, where: str, expected: str) -> Mapping[str, Any]:
 
 
 def text_value(value: Any, where: str, field: str, *, empty: bool = False) -> str:
-    """The value, which must be a text of at most `MAX_TEXT` characters.
-
-    Args:
-        empty: whether a text without a character other than blanks is one.
-    """
+    """The value, which must be a text of at most `MAX_TEXT` characters, and not of blanks alone unless `empty`."""
     if not isinstance(value, str):
         raise InputError(f"{where}: {field} must be a text, got {shown(value)}")
     if len(value) > MAX_TEXT:
@@ -226,12 +222,7 @@ def id_value(value: Any, where: str, field: str) -> str:
     """An id as text; files write them as texts and as whole numbers."""
     if isinstance(value, int) and not isinstance(value, bool):
         return str(value)
-    if _is_name(value):
-        return str(value)
-    raise InputError(
-        f"{where}: {field} must be a whole number or a text of one line with 1 to {MAX_ID} characters, got "
-        f"{_shown_name(value)}"
-    )
+    return name_value(value, where, field, expected="a whole number or a text")
 
 
 def annotation_id(value: Any, where: str, field: str = "ann_id") -> str:
@@ -240,13 +231,13 @@ def annotation_id(value: Any, where: str, field: str = "ann_id") -> str:
     return str(int(text)) if text.isascii() and text.isdigit() else text
 
 
-def name_value(value: Any, where: str, field: str) -> str:
+def name_value(value: Any, where: str, field: str, *, expected: str = "a text") -> str:
     """The name of a class: a text of one line."""
-    if not _is_name(value):
+    if not isinstance(value, str) or not value.strip() or not value.isprintable() or len(value) > MAX_ID:
         raise InputError(
-            f"{where}: {field} must be a text of one line with 1 to {MAX_ID} characters, got {_shown_name(value)}"
+            f"{where}: {field} must be {expected} of one line with 1 to {MAX_ID} characters, got {shown(value)}"
         )
-    return str(value)
+    return value
 
 
 def flag_value(value: Any, where: str, field: str) -> bool | None:
@@ -256,15 +247,6 @@ def flag_value(value: Any, where: str, field: str) -> bool | None:
     if not isinstance(value, int) or value not in (0, 1):
         raise InputError(f"{where}: {field} must be 0 or 1, got {shown(value)}")
     return bool(value)
-
-
-def _is_name(value: Any) -> bool:
-    return isinstance(value, str) and bool(value.strip()) and value.isprintable() and len(value) <= MAX_ID
-
-
-def _shown_name(value: Any) -> str:
-    too_long = isinstance(value, str) and len(value) > MAX_ID
-    return f"{len(value):,} characters" if too_long else shown(value)
 
 
 def object_id(value: Any, where: str, field: str = "object_id") -> int:
@@ -318,13 +300,9 @@ VOLUME_EPSILON = 1e-8
 
 
 def box_ious(boxes: Float64[np.ndarray, "K 2 3"], box: Float64[np.ndarray, "2 3"]) -> Float64[np.ndarray, " K"]:
-    """IoU of boxes with one: common volume / (volume + volume - common volume + 1e-8).
+    """IoU of boxes, by lower and upper corners, with one: common volume / (volume + volume - common volume + 1e-8).
 
     So boxes without volume overlap nothing, and a box that is one quarter of another is below 0.25.
-
-    Args:
-        boxes: lower and upper corners, world units.
-        box: the same of one box.
     """
     common = np.maximum(np.minimum(boxes[:, 1], box[1]) - np.maximum(boxes[:, 0], box[0]), 0)
     sizes, size = boxes[:, 1] - boxes[:, 0], box[1] - box[0]

@@ -107,7 +107,6 @@ class InstancesBenchmark(Benchmark[None]):
     def __init__(self, protocol: InstancesProtocol, evaluation: Evaluation) -> None:
         self.protocol, self.evaluation = protocol, evaluation
         self.classes = predicted_classes(evaluation, instances=True)
-        self.classes.table.check_instance_ids()
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> None:
         points, classes = self.classes.points(scene), self.classes.table
