@@ -78,7 +78,7 @@ _LISTED = (
     Command("ask", "AskCommandConfig", "ask a vision-language model about views of a scene"),
     Command(
         "questions",
-        "QuestionsCommandConfig",
+        "QuestionsConfig",
         "make questions and expressions with their answers from the labels of scenes",
     ),
     Command(

@@ -12,7 +12,6 @@ from gsencoder.core.settings import option
 from gsencoder.data.labels.expressions import write_scanrefer
 from gsencoder.data.labels.made_questions import (
     KINDS,
-    QuestionsConfig,
     kind_of,
     make_expressions,
     make_questions,
@@ -26,7 +25,7 @@ QUESTIONS, EXPRESSIONS, SITUATED = "questions.json", "expressions.json", "situat
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class QuestionsCommandConfig(QuestionsConfig, CommonConfig):
+class QuestionsConfig(CommonConfig):
     """Settings of `questions`."""
 
     paths: tuple[str, ...] = option(
@@ -35,23 +34,24 @@ class QuestionsCommandConfig(QuestionsConfig, CommonConfig):
         metavar="SCENE",
         required=True,
     )
+    seed: int = option(0, "of the choice among all questions that can be asked", ge=0)
+    per_kind: int = option(10, "most questions of a kind about a scene", ge=2)
+    min_pixels: int = option(
+        200, "pixels that some photograph shows of an object before anything is asked about it", ge=1
+    )
     per_object: int = option(3, "most expressions that mean one object", ge=1)
     objects: int = option(0, "most objects of a scene with expressions; 0 = all", ge=0)
     data: SceneConfig = field(default_factory=SceneConfig)
 
-    def __post_init__(self) -> None:
-        CommonConfig.__post_init__(self)
-        QuestionsConfig.__post_init__(self)
 
-
-def run(config: QuestionsCommandConfig, run: Run) -> None:
+def run(config: QuestionsConfig, run: Run) -> None:
     """Reads the labels of all scenes and writes what can be asked as ScanQA, SQA3D and ScanRefer write it."""
     out = run.out("questions")
     with run.folder(out) as folder:
         with run.step("labels"):
             scenes = list(_seen(config, run.track))
         with run.step("make"):
-            questions = make_questions(scenes, config)
+            questions = make_questions(scenes, seed=config.seed, per_kind=config.per_kind)
             situations = make_situations(scenes, seed=config.seed, per_kind=config.per_kind)
             expressions = make_expressions(
                 scenes, seed=config.seed, per_object=config.per_object, per_scene=config.objects
@@ -83,7 +83,7 @@ def run(config: QuestionsCommandConfig, run: Run) -> None:
     )
 
 
-def _seen(config: QuestionsCommandConfig, track: Track) -> Iterator[SeenScene]:
+def _seen(config: QuestionsConfig, track: Track) -> Iterator[SeenScene]:
     paths = find_scenes(config.paths)
     check_names(paths)
     for path in track(paths, "scenes"):

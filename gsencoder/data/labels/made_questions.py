@@ -33,7 +33,7 @@ An object that some photograph shows well enough is described in each way in whi
 
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 from typing import Literal, get_args
 
@@ -41,7 +41,6 @@ import numpy as np
 from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.settings import check_limits, option
 from gsencoder.data.labels.expressions import Expression
 from gsencoder.data.labels.names import NUMBERS, alike, is_plural, plural, with_article
 from gsencoder.data.labels.questions import Question
@@ -75,41 +74,30 @@ Unit = tuple[Question, ...]
 """Questions that stay together, such as one whose answer is yes and one whose answer is no."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class QuestionsConfig:
-    """How questions are made."""
-
-    seed: int = option(0, "of the choice among all questions that can be asked", ge=0)
-    per_kind: int = option(10, "most questions of a kind about a scene", ge=2)
-    min_pixels: int = option(
-        200, "pixels that some photograph shows of an object before anything is asked about it", ge=1
-    )
-    balance: bool = option(True, "as many questions of each kind, as there are of the rarest; false = all")
-    absent: tuple[str, ...] = option(ABSENT, "names that are asked about where a scene does not have them")
-
-    def __post_init__(self) -> None:
-        check_limits(self)
-        if any(not name.strip() for name in self.absent):
-            raise InputError("absent: expected names, got an empty one")
-
-
-def make_questions(scenes: Iterable[SeenScene], config: QuestionsConfig = QuestionsConfig()) -> tuple[Question, ...]:
-    """Questions about scenes, balanced over kinds, without two of one text in a scene.
+def make_questions(
+    scenes: Iterable[SeenScene], *, seed: int = 0, per_kind: int = 10, balance: bool = True
+) -> tuple[Question, ...]:
+    """Questions about scenes, without two of one text in a scene.
 
     What is asked about a scene depends on the scene, its name and the seed alone; which of it is left out for balance
     depends on the other scenes. The order of the scenes does not matter.
+
+    Args:
+        per_kind: most questions of a kind about a scene, from 2.
+        balance: as many questions of each kind as there are of the rarest.
     """
-    scenes = sorted(scenes, key=lambda scene: scene.name)
-    if len({scene.name for scene in scenes}) < len(scenes):
-        raise InputError("questions: two scenes have one name")
-    units = {scene.name: scene_units(scene, config) for scene in scenes}
-    questions = balanced(units, config.balance)
+    units = {scene.name: scene_units(scene, seed, per_kind) for scene in _in_order(scenes)}
+    questions = balanced(units, balance)
     if not questions:
-        raise InputError(
-            f"questions: nothing can be asked about {len(scenes)} scenes: no named object is shown by "
-            f"{config.min_pixels} pixels and is clear"
-        )
+        raise InputError(f"questions: nothing can be asked about {len(units)} scenes: no named object is clear in them")
     return questions
+
+
+def _in_order(scenes: Iterable[SeenScene]) -> list[SeenScene]:
+    ordered = sorted(scenes, key=lambda scene: scene.name)
+    if len({scene.name for scene in ordered}) < len(ordered):
+        raise InputError("questions: two scenes have one name")
+    return ordered
 
 
 def scene_rng(seed: int, scene: str, part: int) -> np.random.Generator:
@@ -117,14 +105,14 @@ def scene_rng(seed: int, scene: str, part: int) -> np.random.Generator:
     return np.random.default_rng([seed, zlib.crc32(scene.encode()), part])
 
 
-def scene_units(scene: SeenScene, config: QuestionsConfig) -> dict[Kind, Sequence[Unit]]:
+def scene_units(scene: SeenScene, seed: int, per_kind: int) -> dict[Kind, Sequence[Unit]]:
     """What is asked about a scene: of each kind at most `per_kind` questions, and, of how_many and color, not more than
     half of them, rounded up, with one answer."""
     units: dict[Kind, Sequence[Unit]] = {}
-    for number, (kind, questions) in enumerate(_candidates(scene, config.absent).items()):
-        rng = scene_rng(config.seed, scene.name, number)
+    for number, (kind, questions) in enumerate(_candidates(scene).items()):
+        rng = scene_rng(seed, scene.name, number)
         shuffled = [questions[row] for row in rng.permutation(len(questions))]
-        units[kind] = _paired(shuffled, config.per_kind) if kind == "is_there" else _varied(shuffled, config.per_kind)
+        units[kind] = _paired(shuffled, per_kind) if kind == "is_there" else _varied(shuffled, per_kind)
     return units
 
 
@@ -163,25 +151,20 @@ def kind_of(question: Question) -> Kind | None:
 
 def clear_names(scene: SeenScene) -> tuple[str, ...]:
     """Names all of whose objects are shown well enough, and beside which no name is that may mean the same."""
-    there = {scene_object.name for scene_object in scene.objects if scene_object.name and scene_object.pixels}
+    there = {each.name for each in scene.objects if each.name and each.pixels}
     return tuple(name for name in scene.names() if not any(alike(name, other) for other in there))
 
 
-def _candidates(scene: SeenScene, absent: Sequence[str]) -> dict[Kind, list[Question]]:
+def _candidates(scene: SeenScene) -> dict[Kind, list[Question]]:
     """All that can be asked, kind by kind, sorted by name."""
     near = near_things(movables(scene.objects))
     clear = clear_names(scene)
-    single = [scene_object for scene_object in map(scene.unique, clear) if scene_object is not None]
+    single = [each for each in map(scene.unique, clear) if each is not None]
     return {
         "next_to": [
-            question
-            for scene_object in single
-            if (beside := neighbor(scene_object, near[scene_object.id])) is not None and scene.shown(beside)
-            for question in [
-                _question(
-                    scene, f"What is next to the {scene_object.name}?", [str(beside.name)], [scene_object, beside]
-                )
-            ]
+            _question(scene, f"What is next to the {each.name}?", [str(beside.name)], [each, beside])
+            for each in single
+            if (beside := neighbor(each, near[each.id])) is not None and scene.shown(beside)
         ],
         "how_many": [
             _question(
@@ -191,27 +174,21 @@ def _candidates(scene: SeenScene, absent: Sequence[str]) -> dict[Kind, list[Ques
             if not is_plural(name) and len(same := scene.named(name)) < len(NUMBERS)
         ],
         "color": [
-            _question(
-                scene, f"What color {_be(scene_object)} the {scene_object.name}?", [scene_object.color], [scene_object]
-            )
-            for scene_object in single
-            if scene_object.color is not None
+            _question(scene, f"What color {_be(each)} the {each.name}?", [each.color], [each])
+            for each in single
+            if each.color is not None
         ],
-        "where": [
-            question
-            for scene_object in single
-            if (question := _where(scene, scene_object, near[scene_object.id])) is not None
-        ],
+        "where": [question for each in single if (question := _where(scene, each, near[each.id])) is not None],
         "is_there": [
             *(_question(scene, _there(name), ["yes"], list(scene.named(name))) for name in clear),
-            *(_question(scene, _there(name), ["no"], []) for name in absent_names(scene, absent)),
+            *(_question(scene, _there(name), ["no"], []) for name in absent_names(scene, ABSENT)),
         ],
     }
 
 
 def absent_names(scene: SeenScene, names: Sequence[str]) -> list[str]:
     """The names that no label of a scene has, nor any name that may stand for the same thing."""
-    there = {scene_object.name for scene_object in scene.objects if scene_object.name}
+    there = {each.name for each in scene.objects if each.name}
     return sorted({name for name in names if name not in there and not any(alike(name, other) for other in there)})
 
 
@@ -244,8 +221,8 @@ def _question(scene: SeenScene, text: str, answers: Sequence[str], objects: Sequ
         scene=scene.name,
         text=text,
         answers=tuple(answers),
-        object_ids=tuple(scene_object.id for scene_object in objects),
-        object_names=tuple(scene_object.name or "" for scene_object in objects),
+        object_ids=tuple(each.id for each in objects),
+        object_names=tuple(each.name or "" for each in objects),
     )
 
 
@@ -273,34 +250,20 @@ SMALLEST_PLACE = 0.5
 """Meters across the box of what one stands at."""
 CLEAR_ANGLE = np.radians(20)
 CLEAR_DISTANCE = 0.5
-MAX_TRIPLES = 50_000
-"""Triples of things that are tried: all of 36 things, a random choice of more."""
+MAX_THINGS = 36
+"""Things whose triples are all tried."""
 
 
 def make_situations(scenes: Iterable[SeenScene], *, seed: int = 0, per_kind: int = 10) -> tuple[Question, ...]:
-    """Questions of both kinds, at most `per_kind` of each a scene, as many to be answered with left as with right."""
-    if per_kind < 2:
-        raise InputError(f"situations: expected per_kind from 2, got {per_kind}")
-    ordered = sorted(scenes, key=lambda scene: scene.name)
-    if len({scene.name for scene in ordered}) < len(ordered):
-        raise InputError("situations: two scenes have one name")
-    situations = [each for scene in ordered for each in _of_scene(scene, seed, per_kind)]
-    return tuple(situations)
+    """Questions of both kinds, at most `per_kind` of each a scene, as many answered with left as with right."""
+    return tuple(each for scene in _in_order(scenes) for each in _situations_of_scene(scene, seed, per_kind))
 
 
-def _of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
+def _situations_of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
     rng = scene_rng(seed, scene.name, PART)
     scene_objects = movables(scene.objects)
-    single = [
-        scene_object
-        for scene_object in map(scene.unique, clear_names(scene))
-        if scene_object is not None and scene_object in scene_objects
-    ]
-    landmarks = [
-        scene_object
-        for scene_object in single
-        if np.linalg.norm(scene_object.aabb_max - scene_object.aabb_min) >= SMALLEST_PLACE
-    ]
+    single = [each for each in map(scene.unique, clear_names(scene)) if each is not None and each in scene_objects]
+    landmarks = [each for each in single if np.linalg.norm(each.aabb_max - each.aabb_min) >= SMALLEST_PLACE]
     shuffled = _shuffled_triples(landmarks, single, rng)
     sides: dict[str, list[Question]] = {"left": [], "right": []}
     nearer: list[Question] = []
@@ -338,15 +301,13 @@ def _of_scene(scene: SeenScene, seed: int, per_kind: int) -> list[Question]:
 def _shuffled_triples(
     landmarks: Sequence[SeenObject], single: Sequence[SeenObject], rng: np.random.Generator
 ) -> list[tuple[SeenObject, SeenObject, SeenObject]]:
-    """A landmark and two other things, each another one, in random order; of very many a random choice."""
-    count = len(landmarks) * len(single) ** 2
-    if count <= MAX_TRIPLES:
-        triples = [each for each in product(landmarks, single, single) if len({one.id for one in each}) == 3]
-        return [triples[row] for row in rng.permutation(len(triples))]
-    numbers = rng.choice(count, MAX_TRIPLES, replace=False) if count < 2**24 else rng.integers(0, count, MAX_TRIPLES)
-    rows = np.unravel_index(numbers, (len(landmarks), len(single), len(single)))
-    chosen = [(landmarks[at], single[facing], single[other]) for at, facing, other in zip(*rows, strict=True)]
-    return [each for each in chosen if len({one.id for one in each}) == 3]
+    """A landmark and two other things, each another one, in random order; of very many things a random choice."""
+    if len(landmarks) * len(single) ** 2 > MAX_THINGS**3:
+        landmarks, single = (
+            [each[row] for row in rng.permutation(len(each))[:MAX_THINGS]] for each in (landmarks, single)
+        )
+    triples = [each for each in product(landmarks, single, single) if len({one.id for one in each}) == 3]
+    return [triples[row] for row in rng.permutation(len(triples))]
 
 
 def side_of(at: SeenObject, facing: SeenObject, other: SeenObject) -> str | None:
@@ -373,8 +334,8 @@ def _corners(scene_object: SeenObject) -> Float64[np.ndarray, "4 2"]:
 def _situation_question(
     scene: SeenScene, at: SeenObject, facing: SeenObject, others: Sequence[SeenObject], text: str, answer: str
 ) -> Question:
-    boxes = [(scene_object.aabb_min, scene_object.aabb_max) for scene_object in scene.objects]
-    middle = (np.min([low for low, _ in boxes], axis=0) + np.max([high for _, high in boxes], axis=0)) / 2
+    lower, upper = (np.array([getattr(each, f"aabb_{end}") for each in scene.objects]) for end in ("min", "max"))
+    middle = (lower.min(axis=0) + upper.max(axis=0)) / 2
     position = at.center - middle
     ahead = facing.center - at.center
     turn = float(np.arctan2(ahead[1], ahead[0]))
@@ -385,8 +346,8 @@ def _situation_question(
         scene=scene.name,
         text=text,
         answers=(answer,),
-        object_ids=tuple(scene_object.id for scene_object in objects),
-        object_names=tuple(str(scene_object.name) for scene_object in objects),
+        object_ids=tuple(each.id for each in objects),
+        object_names=tuple(str(each.name) for each in objects),
         situation=f"I am standing at the {at.name} and facing the {facing.name}.",
         position=(float(position[0]), float(position[1]), 0.0),
         rotation=(float(np.cos(turn / 2)), 0.0, 0.0, float(np.sin(turn / 2))),
@@ -407,11 +368,7 @@ def make_expressions(
         per_object: most expressions of an object.
         per_scene: most objects of a scene; 0 = all.
     """
-    if per_object < 1 or per_scene < 0:
-        raise InputError(f"expressions: expected per_object from 1 and per_scene from 0, got {per_object}, {per_scene}")
-    ordered = sorted(scenes, key=lambda scene: scene.name)
-    if len({scene.name for scene in ordered}) < len(ordered):
-        raise InputError("expressions: two scenes have one name")
+    ordered = _in_order(scenes)
     expressions = [each for scene in ordered for each in _expressions_of_scene(scene, seed, per_object, per_scene)]
     if not expressions:
         raise InputError(f"expressions: no object of {len(ordered)} scenes is shown well enough and can be described")
@@ -477,16 +434,13 @@ def _anchor(
 
 
 def _may_be_on(scene_object: SeenObject, below: SeenObject, scene_objects: Sequence[SeenObject]) -> bool:
-    """Whether a thing may be said to be on something of another's name: it stands near the top of one, or is in its
-    box."""
-    same = [other for other in scene_objects if other.name == below.name]
-    return any(gap(scene_object, other) < NEAR / 2 for other in same)
+    """Whether a thing may be said to be on something of another's name: it is near the box of one."""
+    return any(other.name == below.name and gap(scene_object, other) < NEAR / 2 for other in scene_objects)
 
 
 def _expression(scene: SeenScene, scene_object: SeenObject, text: str, number: int) -> Expression:
-    lower, upper = (
-        (corner / scene.metres_per_unit).tolist() for corner in (scene_object.aabb_min, scene_object.aabb_max)
-    )
+    corners = scene_object.aabb_min, scene_object.aabb_max
+    lower, upper = ((corner / scene.metres_per_unit).tolist() for corner in corners)
     return Expression(
         scene=scene.name,
         object_id=scene_object.id,

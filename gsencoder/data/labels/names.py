@@ -4,7 +4,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64, UInt8
+from jaxtyping import Bool, Int64, UInt8
 
 NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 PLURAL_ONLY = ("scissors", "dice", "pants", "glasses", "products", "utensils")
@@ -101,15 +101,14 @@ MOST_OTHER = 0.15
 
 
 def color_word(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]) -> str | None:
-    """The color of a thing in a photograph, of `RANGES`; None where it is not clear.
+    """The color of a thing in a photograph, of `RANGES`, by the pixels of its mask; None where it is not clear.
 
     It is clear where, of the pixels that do not touch others than the thing's, at least 60 % have the color, and of no
     other color there are more than 15 %.
-
-    Args:
-        mask: the pixels of the thing.
     """
-    pixels = picture[inner_pixels(mask)]
+    from scipy.ndimage import binary_erosion
+
+    pixels = picture[binary_erosion(mask)]
     if not len(pixels):
         return None
     shares = color_counts(pixels) / len(pixels)
@@ -120,7 +119,10 @@ def color_word(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"
 
 def color_counts(pixels: UInt8[np.ndarray, "n 3"]) -> Int64[np.ndarray, " C"]:
     """How many pixels lie in each of `RANGES`, which do not overlap."""
-    hue, saturation, value = hsv(pixels)
+    from matplotlib.colors import rgb_to_hsv
+
+    hue, saturation, value = rgb_to_hsv(pixels / 255).T
+    hue = 360 * hue
     counts = []
     for each in RANGES:
         low, high = each.hue
@@ -129,22 +131,3 @@ def color_counts(pixels: UInt8[np.ndarray, "n 3"]) -> Int64[np.ndarray, " C"]:
             inside &= (channel >= least) & (channel < most)
         counts.append(int(inside.sum()))
     return np.array(counts, np.int64)
-
-
-def hsv(
-    pixels: UInt8[np.ndarray, "n 3"],
-) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Hue in degrees from 0 to below 360 (0 for grays), saturation and value in [0, 1]."""
-    rgb = pixels.astype(np.float64) / 255
-    value, least = rgb.max(axis=1), rgb.min(axis=1)
-    chroma = value - least
-    safe = np.where(chroma > 0, chroma, 1)
-    r, g, b = rgb.T
-    hue = np.select([value == r, value == g], [(g - b) / safe % 6, (b - r) / safe + 2], (r - g) / safe + 4)
-    return np.where(chroma > 0, 60 * hue, 0.0), chroma / np.where(value > 0, value, 1), value
-
-
-def inner_pixels(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """The pixels of a mask whose four neighbors are in it: at its border, colors of two things are mixed."""
-    padded = np.pad(mask, 1)
-    return np.asarray(mask & padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:])

@@ -7,7 +7,7 @@ v1_balanced_sqa_annotations_SPLIT_scannetv2.json.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +16,6 @@ from gsencoder.core.files import write_json
 from gsencoder.data.labels.expressions import PREDICTED
 from gsencoder.data.labels.files import (
     Corner,
-    Entry,
     entries_of,
     id_value,
     number,
@@ -39,26 +38,19 @@ SITUATED = "sqa_annotations"
 class Question:
     """A question about a scene.
 
-    Attributes:
-        dataset: whose files it comes from.
-        id: of the file; numbers are written in decimal.
-        answers: right ones; none in a test set.
-        object_ids: the `objectId`s of ScanNet's aggregation file that the question is about; none where unknown.
-        situation: where the one who asks stands, in words (SQA3D).
-        position: the same in the axes of the scan, in metres from the center of its mesh's box; z is 0 (SQA3D).
-        rotation: the quaternion of the situation as wxyz, a turn about z (SQA3D).
+    Situations are those of SQA3D.
     """
 
     dataset: Literal["scanqa", "sqa3d"]
     id: str
     scene: str
     text: str
-    answers: tuple[str, ...] = ()
-    object_ids: tuple[int, ...] = ()
+    answers: tuple[str, ...] = ()  # right ones; none in a test set
+    object_ids: tuple[int, ...] = ()  # `objectId`s of ScanNet's aggregation file; none where unknown
     object_names: tuple[str, ...] = ()
-    situation: str | None = None
-    position: Corner | None = None
-    rotation: tuple[float, float, float, float] | None = None
+    situation: str | None = None  # where the one who asks stands, in words
+    position: Corner | None = None  # the same in the axes of the scan, metres from the center of its mesh's box; z is 0
+    rotation: tuple[float, float, float, float] | None = None  # wxyz, a turn about z
 
     @property
     def situated_text(self) -> str:
@@ -78,7 +70,7 @@ def read_questions(path: str | Path, *, answered: bool = True) -> tuple[Question
     if isinstance(content, list):
         return _scanqa(content, file, answered)
     if isinstance(content, dict) and "questions" in content:
-        return _sqa3d(content, file, None, answered)
+        return _sqa3d(content, file, answered)
     hint = "; these are SQA3D's annotations: give the file of questions beside them"
     raise InputError(
         f"{file}: expected ScanQA's list of questions or SQA3D's object with questions, got {shown(content)}"
@@ -109,6 +101,9 @@ def _scanqa(rows: Any, path: Path, answered: bool) -> tuple[Question, ...]:
         swapped = next((key for key in PREDICTED if key in entry), None)
         if swapped:
             raise InputError(f"{where}: expected a question, got {swapped}: these are predictions; were both swapped?")
+        ids = entry.get("object_ids", [])
+        if not isinstance(ids, list):
+            raise InputError(f"{where}: object_ids must be a list of whole numbers, got {shown(ids)}")
         questions.append(
             Question(
                 dataset="scanqa",
@@ -116,17 +111,21 @@ def _scanqa(rows: Any, path: Path, answered: bool) -> tuple[Question, ...]:
                 scene=scene_name(entry.get("scene_id"), where),
                 text=text_value(entry.get("question"), where, "question"),
                 answers=text_list(entry["answers"], where, "answers", empty=True) if "answers" in entry else (),
-                object_ids=_object_ids(entry.get("object_ids", []), where),
+                object_ids=tuple(object_id(each, where, f"object_ids[{row}]") for row, each in enumerate(ids)),
                 object_names=text_list(entry.get("object_names", []), where, "object_names"),
             )
         )
     _refuse_repeated(path, [each.id for each in questions])
-    if answered:
-        _check_answered(questions, path)
+    silent = [each.id for each in questions if not each.answers]
+    if answered and silent:
+        raise InputError(
+            f"{path}: {len(silent):,} of {len(questions):,} questions have no answers, such as {silent[0][:60]}; "
+            "expected answers, which ScanQA's test sets do not have"
+        )
     return tuple(questions)
 
 
-def _sqa3d(content: Mapping[str, Any], path: Path, annotations: Path | None, answered: bool) -> tuple[Question, ...]:
+def _sqa3d(content: Mapping[str, Any], path: Path, answered: bool) -> tuple[Question, ...]:
     questions = [
         Question(
             dataset="sqa3d",
@@ -140,20 +139,12 @@ def _sqa3d(content: Mapping[str, Any], path: Path, annotations: Path | None, ans
     _refuse_repeated(path, [each.id for each in questions])
     if not answered:
         return tuple(questions)
-    return _with_annotations(questions, path, annotations or _annotations_beside(path))
-
-
-def _annotations_beside(path: Path) -> Path:
-    beside = path.with_name(path.name.replace("questions", SITUATED))
-    if beside == path or not beside.is_file():
+    annotations = path.with_name(path.name.replace("questions", SITUATED))
+    if annotations == path or not annotations.is_file():
         raise InputError(
-            f"{path}: no answers beside it; expected a file called like it, with {SITUATED} for questions "
-            f"({beside.name if beside != path else 'v1_balanced_sqa_annotations_test_scannetv2.json'})"
+            f"{path}: no answers beside it; expected a file called like it, with {SITUATED} for questions, such as "
+            "v1_balanced_sqa_annotations_test_scannetv2.json"
         )
-    return beside
-
-
-def _with_annotations(questions: Sequence[Question], path: Path, annotations: Path) -> tuple[Question, ...]:
     content = read_benchmark_json(annotations)
     if not isinstance(content, dict) or "annotations" not in content:
         raise InputError(f"{annotations}: expected SQA3D's object with a list of annotations, got {shown(content)}")
@@ -169,11 +160,10 @@ def _with_annotations(questions: Sequence[Question], path: Path, annotations: Pa
             f"{annotations}: belongs to other questions than {path}: {len(missing)} of these have no annotation and "
             f"{len(extra)} annotations no question, such as {name[:60]}"
         )
-    return tuple(_annotated(each, row_of[each.id]) for each in questions)
+    return tuple(_annotated(each, *row_of[each.id]) for each in questions)
 
 
-def _annotated(question: Question, row: Entry) -> Question:
-    entry, where = row
+def _annotated(question: Question, entry: Mapping[str, Any], where: str) -> Question:
     if scene_name(entry.get("scene_id"), where) != question.scene:
         raise InputError(
             f"{where}: question {question.id} is about {question.scene}, and its annotation about "
@@ -182,42 +172,21 @@ def _annotated(question: Question, row: Entry) -> Question:
     rows = entry.get("answers")
     if not isinstance(rows, list) or not rows:
         raise InputError(f"{where}: answers must be a list of objects with an answer, got {shown(rows)}")
-    answers = [
-        text_value(object_of(row, where, "an answer").get("answer"), where, "answer", empty=True) for row in rows
-    ]
+    answers = (object_of(row, where, "an answer").get("answer") for row in rows)
     position = object_of(entry.get("position"), where, "x, y and z as its position")
     rotation = object_of(entry.get("rotation"), where, "_x, _y, _z and _w as its rotation")
     x, y, z = (number(position.get(axis), where, f"position.{axis}") for axis in "xyz")
     qw, qx, qy, qz = (number(rotation.get(f"_{axis}"), where, f"rotation._{axis}") for axis in "wxyz")
-    return Question(
-        dataset="sqa3d",
-        id=question.id,
-        scene=question.scene,
-        text=question.text,
-        situation=question.situation,
-        answers=tuple(answers),
+    return replace(
+        question,
+        answers=tuple(text_value(answer, where, "answer", empty=True) for answer in answers),
         position=(x, y, z),
         rotation=(qw, qx, qy, qz),
     )
 
 
-def _object_ids(value: Any, where: str) -> tuple[int, ...]:
-    if not isinstance(value, list):
-        raise InputError(f"{where}: object_ids must be a list of whole numbers, got {shown(value)}")
-    return tuple(object_id(each, where, f"object_ids[{index}]") for index, each in enumerate(value))
-
-
 def _refuse_repeated(path: Path, ids: Sequence[str]) -> None:
     refuse_repeated(path, ids, lambda each: each[:60], what="question_id")
-
-
-def _check_answered(questions: Sequence[Question], path: Path) -> None:
-    silent = [each.id for each in questions if not each.answers]
-    if silent:
-        raise InputError(
-            f"{path}: {len(silent):,} of {len(questions):,} questions have no answers, such as {silent[0][:60]}; "
-            "expected answers, which ScanQA's test sets do not have"
-        )
 
 
 def write_sqa3d(path: str | Path, questions: Sequence[Question]) -> Path:
@@ -259,13 +228,9 @@ def write_sqa3d(path: str | Path, questions: Sequence[Question]) -> Path:
                     for number, answer in enumerate(each.answers, start=1)
                 ],
                 "rotation": {"_x": x, "_y": y, "_z": z, "_w": w},
-                "position": _axes(each.position),
+                "position": dict(zip("xyz", each.position, strict=True)),
             }
         )
     write_json(file, {"task_type": "Situated question answering", "questions": rows})
     write_json(annotations, {"annotations": answers})
     return annotations
-
-
-def _axes(position: Corner) -> dict[str, float]:
-    return dict(zip("xyz", position, strict=True))

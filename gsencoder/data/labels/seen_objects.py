@@ -1,13 +1,14 @@
 """The objects of a labeled scene, and how well its photographs show them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.names import color_word
+from gsencoder.data.labels.scans import count_pixels
 from gsencoder.types import Scene
 
 COLOR_VIEWS = 4
@@ -16,21 +17,14 @@ COLOR_VIEWS = 4
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SeenObject:
-    """A labeled object.
+    """A labeled object."""
 
-    Attributes:
-        id: its value in the instance maps.
-        aabb_min: lower corner in world coordinates, meters.
-        pixels: its largest area in a photograph; 0 where none shows it.
-        color: its color word, where that is clear.
-    """
-
-    id: int
+    id: int  # its value in the instance maps
     name: str | None
-    aabb_min: Float64[np.ndarray, "3"]
+    aabb_min: Float64[np.ndarray, "3"]  # world coordinates, meters
     aabb_max: Float64[np.ndarray, "3"]
-    pixels: int
-    color: str | None = None
+    pixels: int  # its largest area in a photograph; 0 where none shows it
+    color: str | None = None  # its color word, where that is clear
 
     @property
     def center(self) -> Float64[np.ndarray, "3"]:
@@ -39,18 +33,12 @@ class SeenObject:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SeenScene:
-    """A labeled scene as questions are made from it: in meters, with z up.
-
-    Attributes:
-        objects: all that its labels list, in the order of their ids.
-        min_pixels: the area, in some photograph, from which an object may be asked about.
-        metres_per_unit: of the scene's files, which boxes were multiplied with.
-    """
+    """A labeled scene as questions are made from it: in meters, with z up."""
 
     name: str
-    objects: tuple[SeenObject, ...]
-    min_pixels: int
-    metres_per_unit: float = 1.0
+    objects: tuple[SeenObject, ...]  # all that its labels list, in the order of their ids
+    min_pixels: int  # the area, in some photograph, from which an object may be asked about
+    metres_per_unit: float = 1.0  # of the scene's files, which boxes were multiplied with
 
     def shown(self, scene_object: SeenObject) -> bool:
         """Whether some photograph shows a thing well enough to be asked about."""
@@ -58,21 +46,19 @@ class SeenScene:
 
     def named(self, name: str) -> tuple[SeenObject, ...]:
         """The objects of a name that any photograph shows. What none shows is outside of the recorded place."""
-        return tuple(scene_object for scene_object in self.objects if scene_object.name == name and scene_object.pixels)
+        return tuple(each for each in self.objects if each.name == name and each.pixels)
 
     def names(self) -> tuple[str, ...]:
         """Names all of whose objects that any photograph shows are shown well enough, sorted.
 
         Of other names, people would count differently, and not know which one is meant.
         """
-        names = sorted(
-            {scene_object.name for scene_object in self.objects if scene_object.name and scene_object.pixels}
-        )
+        names = sorted({each.name for each in self.objects if each.name and each.pixels})
         return tuple(name for name in names if all(map(self.shown, self.named(name))))
 
     def unique(self, name: str) -> SeenObject | None:
         """The only object of a name, where it is shown well enough; None where there are several or none."""
-        same = [scene_object for scene_object in self.objects if scene_object.name == name]
+        same = [each for each in self.objects if each.name == name]
         return same[0] if len(same) == 1 and self.shown(same[0]) else None
 
 
@@ -101,31 +87,22 @@ def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
     if scene.up is not None and not np.allclose(scene.up, (0, 0, 1), atol=0.02):
         raise InputError(f"questions: up is {scene.up.round(3).tolist()} in scene {scene.name}; expected z")
     assert views is not None
-    assert views.instances is not None
     ids = np.array([scene_object.id for scene_object in scene.objects])
-    largest = int(ids.max()) + 1
-    counts = np.stack(
-        [np.bincount(np.minimum(labels.ravel(), largest), minlength=largest + 1)[ids] for labels in views.instances]
-    )
+    counts = count_pixels(replace(views, masks=None), ids)
     colors = _colors(scene, counts, min_pixels)
     unit = scene.metres_per_unit
-    scene_objects = [
+    scene_objects = tuple(
         SeenObject(
-            id=scene_object.id,
-            name=scene_object.name,
-            aabb_min=scene_object.aabb_min * unit,
-            aabb_max=scene_object.aabb_max * unit,
+            id=each.id,
+            name=each.name,
+            aabb_min=each.aabb_min * unit,
+            aabb_max=each.aabb_max * unit,
             pixels=int(counts[:, row].max()),
             color=colors[row],
         )
-        for row, scene_object in enumerate(scene.objects)
-    ]
-    return SeenScene(
-        name=scene.name,
-        objects=tuple(sorted(scene_objects, key=lambda scene_object: scene_object.id)),
-        min_pixels=min_pixels,
-        metres_per_unit=unit,
+        for row, each in sorted(enumerate(scene.objects), key=lambda pair: pair[1].id)
     )
+    return SeenScene(name=scene.name, objects=scene_objects, min_pixels=min_pixels, metres_per_unit=unit)
 
 
 def _colors(scene: Scene, counts: Int64[np.ndarray, "V objects"], min_pixels: int) -> list[str | None]:
@@ -172,37 +149,30 @@ def stands_on(upper: SeenObject, lower: SeenObject) -> bool:
     """Whether the lower side of a box lies on the upper side of another."""
     if abs(upper.aabb_min[2] - lower.aabb_max[2]) > TOUCHING:
         return False
-    return outline_share(upper, lower) >= ON_SHARE
+    area = (upper.aabb_max - upper.aabb_min)[:2].prod()
+    return bool(area > 0 and _overlap(upper, lower)[:2].prod() / area >= ON_SHARE)
 
 
-def outline_share(a: SeenObject, b: SeenObject) -> float:
-    """Which share of the outline of a box, seen from above, lies within that of another; 0 for a flat one."""
-    shared = np.clip(np.minimum(a.aabb_max, b.aabb_max) - np.maximum(a.aabb_min, b.aabb_min), 0, None)[:2].prod()
-    area = (a.aabb_max - a.aabb_min)[:2].prod()
-    return float(shared / area) if area > 0 else 0.0
+def _overlap(a: SeenObject, b: SeenObject) -> Float64[np.ndarray, "3"]:
+    return np.maximum(np.minimum(a.aabb_max, b.aabb_max) - np.maximum(a.aabb_min, b.aabb_min), 0)
 
 
 def interlocked(a: SeenObject, b: SeenObject) -> bool:
     """Whether a box is largely inside of another: in it, around it, or in its hollow."""
-    shared = np.clip(np.minimum(a.aabb_max, b.aabb_max) - np.maximum(a.aabb_min, b.aabb_min), 0, None).prod()
     smaller = min((a.aabb_max - a.aabb_min).prod(), (b.aabb_max - b.aabb_min).prod())
-    return bool(smaller > 0 and shared > SAME_PLACE * smaller)
-
-
-def is_structure(scene_object: SeenObject, others: Float64[np.ndarray, "N 2"]) -> bool:
-    """Whether a thing without a name is part of the building: its box holds half of the centers of all the others."""
-    if scene_object.name is not None or not len(others):
-        return False
-    inside = ((others >= scene_object.aabb_min[:2]) & (others <= scene_object.aabb_max[:2])).all(axis=1)
-    return bool(inside.mean() >= 0.5)
+    return bool(smaller > 0 and _overlap(a, b).prod() > SAME_PLACE * smaller)
 
 
 def movables(scene_objects: Sequence[SeenObject]) -> tuple[SeenObject, ...]:
-    """All things that are no part of the building."""
+    """All things but parts of the building, which have no name and whose box holds half of the others' centers."""
     centers = np.array([each.center[:2] for each in scene_objects]).reshape(-1, 2)
-    return tuple(
-        each for row, each in enumerate(scene_objects) if not is_structure(each, np.delete(centers, row, axis=0))
-    )
+    movable = []
+    for row, each in enumerate(scene_objects):
+        others = np.delete(centers, row, axis=0)
+        inside = ((others >= each.aabb_min[:2]) & (others <= each.aabb_max[:2])).all(axis=1)
+        if each.name is not None or not len(others) or inside.mean() < 0.5:
+            movable.append(each)
+    return tuple(movable)
 
 
 def near_things(scene_objects: Sequence[SeenObject]) -> dict[int, tuple[SeenObject, ...]]:

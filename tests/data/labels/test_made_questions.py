@@ -10,20 +10,21 @@ import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.made_questions import KINDS, QuestionsConfig, kind_of, make_questions
-from gsencoder.data.labels.names import RANGES, color_counts, inner_pixels
+from gsencoder.data.labels import made_questions
+from gsencoder.data.labels.made_questions import KINDS, kind_of, make_questions
+from gsencoder.data.labels.names import RANGES, color_counts
 from gsencoder.data.labels.questions import Question, read_questions, write_scanqa
 from gsencoder.data.labels.seen_objects import SeenObject, SeenScene, see_objects
 from gsencoder.data.synthetic import color_words, make_room
 from gsencoder.types import Scene
 
-ALL = QuestionsConfig(balance=False, per_kind=100)
-ROOMS = (0, 1, 2)
+ALL = {"balance": False, "per_kind": 100}
+ROOMS = (0, 1)
 
 
 @pytest.fixture(scope="module")
 def rooms() -> list[Scene]:
-    return [make_room(seed, views=6, width=120, height=90, spacing=0.2) for seed in ROOMS]
+    return [make_room(seed, views=5, width=120, height=90, spacing=0.4) for seed in ROOMS]
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def scene_of(*things: SeenObject) -> SeenScene:
 
 
 def texts(*things: SeenObject) -> dict[str, tuple[str, ...]]:
-    return {each.text: each.answers for each in make_questions([scene_of(*things)], ALL)}
+    return {each.text: each.answers for each in make_questions([scene_of(*things)], **ALL)}
 
 
 def distance(a: SeenObject, b: SeenObject) -> float:
@@ -94,21 +95,12 @@ def check_answer(question: Question, scene: SeenScene, colors: dict[int, str]) -
 
 
 def test_every_answer_follows_from_the_labels(seen: list[SeenScene]) -> None:
-    questions = make_questions(seen, ALL)
+    questions = make_questions(seen, **ALL)
     assert {kind_of(each) for each in questions} == set(KINDS)
     scenes = {each.name: each for each in seen}
     for each in questions:
         seed = int(each.scene.removeprefix("room_"))
         check_answer(each, scenes[each.scene], color_words(seed))
-
-
-def test_what_is_asked_about_is_shown_well_enough_somewhere(rooms: list[Scene]) -> None:
-    for room in rooms:
-        assert room.views is not None
-        assert room.views.instances is not None
-        for each in make_questions([see_objects(room, min_pixels=150)], ALL):
-            for label in each.object_ids:
-                assert max((labels == label).sum() for labels in room.views.instances) >= 150
 
 
 def test_kinds_are_balanced_and_nothing_is_asked_twice(seen: list[SeenScene]) -> None:
@@ -125,20 +117,19 @@ def test_kinds_are_balanced_and_nothing_is_asked_twice(seen: list[SeenScene]) ->
 
 def test_one_seed_gives_the_same_bytes_and_another_one_others(seen: list[SeenScene], tmp_path: Path) -> None:
     files = [tmp_path / f"{number}.json" for number in range(3)]
-    some = QuestionsConfig(per_kind=4)
-    write_scanqa(files[0], make_questions(seen, some))
-    write_scanqa(files[1], make_questions(seen[::-1], some))
-    write_scanqa(files[2], make_questions(seen, replace(some, seed=1)))
+    write_scanqa(files[0], make_questions(seen, per_kind=4))
+    write_scanqa(files[1], make_questions(seen[::-1], per_kind=4))
+    write_scanqa(files[2], make_questions(seen, per_kind=4, seed=1))
     assert files[0].read_bytes() == files[1].read_bytes() != files[2].read_bytes()
-    assert read_questions(files[0]) == make_questions(seen, some)
+    assert read_questions(files[0]) == make_questions(seen, per_kind=4)
     keys = {"scene_id", "question_id", "question", "answers", "object_ids", "object_names"}
     assert all(set(row) == keys for row in json.loads(files[0].read_text()))
 
 
 def test_questions_about_a_scene_do_not_depend_on_the_others(seen: list[SeenScene]) -> None:
-    some = QuestionsConfig(per_kind=4, balance=False)
-    alone = make_questions(seen[:1], some)
-    assert alone == tuple(each for each in make_questions(seen, some) if each.scene == seen[0].name)
+    alone = make_questions(seen[:1], per_kind=4, balance=False)
+    every = make_questions(seen, per_kind=4, balance=False)
+    assert alone == tuple(each for each in every if each.scene == seen[0].name)
 
 
 def test_several_of_a_name_are_counted_and_nothing_else_is_asked_about_them() -> None:
@@ -177,13 +168,6 @@ def test_what_a_thing_stands_on_is_where_it_is_and_not_next_to_it() -> None:
     )
 
 
-def test_absent_names_are_those_that_no_label_may_mean() -> None:
-    config = replace(ALL, absent=("cup", "guitar", "book", "table"))
-    labels = (thing(1, "mug", (0, 0, 0)), thing(2, "book", (3, 0, 0), pixels=0), thing(3, "coffee table", (5, 0, 0)))
-    questions = make_questions([scene_of(*labels)], config)
-    assert [each.text for each in questions if each.answers == ("no",)] == ["Is there a guitar in the room?"]
-
-
 def test_plural_names_are_asked_about_as_such() -> None:
     questions = texts(thing(1, "scissors", (0, 0, 0)), thing(2, "apple", (0.15, 0, 0)))
     assert questions["Are there any scissors in the room?"] == ("yes",)
@@ -191,8 +175,15 @@ def test_plural_names_are_asked_about_as_such() -> None:
     assert not any(text.startswith("How many sci") for text in questions)
 
 
+def test_absent_names_are_those_that_no_label_may_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(made_questions, "ABSENT", ("cup", "guitar", "book", "table"))
+    labels = (thing(1, "mug", (0, 0, 0)), thing(2, "book", (3, 0, 0), pixels=0), thing(3, "coffee table", (5, 0, 0)))
+    questions = make_questions([scene_of(*labels)], **ALL)
+    assert [each.text for each in questions if each.answers == ("no",)] == ["Is there a guitar in the room?"]
+
+
 def test_color_ranges_do_not_overlap() -> None:
-    levels = np.arange(0, 256, 5, dtype=np.uint8)
+    levels = np.arange(0, 256, 15, dtype=np.uint8)
     cube = np.stack(np.meshgrid(levels, levels, levels), axis=-1).reshape(-1, 3)
     counts = color_counts(cube)
     each = np.stack([color_counts(part) for part in cube[::37, None]])
@@ -201,17 +192,8 @@ def test_color_ranges_do_not_overlap() -> None:
     assert each.sum(axis=1).max() == 1
 
 
-def test_inner_pixels_have_all_four_neighbors() -> None:
-    mask = np.zeros((5, 6), bool)
-    mask[1:4, 0:4] = True
-    expected = np.zeros_like(mask)
-    expected[2, 1:3] = True
-    np.testing.assert_array_equal(inner_pixels(mask), expected)
-
-
 def test_scenes_without_labels_are_refused(rooms: list[Scene]) -> None:
     room = rooms[0]
-    assert room.views is not None
     for broken, problem in (
         (replace(room, objects=()), "no labeled objects"),
         (replace(room, views=replace(room.views, instances=None)), "no instance maps"),
@@ -224,12 +206,6 @@ def test_scenes_without_labels_are_refused(rooms: list[Scene]) -> None:
         with pytest.raises(InputError, match=problem):
             see_objects(broken)
     with pytest.raises(InputError, match="nothing can be asked"):
-        make_questions([scene_of(thing(1, "mug", (0, 0, 0), pixels=3))], replace(ALL, absent=()))
+        make_questions([scene_of(thing(1, "mug", (0, 0, 0), pixels=3))])
     with pytest.raises(InputError, match="one name"):
         make_questions([scene_of(), scene_of()])
-
-
-@pytest.mark.parametrize("wrong", [{"seed": -1}, {"per_kind": 1}, {"min_pixels": 0}, {"absent": ("",)}])
-def test_settings_out_of_range_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        QuestionsConfig(**wrong)  # type: ignore[arg-type]

@@ -101,19 +101,13 @@ def test_sqa3d_finds_the_answers_beside_the_questions(tmp_path: Path) -> None:
     ("content", "message"),
     [
         ([entry(question_id="a"), entry(question_id="a")], "entries 0 and 1 have one question_id: a"),
-        ([entry(answers="4")], "entry 0: answers must be a list of texts, got '4'"),
         ([entry(answers=[4])], r"entry 0: answers\[0\] must be a text, got 4"),
-        ([entry(answers=["x" * 10_000_000])], r"entry 0: answers\[0\] has 10,000,000 characters.*: 'xxx"),
         ([entry(), entry(question_id="b", answers=[])], "1 of 2 questions have no answers, such as b"),
         ([entry(object_ids=["seven"])], r"entry 0: object_ids\[0\] must be a whole number"),
         ([entry(object_ids=7)], "entry 0: object_ids must be a list"),
-        ([entry(question=None)], "entry 0: question must be a text, got nothing"),
-        ([entry(question_id="a\nb")], "entry 0: question_id must be a whole number or a text of one line"),
-        ([entry(question_id=1.5)], "entry 0: question_id must be a whole number"),
         ([entry(answer_top10=["4"])], "entry 0: expected a question, got answer_top10: these are predictions"),
         ({"annotations": []}, "these are SQA3D's annotations: give the file of questions"),
         ({}, "expected ScanQA's list of questions or SQA3D's object"),
-        (["x"], "entry 0: expected an object with scene_id"),
     ],
 )
 def test_a_wrong_entry_of_scanqa_is_named(tmp_path: Path, content: Any, message: str) -> None:
@@ -126,15 +120,12 @@ def test_a_wrong_entry_of_scanqa_is_named(tmp_path: Path, content: Any, message:
 @pytest.mark.parametrize(
     ("questions", "annotations", "message"),
     [
-        ([question(1), question(1)], [annotation(1)], "entries 0 and 1 have one question_id: 1"),
         ([question(1)], [annotation(1), annotation(1)], "annotations_test_scannetv2.json: entries 0 and 1 have one"),
         ([question(1)], [], "1 of these have no annotation and 0 annotations no question, such as 1"),
         ([question(1)], [annotation(1), annotation(5)], "0 of these have no annotation and 1 annotations"),
         ([question(1)], [annotation(1, scene_id="scene1")], "about scene0050_00, and its annotation about scene1"),
         ([question(1)], [annotation(1, answers=[])], r"annotations\[0\]: answers must be a list of objects"),
-        ([question(1)], [annotation(1, answers=["x"])], r"annotations\[0\]: expected an object with an answer"),
         ([question(1)], [annotation(1, position={"x": 1})], r"position.y must be a number, got nothing"),
-        ([question(1)], [annotation(1, rotation={})], r"rotation._w must be a number"),
         ([question(1)], None, "no answers beside it; expected a file called like it"),
         ([question(1, situation="")], [annotation(1)], r"questions\[0\]: situation is empty"),
     ],

@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,13 +10,12 @@ from splats import front_camera, random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.made_questions import (
-    QuestionsConfig,
     make_expressions,
     make_questions,
     make_situations,
     side_of,
 )
-from gsencoder.data.labels.names import RANGES, color_counts, color_word, hsv
+from gsencoder.data.labels.names import color_word
 from gsencoder.data.labels.questions import Question, read_questions, write_sqa3d
 from gsencoder.data.labels.seen_objects import COLOR_VIEWS, SeenObject, SeenScene, see_objects
 from gsencoder.types import Scene, SceneObject, Views
@@ -91,66 +89,19 @@ def test_the_color_is_that_of_the_photographs_that_show_most_of_a_thing() -> Non
     assert see_objects(photographed(few), min_pixels=241).objects[0].color is None
 
 
-def test_each_photograph_is_decoded_once_for_the_colors_of_all_things() -> None:
-    class Counted(list[np.ndarray]):
-        reads = 0
-
-        def __getitem__(self, row: Any) -> Any:
-            self.reads += 1
-            return super().__getitem__(row)
-
-    labels = np.repeat(np.arange(40, dtype=np.int32)[None], 20, axis=0)[:, :30]
-    scene = photographed([(np.full((20, 30, 3), RED, np.uint8), labels)] * 3, ids=tuple(range(1, 30)))
-    images = Counted(scene.views.images)  # type: ignore[union-attr, arg-type]
-    scene = replace(scene, views=replace(scene.views, images=images))  # type: ignore[type-var]
-    images.reads = 0
-    assert len(see_objects(scene, min_pixels=5).objects) == 29
-    assert images.reads == 3
-
-
-@pytest.mark.parametrize(
-    ("rgb", "expected"),
-    [
-        ((255, 0, 0), (0, 1, 1)),
-        ((0, 255, 0), (120, 1, 1)),
-        ((0, 0, 255), (240, 1, 1)),
-        ((255, 255, 0), (60, 1, 1)),
-        ((255, 0, 255), (300, 1, 1)),
-        ((100, 50, 50), (0, 0.5, 100 / 255)),
-        ((50, 100, 75), (150, 0.5, 100 / 255)),
-        ((60, 75, 120), (225, 0.5, 120 / 255)),
-        ((255, 0, 30), (360 - 60 * 30 / 255, 1, 1)),
-        ((7, 7, 7), (0, 0, 7 / 255)),
-        ((0, 0, 0), (0, 0, 0)),
-    ],
-)
-def test_hue_saturation_and_value_are_those_of_the_hexagon(
-    rgb: tuple[int, int, int], expected: tuple[float, float, float]
-) -> None:
-    values = hsv(np.array([rgb], np.uint8))
-    assert [float(each[0]) for each in values] == pytest.approx(expected)
-
-
-def test_reds_lie_on_both_sides_of_zero() -> None:
-    words = [each.word for each in RANGES]
-    for rgb, word in (((220, 10, 40), "red"), ((220, 40, 10), "red"), ((220, 10, 80), None), ((220, 50, 10), None)):
-        counts = color_counts(np.array([rgb], np.uint8))
-        assert [words[row] for row in np.flatnonzero(counts)] == ([word] if word else [])
-
-
 def test_a_color_needs_six_tenths_and_no_other_has_more_than_three_twentieths() -> None:
-    def of(reds: int, blues: int) -> str | None:
+    def of(reds: int, blues: int, red: tuple[int, int, int] = RED) -> str | None:
         """Of a hundred inner pixels."""
         image = np.full((12, 12, 3), 128, np.uint8)
         inner = image[1:11, 1:11].reshape(100, 3).copy()
-        inner[:reds], inner[reds : reds + blues] = RED, BLUE
+        inner[:reds], inner[reds : reds + blues] = red, BLUE
         image[1:11, 1:11] = inner.reshape(10, 10, 3)
         return color_word(image, np.ones((12, 12), bool))
 
     assert (of(60, 0), of(59, 0), of(60, 15), of(60, 16), of(0, 60)) == ("red", None, "red", None, "blue")
-
-
-# Questions
+    # Reds lie on both sides of zero.
+    reds = [(220, 10, 40), (220, 40, 10), (220, 10, 80), (220, 50, 10)]
+    assert [of(60, 0, red) for red in reds] == ["red", "red", None, None]
 
 
 def test_of_many_questions_of_a_kind_only_so_many_are_asked() -> None:
@@ -158,7 +109,7 @@ def test_of_many_questions_of_a_kind_only_so_many_are_asked() -> None:
     things = [
         replace(thing(number, name, (3.0 * number, 0, 0)), color=f"c{number}") for number, name in enumerate(names)
     ]
-    made = make_questions([scene_of(*things)], QuestionsConfig(balance=False, per_kind=5))
+    made = make_questions([scene_of(*things)], balance=False, per_kind=5)
     assert sum("What color" in each.text for each in made) == 5
     # An odd number leaves half of a pair out, and at most half, rounded up, have one answer.
     assert sum("there a" in each.text for each in made) == 4
@@ -173,9 +124,6 @@ def test_the_largest_means_the_largest_and_words_of_names_are_joined_in_files() 
     assert (expression.object_id, expression.object_name, expression.multiple) == (3, "card_box", True)
     # Files have units of half a metre.
     np.testing.assert_allclose(expression.aabb, [[18, 0, 0], [18.4, 0.4, 0.4]])
-
-
-# Situations
 
 
 def test_a_side_needs_twenty_degrees_from_straight_ahead_and_from_straight_behind() -> None:
@@ -222,11 +170,6 @@ def test_of_each_kind_there_are_at_most_so_many() -> None:
         kinds = [each.id.split("-")[1] for each in made]
         assert kinds.count("side") == 2 * (per_kind // 2)
         assert kinds.count("nearer") == per_kind
-    with pytest.raises(InputError, match="per_kind from 2, got 1"):
-        make_situations([scene_of(*things)], per_kind=1)
-
-
-# SQA3D's files
 
 
 SITUATED = Question(
