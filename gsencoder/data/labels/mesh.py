@@ -1,6 +1,6 @@
 """Labeled meshes: their files, instances in views, and the labels of the nearest Gaussians.
 
-Vertices are in the order of the file, by which benchmarks count their labels; general readers of meshes do not keep it.
+Vertices are in the order of the file, by which benchmarks count their labels.
 
 Instance maps of views are drawn with a depth buffer; a pixel has the object of the vertex that is nearest to its point
 on the triangle. Where sensor depth is known and differs from the mesh's by more than a tolerance, the pixel has no
@@ -11,100 +11,46 @@ A vertex has the most frequent label among the k nearest Gaussians that have fea
 k = 25: Li et al. 2025; pointcept/utils/misc.py, neighbor_voting).
 """
 
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, no_type_check
+from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int32, Int64
 
 from gsencoder.core.errors import InputError, readable
-from gsencoder.core.files import open_foreign
+from gsencoder.core.files import check_foreign
 from gsencoder.core.threads import compiled
-from gsencoder.data.splats.ply import PlyElement, PlyHeader, read_header, read_property
 from gsencoder.types import MeshLabels, Views
 from gsencoder.types.checks import move_origin, transform
 
-MAX_VERTICES = 100_000_000
-"""More than this are no mesh of a room."""
-
 
 def read_mesh(path: Path) -> tuple[Float32[np.ndarray, "V 3"], Int32[np.ndarray, "F 3"] | None]:
-    """The vertices and triangles of a mesh; None in place of triangles where the file has no faces."""
-    with _opened(path) as stream:
-        header, size = _header(path, stream)
-        columns = [read_property(path, stream, header, size, name) for name in "xyz"]
-        vertices = np.stack(columns, axis=1)
-        good = np.isfinite(vertices).all(axis=1) & (np.abs(vertices) < np.finfo(np.float32).max).all(axis=1)
-        if not good.all():
-            bad = np.flatnonzero(~good)
-            raise InputError(
-                f"{path}: vertex {bad[0]:,} is not finite ({bad.size:,} of {len(vertices):,}); get the file anew"
-            )
-        faces = header.element("face")
-        if faces is None or not faces.count:
-            return vertices.astype(np.float32), None
-        rows = _read_triangles(path, stream, header, faces, size)
-    outside = (rows < 0) | (rows >= len(vertices))
+    """The vertices and triangles of a .ply, in their order; None in place of triangles where the file has no faces."""
+    import trimesh
+
+    with readable(path):
+        check_foreign(path)
+    try:
+        mesh: Any = trimesh.load(path, file_type="ply", process=False)
+    except Exception as error:  # trimesh's readers raise whatever their parsers do.
+        message = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+        raise InputError(f"{path}: not a mesh that trimesh can read ({message})") from error
+    vertices = np.asarray(getattr(mesh, "vertices", ()), np.float64).reshape(-1, 3)
+    faces = np.asarray(getattr(mesh, "faces", ()))
+    if not len(vertices):
+        raise InputError(f"{path}: holds no vertices; expected the mesh of the data set")
+    good = np.isfinite(vertices).all(axis=1) & (np.abs(vertices) < np.finfo(np.float32).max).all(axis=1)
+    if not good.all():
+        bad = np.flatnonzero(~good)
+        raise InputError(f"{path}: vertex {bad[0]:,} is not finite ({bad.size:,} of {len(vertices):,}); get it again")
+    if not len(faces):
+        return vertices.astype(np.float32), None
+    outside = (faces < 0) | (faces >= len(vertices))
     if outside.any():
         row, column = (int(each[0]) for each in np.nonzero(outside))
-        raise InputError(f"{path}: face {row:,} names vertex {rows[row, column]:,} of {len(vertices):,}")
-    return vertices.astype(np.float32), rows.astype(np.int32)
-
-
-def _opened(path: Path) -> BinaryIO:
-    with readable(path):
-        return open_foreign(path)
-
-
-def _header(path: Path, stream: BinaryIO) -> tuple[PlyHeader, int]:
-    if stream.read(4)[:3] != b"ply":
-        raise InputError(f"{path}: not a .ply file; expected the mesh of the data set")
-    size = stream.seek(0, 2)
-    stream.seek(0)
-    header = read_header(path, stream)
-    vertex = header.element("vertex")
-    if vertex is None or not vertex.count:
-        raise InputError(f"{path}: holds no vertices; expected the mesh of the data set")
-    if vertex.count > MAX_VERTICES:
-        raise InputError(f"{path}: claims {vertex.count:,} vertices, at most {MAX_VERTICES:,} are read")
-    return header, size
-
-
-def _read_triangles(
-    path: Path, stream: BinaryIO, header: PlyHeader, faces: PlyElement, size: int
-) -> Int64[np.ndarray, "F 3"]:
-    if faces.triangle is None or [element.name for element in header.elements[:2]] != ["vertex", "face"]:
-        raise InputError(f"{path}: expected vertices, and then faces with one list of vertices each")
-    vertex = header.element("vertex")
-    assert vertex is not None
-    assert vertex.dtype is not None
-    if header.encoding == "ascii":
-        stream.seek(header.start)
-        lines = islice(stream, vertex.count, vertex.count + faces.count)
-        try:
-            table = np.loadtxt(lines, dtype=np.int64, comments=None, ndmin=2, encoding="latin-1")
-        except ValueError as error:
-            raise InputError(f"{path}: a face cannot be read: {' '.join(str(error).split())[:120]}") from error
-        if table.shape != (faces.count, 4):
-            raise InputError(f"{path}: expected {faces.count:,} triangles, got {list(table.shape)} numbers")
-        counts, rows = table[:, 0], np.asarray(table[:, 1:])
-    else:
-        start = header.start + vertex.count * vertex.dtype.itemsize
-        end = start + faces.count * faces.triangle.itemsize
-        if end > size:
-            raise InputError(
-                f"{path}: {faces.count:,} triangles end at byte {end:,}, but the file has {size:,}; it is truncated, "
-                "or its faces are not triangles"
-            )
-        stream.seek(start)
-        records = np.fromfile(stream, faces.triangle, faces.count)
-        counts, rows = records["n"], records["v"].astype(np.int64)
-    if (counts != 3).any():
-        row = int(np.flatnonzero(counts != 3)[0])
-        raise InputError(f"{path}: face {row:,} has {counts[row]} vertices; expected triangles")
-    return rows
+        raise InputError(f"{path}: face {row:,} names vertex {faces[row, column]:,} of {len(vertices):,}")
+    return vertices.astype(np.float32), faces.astype(np.int32)
 
 
 TOLERANCE = 0.1
@@ -119,15 +65,7 @@ class MeshInstances(Sequence[Int32[np.ndarray, "H W"]]):
     """Instance maps of views as int32 [H, W], 0 = none, each drawn on access."""
 
     def __init__(self, labels: MeshLabels, views: Views, origin: Float64[np.ndarray, "3"]) -> None:
-        """Prepares the maps; nothing is drawn.
-
-        Args:
-            labels: of a mesh with faces, in metres.
-            views: cameras, and depth where it is known, relative to `origin`.
-            origin: that was taken off the world of the mesh.
-        """
-        if labels.faces is None:
-            raise InputError("instance maps: the labeled mesh has no faces; expected the mesh of the data set")
+        """The mesh has faces and is in metres; the views are relative to `origin`, taken off its world."""
         self._labels, self._views, self._origin = labels, views, origin
 
     def __len__(self) -> int:
@@ -218,11 +156,8 @@ def draw_triangles(local, faces, labels, K, near, inverse, instances):
 
 VOTERS = 25
 """Gaussians that vote for the label of a vertex, as in SceneSplat's benchmark."""
-
-CHUNK = 1 << 16
-"""Points of one query."""
-MAX_VOTES = 1 << 22
-"""Counters of votes that exist at once: points times distinct labels."""
+CHUNK = 4096
+"""Vertices whose votes are counted at once."""
 
 
 def labels_of_vertices(
@@ -240,8 +175,6 @@ def labels_of_vertices(
 
     Args:
         means: centers of the Gaussians, in the frame of the vertices.
-        k: number of Gaussians that vote; 1 = the nearest one. All vote where there are fewer.
-        none: what means no label, in and out.
         voters: which Gaussians are looked at, such as those that were seen; None = all.
     """
     if voters is not None:
@@ -249,48 +182,27 @@ def labels_of_vertices(
     result = np.full(len(vertices), none, np.int32)
     if not len(means):
         return result
+    from scipy.spatial import cKDTree
+
     names, codes = np.unique(labels, return_inverse=True)
-    # The last counter is that of neighbors that do not vote.
-    codes = np.where(labels == none, len(names), codes).astype(np.int64)
-    codes = np.append(codes, len(names))
-    k = min(k, len(means))
-    chunk = max(1, min(CHUNK, MAX_VOTES // max(len(names) + 1, k)))
-    for part, rows in _neighbors(vertices, means, k, np.inf, chunk):
-        votes = codes[rows] + np.arange(len(rows))[:, None] * (len(names) + 1)
-        counts = np.bincount(votes.ravel(), minlength=len(rows) * (len(names) + 1))
-        counts = counts.reshape(len(rows), len(names) + 1)[:, : len(names)]
-        best = counts.argmax(axis=1)
-        elected = counts[np.arange(len(rows)), best] > 0
-        result[part][elected] = names[best[elected]]
+    tree, k = cKDTree(means), min(k, len(means))
+    for start in range(0, len(vertices), CHUNK):
+        votes = codes[tree.query(vertices[start : start + CHUNK], k=k)[1].reshape(-1, k)]
+        counts = np.zeros((len(votes), len(names)), np.int32)
+        np.add.at(counts, (np.arange(len(votes))[:, None], votes), 1)
+        counts[:, names == none] = 0
+        result[start : start + CHUNK] = np.where(counts.any(axis=1), names[counts.argmax(axis=1)], none)
     return result
 
 
 def nearest_rows(
     points: Float[np.ndarray, "P 3"], targets: Float[np.ndarray, "T 3"], *, max_distance: float = np.inf
 ) -> Int64[np.ndarray, " P"]:
-    """The row of the nearest target of each point; -1 where none is near enough.
-
-    Args:
-        points: finite, in the frame of the targets.
-        max_distance: largest distance, itself included, in the unit of both.
-    """
-    result = np.full(len(points), -1, np.int64)
-    for part, rows in _neighbors(points, targets, 1, max_distance, CHUNK):
-        result[part] = np.where(rows[:, 0] < len(targets), rows[:, 0], -1)
-    return result
-
-
-def _neighbors(
-    points: Float[np.ndarray, "P 3"], targets: Float[np.ndarray, "T 3"], k: int, max_distance: float, chunk: int
-) -> Iterator[tuple[slice, Int64[np.ndarray, "n {k}"]]]:
-    """The rows of the k nearest targets, of one chunk of points after the other; T beyond the distance."""
+    """The row of the nearest target of each point; -1 where none is within the distance, itself included."""
     from scipy.spatial import cKDTree
 
     if not len(targets):
-        return
-    tree = cKDTree(targets)
-    for start in range(0, len(points), chunk):
-        part = slice(start, start + chunk)
-        # The bound excludes itself, and makes queries far from the targets short.
-        _, rows = tree.query(points[part], k=k, distance_upper_bound=np.nextafter(max_distance, np.inf))
-        yield part, rows.reshape(-1, k).astype(np.int64)
+        return np.full(len(points), -1)
+    # The bound excludes itself, and makes queries far from the targets short.
+    _, rows = cKDTree(targets).query(points, distance_upper_bound=np.nextafter(max_distance, np.inf))
+    return np.where(rows < len(targets), rows, -1).astype(np.int64)

@@ -17,9 +17,9 @@ overlap: a vertex can belong to several, of which ScanNet++'s toolkit (semantic/
 import warnings
 from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -34,25 +34,23 @@ from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.types import MeshLabels, Scene, SceneObject, Views
 
 MAX_BYTES = 512 << 20
-"""Larger JSON files are refused before they are read: they would take tens of times as much memory."""
+"""Of JSON files, which take tens of times as much memory."""
 MAX_NAME = 1000
-"""Largest number of characters of a name, as in a text table."""
+"""Characters of a name, as in a text table."""
 MAX_ID = 2**31 - 2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SegmentGroup:
-    """One object of an annotation: objectId, raw name, and the numbers of its segments, ascending and unique."""
+class SegmentGroup(NamedTuple):
+    """One object of an annotation."""
 
     id: int
     label: str
-    segments: Int64[np.ndarray, " S"]
+    segments: Int64[np.ndarray, " S"]  # their numbers, ascending and unique
 
 
 def read_segments(path: Path) -> Int64[np.ndarray, " V"]:
     """The segment of each vertex."""
-    values = _read(path, "segIndices", "the segment of each vertex")
-    numbers = _integers(values, f"{path}: segIndices")
+    numbers = _integers(_read(path, "segIndices", "the segment of each vertex"), f"{path}: segIndices")
     if not len(numbers):
         raise InputError(f"{path}: segIndices is empty; expected the segment of each vertex of the mesh")
     return numbers
@@ -76,9 +74,7 @@ def read_groups(path: Path, *, first_id: int) -> tuple[SegmentGroup, ...]:
             raise InputError(f"{of_object}: segments must be a list of numbers of segments, got {shown(segments)}")
         if not segments:
             raise InputError(f"{of_object}: {label[:40]!r} has no segments; remove it, or get the annotation anew")
-        groups.append(
-            SegmentGroup(id=number, label=label, segments=np.unique(_integers(segments, f"{of_object}: segments")))
-        )
+        groups.append(SegmentGroup(number, label, np.unique(_integers(segments, f"{of_object}: segments"))))
     if repeated := first_repeated(group.id for group in groups):
         number, first, second = repeated
         raise InputError(f"{path}: segGroups[{second}]: objectId {number} is already that of segGroups[{first}]")
@@ -102,10 +98,8 @@ def _integers(values: list[Any], where: str) -> Int64[np.ndarray, " n"]:
     if set(map(type, values)) <= {int}:
         with suppress(OverflowError):
             return np.array(values, np.int64)
-    for index, value in enumerate(values):
-        if isinstance(value, bool) or not isinstance(value, int) or not -(2**63) <= value < 2**63:
-            raise InputError(f"{where}[{index}]: expected a whole number, got {shown(value)}")
-    return np.array(values, np.int64)
+    wrong = next(row for row, each in enumerate(values) if type(each) is not int or not -(2**63) <= each < 2**63)
+    raise InputError(f"{where}[{wrong}]: expected a whole number, got {shown(values[wrong])}")
 
 
 AGGREGATION, SEGMENTS, MESH = ".aggregation.json", "_vh_clean_2.0.010000.segs.json", "_vh_clean_2.ply"
@@ -116,21 +110,17 @@ MAX_OBJECTS_OF_A_VERTEX = 3
 toolkit."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LabelFiles:
-    """The label files of a scan: objects as groups of segments, the segment of each vertex, the mesh, and for ScanNet
-    a text that may hold the alignment of axes."""
+class LabelFiles(NamedTuple):
+    """The label files of a scan."""
 
-    name: str
-    annotation: Path
-    segments: Path
+    annotation: Path  # objects as groups of segments
+    segments: Path  # the segment of each vertex
     mesh: Path
-    meta: Path | None = None
 
     @property
-    def missing(self) -> tuple[Path, ...]:
-        """Those of the needed files that do not exist."""
-        return tuple(path for path in (self.annotation, self.segments, self.mesh) if not path.is_file())
+    def missing(self) -> Path | None:
+        """The first of them that does not exist."""
+        return next((path for path in self if not path.is_file()), None)
 
 
 def find_scannet_files(folder: Path) -> LabelFiles | None:
@@ -150,18 +140,13 @@ def find_scannet_files(folder: Path) -> LabelFiles | None:
             f"{folder}: holds annotations of {len(scans)} scans ({', '.join(scans)[:80]}); expected one, or one named "
             f"{folder.name}{AGGREGATION}"
         )
-    if scans:
-        return _scannet_files(folder, folder.name if folder.name in scans else scans[0])
-    for name in (folder.name, folder.parent.name):
-        if name and (folder.parent / f"{name}{AGGREGATION}").is_file():
-            return _scannet_files(folder.parent, name)
+    stems = [folder / (folder.name if folder.name in scans else scans[0])] if scans else []
+    stems += [folder.parent / name for name in (folder.name, folder.parent.name) if name]
+    for stem in stems:
+        files = LabelFiles(*(stem.with_name(f"{stem.name}{end}") for end in (AGGREGATION, SEGMENTS, MESH)))
+        if files.annotation.is_file():
+            return files
     return None
-
-
-def _scannet_files(folder: Path, name: str) -> LabelFiles:
-    annotation, segments, mesh, meta = (folder / f"{name}{end}" for end in (AGGREGATION, SEGMENTS, MESH, ".txt"))
-    meta_file = meta if meta.is_file() else None
-    return LabelFiles(name=name, annotation=annotation, segments=segments, mesh=mesh, meta=meta_file)
 
 
 def find_scannetpp_files(folder: Path) -> LabelFiles | None:
@@ -171,43 +156,44 @@ def find_scannetpp_files(folder: Path) -> LabelFiles | None:
     if folder.name in ("dslr", "iphone"):
         homes.append(folder.parent / "scans")
     for home in homes:
-        if (home / ANNOTATION).is_file():
-            files = (home / name for name in (ANNOTATION, SEGMENTS_PP, MESH_PP))
-            return LabelFiles(name="the scene", **dict(zip(("annotation", "segments", "mesh"), files, strict=True)))
+        files = LabelFiles(*(home / name for name in (ANNOTATION, SEGMENTS_PP, MESH_PP)))
+        if files.annotation.is_file():
+            return files
     return None
 
 
-def read_scannet_labels(source: Path | LabelFiles) -> MeshLabels:
-    """The labels of a scan, of its folder or its files.
+def read_scannet_labels(folder: Path) -> MeshLabels:
+    """The labels of a scan.
 
     A segment that several objects list belongs to the last of them, as ScanNet's script writes one after the other.
     """
-    files = source if isinstance(source, LabelFiles) else find_scannet_files(source)
+    files = find_scannet_files(folder)
     if files is None:
-        raise InputError(f"{source}: no annotation of ScanNet; expected ID{AGGREGATION}, ID{SEGMENTS} and ID{MESH}")
+        raise InputError(f"{folder}: no annotation of ScanNet; expected ID{AGGREGATION}, ID{SEGMENTS} and ID{MESH}")
     groups, vertices, faces = _annotated_mesh(files, first_id=0)
     instances = np.zeros(len(vertices), np.int32)
     for group, rows in groups:
         instances[rows] = group.id + 1
+    meta = Path(str(files.annotation).removesuffix(AGGREGATION) + ".txt")
     return MeshLabels(
         vertices=vertices,
         instances=instances,
         objects=tuple((group.id + 1, group.label) for group, _ in groups),
         faces=faces,
-        aligned_from_world=None if files.meta is None else read_axis_alignment(files.meta),
+        aligned_from_world=read_axis_alignment(meta) if meta.is_file() else None,
     )
 
 
-def read_scannetpp_labels(source: Path | LabelFiles, *, names: Collection[str] | None = None) -> MeshLabels:
-    """The labels of a scene, of its folder or its files.
+def read_scannetpp_labels(folder: Path, *, names: Collection[str] | None = None) -> MeshLabels:
+    """The labels of a scene, of all objects or of those with some raw names.
 
     A vertex that several objects claim belongs to the one with the fewest vertices, and of equal ones to the first in
     the file. An object whose vertices all belong to others stays in the list.
     """
-    files = source if isinstance(source, LabelFiles) else find_scannetpp_files(source)
+    files = find_scannetpp_files(folder)
     if files is None:
         raise InputError(
-            f"{source}: no annotation of ScanNet++; expected scans/ with {ANNOTATION}, {SEGMENTS_PP}, {MESH_PP}"
+            f"{folder}: no annotation of ScanNet++; expected scans/ with {ANNOTATION}, {SEGMENTS_PP}, {MESH_PP}"
         )
     # Objects count from 1: the toolkit takes 0 for the background.
     groups, vertices, faces = _annotated_mesh(files, first_id=1, names=names)
@@ -229,7 +215,7 @@ def _annotated_mesh(
 ) -> tuple[list[tuple[SegmentGroup, Int64[np.ndarray, " n"]]], np.ndarray, np.ndarray | None]:
     """The objects of a scan with their vertices, and all vertices and faces of its mesh."""
     if files.missing:
-        raise InputError(f"{files.missing[0]}: no such file; the labels of {files.name} need it")
+        raise InputError(f"{files.missing}: no such file; the labels beside it need it")
     groups = [
         group for group in read_groups(files.annotation, first_id=first_id) if names is None or group.label in names
     ]
@@ -296,14 +282,11 @@ def find_labels(folder: Path, *, names: Collection[str] | None = None) -> MeshLa
     """The labels of a scene's mesh in the files of ScanNet or ScanNet++; None where there is no annotation.
 
     Args:
-        folder: of the scene (`Scene.folder`).
         names: of ScanNet++, raw names of the objects that are labeled (`read_scannetpp_labels`); None = all.
     """
-    scannet = find_scannet_files(folder)
-    if scannet is not None:
-        return read_scannet_labels(scannet)
-    scannetpp = find_scannetpp_files(folder)
-    return None if scannetpp is None else read_scannetpp_labels(scannetpp, names=names)
+    if find_scannet_files(folder) is not None:
+        return read_scannet_labels(folder)
+    return None if find_scannetpp_files(folder) is None else read_scannetpp_labels(folder, names=names)
 
 
 def labels_of_scan(folder: Path, raw_names: Collection[str]) -> MeshLabels:
@@ -325,35 +308,24 @@ def labels_of_layout(folder: Path, layout: str) -> MeshLabels | None:
         return None
     if files.missing:
         warnings.warn(
-            f"{files.missing[0]}: no such file, so that the scene has no objects; its annotation needs it",
+            f"{files.missing}: no such file, so that the scene has no objects; its annotation needs it",
             SceneWarning,
             stacklevel=3,
         )
         return None
-    return read_scannet_labels(files) if layout == "ScanNet" else read_scannetpp_labels(files)
+    return read_scannet_labels(folder) if layout == "ScanNet" else read_scannetpp_labels(folder)
 
 
 def is_placed(name: str) -> bool:
-    """Whether a raw name is that of a thing that stands, lies or hangs in a room.
-
-    That is every name but those of parts of the building (`STRUCTURE`: wall, floor, ceiling, door, window, column …)
-    and those that say nothing (`NAMELESS`: object, unknown, remove …); capitals do not matter. Benchmarks have no such
-    notion as small objects beside furniture, so that chairs and beds are placed here.
-    """
+    """Whether a raw name is that of a thing that stands, lies or hangs in a room: chairs and beds are placed, too."""
     plain = " ".join(name.lower().split())
     return plain not in STRUCTURE and plain not in NAMELESS and plain != ""
 
 
 def objects_of_labels(labels: MeshLabels) -> tuple[SceneObject, ...]:
-    """The objects of a labeled mesh, with boxes of their vertices along the axes of the world.
+    """The objects of a mesh in the world of the scene's poses, with boxes of their vertices along its axes.
 
-    The views that show them are not counted; `with_counted_views` does.
-
-    Args:
-        labels: in the world of the scene's poses.
-
-    Warns:
-        SceneWarning: objects whose vertices all belong to others are left out.
+    Objects whose vertices all belong to others are left out, with a warning. `with_counted_views` counts their views.
     """
     boxes = labels.boxes()
     if left_out := [name for number, name in labels.objects if number not in boxes]:
@@ -380,24 +352,17 @@ def objects_of_labels(labels: MeshLabels) -> tuple[SceneObject, ...]:
 
 def with_archived_instances(views: Views, folder: Path) -> Views:
     """Views of a ScanNet scan with the instance maps of SCAN_2d-instance-filt.zip, or else of SCAN_2d-instance.zip,
-    where one lies beside the annotation and the views have no pictures of instances of their own.
-
-    Args:
-        views: called as their color frames.
-
-    Warns:
-        SceneWarning: the archive is not used, since it lacks frames or its pictures have another size.
+    where one lies beside the annotation, has a picture in the photographs' size for each view, and the views have no
+    pictures of instances of their own.
     """
     scan = find_scannet_files(folder)
-    archives = () if scan is None else tuple(scan.annotation.with_name(f"{scan.name}{end}") for end in ARCHIVES)
+    archives = [] if scan is None else [Path(str(scan.annotation).removesuffix(AGGREGATION) + end) for end in ARCHIVES]
     archive = next((path for path in archives if path.is_file()), None)
     if archive is None or views.instances is not None or not len(views):
         return views
     members = members_by_stem(archive)
     stems = [PurePosixPath(name).stem for name in views.names]
-    missing = [stem for stem in stems if stem not in members]
-    fault = ""
-    if missing:
+    if missing := [stem for stem in stems if stem not in members]:
         fault = f"has no picture of {counted(len(missing), 'view')} of {len(stems)} (first: {missing[0]}.png)"
     else:
         maps = label_files([members[stem] for stem in stems], views, ArchivedLabels)
@@ -422,10 +387,25 @@ def with_mesh_instances(views: Views, labels: MeshLabels, origin: Float64[np.nda
     return replace(views, instances=MeshInstances(labels, views, origin))
 
 
-def with_counted_views(scene: Scene) -> Scene:
-    """A scene whose objects state in how many views they show, and their largest area in one.
+def count_pixels(views: Views, ids: Int64[np.ndarray, " N"]) -> Int64[np.ndarray, "V N"]:
+    """The area in pixels of each object in the instance map of each view."""
+    assert views.instances is not None
+    order = np.argsort(ids)
+    counts = np.zeros((len(views), len(ids)), np.int64)
+    for view in range(len(views)):
+        instances = views.instances[view]
+        if views.masks is not None:
+            instances = instances[views.masks[view]]
+        values, areas = np.unique(instances, return_counts=True)
+        rows = np.minimum(np.searchsorted(ids[order], values), len(ids) - 1)
+        known = ids[order][rows] == values
+        counts[view, order[rows[known]]] = areas[known]
+    return counts
 
-    They are counted in the instance maps, inside the masks of the views. A scene whose objects state it stays as it is.
+
+def with_counted_views(scene: Scene) -> Scene:
+    """A scene whose objects state in how many views they show, and their largest area in one, inside the masks of the
+    views. A scene whose objects state it stays as it is.
     """
     if all(each.views is not None and each.max_pixels is not None for each in scene.objects):
         return scene
@@ -434,23 +414,9 @@ def with_counted_views(scene: Scene) -> Scene:
             f"scene {scene.name}: in how many views its objects show is not known, and it has no instance maps to "
             "count in; expected a mesh with faces beside the annotation, or pictures of instances"
         )
-    ids = np.array([each.id for each in scene.objects], np.int64)
-    order = np.argsort(ids)
-    view_counts, largest = np.zeros(len(ids), np.int64), np.zeros(len(ids), np.int64)
-    for view in range(len(scene.views)):
-        instances = scene.views.instances[view]
-        if scene.views.masks is not None:
-            instances = instances[scene.views.masks[view]]
-        values, counts = np.unique(instances, return_counts=True)
-        rows = np.minimum(np.searchsorted(ids[order], values), len(ids) - 1)
-        has_row = ids[order][rows] == values
-        rows, counts = order[rows[has_row]], counts[has_row]
-        view_counts[rows] += 1
-        largest[rows] = np.maximum(largest[rows], counts)
-    return replace(
-        scene,
-        objects=tuple(
-            replace(each, views=int(views), max_pixels=int(pixels))
-            for each, views, pixels in zip(scene.objects, view_counts, largest, strict=True)
-        ),
+    counts = count_pixels(scene.views, np.array([each.id for each in scene.objects], np.int64))
+    objects = tuple(
+        replace(each, views=int(np.count_nonzero(areas)), max_pixels=int(areas.max(initial=0)))
+        for each, areas in zip(scene.objects, counts.T, strict=True)
     )
+    return replace(scene, objects=objects)

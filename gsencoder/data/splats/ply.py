@@ -47,17 +47,12 @@ _COLORS, _NORMALS = ("red", "green", "blue"), ("nx", "ny", "nz")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlyElement:
-    """One element of a header; `dtype` is None where a list property leaves the row size open.
-
-    `triangle` is the type of a row of an element with one list property and nothing else, if the list has three
-    entries: their count `n`, and `v`.
-    """
+    """One element of a header; `dtype` is None where a list property leaves the row size open."""
 
     name: str
     count: int
     dtype: np.dtype | None
     first_bad: str = ""
-    triangle: np.dtype | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +77,6 @@ def read_header(path: Path, stream: BinaryIO) -> PlyHeader:
     lines = head[: end.start()].decode("ascii", errors="replace").splitlines()
     encoding, order = "", "<"
     elements: list[tuple[str, int, list[tuple[str, str]], str]] = []
-    lists: dict[str, list[tuple[str, str]]] = {}
     for number, line in enumerate(lines[1:], start=2):
         words = line.split()
         match words:
@@ -93,9 +87,8 @@ def read_header(path: Path, stream: BinaryIO) -> PlyHeader:
                 order = ">" if encoding == "binary_big_endian" else "<"
             case ["element", name, digits] if digits.isascii() and digits.isdigit() and len(digits) < 20:
                 elements.append((name, int(digits), [], ""))
-            case ["property", "list", count_kind, entry_kind, name] if elements:
+            case ["property", "list", _, _, name] if elements:
                 elements[-1] = (*elements[-1][:3], name)
-                lists.setdefault(elements[-1][0], []).append((count_kind, entry_kind))
             case ["property", kind, name] if elements and kind in _TYPES:
                 elements[-1][2].append((name, order + _TYPES[kind]))
             case _:
@@ -110,17 +103,8 @@ def read_header(path: Path, stream: BinaryIO) -> PlyHeader:
         if len({field for field, _ in fields}) != len(fields):
             raise InputError(f"{path}: the .ply header repeats a property of element {name!r}")
         dtype = None if list_name else np.dtype(fields)
-        triangle = _triangle_type(lists.get(name, []), order) if not fields else None
-        parsed.append(PlyElement(name=name, count=count, dtype=dtype, first_bad=list_name, triangle=triangle))
+        parsed.append(PlyElement(name=name, count=count, dtype=dtype, first_bad=list_name))
     return PlyHeader(encoding=encoding, elements=tuple(parsed), start=end.end())
-
-
-def _triangle_type(lists: list[tuple[str, str]], order: str) -> np.dtype | None:
-    """The type of a row that is one list of three integers."""
-    kinds = [_TYPES.get(kind, "") for kind in lists[0]] if len(lists) == 1 else []
-    if not kinds or any(kind[:1] not in ("i", "u") for kind in kinds):
-        return None
-    return np.dtype([("n", order + kinds[0]), ("v", order + kinds[1], (3,))])
 
 
 def element_start(path: Path, header: PlyHeader, name: str, size: int) -> int:

@@ -1,6 +1,5 @@
 """Labels of meshes from the files of ScanNet and ScanNet++, and every way in which these can be wrong."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +39,6 @@ def test_the_segments_of_an_object_are_its_vertices_and_ids_are_counted_from_one
     assert labels.instances.tolist() == [1, 1, 4, 4, 4, 0]
     assert labels.objects == ((1, "couch"), (4, "office chair"))
     assert np.array_equal(labels.vertices, VERTICES)
-    assert labels.faces is not None
     assert np.array_equal(labels.faces, FACES)
     assert labels.aligned_from_world is None
     boxes = labels.boxes()
@@ -53,7 +51,6 @@ def test_boxes_of_the_aligned_frame_follow_axisAlignment(tmp_path: Path) -> None
     # A quarter turn about z takes (x, y) to (−y, x); then 10 are added to x.
     turn = np.array([[0, -1, 0, 10], [1, 0, 0, 0], [0, 0, 1, -2], [0, 0, 0, 1]], float)
     labels = read_scannet_labels(scan(tmp_path, alignment=turn))
-    assert labels.aligned_from_world is not None
     assert np.array_equal(labels.aligned_from_world, turn)
     aligned, world = labels.boxes(aligned=True), labels.boxes()
     # Of the chair: (0, 2, 0) → (8, 0, −2), (0, 0, 3) → (10, 0, 1), (4, 4, 4) → (6, 4, 2).
@@ -65,9 +62,7 @@ def test_of_two_objects_with_one_segment_the_later_one_has_it_as_in_scannets_scr
     groups = [group(0, "table", [7, 9]), group(1, "book", [9]), group(2, "wall", [2, 2, 2])]
     labels = read_scannet_labels(scan(tmp_path, groups=groups))
     assert labels.instances.tolist() == [1, 1, 3, 2, 2, 0]
-
-
-def test_an_object_without_a_vertex_left_has_no_box(tmp_path: Path) -> None:
+    # An object without a vertex left has no box.
     labels = read_scannet_labels(scan(tmp_path, groups=[group(0, "table", [9]), group(1, "book", [9])]))
     assert labels.objects == ((1, "table"), (2, "book"))
     assert list(labels.boxes()) == [2]
@@ -84,8 +79,7 @@ def test_files_are_found_in_the_folder_or_above_exported_frames(tmp_path: Path) 
     folder = scan(tmp_path)
     (folder / f"{NAME}_vh_clean.aggregation.json").write_text("{}")
     files = find_scannet_files(folder)
-    assert files is not None
-    assert files.name == NAME
+    assert files.annotation == folder / f"{NAME}.aggregation.json"
     (folder / "exported").mkdir()
     assert find_scannet_files(folder / "exported") == files
     assert find_scannet_files(tmp_path) is None
@@ -110,8 +104,11 @@ def test_meshes_of_every_encoding_keep_the_order_of_vertices(tmp_path: Path, tex
     path = write_ply(tmp_path / "a.ply", vertices, faces, labels=nyu40, text=text, order=order)
     read, triangles = read_mesh(path)
     assert np.array_equal(read, vertices)
-    assert triangles is not None
     assert np.array_equal(triangles, faces)
+    faces[1, 2] = -1
+    write_ply(path, vertices, faces, text=text, order=order)
+    with pytest.raises(InputError, match=r"face 1 names vertex -1 of 50"):
+        read_mesh(path)
 
 
 def test_a_cloud_has_no_triangles(tmp_path: Path) -> None:
@@ -134,27 +131,19 @@ def error_of(folder: Path) -> str:
         ({"groups": [group(0, "a", [7]), group(0, "b", [9])]}, "anno", "segGroups[1]: objectId 0 is already that of"),
         ({"groups": [group(5, "a", [])]}, "anno", "segGroups[0] (objectId 5): 'a' has no segments"),
         ({"groups": [group(-1, "a", [7])]}, "anno", "segGroups[0]: objectId must be a whole number from 0, got -1"),
-        ({"groups": [{"label": "a", "segments": [7]}]}, "anno", "segGroups[0]: objectId must be a whole number"),
-        ({"groups": [group(0, "a", [7.5])]}, "anno", "segments[0]: expected a whole number, got 7.5"),
         ({"groups": [group(0, "a", [7, True])]}, "anno", "segments[1]: expected a whole number, got True"),
+        ({"groups": [group(2**31 - 1, "a", [7])]}, "anno", "objectId must be a whole number from 0, got 2147483647"),
+        ({"groups": [group(True, "a", [7])]}, "anno", "objectId must be a whole number from 0, got True"),
         ({"groups": [{**group(0, "a", [7]), "label": None}]}, "anno", "label must be a name, got nothing"),
         ({"groups": [{**group(0, "a", [7]), "segments": "7"}]}, "anno", "segments must be a list"),
-        ({"groups": ["couch"]}, "anno", "segGroups[0]: expected an object with objectId"),
         ({"groups": [group(0, "x" * 1001, [7])]}, "anno", "label has 1,001 characters"),
         ({"segments": SEGMENTS[:5]}, "segs", "segIndices has 5 entries, but"),
         ({"segments": [7, 7, 2, 9, 9, "4"]}, "segs", "segIndices[5]: expected a whole number, got '4'"),
-        ({"segments": [7, 7, 2, 9, 9, None]}, "segs", "segIndices[5]: expected a whole number, got nothing"),
-        ({"segments": [7, 7, 2, 9, [9], 4]}, "segs", "segIndices[4]: expected a whole number, got a list"),
         ({"segments": [7, 7, 2, 9, 9, 2**70]}, "segs", "segIndices[5]: expected a whole number"),
         ({"segments": []}, "segs", "segIndices is empty"),
-        (
-            {"vertices": np.where(np.arange(6)[:, None] == 4, np.nan, VERTICES)},
-            "mesh",
-            "vertex 4 is not finite (1 of 6)",
-        ),
+        ({"vertices": np.where(np.arange(6)[:, None] == 4, np.inf, VERTICES)}, "mesh", "vertex 4 is not finite (1 of"),
         ({"vertices": VERTICES[:0], "faces": None}, "mesh", "holds no vertices"),
         ({"faces": np.array([[0, 1, 2], [3, 4, 6]])}, "mesh", "face 1 names vertex 6 of 6"),
-        ({"faces": np.array([[0, -1, 2]])}, "mesh", "face 0 names vertex -1 of 6"),
     ],
 )
 def test_a_wrong_entry_is_one_line_that_names_file_and_entry(
@@ -166,9 +155,7 @@ def test_a_wrong_entry_is_one_line_that_names_file_and_entry(
     assert problem in message
 
 
-@pytest.mark.parametrize(
-    "content", ["[]", "3", "null", "{}", '{"segGroups": {}, "segIndices": 3}', "", "{", "\x00", "NaN"]
-)
+@pytest.mark.parametrize("content", ["[]", '{"segGroups": {}, "segIndices": 3}', "", "NaN", "[" * 200_000])
 @pytest.mark.parametrize("file", ["anno", "segs"])
 def test_json_of_the_wrong_kind_is_refused(tmp_path: Path, content: str, file: str) -> None:
     folder = scan(tmp_path)
@@ -177,24 +164,9 @@ def test_json_of_the_wrong_kind_is_refused(tmp_path: Path, content: str, file: s
     assert str(path) in error_of(folder)
 
 
-def test_annotation_and_segments_in_each_others_place_are_refused(tmp_path: Path) -> None:
-    folder = scan(tmp_path)
-    anno, segs = (folder / f"{NAME}{SUFFIXES[key]}" for key in ("anno", "segs"))
-    content = anno.read_text()
-    anno.write_text(segs.read_text())
-    assert "expected an object with the list 'segGroups', the objects; got an object with params, sceneId" in error_of(
-        folder
-    )
-    anno.write_text(content)
-    segs.write_text(content)
-    assert "expected an object with the list 'segIndices'" in error_of(folder)
-
-
-def test_deeply_nested_and_gigantic_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gigantic_files_are_refused(tmp_path: Path) -> None:
     folder = scan(tmp_path)
     path = folder / f"{NAME}{SUFFIXES['segs']}"
-    path.write_text("[" * 200_000)
-    assert "not a readable JSON file" in error_of(folder)
     with path.open("wb") as stream:
         stream.truncate(segment_files.MAX_BYTES + 1)
     assert "536,870,913 bytes; at most 536,870,912 are read" in error_of(folder)
@@ -208,7 +180,7 @@ def test_a_missing_file_is_named(tmp_path: Path, file: str) -> None:
     assert (str(path) if file != "anno" else "no annotation of ScanNet") in error_of(folder)
 
 
-@pytest.mark.parametrize("keep", [0, 2, 40, 300, -5, -30])
+@pytest.mark.parametrize("keep", [0, 40, -5, -30])
 def test_truncated_meshes_are_refused(tmp_path: Path, keep: int) -> None:
     folder = scan(tmp_path)
     path = folder / f"{NAME}{SUFFIXES['mesh']}"
@@ -216,23 +188,13 @@ def test_truncated_meshes_are_refused(tmp_path: Path, keep: int) -> None:
     assert str(path) in error_of(folder)
 
 
-def test_meshes_of_other_polygons_and_other_files_are_refused(tmp_path: Path) -> None:
+def test_what_is_no_mesh_is_refused(tmp_path: Path) -> None:
     path = write_ply(tmp_path / "a.ply", VERTICES, FACES)
     good = path.read_bytes()
-    data = bytearray(good)
-    data[-13] = 4
-    path.write_bytes(data)
-    with pytest.raises(InputError, match="face 1 has 4 vertices; expected triangles"):
-        read_mesh(path)
-    path.write_bytes(good.replace(b"list uchar int", b"list uchar float"))
-    with pytest.raises(InputError, match="faces with one list of vertices each"):
-        read_mesh(path)
-    path.write_bytes(good.replace(b"element vertex 6", b"element vertex 9999999999"))
-    with pytest.raises(InputError, match="claims 9,999,999,999 vertices"):
-        read_mesh(path)
-    path.write_bytes(b"PK\x03\x04")
-    with pytest.raises(InputError, match="not a .ply file"):
-        read_mesh(path)
+    for content in (b"PK\x03\x04", good.replace(b"element vertex 6", b"element vertex 9999999999")):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match="not a mesh that trimesh can read"):
+            read_mesh(path)
     with pytest.raises(InputError, match="cannot be read"):
         read_mesh(tmp_path / "missing.ply")
 
@@ -279,13 +241,6 @@ def test_of_overlapping_objects_of_scannetpp_the_smallest_has_the_vertex(tmp_pat
     assert some.objects == ((1, "table"), (7, "screen"))
 
 
-def test_objects_after_the_third_of_a_vertex_are_not_looked_at(tmp_path: Path) -> None:
-    segments = np.array([1, 1, 2, 2, 3])
-    groups = [group(1, "a", [1, 2, 3]), group(2, "b", [1, 2]), group(3, "c", [1, 2]), group(4, "d", [1])]
-    folder = write_scannetpp_labels(tmp_path / "scene", np.zeros((5, 3), np.float32), segments, groups)
-    assert read_scannetpp_labels(folder).instances.tolist() == [2, 2, 2, 2, 1]
-
-
 def test_objects_of_scannetpp_count_from_one(tmp_path: Path) -> None:
     folder = write_scannetpp_labels(tmp_path / "s", VERTICES, SEGMENTS, [group(0, "a", [7])])
     with pytest.raises(InputError, match="objectId must be a whole number from 1, got 0"):
@@ -297,91 +252,20 @@ def test_objects_of_scannetpp_count_from_one(tmp_path: Path) -> None:
         read_scannetpp_labels(tmp_path)
 
 
-def test_labels_that_contradict_each_other_are_refused(no_jaxtyping: None) -> None:
-    none = np.zeros(2, np.int32)
-    points = np.zeros((2, 3), np.float32)
-    with pytest.raises(InputError, match="instances: expected 0 or the id of an object, got 3 in row 1"):
-        MeshLabels(vertices=points, instances=np.array([1, 3], np.int32), objects=((1, "a"),))
-    with pytest.raises(InputError, match="objects: expected unique ids, got 2 twice"):
-        MeshLabels(vertices=points, instances=none, objects=((2, "a"), (2, "b")))
-    with pytest.raises(InputError, match="objects: expected ids from 1, got 0"):
-        MeshLabels(vertices=points, instances=none, objects=((0, "a"),))
-    with pytest.raises(InputError, match="vertices: expected finite"):
-        MeshLabels(vertices=points * np.float32(np.nan), instances=none, objects=())
-    with pytest.raises(InputError, match=r"instances: expected int32\[2\]"):
-        MeshLabels(vertices=points, instances=none[:1], objects=())
-    with pytest.raises(InputError, match="faces: expected rows of 2 vertices"):
-        MeshLabels(vertices=points, instances=none, objects=(), faces=np.array([[0, 1, 2]], np.int32))
-
-
-def test_a_scan_of_two_hundred_thousand_vertices_is_read_by_its_segments(tmp_path: Path) -> None:
-    count = 200_000
-    vertices = np.random.default_rng(0).normal(size=(count, 3)).astype(np.float32)
-    segments = np.arange(count) // 50
-    groups = [group(number, "thing", list(range(number, count // 50, 40))) for number in range(40)]
-    labels = read_scannet_labels(scan(tmp_path, vertices=vertices, segments=segments, groups=groups, faces=None))
-    assert np.array_equal(labels.instances, 1 + (np.arange(count) // 50) % 40)
-
-
-def test_json_of_an_annotation_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
-    folder = scan(tmp_path)
-    path = folder / f"{NAME}{SUFFIXES['anno']}"
-    path.write_text("\ufeff" + json.dumps({"segGroups": GROUPS}), encoding="utf-8")
-    assert len(read_scannet_labels(folder).objects) == 2
-
-
-def test_coordinates_are_finite_and_those_of_float32(tmp_path: Path) -> None:
-    for wrong in (np.nan, np.inf, -np.inf, np.finfo(np.float32).max):
-        vertices = VERTICES.copy()
-        vertices[4, 1] = wrong
-        with pytest.raises(InputError, match=r"vertex 4 is not finite \(1 of 6\); get the file anew"):
-            read_mesh(write_ply(tmp_path / "a.ply", vertices, FACES))
-
-
-@pytest.mark.parametrize("text", [False, True])
-def test_faces_keep_the_order_of_their_vertices_and_name_vertices_that_are_there(tmp_path: Path, text: bool) -> None:
-    faces = np.array([[5, 0, 3], [1, 4, 2]])
-    read = read_mesh(write_ply(tmp_path / "a.ply", VERTICES, faces, text=text))[1]
-    assert read is not None
-    assert read.tolist() == faces.tolist()
-    for wrong in (-1, 6):
-        with pytest.raises(InputError, match=f"face 1 names vertex {wrong} of 6"):
-            read_mesh(write_ply(tmp_path / "a.ply", VERTICES, np.array([[5, 0, 3], [1, 4, wrong]]), text=text))
-
-
 @pytest.mark.parametrize(
-    ("number", "fits"), [(2**31 - 2, True), (2**31 - 1, False), (-1, False), (True, False), (1.0, False)]
+    ("changes", "message"),
+    [
+        ({"instances": np.array([1, 3], np.int32)}, "instances: expected 0 or the id of an object, got 3 in row 1"),
+        ({"objects": ((2, "a"), (2, "b"))}, "objects: expected unique ids, got 2 twice"),
+        ({"objects": ((0, "a"),)}, "objects: expected ids from 1, got 0"),
+        ({"vertices": np.full((2, 3), np.nan, np.float32)}, "vertices: expected finite"),
+        ({"instances": np.zeros(1, np.int32)}, r"instances: expected int32\[2\]"),
+        ({"faces": np.array([[0, 1, 2]], np.int32)}, "faces: expected rows of 2 vertices"),
+    ],
 )
-def test_the_objectId_and_the_number_after_it_fit_into_int32(tmp_path: Path, number: Any, fits: bool) -> None:
-    groups = [group(0, "couch", [7]), group(number, "lamp", [9])]
-    if fits:
-        assert read_scannet_labels(scan(tmp_path, groups=groups)).instances.max() == number + 1
-        return
-    problem = error_of(scan(tmp_path, groups=groups))
-    assert f"segGroups[1]: objectId must be a whole number from 0, got {number}" in problem
-
-
-@pytest.mark.parametrize("number", [2**63 - 1, -(2**63)])
-def test_segments_are_numbers_of_64_bits(tmp_path: Path, number: int) -> None:
-    segments = [7, 7, 2, 9, number, 4]
-    groups = [group(0, "couch", [number, 7])]
-    labels = read_scannet_labels(scan(tmp_path, segments=segments, groups=groups))
-    assert labels.instances.tolist() == [1, 1, 0, 0, 1, 0]
-    beyond = number + (1 if number > 0 else -1)
-    problem = error_of(scan(tmp_path, segments=[7, 7, 2, 9, beyond, 4], groups=groups))
-    assert "segIndices[4]: expected a whole number, got " in problem
-
-
-def test_names_of_objects_have_at_most_a_thousand_characters(tmp_path: Path) -> None:
-    long = read_scannet_labels(scan(tmp_path, groups=[group(0, "a" * 1000, [7])]))
-    assert long.objects == ((1, "a" * 1000),)
-    assert "label has 1,001 characters" in error_of(scan(tmp_path, groups=[group(0, "a" * 1001, [7])]))
-
-
-def test_of_equally_large_objects_of_scannetpp_the_first_has_the_vertex(tmp_path: Path) -> None:
-    groups = [group(8, "table", [7, 9]), group(2, "cloth", [9, 7]), group(5, "cup", [9])]
-    folder = write_scannetpp_labels(tmp_path, VERTICES, SEGMENTS, groups, faces=FACES)
-    assert read_scannetpp_labels(folder).instances.tolist() == [8, 8, 0, 5, 5, 0]
-    # A name that is left out claims nothing.
-    some = read_scannetpp_labels(folder, names=("cloth", "lamp"))
-    assert (some.instances.tolist(), some.objects) == ([2, 2, 0, 2, 2, 0], ((2, "cloth"),))
+def test_labels_that_contradict_each_other_are_refused(
+    no_jaxtyping: None, changes: dict[str, Any], message: str
+) -> None:
+    parts = {"vertices": np.zeros((2, 3), np.float32), "instances": np.zeros(2, np.int32), "objects": ((1, "a"),)}
+    with pytest.raises(InputError, match=message):
+        MeshLabels(**(parts | changes))

