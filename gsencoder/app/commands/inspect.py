@@ -331,13 +331,11 @@ def check_lines(facts: dict[str, Any], depth: DepthCheck | None, matches: Epipol
     if depth is not None:
         agreement = depth.given
         if depth.comparable:
-            near, far = depth.offsets
             lines.append(
                 f"depth of {len(depth.views)} of {facts['views']:,} views carried into each other: "
                 f"{agreement.share:.0%} agree within 2 % where seen ({agreement.compared:,} comparisons); median "
-                f"offset {_percent(agreement.offset, sign=True)}"
+                f"offset {agreement.offset:+.2%}"
             )
-            lines.append(f"median offset of neighbors {_percent(near)}, of views far apart {_percent(far)}")
         else:
             lines.append("depth: by their poses no two views see the same place, so it cannot be compared")
         if np.isfinite(depth.color):
@@ -364,12 +362,6 @@ def check_lines(facts: dict[str, Any], depth: DepthCheck | None, matches: Epipol
     return lines
 
 
-def _percent(value: float, *, sign: bool = False) -> str:
-    if not np.isfinite(value):
-        return "unknown"
-    return f"{value:+.2%}" if sign else f"{value:.2%}"
-
-
 def finding_line(finding: Finding) -> str:
     """A finding as one line."""
     return f"view {finding.view}: {finding.message}" if finding.view is not None else finding.message
@@ -384,8 +376,6 @@ def check_results(depth: DepthCheck | None, matches: EpipolarCheck | None) -> di
             "comparisons": depth.given.compared,
             "share": depth.given.share,
             "offset": depth.given.offset,
-            "offset_near": depth.offsets[0],
-            "offset_far": depth.offsets[1],
             "best_share": depth.best.share,
             "color_correlation": depth.color,
         }

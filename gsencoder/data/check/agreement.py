@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 
 from gsencoder.data.readers.depth_images import ray_lengths
 from gsencoder.types import Cameras, Views
@@ -230,62 +230,32 @@ def agreement(residual: Float64[np.ndarray, "*n"]) -> Agreement:
     )
 
 
-def pair_offsets(residual: Float64[np.ndarray, "V V n"]) -> tuple[float, float]:
-    """The median size of the offset (median r) of pairs of views: of those up to three places apart in the order of the
-    files, and of those at least half the views apart; NaN where there are no such pairs. Poses that drift have a second
-    number well above the first."""
-    count = len(residual)
-    near: list[float] = []
-    far: list[float] = []
-    for view, other in np.ndindex(count, count):
-        distance = abs(view - other)
-        inliers = residual[view, other][np.abs(residual[view, other]) <= CLIP]
-        if len(inliers) >= MIN_SAMPLES and (distance <= 3 or distance >= count / 2):
-            (near if distance <= 3 else far).append(abs(float(np.median(inliers))))
-    return tuple(float(np.median(each)) if each else float("nan") for each in (near, far))  # type: ignore[return-value]
-
-
-def grey_pictures(views: Views, rows: Int64[np.ndarray, " V"], shape: tuple[int, int]) -> Float32[np.ndarray, "V h w"]:
-    """Photographs in grey, 0 to 1, at the size of the small depth images."""
+def grey_picture(views: Views, row: int, width: int, height: int) -> Float64[np.ndarray, "h w"]:
+    """A photograph in grey, 0 to 1."""
     from PIL import Image
 
     assert views.images is not None
-    pictures = []
-    for view in rows:
-        grey = Image.fromarray(views.images[int(view)]).convert("L").resize(shape[::-1], Image.Resampling.BOX)
-        pictures.append(np.asarray(grey, np.float32) / 255)
-    return np.stack(pictures)
+    grey = Image.fromarray(views.images[row]).convert("L").resize((width, height), Image.Resampling.BOX)
+    return np.asarray(grey, np.float64) / 255
 
 
 def color_correlations(
-    views: DepthViews, grey: Float32[np.ndarray, "V h w"], Ks: Float64[np.ndarray, "V 3 3"]
+    views: DepthViews, grey: Float[np.ndarray, "V h w"], Ks: Float64[np.ndarray, "V 3 3"]
 ) -> Float64[np.ndarray, "V V"]:
     """Correlation of the intensities of one place in view i and view j; NaN where they share too few places.
 
-    A place is shared where the depth of both agrees within `TOLERANCE`.
-
-    Args:
-        grey: photographs at the size of the depth images.
+    A place is shared where the depth of both agrees within `TOLERANCE`. `grey` has the size of the depth images.
     """
     result = np.full((len(views), len(views)), np.nan)
+    height, width = grey.shape[1:]
     for view, other, here, there in shared_samples(views, MIN_SAMPLES):
-        intensities, in_view = _intensities(grey[view], Ks[view], here)
-        other_intensities, in_other_view = _intensities(grey[other], Ks[other], there)
-        pair = intensities[in_view & in_other_view], other_intensities[in_view & in_other_view]
-        if len(pair[0]) >= MIN_SAMPLES and min(values.std() for values in pair) > 1e-3:
-            result[view, other] = np.corrcoef(*pair)[0, 1]
+        pixels = np.stack((project_points(here, Ks[view]), project_points(there, Ks[other])))
+        in_both = ((pixels >= 0) & (pixels < (width, height))).all(axis=(0, 2))
+        columns, rows = np.floor(pixels[:, in_both]).astype(np.int64).transpose(2, 0, 1)
+        pair = grey[[[view], [other]], rows, columns]
+        if len(pair[0]) >= MIN_SAMPLES and pair.std(axis=1).min() > 1e-3:
+            result[view, other] = np.corrcoef(pair)[0, 1]
     return result
-
-
-def _intensities(
-    grey: Float32[np.ndarray, "h w"], K: Float64[np.ndarray, "3 3"], local: Float64[np.ndarray, "n 3"]
-) -> tuple[Float32[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """The intensity where points in camera axes project, and whether that is in the picture."""
-    height, width = grey.shape
-    pixels = project_points(local, K)
-    in_view = np.asarray((pixels >= 0).all(axis=1) & (pixels < (width, height)).all(axis=1))
-    columns, rows = np.floor(np.where(in_view[:, None], pixels, 0)).astype(np.int64).T
-    return grey[rows, columns], in_view
 
 
 def view_correlations(correlations: Float64[np.ndarray, "V V"]) -> Float64[np.ndarray, " V"]:
@@ -332,8 +302,7 @@ def fit_registration(views: Views, rows: Int64[np.ndarray, " V"], depth: DepthVi
     """The color camera under which photographs show the same details where their depth agrees.
 
     Args:
-        rows: the rows of the views that are compared.
-        depth: their depth images, under the reading that fits best.
+        rows: of the views whose depth images are given, under the reading that fits best.
     """
     pairs = sorted(shared_samples(depth, MIN_SHARED), key=lambda pair: -len(pair[2]))[:MAX_PAIRS]
     nothing = RegistrationFit(focal_factor=1.0, shift=np.zeros(2), given=np.nan, best=np.nan, pairs=len(pairs))
@@ -381,13 +350,10 @@ def fit_registration(views: Views, rows: Int64[np.ndarray, " V"], depth: DepthVi
 
 
 def _details(views: Views, row: int, width: int, height: int) -> Float64[np.ndarray, "h w"]:
-    from PIL import Image
     from scipy.ndimage import gaussian_filter
 
-    assert views.images is not None
-    grey = Image.fromarray(views.images[row]).convert("L").resize((width, height), Image.Resampling.BOX)
-    values = np.asarray(grey, np.float64) / 255
-    return np.asarray(gaussian_filter(values, FINE) - gaussian_filter(values, COARSE))
+    grey = grey_picture(views, row, width, height)
+    return np.asarray(gaussian_filter(grey, FINE) - gaussian_filter(grey, COARSE))
 
 
 def _correlation(

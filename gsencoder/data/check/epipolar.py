@@ -8,7 +8,6 @@ compared in the pairs with its nearest neighbors, and it is called astray only i
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -25,6 +24,7 @@ from gsencoder.data.seeding.matches import (
     typical_distance,
 )
 from gsencoder.types import Cameras, Views
+from gsencoder.types.scene import unproject_points
 
 PICTURE_SIZE = 640  # Longer side in pixels of the photographs that are matched
 FEATURES = 1000
@@ -53,8 +53,6 @@ STRAY_SHARE = 0.25
 """… this share of their matches is in pairs that fit. It is astray if it has another pose under which two pairs fit
 and …"""
 MOVED_SHARE = 0.5  # … this share of the matches is in pairs that do
-STEPS = 12
-STARTS = 4  # Poses from which that one is looked for, the best that two pairs give
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -291,119 +289,59 @@ def _stray_views(cameras: Cameras, matches: Sequence[PairMatches], names: Sequen
 
 
 def fit_pose_to_matches(cameras: Cameras, view: int, matches: Sequence[PairMatches]) -> Cameras:
-    """The cameras with the pose of one view under which its matches lie nearest to their epipolar lines.
+    """The cameras with the pose of one view under which the rays of its matches lie nearest to their epipolar planes.
 
-    Its turn against each other view comes from the essential matrix of the pair; it stands where the directions of two
-    of them meet, or where it is said to be, or where one of the others is. The best of these is refined.
-
-    Args:
-        matches: pairs of it and others, whose poses stay.
+    It begins at the generalized relative pose between the other views, as one rig, and this one, or at the pose that it
+    has, whichever ends at smaller distances. The poses of the others stay.
     """
+    from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    centers, turns = cameras.centers, cameras.cam_from_world[:, :3, :3].astype(np.float64)
-    unproject = np.linalg.inv(cameras.Ks.astype(np.float64))
-    ends = [_ends(view, pair) for pair in matches]
-    others = [other for other, _, _ in ends]
-    pair = np.repeat(np.arange(len(ends)), [len(here) for _, _, here in ends])
-    there = np.concatenate([_homogeneous(pixels) for _, pixels, _ in ends])
-    here = np.concatenate([_homogeneous(pixels) for _, _, pixels in ends])
-    rays_there = unproject[others].mT @ turns[others]
+    ends = [((each.first, each.first_pixels), (each.second, each.second_pixels)) for each in matches]
+    there, here = zip(*(sorted(end, key=lambda one: one[0] == view) for end in ends), strict=True)
+    pixels_there, pixels_here = (np.concatenate([pixels for _, pixels in side]) for side in (there, here))
+    others = [other for other, pixels in there for _ in pixels]
+    Ks, reach = cameras.Ks.astype(np.float64), typical_distance(cameras)
+    rays = unproject_points(pixels_here, np.ones(len(others)), Ks[view])
+    directions = np.concatenate([_directions(cameras, other, pixels) for other, pixels in there])
+    centers = cameras.centers[others]
 
-    def lines(rotation: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """x₂ᵀ F x₁ of all matches and the lengths of the normals of their lines here and there."""
-        across = np.cross((centers[others] - center)[:, None], rays_there)
-        fundamental = (unproject[view].T @ rotation @ across.mT)[pair]
-        own_lines = np.einsum("mij,mj->mi", fundamental, there)
-        other_lines = np.einsum("mji,mj->mi", fundamental, here)
-        lengths = (np.maximum(np.linalg.norm(each[:, :2], axis=1), 1e-12) for each in (own_lines, other_lines))
-        return np.einsum("mi,mi->m", own_lines, here), *lengths
+    def distances(pose: np.ndarray) -> np.ndarray:
+        """In pixels, by a rotation vector and a translation in units of `reach`."""
+        rotation = Rotation.from_rotvec(pose[:3])
+        normals = np.cross(rotation.apply(centers) + reach * pose[3:], rotation.apply(directions))
+        sines = np.einsum("mi,mi->m", normals, rays) / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+        return np.asarray(Ks[view, 0, 0] * sines)
 
-    def error(rotation: np.ndarray, center: np.ndarray) -> float:
-        product, own, other = lines(rotation, center)
-        return _clipped(np.abs(product) / np.minimum(own, other))
-
-    def sampson(rotation: np.ndarray, center: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """Signed distances to first order (Hartley and Zisserman, eq. 11.9)."""
-        product, own, other = lines(Rotation.from_rotvec(step[:3]).as_matrix() @ rotation, center + reach * step[3:])
-        return product / np.hypot(own, other)
-
-    relative = [_relative_pose(cameras, view, pair) for pair in matches]
-    known = [(centers[other], rotation, direction) for other, rotation, direction in filter(None, relative)]
-    candidates = [(rotation, center) for start, rotation, _ in known for center in (centers[view], start)] + [
-        (rotation, _nearest_point(first, direction, second, other))
-        for (first, rotation, direction), (second, turned, other) in permutations(known, 2)
-        for rotation in (rotation, turned)
-    ]
-    candidates.append((turns[view], centers[view]))
-    candidates.sort(key=lambda candidate: error(*candidate))
-    reach = typical_distance(cameras)
-    fitted = [candidates[0]]
-    for rotation, center in candidates[:STARTS]:
-        for _ in range(STEPS):
-            now = sampson(rotation, center, np.zeros(6))
-            jacobian = np.stack([(sampson(rotation, center, 1e-6 * unit) - now) / 1e-6 for unit in np.eye(6)], axis=1)
-            weighted = jacobian / (1 + np.square(now))[:, None]
-            system = jacobian.T @ weighted
-            step = np.linalg.solve(system + 1e-6 * np.trace(system) * np.eye(6), -weighted.T @ now)
-            rotation, center = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation, center + reach * step[3:]
-            if np.abs(step).max() < 1e-5:
-                break
-        fitted.append((rotation, center))
-    rotation, center = min(fitted, key=lambda candidate: error(*candidate))
-    poses = cameras.cam_from_world.copy()
-    poses[view, :3, :3], poses[view, :3, 3] = rotation, -rotation @ center
-    return replace(cameras, cam_from_world=poses)
-
-
-def _homogeneous(pixels: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 3"]:
-    return np.column_stack((pixels, np.ones(len(pixels))))
-
-
-def _ends(view: int, pair: PairMatches) -> tuple[int, Float64[np.ndarray, "M 2"], Float64[np.ndarray, "M 2"]]:
-    """The other view of a pair, the pixels there and those in this view."""
-    if pair.second == view:
-        return pair.first, pair.first_pixels, pair.second_pixels
-    return pair.second, pair.second_pixels, pair.first_pixels
-
-
-def _relative_pose(
-    cameras: Cameras, view: int, pair: PairMatches
-) -> tuple[int, Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3"]] | None:
-    """The other view of a pair, the rotation cam_from_world that the view has against it, and the direction in which it
-    stands from there."""
     pycolmap = load_pycolmap()
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = INLIER_ERROR, 0
     # All matches fit one fundamental matrix, so that few are wrong here.
-    options.min_num_trials, options.max_num_trials = 50, 2000
-    other, there, here = _ends(view, pair)
+    options.min_num_trials, options.max_num_trials = 20, 200
+    rig = [pycolmap.Rigid3d(pose[:3].astype(np.float64)) for pose in cameras.cam_from_world]
+    rig[view] = pycolmap.Rigid3d()
     models = [
-        pycolmap.Camera(
-            model="PINHOLE",
-            width=int(cameras.widths[row]),
-            height=int(cameras.heights[row]),
-            params=cameras.Ks[row][(0, 1, 0, 1), (0, 1, 2, 2)].astype(float).tolist(),
-        )
-        for row in (other, view)
+        pycolmap.Camera(model="PINHOLE", width=int(width), height=int(height), params=K[(0, 1, 0, 1), (0, 1, 2, 2)])
+        for K, width, height in zip(Ks, cameras.widths, cameras.heights, strict=True)
     ]
-    found = pycolmap.estimate_essential_matrix(there, here, *models, options)
-    if found is None:
-        return None
-    matrix = found["cam2_from_cam1"].matrix()
-    of_other = cameras.cam_from_world[other, :3, :3].astype(np.float64)
-    return other, matrix[:, :3] @ of_other, of_other.T @ (-matrix[:, :3].T @ matrix[:, 3])
+    found = pycolmap.estimate_generalized_relative_pose(
+        pixels_there, pixels_here, others, [view] * len(others), rig, models, options
+    )
+    starts = [cameras.cam_from_world[view, :3].astype(np.float64)]
+    # Of others in one place it gives no distance.
+    if found is not None and found.get("rig2_from_rig1") is not None:
+        starts.append(found["rig2_from_rig1"].matrix())
+    fitted = []
+    for start in starts:
+        pose = np.concatenate((Rotation.from_matrix(start[:, :3]).as_rotvec(), start[:, 3] / reach))
+        pose = least_squares(distances, pose, loss="cauchy", max_nfev=30).x
+        poses = cameras.cam_from_world.copy()
+        poses[view, :3, :3], poses[view, :3, 3] = Rotation.from_rotvec(pose[:3]).as_matrix(), reach * pose[3:]
+        fitted.append(replace(cameras, cam_from_world=poses))
+    return min(fitted, key=lambda candidate: mean_error(candidate, matches))
 
 
-def _nearest_point(
-    first: Float64[np.ndarray, "3"],
-    direction: Float64[np.ndarray, "3"],
-    second: Float64[np.ndarray, "3"],
-    other: Float64[np.ndarray, "3"],
-) -> Float64[np.ndarray, "3"]:
-    """The point nearest to two lines; of nearly parallel ones the middle between their starts."""
-    across = [np.eye(3) - np.outer(ray, ray) for ray in (direction, other)]
-    system = across[0] + across[1]
-    if np.linalg.cond(system) > 1e6:
-        return (first + second) / 2
-    return np.asarray(np.linalg.solve(system, across[0] @ first + across[1] @ second))
+def _directions(cameras: Cameras, view: int, pixels: Float64[np.ndarray, "M 2"]) -> Float64[np.ndarray, "M 3"]:
+    """Of the rays of pixels, in the world."""
+    local = unproject_points(pixels, np.ones(len(pixels)), cameras.Ks[view].astype(np.float64))
+    return np.asarray(local @ cameras.cam_from_world[view, :3, :3].astype(np.float64))

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from gsencoder.core.arrays import even_indices
-from gsencoder.core.errors import SceneWarning, listed
+from gsencoder.core.errors import SceneWarning
 from gsencoder.core.process import Track, untracked
 from gsencoder.data.check.agreement import (
     CLIP,
@@ -19,8 +19,7 @@ from gsencoder.data.check.agreement import (
     depth_at,
     depth_views,
     fit_registration,
-    grey_pictures,
-    pair_offsets,
+    grey_picture,
     residuals,
     view_correlations,
     world_samples,
@@ -130,7 +129,6 @@ OFF_CENTER = 1.3
 """A principal point this many times as far right and down as the middle, or more, is that of a larger picture; one that
 is this many times as near to the corner, that of a smaller one …"""
 EQUALLY = 0.05  # … if it is equally far right and down, to this share
-PHOTOGRAPHS = 4  # Photographs that are looked at for pictures of one color
 SUSPICIOUS = 0.9  # `suspicious_depth` looks for the cause where a smaller share of the depth agrees
 
 
@@ -146,7 +144,6 @@ class DepthCheck:
     views: Int64[np.ndarray, " V"]  # rows of the views that were looked at
     given: Agreement  # agreement of depth as the files have it
     best: Agreement  # that of the reading that fits best; `given` unless a finding names another
-    offsets: tuple[float, float]  # see `pair_offsets`, under the reading that fits best
     findings: tuple[Finding, ...]  # what is wrong, causes that concern all views first
     color: float  # median correlation of the photographs' intensities at the same places; NaN without photographs
     registration: RegistrationFit | None  # of photographs and depth; None without photographs
@@ -210,18 +207,10 @@ def fit_of(depth: DepthCheck | None, matches: EpipolarCheck | None) -> float:
 
 
 def warn_of_faults(scene: Scene) -> None:
-    """Warns if a quick look at a scene's photographs and depth images says that they, or the poses, are wrong."""
+    """Warns if a quick look at a scene's intrinsics and depth images says that they, or the poses, are wrong."""
     views = scene.views
     if views is None:
         return
-    plain, checked = plain_photographs(views)
-    if plain:
-        warnings.warn(
-            f"scene {scene.name}: {len(plain)} of {checked} photographs that were looked at are of one color all "
-            f"over: {listed(plain)}",
-            SceneWarning,
-            stacklevel=2,
-        )
     finding = wrong_size(views.cameras)
     if finding is None and views.depths is not None and len(views) > 1:
         finding = suspicious_depth(views)[1]
@@ -230,15 +219,6 @@ def warn_of_faults(scene: Scene) -> None:
         warnings.warn(
             f"scene {scene.name}: {finding.message}; gsencoder inspect says more{mends}", SceneWarning, stacklevel=2
         )
-
-
-def plain_photographs(views: Views) -> tuple[list[str], int]:
-    """The names of photographs whose pixels all have one color, of up to four, and how many were looked at."""
-    if views.images is None or not len(views):
-        return [], 0
-    rows = even_indices(len(views), PHOTOGRAPHS)
-    plain = [int(view) for view in rows if (views.images[int(view)] == views.images[int(view)][:1, :1]).all()]
-    return [views.names[view] for view in plain], len(rows)
 
 
 def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
@@ -261,7 +241,8 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
     if views.images is not None and fits:
         registration = fit_registration(views, rows, best.views)
         findings = _with_registration(findings, registration)
-        grey = grey_pictures(views, rows, small.depths.shape[1:])
+        height, width = small.depths.shape[1:]
+        grey = np.stack([grey_picture(views, int(row), width, height) for row in rows])
         Ks = small.Ks.copy()
         if registration.differs:
             Ks[:, :2, :2] *= registration.focal_factor
@@ -278,7 +259,6 @@ def check_depth(views: Views, *, limit: int = 32) -> DepthCheck:
         views=rows,
         given=given.agreement,
         best=best.agreement,
-        offsets=pair_offsets(residuals(best.views)),
         findings=(*findings, *stray, *other),
         color=color,
         registration=registration,
@@ -310,17 +290,15 @@ def _best_reading(given: Reading, depth: DepthViews, rows: Int64[np.ndarray, " V
         reading
         for reading in other_readings(depth, rows, views.cameras.cam_from_world)
         if reading.agreement.compared >= _needed(depth)
-        and (reading.cause == "order" or reading.factor is None or _differs(reading.factor))
+        and (
+            reading.cause == "order" or reading.factor is None or abs(np.log(reading.factor)) >= np.log(SMALLEST_FACTOR)
+        )
     ]
     best = min(candidates, key=lambda reading: reading.agreement.spread, default=given)
     if given.agreement.compared < _needed(depth):
         # Views that share nothing are no fault; only a reading under which they agree says that they should.
         return best if best.agreement.share >= CLEAR else given
     return best if best.agreement.spread < BETTER * given.agreement.spread else given
-
-
-def _differs(factor: float) -> bool:
-    return abs(float(np.log(factor))) >= float(np.log(SMALLEST_FACTOR))
 
 
 def _reading_findings(given: Reading, best: Reading) -> list[Finding]:

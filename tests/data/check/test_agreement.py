@@ -12,22 +12,19 @@ from gsencoder.data.check.agreement import (
     MIN_SAMPLES,
     MIN_SHARED,
     SAMPLES,
-    _details,
     agreement,
     agreement_map,
     color_correlations,
     depth_views,
     fit_registration,
-    grey_pictures,
+    grey_picture,
     on_surface,
-    pair_offsets,
     residuals,
     shared_samples,
-    view_correlations,
     world_samples,
 )
-from gsencoder.data.check.findings import _best_factor, other_orders, other_readings
-from gsencoder.data.check.scene_check import _needed, check_depth, check_scene, fit_pose, surface_normals, view_spreads
+from gsencoder.data.check.findings import other_orders, other_readings
+from gsencoder.data.check.scene_check import _needed, check_depth, fit_pose, surface_normals, view_spreads
 from gsencoder.types import Views
 from gsencoder.types.checks import invert_rigid, transform
 
@@ -44,6 +41,10 @@ def small(views):
     return depth_views(views, np.arange(COUNT))
 
 
+def grey_of(views: Views) -> np.ndarray:
+    return np.stack([grey_picture(views, row, 96, 72) for row in range(COUNT)])
+
+
 def off_walls(points: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(np.abs(points) - HALF).min(axis=-1))
 
@@ -55,12 +56,6 @@ def test_samples_lie_where_the_depth_says_in_any_unit(small):
     millimeters = replace(small, depths=1000 * small.depths, values=1000 * small.values, scale=1e-3)
     np.testing.assert_allclose(world_samples(millimeters), world_samples(small), atol=1e-6)
     np.testing.assert_allclose(residuals(millimeters), residuals(small), atol=1e-6)
-
-
-def test_samples_are_read_at_the_pixels_that_they_are_said_to_be_at(small):
-    columns, rows = np.floor(small.pixels).astype(int).transpose(2, 0, 1)
-    for view in range(COUNT):
-        np.testing.assert_array_equal(small.depths[view, rows[view], columns[view]], small.values[view])
 
 
 def test_larger_depth_images_are_sampled_at_the_centers_of_the_smaller_pixels():
@@ -99,25 +94,24 @@ def test_a_summary_of_residuals_counts_what_is_not_hidden():
     assert np.isnan(behind.offset)
 
 
-def test_offsets_of_views_near_and_far_are_told_apart():
-    count = 10
-    residual = np.full((count, count, MIN_SAMPLES), np.nan)
-    for view, other in np.ndindex(count, count):
-        distance = abs(view - other)
-        if distance:
-            size = 0.001 if distance <= 3 else 0.02 if distance >= count / 2 else 0.04
-            residual[view, other] = size * (-1) ** view
-    assert pair_offsets(residual) == pytest.approx((0.001, 0.02))
-    residual[:, :, 0] = np.nan
-    assert np.isnan(pair_offsets(residual)).all()
-
-
 def test_spread_of_a_view_counts_both_directions():
     residual = np.full((3, 3, 2), np.nan)
     residual[0, 1] = 0.01, -0.03
     residual[1, 0] = 0.02, 7.0
     np.testing.assert_allclose(view_spreads(residual)[:2], (0.01 + 0.03 + 0.02 + CLIP) / 4)
     assert np.isnan(view_spreads(residual)[2])
+
+
+def test_residuals_of_exact_depth_are_zero_and_the_map_shows_the_piece_that_is_wrong(small):
+    known = residuals(small)
+    assert np.isnan(known[np.arange(COUNT), np.arange(COUNT)]).all()
+    assert np.nanmedian(np.abs(known)) < 2e-3
+    depths = small.depths.copy()
+    depths[3, 30:42, 30:45] *= 0.8
+    share, piece = agreement_map(replace(small, depths=depths), 3), np.zeros((72, 96), bool)
+    piece[30:42, 30:45] = True
+    assert np.nanmean(share[piece]) < 0.1
+    assert np.nanmean(share[~piece]) > 0.97
 
 
 def test_a_place_that_nobody_else_sees_has_no_share_and_hidden_ones_do_not_count(small):
@@ -147,7 +141,7 @@ def test_shared_samples_are_one_place_in_the_axes_of_both_views(small):
 
 
 def test_colors_of_one_place_correlate_wherever_they_are_seen_from(views, small):
-    grey = grey_pictures(views, np.arange(COUNT), small.depths.shape[1:])
+    grey = grey_of(views)
     light = views.images[0].astype(float) @ (0.299, 0.587, 0.114) / 255
     np.testing.assert_allclose(grey[0], light, atol=0.01)
     known = color_correlations(small, grey, small.Ks)
@@ -163,22 +157,6 @@ def test_colors_of_one_place_correlate_wherever_they_are_seen_from(views, small)
     assert np.isnan(color_correlations(small, dim, small.Ks)[0]).all()
 
 
-def test_colors_are_compared_where_both_photographs_show_the_place(small):
-    """Photographs of a longer focal length leave out the edges of the depth images."""
-    narrow = box_views(box_cameras(COUNT, width=96, height=72, focal=1.5 * 67.2))
-    grey = grey_pictures(narrow, np.arange(COUNT), small.depths.shape[1:])
-    known = color_correlations(small, grey, small.with_focal_times(1.5).Ks)
-    assert np.nanmedian(known) > 0.9
-    assert np.nanmin(known) > 0.6
-
-
-def test_the_correlation_of_a_view_is_its_median_in_both_directions():
-    nan = np.nan
-    correlations = view_correlations(np.array([[nan, 0.1, 0.2], [0.3, nan, nan], [nan, nan, nan]]))
-    np.testing.assert_allclose(correlations, (0.2, 0.2, 0.2))
-    assert np.isnan(view_correlations(np.full((2, 2), nan))).all()
-
-
 def test_orders_move_every_pose_by_one_or_two_places_either_way():
     poses = np.tile(np.eye(4), (5, 1, 1))
     poses[:, 0, 3] = np.arange(5)
@@ -187,7 +165,7 @@ def test_orders_move_every_pose_by_one_or_two_places_either_way():
     assert not list(other_orders(poses[:2]))
 
 
-@pytest.mark.parametrize("factor", [1e-3, 1e-2, 0.1, 0.2, 0.25, 0.5, 0.83, 1.2, 2.0, 4.0, 5.0, 10.0, 1e2, 1e3])
+@pytest.mark.parametrize("factor", [1e-3, 0.2, 0.83, 4.0, 1e3])
 def test_a_depth_scale_that_is_off_by_any_usual_factor_is_read_right(small, factor):
     wrong = replace(small, depths=(small.depths / factor).astype(np.float32), values=small.values / factor)
     readings = {reading.cause: reading for reading in other_readings(wrong, np.arange(COUNT), small.cam_from_world)}
@@ -202,14 +180,6 @@ def test_the_focal_length_of_the_depth_is_refined_between_the_factors_that_are_t
     readings = {reading.cause: reading for reading in other_readings(wrong, np.arange(COUNT), small.cam_from_world)}
     assert readings["depth focal length"].factor == pytest.approx(0.87, rel=2e-3)
     assert {reading.factor for cause, reading in readings.items() if cause not in ("depth scale", "order")} >= {None}
-
-
-def test_a_factor_under_which_hardly_anything_is_compared_says_nothing(small):
-    wrong = small.with_focal_times(1.2)
-    few = replace(small, values=np.where(np.arange(SAMPLES) < 5, small.values, 0))
-    assert agreement(residuals(few)).spread < agreement(residuals(wrong)).spread
-    reading = _best_factor("depth scale", lambda factor: few if factor == 2.0 else wrong, (1.0, 2.0))
-    assert reading.factor != 2.0
 
 
 def test_normals_of_a_box_are_those_of_its_walls_and_there_are_none_beside_missing_depth(small):
@@ -237,13 +207,6 @@ def test_a_view_that_was_moved_is_moved_back_by_as_much(small, turn):
     assert fit.spread < 0.5 * view_spreads(residuals(wrong))[2]
 
 
-def test_a_view_that_stands_right_stays(small):
-    fit = fit_pose(small, 0, [surface_normals(small, view) for view in range(COUNT)])
-    assert fit.moved < 0.008
-    assert np.rad2deg(fit.turned) < 0.2
-    assert fit.spread > 0.9 * view_spreads(residuals(small))[0]
-
-
 def test_a_camera_below_and_beside_the_depth_camera_is_fitted_in_both_directions():
     cameras = box_cameras(5, width=160, height=120, focal=112.0)
     poses = cameras.cam_from_world.copy()
@@ -268,21 +231,9 @@ def test_registration_says_nothing_without_shared_places_or_details(views, small
     assert fit_registration(views, np.arange(COUNT), few).pairs == 0
 
 
-def test_details_are_what_is_between_two_blurs(views):
-    one = _details(views, 0, 96, 72)
-    flat = _details(replace(views, images=[np.full_like(image, 77) for image in views.images]), 0, 96, 72)
-    assert np.abs(flat).max() < 1e-9
-    assert abs(one.mean()) < 0.02
-    assert one.std() > 0.05
-    negative = _details(replace(views, images=[255 - image for image in views.images]), 0, 96, 72)
-    np.testing.assert_allclose(negative, -one, atol=0.01)
-
-
 def test_a_check_looks_at_as_many_views_as_it_says(views):
     check = check_depth(views, limit=3)
     assert check.views.tolist() == [0, 2, 5]
     assert len(check.depth) == 3
-    assert check.comparable == (check.best.compared >= 0.02 * 3 * 2 * SAMPLES)
     assert _needed(check.depth) == pytest.approx(0.02 * 3 * 2 * SAMPLES)
-    depth, matches = check_scene(views)
-    assert (depth.views.tolist(), matches) == (list(range(COUNT)), None)
+    assert check.comparable == (check.best.compared >= _needed(check.depth))

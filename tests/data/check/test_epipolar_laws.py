@@ -9,7 +9,6 @@ from textured_box import box_cameras
 
 from gsencoder.data.check.epipolar import (
     CLIP,
-    FOCAL_FACTORS,
     MIN_MATCHES,
     _best_reading,
     _spread_triples,
@@ -121,38 +120,6 @@ def test_the_distance_from_a_line_is_the_larger_of_both():
     assert epipolar_distances(np.zeros((3, 3)), first, second).tolist() == [0]
 
 
-@pytest.mark.parametrize("cause", ["axes", "inverse", "inverse and axes"])
-def test_poses_that_were_exchanged_are_read_back(cameras, matches, cause):
-    wrong = with_poses(cameras, other_poses(cameras.cam_from_world.astype(np.float64))[cause])
-    if cause == "inverse and axes":
-        # The inverse of a turned inverse: what the reading of that name undoes.
-        flip = np.diag([1.0, -1, -1, 1])
-        wrong = with_poses(cameras, np.linalg.inv(flip @ cameras.cam_from_world.astype(np.float64)))
-    reading, factor, best, error = _best_reading(wrong, wrong, np.arange(6), matches)
-    assert (reading, factor) == (cause, None)
-    assert error < 0.05
-    np.testing.assert_allclose(best.cam_from_world, cameras.cam_from_world, atol=1e-5)
-
-
-@pytest.mark.parametrize("places", [-2, -1, 1, 2])
-def test_poses_of_the_next_photographs_are_read_back(cameras, matches, places):
-    wrong = with_poses(cameras, np.roll(cameras.cam_from_world, -places, axis=0))
-    cause, factor, _, error = _best_reading(wrong, wrong, np.arange(6), matches)
-    assert (cause, factor) == ("order", places)
-    assert error < 0.01
-
-
-@pytest.mark.parametrize("factor", [FOCAL_FACTORS[0], FOCAL_FACTORS[11], FOCAL_FACTORS[-3]])
-def test_another_focal_length_is_read_back(cameras, matches, factor):
-    Ks = cameras.Ks.copy()
-    Ks[:, :2, :2] /= np.float32(factor)
-    wrong = replace(cameras, Ks=Ks)
-    cause, read, best, error = _best_reading(wrong, wrong, np.arange(6), matches)
-    assert (cause, read) == ("focal length", factor)
-    assert error < 0.01
-    np.testing.assert_allclose(best.Ks, cameras.Ks, rtol=1e-5)
-
-
 def test_the_next_photographs_are_those_of_the_scene_and_not_of_the_views_that_were_looked_at():
     right, rows = box_cameras(9, width=320, height=240, focal=200.0), np.array([1, 3, 4, 7])
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (60, 3)) + right.centers.mean(axis=0)
@@ -204,15 +171,10 @@ def test_a_view_is_astray_above_three_times_what_is_usual(cameras, matches, usua
     assert astray(turned_to_error(cameras, matches, 2, 7.5), rough, limit=4.0) == ["2.png"] * named
 
 
-def test_of_few_views_none_is_astray(cameras, matches):
-    """With three views each has two pairs, and the others one."""
-    wrong = turned(cameras, {0: 5.0})
-    assert astray(wrong, [pair for pair in matches if pair.second < 3]) == []
-    assert astray(wrong, [pair for pair in matches if pair.second < 4]) == ["0.png"]
-
-
 def test_two_pairs_are_enough_to_call_a_view_astray_and_one_is_not(cameras, matches):
     wrong = turned(cameras, {0: 5.0})
+    # With three views each has two pairs, and the others one.
+    assert astray(wrong, [pair for pair in matches if pair.second < 3]) == []
     two = [pair for pair in matches if pair.second < 4 and (pair.first, pair.second) != (0, 3)]
     assert astray(wrong, two) == ["0.png"]
     assert astray(wrong, [pair for pair in two if (pair.first, pair.second) != (0, 2)]) == []
@@ -220,8 +182,6 @@ def test_two_pairs_are_enough_to_call_a_view_astray_and_one_is_not(cameras, matc
 
 def test_a_view_without_a_pose_that_fits_is_not_astray(cameras, matches):
     """Each of its pairs fits a fundamental matrix, but they fit no one pose: a motif that repeats itself."""
-    poses = turned(cameras, {2: 8.0}), turned(cameras, {2: -8.0}), cameras
-    assert all(astray(wrong, matches) == ["2.png"] for wrong in poses[:2])
     motif = []
     for index, pair in enumerate(matches):
         if 2 in (pair.first, pair.second):
@@ -234,21 +194,6 @@ def test_a_view_without_a_pose_that_fits_is_not_astray(cameras, matches):
     assert mean_error(cameras, [pair for pair in motif if 2 in (pair.first, pair.second)]) > 5
     assert len(consistent_matches(motif)) == len(motif)
     assert astray(cameras, motif) == []
-
-
-def seen_from(cameras: Cameras, pair: PairMatches, view: int, degrees: float) -> PairMatches:
-    """A pair as it would be if one of its views were turned."""
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (60, 3)) + cameras.centers.mean(axis=0)
-    pixels = turned(cameras, {view: degrees}).project(points)[0].astype(np.float64)
-    return replace(pair, first_pixels=pixels[pair.first], second_pixels=pixels[pair.second])
-
-
-def test_a_pose_that_fits_one_pair_alone_is_none_of_a_view_astray(cameras, matches):
-    pairs = {(pair.first, pair.second): pair for pair in matches if pair.second < 4}
-    del pairs[0, 3]
-    assert astray(turned(cameras, {0: 8.0}), [*pairs.values()]) == ["0.png"]
-    pairs |= {(0, 1): seen_from(cameras, pairs[0, 1], 0, 8), (0, 2): seen_from(cameras, pairs[0, 2], 0, -8)}
-    assert astray(cameras, [*pairs.values()]) == []
 
 
 def test_a_pose_that_does_not_halve_the_error_is_none_of_a_view_astray(cameras, matches):
@@ -302,9 +247,7 @@ def test_a_pose_is_found_from_matches(cameras, matches):
 def test_nothing_is_said_on_little_evidence(cameras, matches):
     wrong = turned(cameras, {0: 9.0, 2: -9.0, 4: 5.0})
     assert judged(wrong, []) == ([], False)
-    for pairs in (1, 2):
-        assert judged(wrong, matches[:pairs]) == ([], False)
-        assert judged(cameras, matches[:pairs]) == ([], False)
+    assert judged(wrong, matches[:2]) == judged(cameras, matches[:2]) == ([], False)
     assert judged(cameras, matches[:3]) == ([], True)
 
 

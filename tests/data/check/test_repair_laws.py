@@ -1,15 +1,17 @@
 """A repair undoes the fault that a finding names; every mended scene survives its transforms.json."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.check.agreement import RegistrationFit
-from gsencoder.data.check.findings import Finding, focal_times, repair_posed
+from gsencoder.data.check.findings import Finding, repair_posed
 from gsencoder.data.readers.posed import PosedImage, PosedImages
 from gsencoder.data.readers.transforms_json import DISTORTION, read_transforms, transforms_of
 from gsencoder.data.readers.undistort import CameraModel
@@ -81,11 +83,6 @@ def test_a_focal_length_is_wrong_for_the_depth_too_where_that_has_a_camera():
     assert both.depth_camera.params == (80.0, 80.0, 30.0, 20.0)
 
 
-def test_distortion_and_principal_point_stay_when_the_focal_length_changes():
-    radial = CameraModel(model="SIMPLE_RADIAL", width=64, height=48, params=(50.0, 32.0, 24.0, 0.1))
-    assert focal_times(radial, 2.0).params == (100.0, 32.0, 24.0, 0.1)
-
-
 def test_a_color_camera_beside_the_depth_camera_leaves_the_depth_where_it_was():
     right = posed()
     fit = RegistrationFit(focal_factor=0.9, shift=np.array([0.02, -0.01]), given=0.1, best=0.9, pairs=9)
@@ -119,36 +116,22 @@ def model(name: str, extra: tuple[float, ...]) -> CameraModel:
 
 @pytest.mark.parametrize("name", DISTORTION)
 def test_every_camera_that_can_be_written_is_read_back(tmp_path, name):
-    import json
-
-    from PIL import Image
-
     extra = tuple(0.01 * (1 + index) for index in range(len(DISTORTION[name])))
-    padding = (0.0,) * 3 if name == "FULL_OPENCV" else ()
-    camera = model(name, (*extra, *padding))
+    camera = model(name, (*extra, *((0.0,) * 3 if name == "FULL_OPENCV" else ())))
     for kind in ("c", "d"):
         (tmp_path / kind).mkdir()
         for view in range(2):
             Image.new("RGB" if kind == "c" else "I;16", (64, 48)).save(tmp_path / kind / f"{view}.png")
-    aside = np.eye(4)
-    aside[0, 3] = 0.1
+    beside = np.eye(4)
+    beside[0, 3] = 0.1
     scene = posed(2)
-    images = tuple(
-        replace(
-            image,
-            camera=camera,
-            image=tmp_path / "c" / image.name,
-            depth=tmp_path / "d" / image.name,
-            mask=tmp_path / "c" / image.name,
-            instance=tmp_path / "d" / image.name,
-            depth_camera=PINHOLE,
-            depth_from_color=aside,
-            no_depth=65535,
-            depth_measure="ray",
-        )
-        for image in scene.images
-    )
-    content = transforms_of(replace(scene, images=images), tmp_path)
+    images = []
+    for image in scene.images:
+        color, depth = tmp_path / "c" / image.name, tmp_path / "d" / image.name
+        files = {"image": color, "mask": color, "depth": depth, "instance": depth}
+        measure = {"depth_from_color": beside, "no_depth": 65535, "depth_measure": "ray"}
+        images.append(replace(image, camera=camera, depth_camera=PINHOLE, **files, **measure))
+    content = transforms_of(replace(scene, images=tuple(images)), tmp_path)
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     read = read_transforms(tmp_path / "transforms.json")
     assert (read.metres_per_unit, read.up is None) == (1.0, False)
@@ -156,12 +139,10 @@ def test_every_camera_that_can_be_written_is_read_back(tmp_path, name):
         np.testing.assert_allclose(back.cam_from_world, image.cam_from_world, atol=1e-9)
         assert back.camera.pinhole_params() == camera.pinhole_params()
         assert [value for value in back.camera.params if value][4:] == list(extra)
-        assert (back.image, back.depth, back.mask, back.instance) == (
-            image.image, image.depth, image.mask, image.instance,
-        )  # fmt: skip
-        assert (back.depth_scale, back.no_depth, back.depth_measure) == (1e-3, 65535, "ray")
+        for field in ("image", "depth", "mask", "instance", "depth_scale", "no_depth", "depth_measure"):
+            assert getattr(back, field) == getattr(image, field)
         assert back.depth_camera.pinhole_params() == PINHOLE.pinhole_params()
-        np.testing.assert_array_equal(back.depth_from_color, aside)
+        np.testing.assert_array_equal(back.depth_from_color, beside)
 
 
 @pytest.mark.parametrize("camera", [model("FULL_OPENCV", (0.0,) * 5 + (0.1, 0.0, 0.0)), model("FOV", (0.5,))])
