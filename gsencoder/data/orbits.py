@@ -36,20 +36,11 @@ def orbit_cameras(
     ball of that radius fits into the smaller field of view. Directions follow a golden-angle spiral.
 
     Args:
-        width: of the pictures, pixels.
-        height: of the pictures, pixels.
         up: if known, cameras are between 15° below and 60° above the horizon. If None, cameras surround the splat on
             all sides, and -y is upward in the pictures, as in COLMAP's worlds.
-
-    Returns:
-        `count` cameras, relative to the origin of the Gaussians.
     """
     if not len(gaussians):
         raise InputError("orbit cameras need at least one Gaussian, got none")
-    if count < 1 or width < 1 or height < 1 or not 1 <= fov_degrees <= 170:
-        raise InputError(
-            f"orbit cameras: {count} of {width}×{height}, fov_degrees {fov_degrees}: expected 1 or more, and 1 to 170"
-        )
     center, radius = robust_ball(gaussians)
     focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
     half_field = math.atan(min(width, height) / 2 / focal)
@@ -68,10 +59,7 @@ def spiral_directions(
         elevations: lowest and highest angle above the horizon, degrees.
     """
     vertical = np.array([0.0, -1.0, 0.0]) if up is None else np.asarray(up, np.float64)
-    length = float(np.linalg.norm(vertical))
-    if not 1e-6 < length < 1e6:
-        raise InputError(f"orbit cameras: up must be a direction, got {vertical.tolist()}")
-    vertical = vertical / length
+    vertical = vertical / np.linalg.norm(vertical)
     # Equal steps of the sine of the elevation sample the sphere evenly.
     low, high = (-0.9, 0.9) if up is None else (math.sin(math.radians(degrees)) for degrees in elevations)
     steps = (np.arange(count) + 0.5) / count

@@ -7,11 +7,10 @@ files are called by the digest of what is in them, so that questions about the s
 import io
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float16, UInt8
@@ -35,17 +34,10 @@ class StoredPrompt:
 
 
 class PromptStore:
-    """A folder of prompts. Each is on the disk when `add` returns, so that an interrupted preparation is continued.
-
-    Attributes:
-        folder: where they are.
-        prompts: by key.
-    """
+    """A folder of prompts by key. Each is on the disk when `add` returns: an interrupted preparation goes on."""
 
     def __init__(self, folder: Path) -> None:
-        """Args:
-        folder: an existing one; empty, or filled by a store.
-        """
+        """Takes an existing folder, empty or filled by a store."""
         self.folder = folder
         self.prompts: dict[str, StoredPrompt] = {}
         path = folder / PROMPTS_FILE
@@ -56,20 +48,16 @@ class PromptStore:
             lines = read_foreign(path, MODEL_BYTES).split(b"\n")[:-1]
         for number, line in enumerate(lines, start=1):
             try:
-                self._take(unsealed(json.loads(line)))
+                row = unsealed(json.loads(line))
+                key, pictures = row.pop("key"), tuple(row.pop("pictures"))
+                names = (*pictures, row["tokens"]) if row["tokens"] else pictures
+                if not pictures or any(Path(name).name != name or name == ".." for name in names):
+                    raise ValueError(row)
+                self.prompts[key] = StoredPrompt(pictures=pictures, **row)
             except (ValueError, KeyError, TypeError, RecursionError) as error:
                 raise InputError(
                     f"{path}: line {number} is no prompt, or damaged; remove the folder to make it again"
                 ) from error
-
-    def _take(self, row: Mapping[str, Any]) -> None:
-        text, tokens, space = row["text"], row["tokens"], row["space"]
-        prompt = StoredPrompt(text=text, pictures=tuple(row["pictures"]), tokens=tokens, space=space)
-        names = (*prompt.pictures, *([prompt.tokens] if prompt.tokens else []))
-        texts = isinstance(text, str) and isinstance(space, str) and isinstance(tokens, str)
-        if not texts or not prompt.pictures or not all(_is_file_name(name) for name in names):
-            raise ValueError(row)
-        self.prompts[row["key"]] = prompt
 
     def add(
         self,
@@ -79,11 +67,7 @@ class PromptStore:
         tokens: Float16[np.ndarray, "V P D"] | None = None,
         space: str = "",
     ) -> StoredPrompt:
-        """Writes a prompt.
-
-        Args:
-            tokens: rendered features of the pictures on the grid of a vision tower.
-        """
+        """Writes a prompt, with rendered features of its pictures on the grid of a vision tower as tokens."""
         names = tuple(self._write_picture(each) for each in pictures)
         file = "" if tokens is None else self._write_tokens(tokens)
         prompt = StoredPrompt(text=text, pictures=names, tokens=file, space=space)
@@ -114,18 +98,18 @@ class PromptStore:
 
     def _write_picture(self, data: bytes) -> str:
         name = f"{sha256(data).hexdigest()[:32]}.{'png' if data.startswith(bytes([137]) + b'PNG') else 'jpg'}"
-        folder = self.folder / PICTURES_FOLDER
-        folder.mkdir(exist_ok=True)
-        if not (folder / name).is_file():
-            write_bytes(folder / name, data)
+        path = self.folder / PICTURES_FOLDER / name
+        path.parent.mkdir(exist_ok=True)
+        if not path.is_file():
+            write_bytes(path, data)
         return name
 
     def _write_tokens(self, tokens: Float16[np.ndarray, "V P D"]) -> str:
         name = f"{sha256(repr(tokens.shape).encode() + tokens.tobytes()).hexdigest()[:32]}.safetensors"
-        folder = self.folder / TOKENS_FOLDER
-        folder.mkdir(exist_ok=True)
-        if not (folder / name).is_file():
-            write_archive(folder / name, {"tokens": tokens}, {})
+        path = self.folder / TOKENS_FOLDER / name
+        path.parent.mkdir(exist_ok=True)
+        if not path.is_file():
+            write_archive(path, {"tokens": tokens}, {})
         return name
 
     def picture(self, name: str) -> UInt8[np.ndarray, "H W 3"]:
@@ -144,7 +128,3 @@ class PromptStore:
         path = self.folder / TOKENS_FOLDER / name
         with open_archive(path) as file:
             return file.array("tokens", "float16", file.shape("tokens", "float16", 3))
-
-
-def _is_file_name(name: object) -> bool:
-    return isinstance(name, str) and Path(name).name == name and name not in (".", "..")

@@ -1,11 +1,8 @@
 """Procedural rooms: their plan, the shapes in them, rendered photographs with depth and labels, and their files."""
 
 import json
-import os
-import secrets
-import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -14,6 +11,7 @@ from jaxtyping import Bool, Float32, Float64, Int32, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_bytes, write_picture
+from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.data.seeding.points import OPACITY, SIZE, THICKNESS, quats_from_normals
 from gsencoder.types import Cameras, Gaussians, Scene, SceneObject, Views, sh_from_colors
@@ -31,8 +29,7 @@ class Solid:
 
     @property
     def world_from_local(self) -> Float64[np.ndarray, "3 3"]:
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
-        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        return _turn(self.yaw)
 
     def aabb(self) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
         """The exact axis-aligned box."""
@@ -48,8 +45,7 @@ class Solid:
 
     def contains(self, points: Float64[np.ndarray, "n 3"], margin: float) -> Bool[np.ndarray, " n"]:
         """Points inside the solid grown by `margin` metres."""
-        grown = Solid(shape=self.shape, center=self.center, half=self.half + margin, yaw=self.yaw)
-        q = grown.to_unit(points)
+        q = replace(self, half=self.half + margin).to_unit(points)
         if self.shape == "box":
             return (np.abs(q) <= 1).all(axis=-1)
         if self.shape == "ellipsoid":
@@ -91,9 +87,7 @@ class Solid:
         if self.shape == "box":
             unit = np.concatenate([_face(self.half, axis, spacing) for axis in range(3)])
         elif self.shape == "ellipsoid":
-            radius = self.half.max()
-            count = max(16, int(np.ceil(4 * np.pi * radius**2 / spacing**2)))
-            unit = _fibonacci(count)
+            unit = _fibonacci(max(16, int(np.ceil(4 * np.pi * self.half.max() ** 2 / spacing**2))))
         else:
             around = max(8, int(np.ceil(2 * np.pi * self.half[:2].max() / spacing)))
             angle = 2 * np.pi * np.arange(around) / around
@@ -106,6 +100,11 @@ class Solid:
             caps = [np.column_stack([disc, np.full(len(disc), z)]) for z in (-1.0, 1.0)]
             unit = np.concatenate([side, *caps])
         return unit * self.half @ self.world_from_local.T + self.center
+
+
+def _turn(yaw: float) -> Float64[np.ndarray, "3 3"]:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _slabs(o: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -196,7 +195,9 @@ def plan_room(seed: int = 0, *, objects: int = 8) -> tuple[PlannedObject, ...]:
     rng = np.random.default_rng(seed)
     furniture = _furniture()
     names = [list(_CATALOGUE)[row] for row in rng.permutation(len(_CATALOGUE))[:objects]]
-    colors = [OBJECT_COLORS[row % len(OBJECT_COLORS)] for row in _shuffled(rng, objects)]
+    # Each color once before any comes again.
+    rounds = -(-objects // len(OBJECT_COLORS))
+    colors = [OBJECT_COLORS[row] for _ in range(rounds) for row in rng.permutation(len(OBJECT_COLORS))]
     circles: list[tuple[float, np.ndarray]] = []
     placed_objects = []
     # Wide things first: small ones fit between them.
@@ -204,20 +205,14 @@ def plan_room(seed: int = 0, *, objects: int = 8) -> tuple[PlannedObject, ...]:
     homes = {}
     for row in order:
         on_floor, build = _CATALOGUE[names[row]]
-        parts = build()
-        homes[row] = _find_home(rng, _radius(parts), on_floor, circles)
+        homes[row] = _find_home(rng, _radius(build()), on_floor, circles)
     for row in range(objects):
         parts = _CATALOGUE[names[row]][1]()
         yaw = float(rng.uniform(-np.pi, np.pi))
-        stood = tuple(_stand(part, homes[row], yaw) for part in parts)
+        turn = _turn(yaw)
+        stood = tuple(replace(part, center=homes[row] + turn @ part.center, yaw=part.yaw + yaw) for part in parts)
         placed_objects.append(PlannedObject(id=FIRST_ID + row, name=names[row], color=colors[row], parts=stood))
     return (*furniture, *placed_objects)
-
-
-def _shuffled(rng: np.random.Generator, count: int) -> list[int]:
-    """`count` color numbers, each color once before any comes again."""
-    rounds = -(-count // len(OBJECT_COLORS))
-    return [int(row) for _ in range(rounds) for row in rng.permutation(len(OBJECT_COLORS))][:count]
 
 
 def _find_home(
@@ -240,17 +235,10 @@ def _find_home(
         if (room < 0).any():
             continue
         spot = np.append(center + rng.uniform(-room, room), height)
-        clear = all(np.hypot(*(spot - other)[:2]) > radius + reach + GAP for reach, other in circles)
-        if clear:
+        if all(np.hypot(*(spot - other)[:2]) > radius + reach + GAP for reach, other in circles):
             circles.append((radius, spot))
             return spot
     raise InputError("synthetic room: no free place for all objects; ask for fewer")
-
-
-def _stand(part: Solid, home: np.ndarray, yaw: float) -> Solid:
-    c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return Solid(shape=part.shape, center=home + turn @ part.center, half=part.half, yaw=part.yaw + yaw)
 
 
 def _radius(parts: tuple[Solid, ...]) -> float:
@@ -343,48 +331,29 @@ _CATALOGUE: dict[str, tuple[bool, Callable[[], tuple[Solid, ...]]]] = {
 
 
 def write_room(scene: Scene, folder: str | Path) -> None:
-    """Writes a scene with images, depth and instance maps as a folder that `load_scene` reads; all of it or nothing.
+    """Writes a scene with images, depth and instance maps as a new folder that `load_scene` reads.
 
-    transforms.json (nerfstudio: OpenGL axes, camera to world), images/*.png, depth/*.png (uint16 millimetres, 0 =
-    none), instance/*.png (uint16), objects.json.
+    images/*.png, depth/*.png (uint16 millimetres, 0 = none), instance/*.png (uint16), objects.json and, last,
+    transforms.json (nerfstudio: OpenGL axes, camera to world).
     """
-    target = Path(folder)
-    views = scene.views
+    folder, views = Path(folder), scene.views
     if views is None or not len(views) or views.images is None or views.depths is None or views.instances is None:
         raise InputError(f"{folder}: a room to write needs views with images, depth and instance maps")
     if scene.metres_per_unit is None:
         raise InputError(f"{folder}: depth files are in millimetres, but the scene's metres_per_unit is unknown")
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"{folder}: exists and is not an empty folder; choose another name")
-    temporary = target.parent / f".{target.name}.{secrets.token_hex(6)}.tmp"
-    try:
-        temporary.mkdir(parents=True)
-        for name in ("images", "depth", "instance"):
-            (temporary / name).mkdir()
-        _write_views(scene, views, temporary)
-        if target.exists():
-            target.rmdir()
-        os.replace(temporary, target)
-    except InputError as error:
-        raise InputError(str(error).replace(str(temporary), str(folder))) from error
-    except OSError as error:
-        raise InputError(f"{folder}: cannot write: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _write_views(scene: Scene, views: Views, folder: Path) -> None:
-    assert views.images is not None
-    assert views.depths is not None
-    assert views.instances is not None
-    cameras, frames = views.cameras, []
+    cameras = views.cameras
     if (cameras.Ks != cameras.Ks[0]).any() or len(set(zip(cameras.widths, cameras.heights, strict=True))) > 1:
         raise InputError(f"{folder}: the views of a room to write must share one camera")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: exists and is not an empty folder; choose another name")
+    for name in ("images", "depth", "instance"):
+        (folder / name).mkdir(parents=True)
     world_from_cam = cameras.world_from_cam
     world_from_cam[:, :3, 3] += scene.origin
+    frames = []
     for view in range(len(views)):
         stem = f"{view:03d}.png"
-        millimetres = np.rint(views.depths[view].astype(np.float64) * (1000 * float(scene.metres_per_unit or 1)))
+        millimetres = np.rint(views.depths[view].astype(np.float64) * (1000 * scene.metres_per_unit))
         if millimetres.max(initial=0) > 65535:
             raise InputError(f"view {views.names[view]!r}: depth above 65.535 m does not fit in uint16 millimetres")
         write_picture(folder / "images" / stem, views.images[view])
@@ -398,6 +367,19 @@ def _write_views(scene: Scene, views: Views, folder: Path) -> None:
                 "transform_matrix": (world_from_cam[view] @ OPENCV_FROM_OPENGL).tolist(),
             }
         )
+    objects = [
+        {
+            "id": each.id,
+            "category": each.name or "room",
+            "name": each.name,
+            "aabb_min": each.aabb_min.tolist(),
+            "aabb_max": each.aabb_max.tolist(),
+            "views": each.views,
+            "max_pixels": each.max_pixels,
+            "placed": each.placed,
+        }
+        for each in scene.objects
+    ]
     K = cameras.Ks[0].astype(float)
     transforms = {
         "camera_model": "PINHOLE",
@@ -410,20 +392,7 @@ def _write_views(scene: Scene, views: Views, folder: Path) -> None:
         "depth_unit_scale_factor": 0.001,
         "frames": frames,
     }
-    objects = [
-        {
-            "id": scene_object.id,
-            "category": scene_object.name or "room",
-            "name": scene_object.name,
-            "aabb_min": scene_object.aabb_min.tolist(),
-            "aabb_max": scene_object.aabb_max.tolist(),
-            "views": scene_object.views,
-            "max_pixels": scene_object.max_pixels,
-            "placed": scene_object.placed,
-        }
-        for scene_object in scene.objects
-    ]
-    for name, content in (("transforms.json", transforms), ("objects.json", objects)):
+    for name, content in (("objects.json", objects), ("transforms.json", transforms)):
         write_bytes(folder / name, json.dumps(content, indent=1).encode())
 
 
@@ -455,16 +424,20 @@ def make_room(
         width: of the images, pixels.
         spacing: between Gaussians, metres.
     """
-    if min(width, height) < 1 or views < 0:
-        raise InputError(f"synthetic room: expected positive sizes and views ≥ 0, got {width}×{height} and {views}")
-    if not 0 < spacing < np.inf:
-        raise InputError(f"synthetic room: spacing must be a positive length, got {spacing}")
     plan = plan_room(seed, objects=objects)
     cameras = _cameras(seed, views, width, height)
     surfaces = [_Surface(part, planned) for planned in plan for part in planned.parts]
     pictures = [_cast(surfaces, cameras, view) for view in range(views)]
-    instances = [labels for _, _, labels in pictures]
-    return Scene(
+    scene_objects = []
+    for planned in plan:
+        lower, upper = planned.aabb()
+        scene_objects.append(
+            SceneObject(
+                id=planned.id, name=planned.name, aabb_min=lower, aabb_max=upper, placed=planned.placed,
+                views=None, max_pixels=None,
+            )
+        )  # fmt: skip
+    scene = Scene(
         name=f"room_{seed:03d}",
         gaussians=_gaussians(surfaces, spacing),
         views=Views(
@@ -472,12 +445,13 @@ def make_room(
             names=tuple(f"images/{view:03d}.png" for view in range(views)),
             images=[image for image, _, _ in pictures],
             depths=[depth for _, depth, _ in pictures],
-            instances=instances,
+            instances=[labels for _, _, labels in pictures],
         ),
         metres_per_unit=1.0,
         up=np.array([0.0, 0.0, 1.0]),
-        objects=_objects(plan, instances),
+        objects=tuple(scene_objects),
     )
+    return with_counted_views(scene)
 
 
 def color_words(seed: int = 0, *, objects: int = 8) -> dict[int, str]:
@@ -588,25 +562,3 @@ def _gaussians(surfaces: list[_Surface], spacing: float) -> Gaussians:
         opacities=np.full(len(size), OPACITY, np.float32),
         sh=sh_from_colors(np.concatenate(colors)).astype(np.float32),
     )
-
-
-def _objects(plan: tuple[PlannedObject, ...], instances: list[np.ndarray]) -> tuple[SceneObject, ...]:
-    largest = max(planned.id for planned in plan) + 1
-    counts = np.array(
-        [np.bincount(labels.ravel(), minlength=largest) for labels in instances] or np.zeros((1, largest), int)
-    )
-    objects = []
-    for planned in plan:
-        lower, upper = planned.aabb()
-        objects.append(
-            SceneObject(
-                id=planned.id,
-                name=planned.name,
-                aabb_min=lower,
-                aabb_max=upper,
-                placed=planned.placed,
-                views=int(np.count_nonzero(counts[:, planned.id])),
-                max_pixels=int(counts[:, planned.id].max()),
-            )
-        )
-    return tuple(objects)

@@ -53,7 +53,6 @@ class Up:
     # cameras alone, how level they stand.
     confidence: float
     source: str  # files, cameras, surfaces, or cameras and surfaces
-    from_cameras: float | None  # angle in radians between it and what the cameras say; None without cameras
 
     def describe(self) -> str:
         """The direction and how it is known, for people."""
@@ -90,7 +89,7 @@ def up_of_scene(scene: Scene) -> Up | None:
     on nothing either (`MIN_CONFIDENCE`), as on one soft object, level cameras alone say more.
     """
     if scene.up is not None:
-        return Up(direction=scene.up, confidence=1.0, source="files", from_cameras=None)
+        return Up(direction=scene.up, confidence=1.0, source="files")
     cameras = upright_views(scene.views).cameras if scene.views is not None else None
     surfaces = None
     if scene.gaussians is not None:
@@ -121,15 +120,13 @@ def with_up(scene: Scene) -> tuple[Scene, Up | None]:
     up = up_of_scene(scene)
     if up is None:
         return scene, None
-    if up.source == "surfaces" and up.confidence < _needed_confidence(up.direction):
-        return scene, None
-    if up.source == "surfaces" and scene.gaussians is not None and not enclosure_of(scene.gaussians).is_room:
-        return scene, None
+    if up.source == "surfaces":
+        near_usual = -up.direction[1] >= np.cos(MAX_TILT)
+        if up.confidence < (MIN_CONFIDENCE_NEAR_USUAL if near_usual else MIN_CONFIDENCE):
+            return scene, None
+        if scene.gaussians is not None and not enclosure_of(scene.gaussians).is_room:
+            return scene, None
     return (scene if scene.up is not None else replace(scene, up=up.direction)), up
-
-
-def _needed_confidence(direction: Float64[np.ndarray, "3"]) -> float:
-    return MIN_CONFIDENCE_NEAR_USUAL if -direction[1] >= np.cos(MAX_TILT) else MIN_CONFIDENCE
 
 
 def estimate_up(surfaces: Surfaces | None, cameras: Cameras | None) -> Up:
@@ -138,7 +135,11 @@ def estimate_up(surfaces: Surfaces | None, cameras: Cameras | None) -> Up:
     if surfaces is None or not surfaces.areas.sum() > 0:
         if prior is None:
             raise InputError("up: there are neither cameras nor flat surfaces to estimate it from; give up=")
-        return Up(direction=prior, confidence=_level(cameras, prior), source="cameras", from_cameras=0.0)
+        assert cameras is not None
+        # How level they stand: 1 if all right axes are horizontal, 0 if they have any direction.
+        right = cameras.cam_from_world[:, 0, :3].astype(np.float64)
+        level = float(np.clip(1 - 3 * np.square(right @ prior).mean(), 0, 1)) if len(cameras) > 2 else 0.0
+        return Up(direction=prior, confidence=level, source="cameras")
     means, normals, areas, rest = surfaces
     # A few huge Gaussians, such as a sky's, must not outvote the scene.
     areas = np.minimum(areas, np.quantile(areas, 0.95))
@@ -160,17 +161,8 @@ def estimate_up(surfaces: Surfaces | None, cameras: Cameras | None) -> Up:
     typical = float(np.median(_support(_sphere(200), normals, areas)))
     support = float(_support(best[None], normals, areas)[0])
     confidence = float(np.clip((support - typical) / (1 - typical), 0, 1))
-    if prior is None:
-        return Up(direction=best, confidence=confidence, source="surfaces", from_cameras=None)
-    angle = float(np.arccos(np.clip(best @ prior, -1, 1)))
-    return Up(direction=best, confidence=confidence, source="cameras and surfaces", from_cameras=angle)
-
-
-def _level(cameras: Cameras | None, up: Float64[np.ndarray, "3"]) -> float:
-    """How level cameras stand under `up`: 1 if all right axes are horizontal, 0 if they have any direction."""
-    assert cameras is not None
-    right = cameras.cam_from_world[:, 0, :3].astype(np.float64)
-    return float(np.clip(1 - 3 * np.square(right @ up).mean(), 0, 1)) if len(cameras) > 2 else 0.0
+    source = "surfaces" if prior is None else "cameras and surfaces"
+    return Up(direction=best, confidence=confidence, source=source)
 
 
 def _sphere(count: int) -> Float64[np.ndarray, "n 3"]:

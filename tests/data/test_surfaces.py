@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from scene_files import some_gaussians
 from scipy.spatial.transform import Rotation
 
-from gsencoder.data.enclosure import MAX_SAMPLES, planes_of_gaussians, surfaces_of_depth, surfaces_of_gaussians
+from gsencoder.data.enclosure import planes_of_gaussians, surfaces_of_depth, surfaces_of_gaussians
 from gsencoder.types import Cameras, Gaussians, Views
 
 
@@ -52,14 +53,7 @@ def test_areas_of_depth_samples_are_those_of_the_surfaces():
 
 
 def cloud(means: np.ndarray, opacity: float = 1.0) -> Gaussians:
-    count = len(means)
-    return Gaussians(
-        means=means.astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        scales=np.full((count, 3), 0.01, np.float32),
-        opacities=np.full(count, opacity, np.float32),
-        sh=np.zeros((count, 1, 3), np.float32),
-    )
+    return some_gaussians(means, np.full(len(means), opacity))
 
 
 def test_planes_through_means_are_those_that_the_means_lie_on():
@@ -91,11 +85,3 @@ def test_faint_few_and_coincident_gaussians_have_no_planes():
         surfaces = planes_of_gaussians(gaussians)
         assert len(surfaces.areas) == len(surfaces.normals) == len(surfaces.means) == 0
     assert len(planes_of_gaussians(cloud(flat[:32])).areas) == 32
-
-
-def test_of_large_clouds_a_random_choice_is_looked_at_that_a_seed_repeats():
-    made = np.random.default_rng(0)
-    flat = np.concatenate((made.uniform(0, 1, (MAX_SAMPLES + 5000, 2)), np.zeros((MAX_SAMPLES + 5000, 1))), axis=1)
-    first, again = planes_of_gaussians(cloud(flat)), planes_of_gaussians(cloud(flat))
-    assert len(first.areas) == MAX_SAMPLES
-    np.testing.assert_array_equal(first.means, again.means)

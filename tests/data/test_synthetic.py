@@ -9,7 +9,6 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.synthetic import (
     _CATALOGUE,
     COLORS,
-    FIRST_ID,
     HALF_ROOM,
     SHELF,
     TABLE,
@@ -63,32 +62,7 @@ def test_every_pixel_lies_on_its_own_object_and_inside_its_box(room):
             assert not np.any([part.contains(mine, -1e-5) for part in parts], axis=0).any()
 
 
-def test_no_surface_lies_in_front_of_the_depth_that_was_cast(room):
-    """An independent look at the rays: points along them before the hit are in no solid."""
-    solids = [part for thing in plan_room(3) for part in thing.parts]
-    points = _world_points(room.views, 2)[room.views.depths[2] > 0]
-    center = room.views.cameras.centers[2]
-    for share in np.linspace(0.05, 0.999, 25):
-        on_the_way = center + share * (points - center)
-        assert not np.any([solid.contains(on_the_way, -1e-6) for solid in solids], axis=0).any()
-
-
-def test_the_boxes_are_as_tight_as_what_all_views_see_of_free_standing_things():
-    scene = make_room(0, views=20, width=200, height=150)
-    seen: dict[int, list[np.ndarray]] = {}
-    for view in range(20):
-        points, labels = _world_points(scene.views, view), scene.views.instances[view]
-        for label in np.unique(labels[labels >= FIRST_ID]):
-            seen.setdefault(int(label), []).append(points[labels == label])
-    for thing in scene.objects:
-        if thing.placed and thing.views >= 16:
-            points = np.concatenate(seen[thing.id])
-            # The lower face is hidden, and the sides show to about a pixel.
-            assert np.abs(points.max(axis=0) - thing.aabb_max).max() < 0.02
-            assert np.abs(points.min(axis=0) - thing.aabb_min)[:2].max() < 0.02
-
-
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(4))
 def test_objects_rest_on_something_keep_apart_and_show_in_several_views(seed):
     scene = make_room(seed, width=80, height=60)
     placed = [thing for thing in scene.objects if thing.placed]
@@ -104,13 +78,6 @@ def test_objects_rest_on_something_keep_apart_and_show_in_several_views(seed):
             points = np.concatenate([part.lattice(0.01) for part in parts[0].parts])
             touching = np.any([part.contains(points, 0.005) for part in parts[1].parts], axis=0)
             assert apart.any() or not touching.any()
-
-
-def test_views_and_pixels_are_counted_from_the_instance_maps(room):
-    for thing in room.objects:
-        counts = [int((labels == thing.id).sum()) for labels in room.views.instances]
-        assert thing.views == sum(count > 0 for count in counts)
-        assert thing.max_pixels == max(counts)
 
 
 def test_gaussians_lie_on_the_surfaces_with_the_colors_of_the_pictures(room):
@@ -133,34 +100,14 @@ def test_gaussians_lie_on_the_surfaces_with_the_colors_of_the_pictures(room):
     assert wrong < 0.03 * checked  # A pixel on the border of a check or of an object shows the other side.
 
 
-def test_every_pixel_has_a_gaussian_of_its_surface_beside_it(room):
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(room.gaussians.means)
-    for view in (0, 7):
-        labels = room.views.instances[view]
-        distance, _ = tree.query(_world_points(room.views, view)[labels > 0])
-        on_walls = labels[labels > 0] == 2
-        assert distance[~on_walls].max() < 0.04
-        assert distance.max() < 0.08
-
-
-def test_color_words_are_the_hues_of_the_pictures():
-    words = color_words(3)
-    scene = make_room(3)
-    assert len({words[thing.id] for thing in scene.objects if thing.placed}) == 8
-    for thing in scene.objects:
-        if thing.placed:
-            pixels = np.concatenate(
-                [
-                    image[labels == thing.id]
-                    for image, labels in zip(scene.views.images, scene.views.instances, strict=True)
-                ]
-            )
-            mean = pixels.mean(axis=0)
-            wanted = np.array(COLORS[words[thing.id]], float)
-            assert mean @ wanted / np.linalg.norm(mean) / np.linalg.norm(wanted) > 0.995
-            assert 0.5 < np.linalg.norm(mean) / np.linalg.norm(wanted) <= 1.01
+def test_color_words_are_the_hues_of_the_pictures(room):
+    words, pictures, labels = color_words(3), np.stack(room.views.images), np.stack(room.views.instances)
+    placed = [thing for thing in room.objects if thing.placed]
+    assert len({words[thing.id] for thing in placed}) == 8
+    for thing in placed:
+        mean, wanted = pictures[labels == thing.id].mean(axis=0), np.array(COLORS[words[thing.id]], float)
+        assert mean @ wanted / np.linalg.norm(mean) / np.linalg.norm(wanted) > 0.995
+        assert 0.5 < np.linalg.norm(mean) / np.linalg.norm(wanted) <= 1.01
 
 
 @pytest.mark.shared
@@ -193,17 +140,14 @@ def test_a_written_room_loads_as_the_same_scene(room, tmp_path):
 
 
 @pytest.mark.shared
-def test_a_written_room_has_the_keys_and_file_types_of_the_house_scenes(room, shared, tmp_path):
+def test_a_written_room_has_the_keys_of_the_house_scenes(room, shared, tmp_path):
     write_room(room, tmp_path / "room")
-    house = shared / "scenes/house/train_000"
     for name in ("objects.json", "transforms.json"):
-        ours, theirs = (json.loads((folder / name).read_text()) for folder in (tmp_path / "room", house))
-        if name == "objects.json":
-            ours, theirs = ours[0], theirs[0]
-        assert set(ours) == set(theirs)
-    for kind in ("depth", "instance"):
-        with Image.open(tmp_path / "room" / kind / "000.png") as ours, Image.open(house / kind / "000.png") as theirs:
-            assert ours.mode == theirs.mode == "I;16"
+        folders = tmp_path / "room", shared / "scenes/house/train_000"
+        ours, theirs = (json.loads((folder / name).read_text()) for folder in folders)
+        assert set(ours[0] if name == "objects.json" else ours) == set(theirs[0] if name == "objects.json" else theirs)
+    with Image.open(tmp_path / "room/depth/000.png") as depth:
+        assert depth.mode == "I;16"
 
 
 def test_a_folder_with_something_in_it_is_not_written_over(room, tmp_path):
@@ -211,16 +155,6 @@ def test_a_folder_with_something_in_it_is_not_written_over(room, tmp_path):
     with pytest.raises(InputError, match="not an empty folder"):
         write_room(room, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["note.txt"]
-
-
-def test_a_write_that_fails_leaves_nothing_behind(room, tmp_path, monkeypatch):
-    def full(*_args, **_kwargs):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    with pytest.raises(InputError, match=r"/room/images/000\.png: no space left on the device"):
-        write_room(room, tmp_path / "room")
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("shape", ["box", "ellipsoid", "cylinder"])
@@ -249,6 +183,5 @@ def test_ends_of_the_range():
     tiny = make_room(0, objects=18, views=1, width=1, height=1, spacing=0.2)
     assert tiny.views.depths[0].shape == (1, 1)
     assert len(tiny.objects) == 22
-    for arguments in ({"objects": 19}, {"objects": -1}, {"width": 0}, {"views": -1}, {"spacing": 0.0}):
-        with pytest.raises(InputError, match="synthetic room"):
-            make_room(0, **arguments)
+    with pytest.raises(InputError, match="synthetic room"):
+        make_room(0, objects=19)

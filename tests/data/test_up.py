@@ -8,15 +8,13 @@ from scipy.spatial.transform import Rotation
 from textured_box import box_cameras, box_views, write_box
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.enclosure import Surfaces, surfaces_of_depth, surfaces_of_gaussians
+from gsencoder.data.enclosure import Surfaces, surfaces_of_gaussians
 from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.synthetic import make_room
 from gsencoder.data.up import (
     Up,
-    _bells,
     _floor_area,
     _refine,
-    _sphere,
     _support,
     estimate_up,
     up_of_cameras,
@@ -73,16 +71,6 @@ def test_up_of_a_turned_room_turns_with_it(room, number):
         assert up.confidence > 0.4
 
 
-def test_cameras_that_are_tilted_leave_the_last_degrees_to_the_surfaces(room):
-    """A photographer who rolls the camera by 10° on average."""
-    roll = Rotation.from_rotvec(np.deg2rad(10) * np.array([0, 0, 1.0])).as_matrix()
-    poses = room.views.cameras.cam_from_world.astype(np.float64)
-    poses[:, :3] = roll @ poses[:, :3]
-    rolled = replace(room.views, cameras=replace(room.views.cameras, cam_from_world=poses.astype(np.float32)))
-    up = up_of_scene(replace(room, views=rolled))
-    assert degrees(up.direction, UP) < 1.0
-
-
 def test_a_camera_that_moves_ahead_has_the_mean_of_its_own_up():
     poses = np.tile(np.eye(4, dtype=np.float32), (5, 1, 1))
     poses[:, 2, 3] = np.arange(5)
@@ -129,35 +117,19 @@ def test_up_can_be_stated_when_a_scene_is_read(tmp_path):
     write_box(tmp_path / "box", box_views(box_cameras(2, width=64, height=48, focal=44.8)))
     scene = load_scene(tmp_path / "box", options=SceneConfig(up=(0.0, -3.0, 4.0)))
     np.testing.assert_allclose(scene.up, (0, -0.6, 0.8))
-    for wrong in ((0.0, 0.0, 0.0), (float("inf"), 0.0, 0.0)):
-        with pytest.raises(InputError, match="up: expected three finite numbers"):
-            SceneConfig(up=wrong)
-
-
-def test_the_candidates_lie_evenly_on_the_sphere():
-    """Their mean is zero and their second moments are those of the sphere, a third of the unit matrix."""
-    sphere = _sphere(4000)
-    np.testing.assert_allclose(np.linalg.norm(sphere, axis=1), 1, atol=1e-12)
-    np.testing.assert_allclose(sphere.mean(axis=0), 0, atol=1e-3)
-    np.testing.assert_allclose(sphere.T @ sphere / 4000, np.eye(3) / 3, atol=1e-3)
-    nearest = np.rad2deg(np.arccos(np.sort(sphere @ sphere.T, axis=1)[:, -2].clip(-1, 1)))
-    assert 2.5 < nearest.min() <= nearest.max() < 3.5
-
-
-def test_bells_are_one_on_their_axis_and_fall_off_as_a_gaussian_of_six_degrees():
-    cosines = np.cos(np.deg2rad([0.0, 6, 45, 84, 90, 96, 174, 180]))
-    lying, standing = _bells(cosines)
-    e = np.exp(-1)
-    np.testing.assert_allclose(lying, [1, e, 0, 0, 0, 0, e, 1], atol=1e-9)
-    np.testing.assert_allclose(standing, [0, 0, 0, e, 1, e, 0, 0], atol=1e-9)
+    with pytest.raises(InputError, match="up: expected three finite numbers"):
+        SceneConfig(up=(0.0, 0.0, 0.0))
 
 
 def test_support_is_the_area_that_lies_and_half_of_what_stands():
-    normals = np.array([[0.0, 0, 1], [0, 0, -1], [1, 0, 0], [np.sqrt(0.5), 0, np.sqrt(0.5)]])
-    areas = np.array([0.2, 0.1, 0.4, 0.3])
-    np.testing.assert_allclose(_support(UP[None], normals, areas), [0.2 + 0.1 + 0.5 * 0.4], atol=1e-6)
-    many = np.concatenate((np.tile(UP, (600, 1)), np.array([[0.0, 1, 0]])))
-    np.testing.assert_allclose(_support(many, normals, areas), [0.5] * 600 + [0.5], atol=1e-6)
+    """Within a bell of six degrees; many directions at once have the same."""
+    leaning = np.deg2rad([0, 6, 45, 84, 90, 180])
+    normals = np.stack((np.sin(leaning), 0 * leaning, np.cos(leaning)), axis=1)
+    expected = [1, np.exp(-1), 0, 0.5 * np.exp(-1), 0.5, 1]
+    for row, normal in enumerate(normals):
+        np.testing.assert_allclose(_support(np.tile(UP, (600, 1)), normal[None], np.ones(1)), expected[row], atol=1e-4)
+    areas = np.array([0.2, 0.1, 0.4, 0.1, 0.1, 0.1])
+    np.testing.assert_allclose(_support(UP[None], normals, areas), areas @ expected, atol=1e-4)
 
 
 def test_a_refined_direction_is_what_floors_and_walls_agree_on():
@@ -236,20 +208,10 @@ def test_of_two_floors_the_one_below_the_usual_up_counts_twice_as_much():
         assert degrees(up.direction, np.array(direction)) < 1
 
 
-def test_surfaces_without_a_normal_lower_confidence(room):
-    surfaces = surfaces_of_depth(room.views)  # type: ignore[arg-type]
-    alone = estimate_up(surfaces, None)
-    with_rest = estimate_up(
-        surfaces._replace(rest=float(np.minimum(surfaces.areas, np.quantile(surfaces.areas, 0.95)).sum())), None
-    )
-    np.testing.assert_allclose(with_rest.direction, alone.direction)
-    assert 0.3 * alone.confidence < with_rest.confidence < 0.6 * alone.confidence
-
-
 def test_confidence_is_how_level_cameras_stand_and_what_surfaces_support(room):
     cameras = room.views.cameras
     level = estimate_up(None, cameras)
-    assert (level.source, level.from_cameras) == ("cameras", 0.0)
+    assert level.source == "cameras"
     assert level.confidence > 0.99
     rolled = cameras.cam_from_world.astype(np.float64)
     for view, angle in enumerate(np.linspace(-0.5, 0.5, len(rolled))):
@@ -259,10 +221,6 @@ def test_confidence_is_how_level_cameras_stand_and_what_surfaces_support(room):
     assert other.confidence == pytest.approx(1 - 3 * np.mean(np.square(right @ other.direction)), abs=1e-5)
     assert estimate_up(None, cameras.select([0, 1])).confidence == 0
     estimate = up_of_scene(room)
-    assert estimate.from_cameras < 0.02
-    assert estimate.to_dict() == {
-        "direction": estimate.direction.tolist(), "source": "cameras and surfaces", "confidence": estimate.confidence,
-    }  # fmt: skip
     assert estimate.describe().endswith(f"estimated from cameras and surfaces, confidence {estimate.confidence:.2f}")
 
 
@@ -283,9 +241,7 @@ def test_surfaces_that_lie_far_from_what_cameras_say_do_not_count(room):
 def test_surfaces_of_a_bare_splat_need_less_where_they_say_what_is_assumed_anyway(
     monkeypatch, direction, confidence, used
 ):
-    estimate = Up(
-        direction=np.array(direction, np.float64), confidence=confidence, source="surfaces", from_cameras=None
-    )
+    estimate = Up(direction=np.array(direction, np.float64), confidence=confidence, source="surfaces")
     monkeypatch.setattr("gsencoder.data.up.up_of_scene", lambda scene: estimate)
     scene, up = with_up(Scene(name="bare"))
     assert (up is estimate) == used
