@@ -28,7 +28,7 @@ from gsencoder.data.labels.files import read_checked_text, read_rows
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClassTable:
-    """Classes that are scored. Whatever truth has beside them is ignored."""
+    """Classes that are scored. Other ids of labels are ignored."""
 
     names: tuple[str, ...]
     ids: tuple[int, ...]  # of the names, in files; 0 or more
@@ -55,7 +55,7 @@ class ClassTable:
         return dict(zip(self.names, self.ids, strict=True))
 
     def without(self, names: Collection[str]) -> "ClassTable":
-        """The table without some names, of which those that it does not have are passed over."""
+        """The table without some names, those that it does not have are passed over."""
         rows = [row for row, name in enumerate(self.names) if name not in names]
         return ClassTable(
             names=tuple(self.names[row] for row in rows),

@@ -6,10 +6,10 @@ A question is made only where people would agree on its answer:
   scene may stand for the same thing (`names.alike`). "The" thing is the only one of its name in the labels.
 - next_to: the nearest thing beside it, at most 0.5 m away, and nearer than any of another name by 0.1 m and by half
   (`seen_objects.neighbor`).
-- how_many: every object of the name that any photograph shows is shown well enough; at most ten.
+- how_many: every object of the name that any photograph shows is well visible; at most ten.
 - color: nearly all pixels of it have one color word in every photograph that shows it well (`names.color_word`).
 - where: what it stands on, if one thing qualifies and it is in none (`seen_objects.supporter`), or what it is next to.
-- is_there: yes where an object of the name is shown well enough; no for names that no label has, nor any name that may
+- is_there: yes where an object of the name is well visible; no for names that no label has, nor any name that may
   stand for the same thing.
 
 Questions of one who stands in a labeled scene and faces something, made from the labels: SQA3D's task.
@@ -19,16 +19,16 @@ Questions of one who stands in a labeled scene and faces something, made from th
 - nearer: "Which is closer to me, the X or the Y?" The box of one is nearer to that of the thing one stands at, by half
   and by 0.5 m.
 
-All things have names of their own and are shown well enough; one stands at things of 0.5 m or more.
+All things have names of their own and are well visible; one stands at things of 0.5 m or more.
 
 Expressions that mean one object of a labeled scene, made from the labels: ScanRefer's task, and Scan2Cap's.
 
 An object that some photograph shows well enough is described in each way in which people would know that it is meant:
 
 - by its name, if it is the only one of it in the labels;
-- by what it is next to, if that has a name of its own, and no other object of the name is as near to it or shown badly;
+- by what it is next to, if that has a name of its own, and no other object of the name is as near to it;
 - by what it stands on, if only one object of the name stands on a thing of that name;
-- as the largest of its name, if all are shown well enough and its box is 1.3 times as long across as any other.
+- as the largest of its name, if all are well visible and its box is 1.3 times as long across as any other.
 """
 
 import zlib
@@ -48,7 +48,7 @@ from gsencoder.data.labels.seen_objects import (
     NEAR,
     SeenObject,
     SeenScene,
-    beside,
+    adjacent,
     clearly_nearer,
     gap,
     interlocked,
@@ -150,7 +150,7 @@ def kind_of(question: Question) -> Kind | None:
 
 
 def clear_names(scene: SeenScene) -> tuple[str, ...]:
-    """Names all of whose objects are shown well enough, and beside which no name is that may mean the same."""
+    """Names all of whose objects are well visible, for which the scene has no other name that may mean the same."""
     there = {each.name for each in scene.objects if each.name and each.pixels}
     return tuple(name for name in scene.names() if not any(alike(name, other) for other in there))
 
@@ -162,9 +162,9 @@ def _candidates(scene: SeenScene) -> dict[Kind, list[Question]]:
     single = [each for each in map(scene.unique, clear) if each is not None]
     return {
         "next_to": [
-            _question(scene, f"What is next to the {each.name}?", [str(beside.name)], [each, beside])
+            _question(scene, f"What is next to the {each.name}?", [str(other.name)], [each, other])
             for each in single
-            if (beside := neighbor(each, near[each.id])) is not None and scene.shown(beside)
+            if (other := neighbor(each, near[each.id])) is not None and scene.is_visible(other)
         ],
         "how_many": [
             _question(
@@ -193,12 +193,12 @@ def absent_names(scene: SeenScene, names: Sequence[str]) -> list[str]:
 
 
 def _where(scene: SeenScene, scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> Question | None:
-    """Where a thing is: on what, and beside what, as far as this is clear; the first of both is what must be seen."""
-    on, beside = supporter(scene_object, scene_objects), neighbor(scene_object, scene_objects)
+    """Where a thing is: on what, and next to what, as far as this is clear; the first of both is what must be seen."""
+    on, near = supporter(scene_object, scene_objects), neighbor(scene_object, scene_objects)
     answers: list[str] = []
     objects: list[SeenObject] = []
-    for word, other in (("on", on), ("next to", beside)):
-        if other is not None and scene.shown(other):
+    for word, other in (("on", on), ("next to", near)):
+        if other is not None and scene.is_visible(other):
             answers.append(f"{word} the {other.name}")
             objects = objects or [scene_object, other]
     return (
@@ -227,7 +227,7 @@ def _question(scene: SeenScene, text: str, answers: Sequence[str], objects: Sequ
 
 
 def _varied(questions: Sequence[Question], count: int) -> list[Unit]:
-    """The first so many questions, of which no answer has more than half, rounded up."""
+    """The first `count` questions, of which no answer has more than half, rounded up."""
     most = -(-count // 2)
     counts: dict[str, int] = {}
     selected: list[Unit] = []
@@ -361,7 +361,7 @@ EXPRESSIONS_PART = 100
 def make_expressions(
     scenes: Iterable[SeenScene], *, seed: int = 0, per_object: int = 3, per_scene: int = 0
 ) -> tuple[Expression, ...]:
-    """Expressions for all objects that are shown well enough and can be described.
+    """Expressions for all objects that are well visible and can be described.
 
     Args:
         seed: of the order in which ways to describe an object are taken, and of the choice of objects.
@@ -371,7 +371,7 @@ def make_expressions(
     ordered = _in_order(scenes)
     expressions = [each for scene in ordered for each in _expressions_of_scene(scene, seed, per_object, per_scene)]
     if not expressions:
-        raise InputError(f"expressions: no object of {len(ordered)} scenes is shown well enough and can be described")
+        raise InputError(f"expressions: no object of {len(ordered)} scenes is well visible and can be described")
     return tuple(expressions)
 
 
@@ -382,7 +382,7 @@ def _expressions_of_scene(scene: SeenScene, seed: int, per_object: int, per_scen
     described = [
         (scene_object, ways)
         for scene_object in scene_objects
-        if scene_object.name and scene.shown(scene_object) and (ways := _ways_to_say(scene, scene_object, near))
+        if scene_object.name and scene.is_visible(scene_object) and (ways := _ways_to_say(scene, scene_object, near))
     ]
     shuffled = rng.permutation(len(described)).tolist()
     expressions = []
@@ -406,11 +406,11 @@ def _ways_to_say(scene: SeenScene, scene_object: SeenObject, near: Mapping[int, 
     below = supporter(scene_object, near[scene_object.id])
     if (
         below is not None
-        and scene.shown(below)
+        and scene.is_visible(below)
         and not any(_may_be_on(other, below, near[other.id]) for other in others)
     ):
         ways.append(f"the {name} on the {below.name}")
-    if others and all(scene.shown(other) for other in others) and largest([scene_object, *others]) is scene_object:
+    if others and all(scene.is_visible(other) for other in others) and largest([scene_object, *others]) is scene_object:
         ways.append(f"the largest {name}")
     return ways
 
@@ -423,7 +423,7 @@ def _anchor(
         # The one thing of a name is next to what the question's rule says, too.
         near = neighbor(scene_object, scene_objects)
         return near if near is not None and scene.unique(str(near.name)) is near else None
-    for distance, anchor in beside(scene_object, scene_objects):
+    for distance, anchor in adjacent(scene_object, scene_objects):
         if distance > NEAR:
             return None
         if anchor.name is None or scene.unique(anchor.name) is not anchor:

@@ -28,8 +28,8 @@ SAME_THINGS = (
     ("bowl", "plate"),
     ("candle", "vase", "bottle"),
 )
-"""Names that people use for the same thing, or for things that look alike: no count of one is clear beside the other,
-and neither is the absence of one."""
+"""Names that people use for the same thing, or for things that look alike: where one is there, neither the
+number nor the absence of the other is clear."""
 
 
 def is_plural(name: str) -> bool:

@@ -73,7 +73,7 @@ def read_groups(path: Path, *, first_id: int) -> tuple[SegmentGroup, ...]:
         if not isinstance(segments, list):
             raise InputError(f"{of_object}: segments must be a list of numbers of segments, got {shown(segments)}")
         if not segments:
-            raise InputError(f"{of_object}: {label[:40]!r} has no segments; remove it, or get the annotation anew")
+            raise InputError(f"{of_object}: {label[:40]!r} has no segments; remove it, or get the annotation again")
         groups.append(SegmentGroup(number, label, np.unique(_integers(segments, f"{of_object}: segments"))))
     if repeated := first_repeated(group.id for group in groups):
         number, first, second = repeated
@@ -215,7 +215,7 @@ def _annotated_mesh(
 ) -> tuple[list[tuple[SegmentGroup, Int64[np.ndarray, " n"]]], np.ndarray, np.ndarray | None]:
     """The objects of a scan with their vertices, and all vertices and faces of its mesh."""
     if files.missing:
-        raise InputError(f"{files.missing}: no such file; the labels beside it need it")
+        raise InputError(f"{files.missing}: no such file; the labels of the scan need it")
     groups = [
         group for group in read_groups(files.annotation, first_id=first_id) if names is None or group.label in names
     ]
@@ -297,7 +297,7 @@ def labels_of_scan(folder: Path, raw_names: Collection[str]) -> MeshLabels:
 
 
 def labels_of_layout(folder: Path, layout: str) -> MeshLabels | None:
-    """The labels that lie beside the photographs of a scene, in the world of its poses.
+    """The labels next to the photographs of a scene, in the world of its poses.
 
     Only the layouts ScanNet and ScanNet++ have labels. A warning says where an annotation lacks files that it needs.
     """

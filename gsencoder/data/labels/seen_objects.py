@@ -40,7 +40,7 @@ class SeenScene:
     min_pixels: int  # the area, in some photograph, from which an object may be asked about
     metres_per_unit: float = 1.0  # of the scene's files, which boxes were multiplied with
 
-    def shown(self, scene_object: SeenObject) -> bool:
+    def is_visible(self, scene_object: SeenObject) -> bool:
         """Whether some photograph shows a thing well enough to be asked about."""
         return scene_object.pixels >= self.min_pixels
 
@@ -49,21 +49,21 @@ class SeenScene:
         return tuple(each for each in self.objects if each.name == name and each.pixels)
 
     def names(self) -> tuple[str, ...]:
-        """Names all of whose objects that any photograph shows are shown well enough, sorted.
+        """Names all of whose objects that any photograph shows are well visible, sorted.
 
         Of other names, people would count differently, and not know which one is meant.
         """
         names = sorted({each.name for each in self.objects if each.name and each.pixels})
-        return tuple(name for name in names if all(map(self.shown, self.named(name))))
+        return tuple(name for name in names if all(map(self.is_visible, self.named(name))))
 
     def unique(self, name: str) -> SeenObject | None:
-        """The only object of a name, where it is shown well enough; None where there are several or none."""
+        """The only object of a name, where it is well visible; None where there are several or none."""
         same = [each for each in self.objects if each.name == name]
-        return same[0] if len(same) == 1 and self.shown(same[0]) else None
+        return same[0] if len(same) == 1 and self.is_visible(same[0]) else None
 
 
 def see_objects(scene: Scene, min_pixels: int = 200) -> SeenScene:
-    """Counts the pixels of each object in the photographs, and reads the color of those that are shown well.
+    """Counts the pixels of each object in the photographs, and reads the color of those that are well visible.
 
     Args:
         scene: with labeled objects, instance maps and photographs, up = z.
@@ -136,7 +136,7 @@ SAME_PLACE = 0.3
 REACH = 1.0
 """Things farther apart than this, which is beyond what `clearly_nearer` asks of `NEAR`, do not decide any relation."""
 LARGEST = 1.3
-"""The largest of some things is so many times as long, across its box, as any other."""
+"""The largest of some things is this many times as long, across its box, as any other."""
 
 
 def gap(a: SeenObject, b: SeenObject) -> float:
@@ -186,8 +186,8 @@ def near_things(scene_objects: Sequence[SeenObject]) -> dict[int, tuple[SeenObje
     return near
 
 
-def beside(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> list[tuple[float, SeenObject]]:
-    """The things that may be beside another, nearest first, with their distances.
+def adjacent(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> list[tuple[float, SeenObject]]:
+    """The things that may be next to another, nearest first, with their distances.
 
     Left out are what it stands on or carries, what it is in or around, and what is wholly above or below it, as a
     carpet is.
@@ -210,9 +210,9 @@ def clearly_nearer(first: float, second: float) -> bool:
 
 
 def neighbor(scene_object: SeenObject, scene_objects: Sequence[SeenObject]) -> SeenObject | None:
-    """What a thing is next to, where people would agree on its kind: the nearest of `beside`, at most 0.5 m away, and
+    """What a thing is next to, where people would agree on its kind: the nearest of `adjacent`, at most 0.5 m away, and
     nearer than any thing of another name by 0.1 m and by half. None where it has no name or nothing is clear."""
-    ranked = beside(scene_object, scene_objects)
+    ranked = adjacent(scene_object, scene_objects)
     if not ranked or ranked[0][1].name is None or ranked[0][1].name == scene_object.name or ranked[0][0] > NEAR:
         return None
     first, nearest = ranked[0]

@@ -6,7 +6,7 @@ import pytest
 from gsencoder.data.labels.names import alike, is_plural, plural, with_article
 from gsencoder.data.labels.seen_objects import (
     SeenObject,
-    beside,
+    adjacent,
     clearly_nearer,
     gap,
     interlocked,
@@ -80,7 +80,7 @@ def test_beside_is_neither_on_nor_in_nor_wholly_above_or_below_and_the_nearest_c
         box(4, (0.2, 0, 0)),  # In it.
         box(8, (2, 0, 1)),  # Above it, and aside.
     ]
-    neighbors = beside(thing, [*around, thing])
+    neighbors = adjacent(thing, [*around, thing])
     # Of equal distances the smaller id.
     assert ids(other for _, other in neighbors) == [5, 6, 7]
     assert [distance for distance, _ in neighbors] == pytest.approx([0.5, 0.5, 2])

@@ -75,7 +75,8 @@ def test_areas_are_those_of_the_objects_own_value_and_boxes_become_metres() -> N
     assert (seen.objects[0].aabb_min.tolist(), seen.objects[0].aabb_max.tolist()) == ([3.5] * 3, [4.5] * 3)
     assert seen.objects[0].center.tolist() == [4.0] * 3
     assert seen.metres_per_unit == 0.5
-    assert (seen.shown(seen.objects[2]), replace(seen, min_pixels=101).shown(seen.objects[2])) == (True, False)
+    assert seen.is_visible(seen.objects[2])
+    assert not replace(seen, min_pixels=101).is_visible(seen.objects[2])
 
 
 def test_the_color_is_that_of_the_photographs_that_show_most_of_a_thing() -> None:
