@@ -40,12 +40,14 @@ class PromptStore:
         """Takes an existing folder, empty or filled by a store."""
         self.folder = folder
         self.prompts: dict[str, StoredPrompt] = {}
+        self._end = 0
         path = folder / PROMPTS_FILE
         if not path.is_file():
             return
         with readable(path):
-            # What follows the last line break was cut off.
+            # What follows the last line break was cut off, and the next prompt is written over it.
             lines = read_foreign(path, MODEL_BYTES).split(b"\n")[:-1]
+        self._end = sum(len(line) + 1 for line in lines)
         for number, line in enumerate(lines, start=1):
             try:
                 row = unsealed(json.loads(line))
@@ -74,27 +76,17 @@ class PromptStore:
         line = json.dumps(sealed({"key": key, **asdict(prompt)}), ensure_ascii=False).encode() + b"\n"
         path = self.folder / PROMPTS_FILE
         try:
-            if not self.prompts:
-                path.unlink(missing_ok=True)
-            elif key not in self.prompts:
-                self._drop_cut_line(path)
-            with path.open("ab") as stream:
+            path.touch()
+            with path.open("r+b") as stream:
+                stream.seek(self._end)
+                stream.truncate()
                 stream.write(line)
                 stream.flush()
                 os.fsync(stream.fileno())
         except OSError as error:
             raise InputError(f"{path}: cannot write: {error.strerror or error}") from error
-        self.prompts[key] = prompt
+        self.prompts[key], self._end = prompt, self._end + len(line)
         return prompt
-
-    def _drop_cut_line(self, path: Path) -> None:
-        """Removes a last line that was cut off, to which the next would be appended."""
-        size = path.stat().st_size
-        with path.open("r+b") as stream:
-            stream.seek(max(0, size - 1))
-            if stream.read(1) != b"\n":
-                stream.seek(0)
-                stream.truncate(stream.read().rfind(b"\n") + 1)
 
     def _write_picture(self, data: bytes) -> str:
         name = f"{sha256(data).hexdigest()[:32]}.{'png' if data.startswith(bytes([137]) + b'PNG') else 'jpg'}"
