@@ -27,10 +27,10 @@ from gsencoder.types.checks import move_origin, transform
 
 def read_mesh(path: Path) -> tuple[Float32[np.ndarray, "V 3"], Int32[np.ndarray, "F 3"] | None]:
     """The vertices and triangles of a .ply, in their order; None in place of triangles where the file has no faces."""
-    import trimesh
-
     with readable(path):
         check_foreign(path)
+    import trimesh
+
     try:
         mesh: Any = trimesh.load(path, file_type="ply", process=False)
     except Exception as error:  # trimesh's readers raise whatever their parsers do.
