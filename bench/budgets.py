@@ -2,7 +2,7 @@
 
     python bench/budgets.py SCENE… [--error 0.01] [--teacher labels|palette|MODEL.onnx] [--out budgets.csv]
 
-A line for each scene: the limit (promise), the error on a tenth of the Gaussians that `preset=exact` sees, the same
+A line for each scene: the limit, the error on a tenth of the Gaussians that `preset=exact` sees, the same
 over all of them, the number of views, and CPU seconds of choosing, of the fusion and of the fusion at exact. Maps that
 are made while choosing are used by the fusion and count to that. `cpu_exact` counts every map, those that were made
 before at the mean of the others.
@@ -11,11 +11,11 @@ before at the mean of the others.
 import argparse
 import csv
 import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from budget_figures import summary_of
 from json_option import add_json_option, write_figures
 
 from gsencoder.data.scenes import SceneConfig, load_scene
@@ -80,7 +80,7 @@ def measured(scene: Scene, teacher: Teacher, error: float, maps: Path) -> tuple[
         "scene": scene.name,
         "gaussians": len(made.fusion.features),
         "all_views": len(scene.views or ()),
-        "promise": error,
+        "limit": error,
         "realised": judge(made.fusion.features, exact).total,
         "over_all": field_error(made.fusion.features, exact, sample=0).total,
         "predicted": made.choice.estimate.error,
@@ -99,6 +99,20 @@ def measured(scene: Scene, teacher: Teacher, error: float, maps: Path) -> tuple[
 def sum_of_maps(made: BudgetFusion, counted: CountedTeacher) -> float:
     """CPU seconds of the maps that were made while choosing."""
     return len(made.teacher.maps) * counted.seconds / max(counted.made, 1)
+
+
+def summary_of(lines: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+    """Limits of error and how many were kept, the largest error by its limit, and the CPU time of choosing.
+
+    Args:
+        lines: with `limit`, `realised` and `choosing_of_exact`.
+    """
+    return {
+        "limits": len(lines),
+        "kept": sum(line["realised"] <= line["limit"] for line in lines),
+        "largest error by its limit": max(line["realised"] / line["limit"] for line in lines),
+        "largest share of choosing": max(line["choosing_of_exact"] for line in lines),
+    }
 
 
 def main() -> None:

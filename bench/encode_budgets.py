@@ -2,7 +2,7 @@
 
     python bench/encode_budgets.py SCENE… [--errors 0.001,0.003,0.01] [--weights house_cpu] [--chunk 250000]
 
-A line for each scene and promise: the setting, the error that was predicted, its bound, the error on a tenth of the
+A line for each scene and limit: the setting, the error that was predicted, its bound, the error on a tenth of the
 Gaussians, drawn after the choice, and over all of them; CPU seconds of choosing, of the encoding, and of preset=exact.
 Kernels are compiled before, on a few Gaussians.
 """
@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from budget_figures import summary_of
+from budgets import summary_of
 from json_option import add_json_option, write_figures
 
 from gsencoder.core.process import retain_freed_memory
@@ -59,7 +59,7 @@ def main() -> None:
                 {
                     "scene": scene.name,
                     "gaussians": len(gaussians),
-                    "promise": error,
+                    "limit": error,
                     "precision": made.choice.setting.precision,
                     "halo": made.choice.setting.halo,
                     "predicted": made.choice.estimate.error,

@@ -4,7 +4,7 @@
     python bench/views_budgets.py FEATURES… --queries table,chair
 
 Each FEATURES is a folder of features; each name of its scene's objects.json in FOLDER, or each query, is a target by
-itself where it has a box. A line for each target and promise: views, the error by the small renders, the error at the
+itself where it has a box. A line for each target and limit: views, the error by the small renders, the error at the
 size of the pictures, and that of the eight views that are chosen without a budget.
 """
 
@@ -69,7 +69,7 @@ def main() -> None:
                         "target": target.name,
                         "gaussians": len(target.rows),
                         "candidates": len(cameras),
-                        "promise": error,
+                        "limit": error,
                         "views": len(picked.order),
                         "predicted": choice.estimate.error,
                         "realised": measured,
@@ -85,8 +85,8 @@ def main() -> None:
             writer.writerow({key: f"{value:.4g}" if isinstance(value, float) else value for key, value in line.items()})
     figures = {}
     for error in errors:
-        of_error = [line for line in lines if line["promise"] == error]
-        figures[f"promises of {error:g} kept"] = sum(line["realised"] <= error for line in of_error)
+        of_error = [line for line in lines if line["limit"] == error]
+        figures[f"limits of {error:g} kept"] = sum(line["realised"] <= error for line in of_error)
         figures[f"views for {error:g}"] = float(np.mean([line["views"] for line in of_error]))
     print({"targets": len(lines) // len(errors), **figures})
     write_figures(given.json, figures)

@@ -1,6 +1,5 @@
 """What a scene or an option names is a regular file: pipes and devices end with an error, within a second."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +9,7 @@ from no_files import ends_within, make_no_file
 
 from gsencoder.core.archive import read_npz
 from gsencoder.core.errors import InputError
-from gsencoder.core.files import TEXT_BYTES, check_foreign, check_written, open_foreign, read_foreign, read_foreign_text
+from gsencoder.core.files import TEXT_BYTES, check_foreign, open_foreign, read_foreign, read_foreign_text
 from gsencoder.core.pretrained import load_companion, open_session, read_config
 from gsencoder.data.labels.files import read_checked
 from gsencoder.data.labels.mesh import read_mesh
@@ -18,11 +17,9 @@ from gsencoder.data.readers.colmap import read_colmap
 from gsencoder.data.readers.images import load_npy, open_picture
 from gsencoder.data.readers.label_images import table_lines
 from gsencoder.data.readers.transforms_json import read_json
-from gsencoder.data.scenes import kind_of_path
 from gsencoder.data.splats.files import load_property, load_splat
 from gsencoder.data.splats.ply import read_points
 from gsencoder.evaluate.benchmarks.files import scene_files
-from gsencoder.infer.ask.questions import is_question_set
 from gsencoder.text.models import _load_tokenizer
 
 READERS: dict[str, Callable[[Path], object]] = {
@@ -61,19 +58,6 @@ def test_a_pipe_and_a_device_are_refused_by_every_reader(tmp_path, name, kind):
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_a_summary_that_is_no_file_is_no_summary(tmp_path, kind):
-    (tmp_path / "views.json").write_text("{}")
-    make_no_file(tmp_path / "summary.json", kind)
-    check_written(tmp_path / "views.json")
-    assert kind_of_path(tmp_path) == "a folder of other files"
-
-
-@pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_questions_that_are_no_file_are_no_set(tmp_path, kind):
-    assert not is_question_set(make_no_file(tmp_path / "questions.json", kind))
-
-
-@pytest.mark.parametrize("kind", ["pipe", "device"])
 def test_a_binary_model_that_is_no_file_is_refused(tmp_path, kind):
     for name in ("cameras.bin", "images.bin", "points3D.bin"):
         make_no_file(tmp_path / name, kind)
@@ -101,21 +85,6 @@ def test_a_text_of_gigabytes_is_refused_where_no_limit_is_named(tmp_path, read):
         stream.truncate(TEXT_BYTES + 1)
     with pytest.raises(InputError, match="at most 268,435,456 are read"):
         read(tmp_path / "file")
-
-
-@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_lines_may_end_as_on_any_system(tmp_path, end):
-    (tmp_path / "file").write_bytes(f"a{end}{end}b{end}".encode())
-    assert read_foreign_text(tmp_path / "file") == "a\n\nb\n"
-
-
-def test_a_file_that_is_refused_is_closed(tmp_path):
-    (tmp_path / "file").write_bytes(b"1234")
-    opened = len(os.listdir("/dev/fd"))
-    for path in (tmp_path, tmp_path / "file", make_no_file(tmp_path / "pipe", "pipe")):
-        with pytest.raises(InputError):
-            open_foreign(path, 3)
-    assert len(os.listdir("/dev/fd")) == opened
 
 
 @pytest.mark.parametrize("kind", ["pipe", "device", "dangling"])

@@ -9,7 +9,7 @@ from splats import random_gaussians
 
 from gsencoder.core.errors import InputError
 from gsencoder.render import blend
-from gsencoder.types import Cameras, FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Scene, SceneObject, Views
+from gsencoder.types import Cameras, FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Scene, Views
 
 
 def camera(width: int, height: int) -> Cameras:
@@ -136,11 +136,6 @@ def test_features_lie_on_the_gaussians_of_their_scene():
     for gaussians, got in ((None, "no Gaussians"), (random_gaussians(4), "4 Gaussians")):
         with pytest.raises(InputError, match=rf"Scene\.features\['a'\]: expected 5 Gaussians to lie on, got {got}"):
             Scene(name="a", gaussians=gaussians, features={"a": features})
-
-
-def test_an_object_that_nobody_counted_has_no_views():
-    thing = SceneObject(id=3, name=None, aabb_min=np.zeros(3), aabb_max=np.ones(3))
-    assert (thing.placed, thing.views, thing.max_pixels) == (True, 0, 0)
 
 
 GRID: dict[str, Any] = {"grid_from_image": np.eye(2, 3), "space": FeatureSpace(name="a", channels=2)}

@@ -27,10 +27,7 @@ DEVIATIONS = 2.0
 
 
 class Budget:
-    """Limits: a frozen dataclass with fields `error`, `seconds` or `megabytes`, None = no limit.
-
-    A field `seed`, where there is one, is of what the choice draws.
-    """
+    """Limits: a frozen dataclass with fields `error`, `seconds` or `megabytes`, None = no limit."""
 
     __slots__ = ()
 
@@ -41,8 +38,6 @@ class Budget:
                 raise InputError(f"error: expected a number between 0 and 1, got {value}")
             if not 0 < value < inf:
                 raise InputError(f"{name}: expected a number above 0, got {value}")
-        if (seed := getattr(self, "seed", 0)) < 0:
-            raise InputError(f"seed: expected 0 or more, got {seed}")
 
     @property
     def limits(self) -> tuple[str, ...]:

@@ -1,7 +1,6 @@
 """Even indices, repeated values, row numbers, and rows in a temporary file."""
 
 import errno
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -23,24 +22,10 @@ def test_places_are_distinct_ascending_and_as_many_as_wanted_or_as_there_are(ava
         assert places[-1] == available - 1
 
 
-def test_of_none_there_are_none() -> None:
-    assert even_indices(0, 4).tolist() == []
-
-
 def test_the_value_and_both_places_are_given() -> None:
     assert first_repeated(["a", "b", "c", "b", "a"]) == ("b", 1, 3)
     assert first_repeated([]) is first_repeated(["a"]) is None
     assert first_repeated(iter([None, 0, None])) == (None, 0, 2)
-
-
-@given(st.lists(st.integers(0, 5)))
-def test_there_is_one_exactly_where_a_value_is_counted_more_than_once(values: list[int]) -> None:
-    repeated = first_repeated(values)
-    assert (repeated is not None) == any(count > 1 for count in Counter(values).values())
-    if repeated:
-        value, first, second = repeated
-        assert values[first] == values[second] == value
-        assert len(set(values[:second])) == second
 
 
 @pytest.mark.parametrize(

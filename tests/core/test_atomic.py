@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from safetensors.numpy import save
 
-from gsencoder.core import files as atomic
 from gsencoder.core.archive import copy_checked, write_archive, write_safetensors
 from gsencoder.core.errors import InputError, WriteError
-from gsencoder.core.files import atomic_file, locked, write_bytes, write_picture
+from gsencoder.core.files import atomic_file, write_bytes, write_picture
 
 KILLED = """
 import os, signal, sys
@@ -55,17 +54,6 @@ def test_a_hidden_file_that_cannot_be_emptied_is_removed(tmp_path: Path, monkeyp
     assert (tmp_path / "a").read_bytes() == b"earlier"
 
 
-def test_two_that_write_one_file_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
-    with atomic_file(tmp_path / "a") as first:
-        first.write(b"first")
-        with atomic_file(tmp_path / "a") as second:
-            second.write(b"second")
-        assert (tmp_path / "a").read_bytes() == b"second"
-        write_bytes(tmp_path / "a", b"third")
-    assert (tmp_path / "a").read_bytes() == b"first"
-    assert names(tmp_path) == ["a"]
-
-
 def test_of_many_writers_every_reader_sees_one_whole(tmp_path: Path) -> None:
     parts = [bytes([letter]) * 50_000 for letter in b"abcd"]
     seen, begun = set(), threading.Barrier(4)
@@ -83,17 +71,6 @@ def test_of_many_writers_every_reader_sees_one_whole(tmp_path: Path) -> None:
         thread.join()
     assert seen <= set(parts)
     assert names(tmp_path) == ["x"]
-
-
-def test_without_locks_each_writer_has_a_name_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(atomic, "fcntl", None)
-    with atomic_file(tmp_path / "a") as first:
-        write_bytes(tmp_path / "a", b"second")
-        first.write(b"first")
-    assert (tmp_path / "a").read_bytes() == b"first"
-    assert names(tmp_path) == ["a"]
-    with locked(tmp_path) as known:
-        assert not known
 
 
 @pytest.mark.skipif(not hasattr(os, "symlink"), reason="needs symbolic links")

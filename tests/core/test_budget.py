@@ -24,7 +24,6 @@ class FullBudget(Budget):
     megabytes: float | None = None
     seconds: float | None = None
     error: float | None = None
-    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,9 +100,7 @@ def test_a_limit_that_means_nothing_is_refused(name: str, value: float) -> None:
         FullBudget(**{name: value})
 
 
-def test_a_negative_seed_and_a_budget_without_limits_are_refused() -> None:
-    with pytest.raises(InputError, match="^seed: expected 0 or more, got -1$"):
-        FullBudget(seed=-1)
+def test_a_budget_without_limits_is_refused() -> None:
     with pytest.raises(InputError, match="^budget: expected budget.error="):
         check_any_limit(FullBudget())
 

@@ -47,10 +47,6 @@ def test_slurm_tells_rank_and_size_and_where_to_meet() -> None:
     assert meeting == "tcp://gpu03:23456"
 
 
-def test_an_address_that_is_given_is_taken() -> None:
-    assert rank_from_environment({**SLURM, "MASTER_ADDR": "h", "MASTER_PORT": "9"})[1] == "tcp://h:9"
-
-
 def test_a_batch_script_itself_is_one_process() -> None:
     environment = {name: value for name, value in SLURM.items() if name != "SLURM_STEP_ID"}
     assert rank_from_environment(environment) == (ProcessRank(), "")
@@ -176,20 +172,6 @@ def test_what_is_held_back_happens_as_a_whole_and_is_stopped_then(number: int) -
         os.kill(os.getpid(), number)
 
 
-def test_blocks_within_blocks_end_with_the_outer_one(number: int) -> None:
-    done = []
-
-    def work() -> None:
-        with defer_signals():
-            with defer_signals():
-                os.kill(os.getpid(), number)
-            done.append("outer")
-
-    with pytest.raises(Stopped):
-        work()
-    assert done == ["outer"]
-
-
 def test_a_signal_is_heard_beside_an_error_too(number: int) -> None:
     def work() -> None:
         with defer_signals():
@@ -210,27 +192,6 @@ def test_signals_that_python_does_not_handle_are_left_alone() -> None:
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-def test_a_handler_that_was_taken_out_of_a_block_leads_to_the_one_before_it(number: int) -> None:
-    with defer_signals():
-        taken = signal.getsignal(number)
-    assert callable(taken)
-    with pytest.raises(Stopped):
-        taken(number, None)
-
-
-def test_other_threads_need_nothing() -> None:
-    done = []
-
-    def work() -> None:
-        with defer_signals():
-            done.append(1)
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join()
-    assert done == [1]
 
 
 def test_a_stop_is_known_by_itself_and_within_what_compiled_code_raises() -> None:

@@ -1,8 +1,6 @@
 """The log: one line a row, columns that may come later, and no line twice."""
 
-import errno
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,12 +33,6 @@ def test_a_continued_log_has_every_step_once(tmp_path: Path) -> None:
     again = Log(tmp_path, done=2, events=False)
     again.add(3, {"loss": 9.0})
     assert [row["loss"] for row in read_log(tmp_path / LOG_FILE)] == ["1.0", "2.0", "9.0"]
-
-
-def test_a_log_that_begins_anew_keeps_nothing(tmp_path: Path) -> None:
-    Log(tmp_path, done=0, events=False).add(1, {"loss": 1.0})
-    Log(tmp_path, done=0, events=False)
-    assert read_log(tmp_path / LOG_FILE) == []
 
 
 def test_a_file_that_is_no_log_is_refused(tmp_path: Path) -> None:
@@ -77,20 +69,3 @@ def test_tensorboard_shows_the_steps_of_a_continued_run_once(tmp_path: Path) -> 
     for step in range(3, 6):
         again.add(step, {"loss": 10.0 * step})
     assert shown(tmp_path / "tensorboard") == [(1, 1.0), (2, 2.0), (3, 30.0), (4, 40.0), (5, 50.0)]
-
-
-def test_an_event_that_cannot_be_written_is_an_error_of_the_caller_that_names_the_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("tensorboard")
-    log = Log(tmp_path, done=0, events=True)
-    usual = Path.open
-
-    def full(self: Path, *arguments: Any, **more: Any) -> Any:
-        if "tfevents" in self.name:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return usual(self, *arguments, **more)
-
-    monkeypatch.setattr(Path, "open", full)
-    with pytest.raises(InputError, match=r"tensorboard/events\.out\.tfevents\S*: cannot write: No space left"):
-        log.add(1, {"loss": 1.0})

@@ -66,18 +66,6 @@ def test_of_several_errors_the_one_of_the_first_piece_is_raised_and_no_more_piec
     assert parallel(lambda piece: piece, range(3)) == [0, 1, 2]
 
 
-def test_results_are_in_the_order_of_pieces_also_where_a_later_one_ends_first(two_threads: None) -> None:
-    later = threading.Event()
-
-    def work(piece: int) -> int:
-        if piece == 0:
-            assert later.wait(60)
-        later.set()
-        return piece
-
-    assert parallel(work, range(4)) == [0, 1, 2, 3]
-
-
 def test_an_interrupt_that_work_meets_on_another_thread_is_raised_by_the_caller(two_threads: None) -> None:
     barrier = threading.Barrier(2)
 
@@ -89,15 +77,6 @@ def test_an_interrupt_that_work_meets_on_another_thread_is_raised_by_the_caller(
 
     with pytest.raises(KeyboardInterrupt, match="of a thread"):
         parallel(work, range(2))
-
-
-def test_an_interrupt_before_any_thread_has_begun_is_raised(two_threads: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(_: threading.Thread) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(threading.Thread, "start", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        parallel(lambda piece: piece, range(3))
 
 
 def test_where_the_caller_is_interrupted_no_more_pieces_begin_and_none_runs_on(
