@@ -56,7 +56,8 @@ OPTIONS_SET_BY_BUDGET = (
     "blend.min_weight",
 )
 ALL_VIEWS, VIEWS_SHARE = 24, 2
-"""Up to so many views are all looked at on a few rays; of more, one of so many if that is more."""
+"""The smallest number of views that are looked at on a few rays, and of how many one is, if that is more. A scene of
+fewer views and a cheap teacher is fused exactly: looking at a view costs half as much as fusing it."""
 FIRST_MAPS, MAPS_SHARE = 4, 4
 """A costly teacher's maps of so many views are made to choose by, or of one of so many if that is more; all of them are
 lifted."""
@@ -176,7 +177,7 @@ def fuse_within(
         teacher = cached_maps(work, settings, teacher, gaussians, views, range(len(views)), None)
     maps, count = KeptMaps(teacher), len(views)
     order, sampled = bisection_order(count), None
-    if budget.error is not None:
+    if budget.error is not None and not (teacher.cheap and count <= ALL_VIEWS):
         sampled = sample_views(gaussians, views, maps, visibility, exact.blend)
         order = sampled.order
 
@@ -190,8 +191,11 @@ def fuse_within(
         return clock() - begun
 
     def measure(number: int) -> Estimate:
-        error, bound = (math.nan, math.nan) if sampled is None else sampled.error(number)
-        seconds = math.nan
+        error = bound = seconds = math.nan
+        if number == count:
+            error = bound = 0.0
+        elif sampled is not None:
+            error, bound = sampled.error(number)
         if budget.seconds is not None:
             # Of views whose maps are kept it is on the safe side.
             seconds = seconds_of_view() * number + clock() - start
@@ -277,7 +281,7 @@ class SampledViews:
 
     def error(self, number: int) -> tuple[float, float]:
         """The error with the first `number` views of the order, and what it stays below."""
-        if number == self.views or not self.errors.size:
+        if not self.errors.size:
             return 0.0, 0.0
         share = number / self.views
         errors = self.errors[max(int(share * len(self.errors)), 1) - 1]

@@ -56,9 +56,9 @@ def kept_error(scene: Scene, teacher: FixedTeacher, made: BudgetFusion) -> float
 def kinds() -> dict[str, Callable[[np.random.Generator], tuple[Scene, FixedTeacher]]]:
     return {
         "many views": lambda rng: (make_scene(count=12), FixedTeacher(alike(12, 0.3, rng))),
-        "codes": lambda rng: (make_scene(count=12), coded(12, rng)),
+        "codes": lambda rng: (make_scene(count=30), coded(30, rng)),
         "one view": lambda rng: (make_scene(count=1), FixedTeacher(alike(1, 0.3, rng))),
-        "some look away": lambda rng: (with_turned(make_scene(count=8), [0, 3, 4]), coded(8, rng)),
+        "some look away": lambda rng: (with_turned(make_scene(count=30), [0, 3, 4]), coded(30, rng)),
         "one Gaussian": lambda rng: (make_scene(gaussians=one_gaussian(), count=6), FixedTeacher(alike(6, 0.3, rng))),
     }
 
@@ -76,17 +76,25 @@ def test_a_limit_of_error_is_kept_and_a_looser_one_never_costs_more(kind: str, r
 
 @pytest.mark.parametrize("costly", [False, True])
 def test_a_loose_limit_takes_fewer_views_and_each_of_their_maps_is_used(costly: bool, rng: np.random.Generator) -> None:
-    scene, teacher = make_scene(count=24), FixedTeacher(alike(24, 0.1, rng))
+    scene, teacher = make_scene(count=30), FixedTeacher(alike(30, 0.1, rng))
     teacher.cheap = not costly
     made = fuse_within(scene, teacher, BASE, FusionBudget(error=0.3))
-    assert len(made.fusion.views) < 24
+    assert len(made.fusion.views) < 30
     if costly:
         assert made.teacher.maps.keys() <= set(made.fusion.views)
         assert teacher.calls == len(made.fusion.views)
 
 
+def test_few_views_of_a_cheap_teacher_are_fused_exactly_and_none_is_looked_at(rng: np.random.Generator) -> None:
+    scene, teacher = make_scene(count=24), FixedTeacher(alike(24, 0.1, rng))
+    teacher.cheap = True
+    made = fuse_within(scene, teacher, BASE, FusionBudget(error=0.3))
+    assert (made.choice.setting, made.predicted["error"], teacher.calls) == (24, 0.0, 24)
+    assert kept_error(scene, teacher, made) == 0
+
+
 def test_views_that_see_nothing_are_not_used(rng: np.random.Generator) -> None:
-    scene, teacher = with_turned(make_scene(count=8), [0, 3, 4]), coded(8, rng)
+    scene, teacher = with_turned(make_scene(count=30), [0, 3, 4]), coded(30, rng)
     made = fuse_within(scene, teacher, BASE, FusionBudget(error=1e-6))
     assert not {0, 3, 4} & set(made.fusion.views)
 
