@@ -25,11 +25,11 @@ from gsencoder.data.seeding.matches import match_photographs
 from gsencoder.types import Cameras, Scene, Views
 from gsencoder.types.checks import OPENCV_FROM_OPENGL, invert_rigid
 
-ROW = 4
+ROW = 3
 """The view that alone is wrong."""
 
 
-def few_cameras(count: int = 6, focal: float = 156.8) -> Cameras:
+def few_cameras(count: int = 5, focal: float = 156.8) -> Cameras:
     """The first of an arc of ten: what a check takes grows with the square of their number."""
     return box_cameras(width=224, height=168, focal=focal).select(range(count))
 
