@@ -3,11 +3,11 @@
 A question is made only where people would agree on its answer:
 
 - A thing is asked about if some photograph shows at least `min_pixels` of it, by its name, if no other name of the
-  scene may stand for the same thing (`names.alike`). "The" thing is the only one of its name in the labels.
+  scene may stand for the same thing (`alike`). "The" thing is the only one of its name in the labels.
 - next_to: the nearest thing beside it, at most 0.5 m away, and nearer than any of another name by 0.1 m and by half
   (`seen_objects.neighbor`).
 - how_many: every object of the name that any photograph shows is well visible; at most ten.
-- color: nearly all pixels of it have one color word in every photograph that shows it well (`names.color_word`).
+- color: nearly all pixels of it have one color word in every photograph that shows it well (`seen_objects.color_word`).
 - where: what it stands on, if one thing qualifies and it is in none (`seen_objects.supporter`), or what it is next to.
 - is_there: yes where an object of the name is well visible; no for names that no label has, nor any name that may
   stand for the same thing.
@@ -34,6 +34,7 @@ An object that some photograph shows well enough is described in each way in whi
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import product
 from typing import Literal, get_args
 
@@ -42,7 +43,6 @@ from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.expressions import Expression
-from gsencoder.data.labels.names import NUMBERS, alike, is_plural, plural, with_article
 from gsencoder.data.labels.questions import Question
 from gsencoder.data.labels.seen_objects import (
     NEAR,
@@ -58,6 +58,71 @@ from gsencoder.data.labels.seen_objects import (
     neighbor,
     supporter,
 )
+
+NUMBERS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+PLURAL_ONLY = ("scissors", "dice", "pants", "glasses", "products", "utensils")
+"""Last words of names that are plurals."""
+VES = {"knife": "knives", "shelf": "shelves", "bookshelf": "bookshelves", "loaf": "loaves", "leaf": "leaves"}
+SAME_THINGS = (
+    ("cup", "mug", "pitcher"),
+    ("cabinet", "cupboard", "wardrobe", "nightstand", "shelf", "dresser"),
+    ("table", "coffee table", "dining table", "desk", "nightstand"),
+    ("ball", "softball", "baseball", "tennis ball", "golf ball"),
+    ("sofa", "couch"),
+    ("chair", "stool", "bench"),
+    ("carpet", "rug"),
+    ("television", "monitor", "laptop"),
+    ("picture frame", "painting", "poster"),
+    ("trash can", "basket", "barrel"),
+    ("box", "cracker", "pudding", "book"),
+    ("cube", "dice", "lego", "box"),
+    ("tin can", "can", "soup"),
+    ("bottle", "condiment", "detergent", "cleaning products"),
+    ("bowl", "plate"),
+    ("candle", "vase", "bottle"),
+)
+"""Names that people use for the same thing, or for things that look alike: where one is there, neither the
+number nor the absence of the other is clear."""
+
+
+def is_plural(name: str) -> bool:
+    """Whether a name is a plural, such as scissors."""
+    return name.split()[-1] in PLURAL_ONLY
+
+
+def with_article(name: str) -> str:
+    """The name with "a" or "an"; plurals have none."""
+    if is_plural(name):
+        return name
+    return (
+        f"{'an' if name[0].lower() in 'aeiou' and not name.lower().startswith(('uni', 'use', 'one')) else 'a'} {name}"
+    )
+
+
+def plural(name: str) -> str:
+    """The plural of a name that is a singular."""
+    first, last = name.rpartition(" ")[0::2]
+    if last in VES:
+        last = VES[last]
+    elif last.endswith("y") and last[-2:-1] not in "aeiou":
+        last = last[:-1] + "ies"
+    else:
+        last += "es" if last.endswith(("s", "x", "z", "ch", "sh")) else "s"
+    return f"{first} {last}".strip()
+
+
+def alike(a: str, b: str) -> bool:
+    """Whether two different names may be used for one thing: by `SAME_THINGS`, or as one has all words of the other."""
+    if a == b:
+        return False
+    (words_a, groups_a), (words_b, groups_b) = _words_and_groups(a), _words_and_groups(b)
+    return words_a <= words_b or words_b <= words_a or not groups_a.isdisjoint(groups_b)
+
+
+@lru_cache(maxsize=4096)
+def _words_and_groups(name: str) -> tuple[frozenset[str], frozenset[int]]:
+    return frozenset(name.split()), frozenset(row for row, group in enumerate(SAME_THINGS) if name in group)
+
 
 Kind = Literal["next_to", "how_many", "color", "where", "is_there"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

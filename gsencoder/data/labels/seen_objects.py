@@ -2,14 +2,77 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64, UInt8
 
 from gsencoder.core.errors import InputError
-from gsencoder.data.labels.names import color_word
 from gsencoder.data.labels.scans import count_pixels
 from gsencoder.types import Scene
+
+
+class ColorRange(NamedTuple):
+    """Pixels that people call by one word: bounds of hue (degrees), saturation and value, the lower ones included."""
+
+    word: str
+    hue: tuple[float, float]
+    saturation: tuple[float, float]
+    value: tuple[float, float]
+
+
+RANGES = (
+    ColorRange("black", (0, 360), (0, 1.01), (0, 0.17)),
+    ColorRange("white", (0, 360), (0, 0.12), (0.8, 1.01)),
+    ColorRange("red", (350, 370), (0.65, 1.01), (0.35, 1.01)),
+    ColorRange("brown", (12, 38), (0.35, 0.75), (0.2, 0.52)),
+    ColorRange("orange", (14, 36), (0.75, 1.01), (0.6, 1.01)),
+    ColorRange("yellow", (43, 68), (0.45, 1.01), (0.5, 1.01)),
+    ColorRange("green", (85, 165), (0.3, 1.01), (0.2, 1.01)),
+    ColorRange("blue", (200, 250), (0.35, 1.01), (0.2, 1.01)),
+    ColorRange("purple", (264, 295), (0.3, 1.01), (0.2, 1.01)),
+    ColorRange("pink", (310, 350), (0.2, 0.6), (0.65, 1.01)),
+)
+"""The ranges of different words are apart: what lies between them is called differently by different people. Gray is
+no word here, since white in the shade has the same pixels."""
+LEAST_SHARE = 0.6
+"""A thing has a color if it has this share of its pixels …"""
+MOST_OTHER = 0.15
+"""… and no other color has more than this share."""
+
+
+def color_word(picture: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]) -> str | None:
+    """The color of a thing in a photograph, of `RANGES`, by the pixels of its mask; None where it is not clear.
+
+    It is clear where, of the pixels that do not touch others than the thing's, at least 60 % have the color, and of no
+    other color there are more than 15 %.
+    """
+    from scipy.ndimage import binary_erosion
+
+    pixels = picture[binary_erosion(mask)]
+    if not len(pixels):
+        return None
+    shares = color_counts(pixels) / len(pixels)
+    order = np.argsort(-shares, kind="stable")
+    clear = shares[order[0]] >= LEAST_SHARE and shares[order[1]] <= MOST_OTHER
+    return RANGES[order[0]].word if clear else None
+
+
+def color_counts(pixels: UInt8[np.ndarray, "n 3"]) -> Int64[np.ndarray, " C"]:
+    """How many pixels lie in each of `RANGES`, which do not overlap."""
+    from matplotlib.colors import rgb_to_hsv
+
+    hue, saturation, value = rgb_to_hsv(pixels / 255).T
+    hue = 360 * hue
+    counts = []
+    for each in RANGES:
+        low, high = each.hue
+        inside = ((hue >= low) & (hue < high)) | (hue + 360 < high)
+        for channel, (least, most) in ((saturation, each.saturation), (value, each.value)):
+            inside &= (channel >= least) & (channel < most)
+        counts.append(int(inside.sum()))
+    return np.array(counts, np.int64)
+
 
 COLOR_VIEWS = 4
 """Photographs that a thing's color is read from: those that show most of it."""

@@ -12,9 +12,8 @@ import pytest
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels import made_questions
 from gsencoder.data.labels.made_questions import KINDS, kind_of, make_questions
-from gsencoder.data.labels.names import RANGES, color_counts
 from gsencoder.data.labels.questions import Question, read_questions, write_scanqa
-from gsencoder.data.labels.seen_objects import SeenObject, SeenScene, see_objects
+from gsencoder.data.labels.seen_objects import RANGES, SeenObject, SeenScene, color_counts, see_objects
 from gsencoder.data.synthetic import color_words, make_room
 from gsencoder.types import Scene
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsencoder.data.labels.names import alike, is_plural, plural, with_article
+from gsencoder.data.labels.made_questions import alike, is_plural, plural, with_article
 from gsencoder.data.labels.seen_objects import (
     SeenObject,
     adjacent,

@@ -15,9 +15,8 @@ from gsencoder.data.labels.made_questions import (
     make_situations,
     side_of,
 )
-from gsencoder.data.labels.names import color_word
 from gsencoder.data.labels.questions import Question, read_questions, write_sqa3d
-from gsencoder.data.labels.seen_objects import COLOR_VIEWS, SeenObject, SeenScene, see_objects
+from gsencoder.data.labels.seen_objects import COLOR_VIEWS, SeenObject, SeenScene, color_word, see_objects
 from gsencoder.types import Scene, SceneObject, Views
 
 RED, BLUE, GREEN = (200, 20, 30), (20, 60, 220), (20, 160, 40)
