@@ -8,7 +8,7 @@ from pathlib import Path
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import Knob
 from gsencoder.evaluate.tradeoff.measure import Record, Timing
-from gsencoder.evaluate.tradeoff.stage import Judged, Score, Stage
+from gsencoder.evaluate.tradeoff.stages import Opened, Score, Scores, Stage
 
 
 @dataclass(frozen=True)
@@ -24,16 +24,30 @@ class ToySettings:
 class Toy:
     """Runs and judgments of all scenes in order, as they were asked for; a run may be made to fail."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, colors_count: bool = False) -> None:
         self.runs: list[tuple[str, ToySettings]] = []
         self.judged: list[tuple[str, ToySettings]] = []
         self.fail_at: int | None = None
+        self.colors_count = colors_count
+
+    @contextmanager
+    def opened(self, path: Path) -> Iterator[Opened]:
+        def run(settings: ToySettings) -> ToySettings:
+            if self.fail_at == len(self.runs):
+                raise KeyboardInterrupt
+            self.runs.append((path.name, settings))
+            return settings
+
+        def judge(product: ToySettings, settings: ToySettings) -> tuple[Scores, int]:
+            assert product == settings
+            self.judged.append((path.name, settings))
+            hits = settings.color if self.colors_count else settings.effort
+            scores = {"error": Score(1 / settings.effort), "acc_25": Score(hits, 8)}
+            return scores, 100 * settings.effort + self.colors_count * settings.color
+
+        yield run, judge
 
     def stage(self) -> Stage:
-        @contextmanager
-        def opened(path: Path) -> Iterator[ToyScene]:
-            yield ToyScene(self, path.name)
-
         return Stage(
             name="fusion",
             knobs=(
@@ -41,31 +55,12 @@ class Toy:
                 Knob(name="color", key="color", values=(1, 2)),
             ),
             base=ToySettings(),
-            open=opened,
+            open=self.opened,
             accuracy="error",
             cost="bytes",
         )
 
 
-class ToyScene:
-    def __init__(self, toy: Toy, name: str) -> None:
-        self._toy, self._name = toy, name
-
-    def run(self, settings: ToySettings) -> ToySettings:
-        if self._toy.fail_at == len(self._toy.runs):
-            raise KeyboardInterrupt
-        self._toy.runs.append((self._name, settings))
-        return settings
-
-    def judge(self, product: ToySettings, settings: ToySettings) -> Judged:
-        assert product == settings
-        self._toy.judged.append((self._name, settings))
-        scores = {"error": Score(1 / settings.effort), "acc_25": Score(settings.effort, 8)}
-        return Judged(scores=scores, bytes=100 * settings.effort)
-
-
-def record(scene: str, cpu: list[float], scores: dict[str, Score] | None = None, **knobs: int) -> Record:
+def record(scene: str, cpu: list[float], scores: Scores | None = None, **knobs: int) -> Record:
     timings = tuple(Timing(seconds=2 * value, cpu_seconds=value, mib=10.0) for value in cpu)
-    return Record(
-        stage="fusion", scene=scene, knobs=knobs, timings=timings, judged=Judged(scores=scores or {}, bytes=1)
-    )
+    return Record(stage="fusion", scene=scene, knobs=knobs, timings=timings, scores=scores or {}, bytes=1)

@@ -33,7 +33,7 @@ from gsencoder.data.prompts import PROMPTS_FILE, PromptStore
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.data.video import RECORD_FILE, _taken
-from gsencoder.evaluate.tradeoff.measure import IDENTITY_FILE, RECORDS_FILE, Records
+from gsencoder.evaluate.tradeoff.measure import RECORDS_FILE, Records
 from gsencoder.fusion.checkpoint import SETTINGS_FILE, CachedTeacher
 from gsencoder.infer.ask.batch import ANSWERS, _answered
 from gsencoder.infer.ask.questions import read_answers
@@ -162,13 +162,6 @@ def test_of_the_files_of_a_run_those_without_checksums_of_their_own_are_listed(t
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep" / "a.json").write_text("{}")
     assert set(checksums_of(tmp_path)) == {"adapter_model.safetensors", "deep/a.json"}
-
-
-def test_settings_of_a_sweep_that_are_no_text_are_those_of_another(tmp_path: Path) -> None:
-    (tmp_path / IDENTITY_FILE).write_bytes(bytes([255, 254]))
-    (tmp_path / RECORDS_FILE).touch()
-    with pytest.raises(InputError, match="a sweep with other settings; give resume=false"):
-        Records(tmp_path, {})
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"files": 3}', '{"files": {"a": 3}}', "\0"])

@@ -3,13 +3,12 @@
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from gsencoder.core.files import plain
-from gsencoder.evaluate.tradeoff.scaling import ScalingResult
-from gsencoder.evaluate.tradeoff.stage import HIGHER_IS_BETTER
+from gsencoder.evaluate.tradeoff.stages import HIGHER_IS_BETTER
 from gsencoder.evaluate.tradeoff.sweep import SettingResult, StageResult
 
 TEMPLATE = Path(__file__).with_name("plot.html")
@@ -17,6 +16,7 @@ DATA = "/*DATA*/"
 OFFSETS = (((6, 4), "left"), ((6, -11), "left"), ((-6, 4), "right"), ((-6, -11), "right"))
 """Where labels stand relative to their points, and the side at which they begin."""
 Label = tuple[str, tuple[float, float]]
+"""A text, and the point that it belongs to."""
 COST_NAMES = {
     "cpu_seconds": "CPU seconds a scene",
     "seconds": "seconds a scene",
@@ -25,13 +25,13 @@ COST_NAMES = {
 }
 
 
-def to_json(stages: Sequence[StageResult], scaling: Sequence[ScalingResult] = ()) -> dict[str, Any]:
+def to_json(stages: Sequence[StageResult], scaling: Sequence[Mapping[str, Any]] = ()) -> dict[str, Any]:
     """All that a sweep gave as JSON values."""
     return {
         "stages": [
             {
                 "stage": each.stage.name,
-                "cost": each.cost,
+                "cost": each.stage.cost,
                 "accuracy": each.stage.accuracy,
                 "matter": list(each.matter),
                 "rungs": [
@@ -41,17 +41,17 @@ def to_json(stages: Sequence[StageResult], scaling: Sequence[ScalingResult] = ()
             }
             for each in stages
         ],
-        "settings": [{**result.row(), "knobs": dict(result.knobs)} for each in stages for result in each.results],
+        "settings": [{**result.row, "knobs": dict(result.knobs)} for each in stages for result in each.results],
         "scores": list(HIGHER_IS_BETTER),
         "less_is_better": [name for name, higher in HIGHER_IS_BETTER.items() if not higher],
-        "scaling": [each.row() for each in scaling],
+        "scaling": list(scaling),
     }
 
 
-def page(stages: Sequence[StageResult], scaling: Sequence[ScalingResult] = ()) -> bytes:
-    """The interactive plot as one HTML file that needs no network."""
+def page(results: Mapping[str, Any]) -> bytes:
+    """The interactive plot of `to_json`'s values as one HTML file that needs no network."""
     # In a script element `</` would end it, whatever it stands in.
-    data = json.dumps(plain(to_json(stages, scaling)), ensure_ascii=False).replace("</", "<\\/")
+    data = json.dumps(plain(results), ensure_ascii=False).replace("</", "<\\/")
     return TEMPLATE.read_text(encoding="utf-8").replace(DATA, data).encode("utf-8", "backslashreplace")
 
 
@@ -66,41 +66,42 @@ def picture(stages: Sequence[StageResult]) -> bytes:
     figure = Figure(figsize=(7.5 * columns, 5.4 * rows), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for axes, stage in zip(panels, stages, strict=False):
-        _panel(axes, stage)
+    labels = [_panel(axes, stage) for axes, stage in zip(panels, stages, strict=False)]
     for axes in panels[len(stages) :]:
         axes.set_visible(False)
     # Where points and legends are is known once they are drawn.
     canvas.draw()
-    for axes, stage in zip(panels, stages, strict=False):
-        label_points(axes, _labels(stage))
+    for axes, texts in zip(panels, labels, strict=False):
+        label_points(axes, texts)
     stream = io.BytesIO()
     canvas.print_png(stream)
     return stream.getvalue()
 
 
-def _panel(axes: Any, stage: StageResult) -> None:
-    accuracy = stage.stage.accuracy
-    settings = _measured(stage)
-    colors = {name: f"C{number}" for number, name in enumerate(dict.fromkeys(map(_group, settings)))}
-    labeled: set[str] = set()
+def _panel(axes: Any, result: StageResult) -> list[Label]:
+    """Draws the settings of a stage whose accuracy is a number, and gives the labels of their points."""
+    stage = result.stage
+    settings = [each for each in result.results if not math.isnan(each.score(stage.accuracy))]
+    colors: dict[str, str] = {}
+    labels: list[Label] = []
     for each in settings:
-        group, point = _group(each), (each.cost(stage.cost), each.score(accuracy))
-        is_base = each.phase == "base"
+        group, point = _group(each), (each.score(stage.cost), each.score(stage.accuracy))
+        is_base, is_new = not each.knobs, group not in colors
         axes.scatter(
             *point,
             s=160 if is_base else 30,
             marker="*" if is_base else "o",
-            color=colors[group],
-            label=None if group in labeled else group,
+            color=colors.setdefault(group, f"C{len(colors)}"),
+            label=group if is_new else None,
             zorder=3,
         )
-        labeled.add(group)
-        if each.on_front:
+        if each.row["on_front"]:
             axes.scatter(*point, s=180, facecolors="none", edgecolors="black", linewidths=1.1, zorder=4)
+        if not is_base and each.row["phase"] != "joint":
+            labels.append((", ".join(map(str, each.knobs.values())), point))
     axes.set_xlabel(COST_NAMES[stage.cost])
-    axes.set_ylabel(accuracy + (" (more is better)" if HIGHER_IS_BETTER[accuracy] else " (less is better)"))
-    axes.set_title(f"{stage.stage.name} (ringed: on the Pareto front)")
+    axes.set_ylabel(stage.accuracy + (" (more is better)" if HIGHER_IS_BETTER[stage.accuracy] else " (less is better)"))
+    axes.set_title(f"{stage.name} (ringed: on the Pareto front)")
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "235" else "")
@@ -108,35 +109,12 @@ def _panel(axes: Any, stage: StageResult) -> None:
     axes.set_axisbelow(True)
     if settings:
         axes.legend(fontsize=7)
-
-
-def _measured(stage: StageResult) -> list[SettingResult]:
-    """The settings whose accuracy is a number."""
-    return [each for each in stage.results if not math.isnan(each.score(stage.stage.accuracy))]
-
-
-def _labels(stage: StageResult) -> list[Label]:
-    """The values of settings, and the points that they belong to."""
-    return [
-        (
-            ", ".join(str(value) for value in each.knobs.values()),
-            (each.cost(stage.cost), each.score(stage.stage.accuracy)),
-        )
-        for each in _measured(stage)
-        if each.knobs and each.phase != "joint"
-    ]
+    return labels
 
 
 def label_points(axes: Any, labels: Sequence[Label]) -> list[Any]:
-    """Writes labels beside points, each at the first of `OFFSETS` where it covers no other label.
-
-    Args:
-        axes: a panel that was drawn.
-        labels: texts, and their points in the panel's units.
-
-    Returns:
-        Their annotations; a label for which there is no room is left out.
-    """
+    """Writes labels beside points of a panel that was drawn, each at the first of `OFFSETS` where it covers no other
+    label, and returns their annotations; a label for which there is no room is left out."""
     renderer = axes.figure.canvas.get_renderer()
     legend = axes.get_legend()
     occupied = [] if legend is None else [legend.get_window_extent(renderer)]

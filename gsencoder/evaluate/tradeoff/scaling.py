@@ -1,32 +1,40 @@
-"""How the cost of fusion and of the encoder grows with Gaussians, views, channels and pixels."""
+"""How the cost of fusion and of the encoder grows with Gaussians, views, channels and pixels.
+
+Power laws, cost = constant · size^exponent, are fitted by least squares of logarithms. Costs that do not grow with a
+size, and what is constant, pull an exponent down at small sizes: it holds for the sizes that were measured.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Float64, Int64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Track, untracked
+from gsencoder.core.settings import check_limits, option
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
-from gsencoder.evaluate.tradeoff.measure import Exponent, fit_exponent, interleaved, timed_run
-from gsencoder.evaluate.tradeoff.stage import Inputs, StageName
-from gsencoder.evaluate.tradeoff.stages import EncoderSettings, encoder_of, taught_scene
+from gsencoder.evaluate.tradeoff.measure import interleaved, timed_run
+from gsencoder.evaluate.tradeoff.stages import EncoderSettings, Inputs, StageName, encoder_of, taught_scene
 from gsencoder.fusion.fuse import fuse
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import build_teacher, text_table_of
 from gsencoder.teachers.labels import LabelsConfig
-from gsencoder.types import FeatureMap, FeatureSpace, Gaussians, Scene, Views
+from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
 from gsencoder.types.orientation import upright_views
 
 Factor = Literal["gaussians", "views", "channels", "pixels"]
 SPAN = 8.0
 """The largest size as a multiple of the smallest."""
+ROUNDS = 2
+"""Timed runs at each size."""
 DENSE_CELL = 8
 """Pixels along a cell of the labels teacher where channels are counted: maps of single pixels are codes into a table,
 and cost the same whatever the table's width."""
@@ -36,56 +44,56 @@ and cost the same whatever the table's width."""
 class ScalingConfig:
     """Which sizes are measured."""
 
-    points: int = field(
-        default=0, metadata={"help": "sizes of each kind for exponents of cost (fusion, encoder); 0 = no exponents"}
-    )
-    rounds: int = field(default=2, metadata={"help": "timed runs at each size"})
+    points: int = option(0, "sizes of each kind for exponents of cost (fusion, encoder); 0 = no exponents", ge=0)
 
     def __post_init__(self) -> None:
-        if self.points < 0 or self.points in (1, 2):
+        check_limits(self)
+        if self.points in (1, 2):
             raise InputError(f"points: expected 0 (none) or 3 and more, got {self.points}")
-        if self.rounds < 1:
-            raise InputError(f"rounds: expected 1 or more, got {self.rounds}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScalingResult:
-    """How a stage's CPU time grows with one size.
+class Exponent(NamedTuple):
+    """A power law fitted to costs: its exponent with the 95 % confidence interval, and the cost at size 1."""
 
-    Attributes:
-        stage: its name.
-        factor: the size that was changed.
-        scenes: how many were measured.
-        sizes, cpu_seconds: one for each timed run, of all scenes.
-        exponent: of CPU time, each scene with a constant of its own.
+    value: float
+    low: float
+    high: float
+    constant: float
+
+
+def fit_exponent(
+    sizes: Float64[np.ndarray, " n"], costs: Float64[np.ndarray, " n"], groups: Int64[np.ndarray, " n"] | None = None
+) -> Exponent:
+    """Fits log cost = log constant + exponent · log size.
+
+    Args:
+        groups: a number for each pair; each group has a constant of its own, and all have the same exponent. None = one
+            group.
     """
+    from scipy.stats import t
 
-    stage: StageName
-    factor: Factor
-    scenes: int
-    sizes: tuple[float, ...]
-    cpu_seconds: tuple[float, ...]
-    exponent: Exponent
+    if not (np.minimum(sizes, costs) > 0).all():
+        raise InputError("fit_exponent: expected positive sizes and costs")
+    labels = np.zeros(len(sizes), np.int64) if groups is None else np.unique(groups, return_inverse=True)[1]
+    free = len(sizes) - (int(labels.max(initial=0)) + 1) - 1
 
-    def row(self) -> dict[str, Any]:
-        """The result as a row of a table."""
-        return {
-            "stage": self.stage,
-            "size": self.factor,
-            "scenes": self.scenes,
-            "smallest": min(self.sizes),
-            "largest": max(self.sizes),
-            "exponent": self.exponent.value,
-            "low": self.exponent.low,
-            "high": self.exponent.high,
-            "runs": self.exponent.points,
-        }
+    def about_means(values: np.ndarray) -> np.ndarray:
+        return np.asarray(values - (np.bincount(labels, values) / np.bincount(labels))[labels])
+
+    log_x, log_y = np.log(sizes), np.log(costs)
+    x, y = about_means(log_x), about_means(log_y)
+    moment = float((x**2).sum())
+    if free < 1 or not moment > 1e-12:
+        raise InputError(f"fit_exponent: expected three different sizes or more, got {np.unique(sizes).tolist()}")
+    value = float((x * y).sum() / moment)
+    half = float(t.ppf(0.975, free)) * float(np.sqrt(((y - value * x) ** 2).sum() / free / moment))
+    constant = float(np.exp(log_y.mean() - value * log_x.mean()))
+    return Exponent(value=value, low=value - half, high=value + half, constant=constant)
 
 
-def geometric_sizes(most: int, config: ScalingConfig, least: int = 1) -> list[int]:
+def geometric_sizes(most: int, points: int) -> list[int]:
     """Whole sizes up to `most` at equal ratios, without repeats."""
-    smallest = max(least, most / SPAN)
-    return sorted({int(size) for size in np.geomspace(smallest, most, config.points).round()})
+    return sorted({int(size) for size in np.geomspace(max(1, most / SPAN), most, points).round()})
 
 
 class DenseTeacher:
@@ -126,134 +134,100 @@ class DenseTeacher:
         return {}
 
 
-def thinned(gaussians: Gaussians, count: int) -> Gaussians:
-    """So many of the Gaussians, evenly spread over their order."""
-    return gaussians.select(even_indices(len(gaussians), count))
+Runs = dict[Factor, list[tuple[float, Callable[[], Any]]]]
+"""Sizes, one of which is changed at a time, and what is timed at them."""
 
 
-Run = tuple[float, Callable[[], Any]]
-"""A size, and what is timed at it."""
-
-
-class _Timed:
-    """A run as a `StageScene`, for `timed_run`."""
-
-    def __init__(self, run: Callable[[], Any]) -> None:
-        self._run = run
-
-    def run(self, settings: Any) -> Any:  # noqa: ARG002
-        return self._run()
-
-    def judge(self, product: Any, settings: Any) -> Any:
-        raise NotImplementedError
+def gaussian_sizes(scene: Scene, points: int) -> Iterator[tuple[int, Scene]]:
+    """A scene with fewer of its Gaussians, evenly spread over their order."""
+    gaussians = scene.gaussians
+    assert gaussians is not None
+    for size in geometric_sizes(len(gaussians), points):
+        yield size, replace(scene, gaussians=gaussians.select(even_indices(len(gaussians), size)))
 
 
 @contextmanager
-def fusion_runs(path: Path, inputs: Inputs, config: ScalingConfig) -> Iterator[dict[Factor, list[Run]]]:
-    """What is fused at which sizes: one is changed at a time, the others are those of the scene."""
-    with taught_scene(path, inputs) as taught:
-        scene, teacher = taught.scene, taught.teacher
-        assert scene.gaussians is not None
-        assert scene.views is not None
-        gaussians, views = scene.gaussians, scene.views
-
-        def fused(scene: Scene, teacher: Teacher, **changes: Any) -> Callable[[], Any]:
-            settings = replace(inputs.fusion, **changes)
-            return lambda: fuse(scene, teacher, settings)
-
-        runs: dict[Factor, list[Run]] = {
-            "gaussians": [
-                (size, fused(replace(scene, gaussians=thinned(gaussians, size)), teacher))
-                for size in geometric_sizes(len(gaussians), config)
-            ],
-            "views": [(size, fused(scene, teacher, views=size)) for size in geometric_sizes(len(views), config)],
-            "channels": [],
-            "pixels": [],
-        }
+def fusion_runs(path: Path, inputs: Inputs, points: int) -> Iterator[Runs]:
+    """What is fused at which sizes; those that do not change are those of the scene."""
+    with taught_scene(inputs, path) as taught:
+        scene, teacher, fusion = taught.scene, taught.teacher, inputs.fusion
+        views = scene.views
+        assert views is not None
         words = text_table_of(inputs.teacher)
         coarse = inputs.teacher
         if isinstance(coarse, LabelsConfig) and coarse.cell == 1:
             coarse = replace(coarse, cell=DENSE_CELL)
         source = build_teacher(coarse, scene, words)
-        for size in geometric_sizes(teacher.space.channels, config):
-            dense = DenseTeacher(source, views, size)
-            runs["channels"].append((size, fused(scene, dense, basis=False)))
-        for size in np.geomspace(1 / SPAN, 1, config.points):
+        runs: Runs = {
+            "gaussians": [(size, partial(fuse, part, teacher, fusion)) for size, part in gaussian_sizes(scene, points)],
+            "views": [
+                (size, partial(fuse, scene, teacher, replace(fusion, views=size)))
+                for size in geometric_sizes(len(views), points)
+            ],
+            "channels": [
+                (size, partial(fuse, scene, DenseTeacher(source, views, size), replace(fusion, basis=False)))
+                for size in geometric_sizes(teacher.space.channels, points)
+            ],
+            "pixels": [],
+        }
+        for size in np.geomspace(1 / SPAN, 1, points):
             scale = inputs.data.image_scale * float(np.sqrt(size))
             smaller = load_scene(path, options=replace(inputs.data, image_scale=scale))
             assert smaller.views is not None
             cameras = smaller.views.cameras
-            smaller = replace(smaller, gaussians=gaussians, objects=scene.objects)
+            smaller = replace(smaller, gaussians=scene.gaussians, objects=scene.objects)
             pixels = float((cameras.widths.astype(np.float64) * cameras.heights).mean())
-            runs["pixels"].append((pixels, fused(smaller, build_teacher(inputs.teacher, smaller, words))))
+            runs["pixels"].append(
+                (pixels, partial(fuse, smaller, build_teacher(inputs.teacher, smaller, words), fusion))
+            )
         yield runs
 
 
 @contextmanager
-def encoder_runs(path: Path, inputs: Inputs, config: ScalingConfig) -> Iterator[dict[Factor, list[Run]]]:
+def encoder_runs(path: Path, inputs: Inputs, points: int) -> Iterator[Runs]:
     """What is encoded at which numbers of Gaussians."""
     scene = with_gaussians(load_scene(path, options=inputs.data), inputs.seeds)
-    assert scene.gaussians is not None
     encoder = encoder_of(EncoderSettings().weights, 0.0, 0)
-    unit = unit_of(scene, encoder.voxel)
-
-    def encoded(part: Gaussians) -> Callable[[], Any]:
-        return lambda: encoder.encode_spaces(part, inputs.encode, metres_per_unit=unit)
-
-    sizes = geometric_sizes(len(scene.gaussians), config)
-    yield {"gaussians": [(size, encoded(thinned(scene.gaussians, size))) for size in sizes]}
+    encode = partial(encoder.encode_spaces, config=inputs.encode, metres_per_unit=unit_of(scene, encoder.voxel))
+    yield {"gaussians": [(size, partial(encode, part.gaussians)) for size, part in gaussian_sizes(scene, points)]}
 
 
 RUNS = {"fusion": fusion_runs, "encoder": encoder_runs}
+"""The stages whose sizes can be changed here."""
 
 
 def scaling(
-    stages: Sequence[StageName],
-    paths: Sequence[Path],
-    inputs: Inputs,
-    config: ScalingConfig,
-    *,
-    seed: int = 0,
-    track: Track = untracked,
-) -> list[ScalingResult]:
-    """Exponents of the CPU time of stages; stages whose sizes nobody can change here have none.
-
-    Args:
-        stages: names.
-        paths: folders of the scenes.
-        inputs: what stages start from.
-        config: which sizes.
-        seed: of the order of the runs.
-        track: progress.
-
-    Raises:
-        InputError: a scene is too small for three different sizes.
-    """
-    sizes: dict[tuple[StageName, Factor], list[tuple[int, float, float]]] = {}
+    stages: Sequence[StageName], paths: Sequence[Path], inputs: Inputs, points: int, *, track: Track = untracked
+) -> list[dict[str, Any]]:
+    """Exponents of the CPU time of stages, as rows of a table; each scene has a constant of its own."""
+    measured: dict[tuple[StageName, Factor], list[tuple[int, float, float]]] = {}
     for stage in stages:
         if stage not in RUNS:
             continue
         for number, path in enumerate(track(list(paths), f"{stage}: exponents")):
-            with RUNS[stage](path, inputs, config) as by_factor:
+            with RUNS[stage](path, inputs, points) as by_factor:
                 for factor, runs in by_factor.items():
                     for _, run in runs:
                         run()
-                    for _, index in track(list(interleaved(len(runs), config.rounds, seed)), factor):
+                    for _, index in track(list(interleaved(len(runs), ROUNDS, seed=0)), factor):
                         size, run = runs[index]
-                        cost = timed_run(_Timed(run), None).cpu_seconds
-                        sizes.setdefault((stage, factor), []).append((number, size, cost))
-    results = []
-    for (stage, factor), measured in sizes.items():
-        groups, at, costs = zip(*measured, strict=True)
-        exponent = fit_exponent(np.array(at, np.float64), np.array(costs), np.array(groups))
-        results.append(
-            ScalingResult(
-                stage=stage,
-                factor=factor,
-                scenes=len(paths),
-                sizes=tuple(map(float, at)),
-                cpu_seconds=tuple(costs),
-                exponent=exponent,
-            )
+                        row = number, size, timed_run(run).cpu_seconds
+                        measured.setdefault((stage, factor), []).append(row)
+    rows = []
+    for (stage, factor), timings in measured.items():
+        groups, sizes, costs = map(np.array, zip(*timings, strict=True))
+        exponent = fit_exponent(sizes.astype(np.float64), costs, groups)
+        rows.append(
+            {
+                "stage": stage,
+                "size": factor,
+                "scenes": len(paths),
+                "smallest": float(sizes.min()),
+                "largest": float(sizes.max()),
+                "exponent": exponent.value,
+                "low": exponent.low,
+                "high": exponent.high,
+                "runs": len(timings),
+            }
         )
-    return results
+    return rows

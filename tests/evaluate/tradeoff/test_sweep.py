@@ -1,6 +1,7 @@
-"""Sweeps: what is run in which order, and what an interrupted one does again."""
+"""Sweeps: what is run in which order, what an interrupted one does again, what goes on, and what results say."""
 
 import errno
+import itertools
 import os
 from collections import Counter
 from contextlib import nullcontext
@@ -9,27 +10,42 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_stage import Toy, ToyScene, ToySettings
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import sem
+from toy_stage import Toy, ToySettings, record
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.process import Growth
 from gsencoder.evaluate.tradeoff.measure import RECORDS_FILE, Record, Records, Timing, interleaved, measure
-from gsencoder.evaluate.tradeoff.stage import Judged, Score
+from gsencoder.evaluate.tradeoff.stages import Score
 from gsencoder.evaluate.tradeoff.sweep import (
     HalvingConfig,
     SweepConfig,
+    best_first,
     check_sweep,
+    crowding,
+    draw_settings,
+    estimate,
     knobs_that_matter,
+    mark_front,
+    non_dominated_ranks,
+    scene_row,
     settings_of,
+    successive_halving,
+    summarize,
     sweep_stage,
 )
 
 SCENES = [Path("/rooms/a"), Path("/rooms/b"), Path("/rooms/c")]
+CHANGES = [{}, {"effort": 1}, {"color": 2}]
+TIMING = Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0)
+ALL = HalvingConfig(settings=50)
 
 
 @pytest.fixture(autouse=True)
 def _without_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Measuring memory collects garbage, which takes long beside all that tests have imported."""
+    """Measuring memory collects garbage, which takes long after all that tests have imported."""
     monkeypatch.setattr("gsencoder.evaluate.tradeoff.measure.memory_growth", lambda: nullcontext(Growth()))
 
 
@@ -44,37 +60,29 @@ def test_every_round_takes_every_setting_once_in_an_order_of_its_own() -> None:
 
 def test_each_setting_is_warmed_up_and_judged_once_and_then_timed_in_each_round() -> None:
     toy = Toy()
-    settings = [{}, {"effort": 1}, {"color": 2}]
-    rows = measure(toy.stage(), SCENES[:2], settings, Records(), rounds=3)
-    assert [[record.scene for record in row] for row in rows] == [["a", "b"]] * 3
-    assert Counter(toy.runs) == {(scene, replace(ToySettings(), **each)): 4 for scene in "ab" for each in settings}
+    rows = measure(toy.stage(), SCENES[:2], CHANGES, Records(), rounds=3)
+    assert [[each.scene for each in row] for row in rows] == [["a", "b"]] * 3
+    assert Counter(toy.runs) == {(scene, replace(ToySettings(), **each)): 4 for scene in "ab" for each in CHANGES}
     assert len(toy.judged) == len(set(toy.judged)) == 6
-    # Judged ones come before timed ones.
     assert toy.runs[:3] == toy.judged[:3]
 
 
-@pytest.mark.parametrize("fail_at", range(1, 19, 3))
+@pytest.mark.parametrize("fail_at", range(1, 19, 6))
 def test_an_interrupted_sweep_goes_on_where_it_was(tmp_path: Path, fail_at: int) -> None:
-    settings = [{}, {"effort": 1}, {"color": 2}]
-    whole = Toy()
-    expected = measure(whole.stage(), SCENES[:2], settings, Records(), rounds=2)
-    toy = Toy()
+    whole, toy = Toy(), Toy()
+    expected = measure(whole.stage(), SCENES[:2], CHANGES, Records(), rounds=2)
     toy.fail_at = fail_at
     with pytest.raises(KeyboardInterrupt):
-        measure(toy.stage(), SCENES[:2], settings, Records(tmp_path), rounds=2)
-    before = len(toy.judged)
+        measure(toy.stage(), SCENES[:2], CHANGES, Records(tmp_path), rounds=2)
     toy.fail_at = None
-    rows = measure(toy.stage(), SCENES[:2], settings, Records(tmp_path), rounds=2)
-    assert [[record.scores for record in row] for row in rows] == [
-        [record.scores for record in row] for row in expected
-    ]
-    assert {len(record.timings) for row in rows for record in row} == {2}
+    rows = measure(toy.stage(), SCENES[:2], CHANGES, Records(tmp_path), rounds=2)
+    assert [[each.scores for each in row] for row in rows] == [[each.scores for each in row] for row in expected]
+    assert {len(each.timings) for row in rows for each in row} == {2}
     # Nothing is judged twice, and no run is timed twice: warm-up runs alone are repeated.
     assert len(toy.judged) == len(set(toy.judged)) == 6
-    assert before < 6 or fail_at > 12
     assert len(toy.runs) <= len(whole.runs) + 3
     again = len(toy.runs)
-    measure(toy.stage(), SCENES[:2], settings, Records(tmp_path), rounds=2)
+    measure(toy.stage(), SCENES[:2], CHANGES, Records(tmp_path), rounds=2)
     assert len(toy.runs) == again
 
 
@@ -87,41 +95,29 @@ def test_a_line_that_a_kill_cut_off_is_measured_again_and_a_damaged_one_refused(
     (row,) = measure(toy.stage(), SCENES[:1], [{}], Records(tmp_path), rounds=2)
     assert len(row[0].timings) == 2
     assert len(file.read_bytes().splitlines()) == len(whole.splitlines())
-    file.write_bytes(b'{"stage": 3}\n')
-    with pytest.raises(InputError, match="line 1 is damaged .*resume=false"):
+    file.write_bytes(b'{}\n{"stage": 3}\n')
+    with pytest.raises(InputError, match="line 2 is damaged .*resume=false"):
         Records(tmp_path)
 
 
 def test_measurements_of_another_sweep_are_not_mixed_in(tmp_path: Path) -> None:
-    timing = Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0)
-    Records(tmp_path, {"scenes": 1}).add_timing("fusion", "a", {}, timing)
-    assert len(Records(tmp_path, {"scenes": 1})) == 1
-    with pytest.raises(InputError, match="holds measurements of a sweep with other settings; give resume=false"):
-        Records(tmp_path, {"scenes": 2})
-
-
-def test_a_sweep_that_measured_nothing_leaves_nothing_and_does_not_stand_in_the_way_of_another(tmp_path: Path) -> None:
     Records(tmp_path, {"scenes": 1})
     assert list(tmp_path.iterdir()) == []
-    Records(tmp_path, {"scenes": 2}).add_timing("fusion", "a", {}, Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0))
+    Records(tmp_path, {"scenes": 2}).add("fusion", "a", {}, TIMING)
     assert len(Records(tmp_path, {"scenes": 2})) == 1
+    with pytest.raises(InputError, match="holds measurements of a sweep with other settings; give resume=false"):
+        Records(tmp_path, {"scenes": 1})
 
 
-def test_numbers_that_are_not_finite_survive_the_file(tmp_path: Path) -> None:
+def test_measurements_come_back_from_the_file_whatever_the_order_of_knobs(tmp_path: Path) -> None:
     records = Records(tmp_path)
-    records.add_timing("fusion", "a", {"x": 1}, Timing(seconds=1.0, cpu_seconds=0.5, mib=float("nan")))
-    records.add_judged("fusion", "a", {"x": 1}, Judged(scores={"cosine": Score(float("nan"), 1)}, bytes=7))
-    read = Records(tmp_path).get("fusion", "a", {"x": 1})
+    records.add("fusion", "a", {"x": 1, "y": 2}, replace(TIMING, mib=float("nan")))
+    records.add("fusion", "a", {"x": 1, "y": 2}, ({"cosine": Score(float("nan"), 1)}, 7))
+    read = Records(tmp_path).get("fusion", "a", {"y": 2, "x": 1})
     assert read.timings[0].seconds == 1.0
     assert np.isnan(read.timings[0].mib)
-    assert np.isnan(read.scores["cosine"].total)
+    assert np.isnan(read.scores["cosine"].total)  # type: ignore[index]
     assert read.bytes == 7
-
-
-def test_the_order_of_knobs_tells_no_records_apart(tmp_path: Path) -> None:
-    records = Records(tmp_path)
-    records.add_timing("fusion", "a", {"x": 1, "y": 2}, Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0))
-    assert len(Records(tmp_path).get("fusion", "a", {"y": 2, "x": 1}).timings) == 1
 
 
 @pytest.mark.parametrize(
@@ -133,24 +129,17 @@ def test_a_measurement_that_cannot_be_written_ends_the_sweep(
     def refused(*_: object) -> None:
         raise OSError(number, os.strerror(number))
 
-    timing = Timing(seconds=1.0, cpu_seconds=0.5, mib=1.0)
     records = Records(tmp_path)
-    records.add_timing("fusion", "a", {}, timing)
+    records.add("fusion", "a", {}, TIMING)
     monkeypatch.setattr(Path, "open", refused)
     with pytest.raises(InputError, match=f"{RECORDS_FILE}: cannot write: {problem}"):
-        records.add_timing("fusion", "a", {}, timing)
+        records.add("fusion", "a", {}, TIMING)
 
 
 def test_one_knob_is_changed_at_a_time_and_the_base_comes_first() -> None:
     stage = Toy().stage()
-    assert settings_of(stage, SweepConfig()) == [
-        {},
-        {"effort": 1},
-        {"effort": 2},
-        {"effort": 8},
-        {"color": 1},
-        {"color": 2},
-    ]
+    one_at_a_time = [{}, {"effort": 1}, {"effort": 2}, {"effort": 8}, {"color": 1}, {"color": 2}]
+    assert settings_of(stage, SweepConfig()) == one_at_a_time
     assert settings_of(stage, SweepConfig(knobs=("color",), values=("color:0/7",))) == [{}, {"color": 7}]
     assert len(settings_of(stage, SweepConfig(grid=True))) == 4 * 3
 
@@ -159,12 +148,9 @@ def test_one_knob_is_changed_at_a_time_and_the_base_comes_first() -> None:
     ("sweep", "message"),
     [
         (SweepConfig(knobs=("rays",)), "^sweep.knobs: 'rays' is no knob of fusion; expected some of effort, color"),
-        (SweepConfig(values=("rays:1",)), "^sweep.values: 'rays' is no knob"),
         (SweepConfig(values=("effort:1", "effort:2")), "^sweep.values: effort is given twice"),
-        (SweepConfig(values=("effort",)), "^sweep.values: expected KNOB:VALUE/VALUE, got 'effort'"),
         (SweepConfig(values=("effort:",)), "^sweep.values: expected KNOB:VALUE/VALUE, got 'effort:'"),
         (SweepConfig(knobs=("color",), values=("effort:1",)), "^sweep.values: effort is not among sweep.knobs=color;"),
-        (SweepConfig(values=("effort:much",)), "^effort: expected a whole number, got 'much'"),
         (SweepConfig(values=("effort:0",)), "^effort=0: effort: expected 1 or more"),
     ],
 )
@@ -175,16 +161,18 @@ def test_a_sweep_that_cannot_be_is_refused_at_once(sweep: SweepConfig, message: 
 
 def test_a_knob_without_effect_does_not_matter_and_is_not_changed_with_others() -> None:
     toy = Toy()
-    result = sweep_stage(toy.stage(), SCENES, Records(), SweepConfig(rounds=1), HalvingConfig(settings=50))
+    result = sweep_stage(toy.stage(), SCENES, Records(), SweepConfig(rounds=1), ALL)
     assert result.matter == ("effort",)
-    assert {knob for each in result.results if each.phase == "joint" for knob in each.knobs} <= {"effort"}
+    assert {knob for each in result.results if each.row["phase"] == "joint" for knob in each.knobs} <= {"effort"}
     assert [rung.scenes for rung in result.rungs] == [1, 3]
     # Cost and error of the toy trade against each other, so nothing that was tried with the knob is beaten.
-    assert all(each.on_front for each in result.results if "color" not in each.knobs)
-    assert result.results[0].phase == "base"
+    assert all(each.row["on_front"] for each in result.results if "color" not in each.knobs)
+    assert result.results[0].row["phase"] == "base"
+    # What was measured one at a time is not measured again.
+    assert max(Counter(toy.runs).values()) == 2
 
 
-def test_a_knob_that_needs_another_is_tried_beside_it_and_judged_against_that() -> None:
+def test_a_knob_that_needs_another_is_tried_with_it_and_judged_against_that() -> None:
     stage = Toy().stage()
     effort, color = stage.knobs
     # The color has no effect of its own; against the base it would seem to have that of the effort.
@@ -192,12 +180,6 @@ def test_a_knob_that_needs_another_is_tried_beside_it_and_judged_against_that() 
     sweep = SweepConfig(rounds=1, knobs=("color",))
     assert settings_of(stage, sweep) == [{}, {"effort": 8}, {"effort": 8, "color": 1}, {"effort": 8, "color": 2}]
     assert sweep_stage(stage, SCENES, Records(), sweep).matter == ("effort",)
-
-
-def test_settings_of_the_joint_part_that_were_measured_before_are_not_measured_again() -> None:
-    toy = Toy()
-    sweep_stage(toy.stage(), SCENES, Records(), SweepConfig(rounds=1), HalvingConfig(settings=50))
-    assert max(Counter(toy.runs).values()) == 2
 
 
 @dataclass(frozen=True)
@@ -210,31 +192,190 @@ class Picky(ToySettings):
             raise InputError("color=2: expected another effort than 8")
 
 
-def test_combinations_that_a_stage_refuses_are_left_out_and_every_result_has_its_records(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def judge(self: ToyScene, product: ToySettings, settings: ToySettings) -> Judged:
-        scores = {"error": Score(1 / settings.effort), "acc_25": Score(settings.color, 8)}
-        return Judged(scores=scores, bytes=100 * settings.effort + settings.color)
-
-    monkeypatch.setattr(ToyScene, "judge", judge)
-    stage, sweep = replace(Toy().stage(), base=Picky(), cost="bytes"), SweepConfig(rounds=1)
-    result = sweep_stage(stage, SCENES, Records(), sweep, HalvingConfig(settings=50))
+def test_combinations_that_a_stage_refuses_are_left_out_and_every_result_has_its_records() -> None:
+    stage, sweep = replace(Toy(colors_count=True).stage(), base=Picky()), SweepConfig(rounds=1)
+    result = sweep_stage(stage, SCENES, Records(), sweep, ALL)
     assert result.matter == ("effort", "color")
     assert len(result.rungs[0].settings) == 4 * 3 - 1
     # What others beat on the first scene is not measured on the rest.
-    assert {each.scenes for each in result.results if each.phase == "joint"} == {1}
+    assert {each.row["scenes"] for each in result.results if each.row["phase"] == "joint"} == {1}
     measured = Counter(each.label for each in result.records)
-    assert measured == {each.label: each.scenes for each in result.results}
+    assert measured == {each.row["setting"]: each.row["scenes"] for each in result.results}
 
 
 def test_the_cost_of_the_stage_is_the_one_that_decides() -> None:
-    stage = replace(Toy().stage(), cost="seconds")
-    result = sweep_stage(stage, SCENES[:1], Records(), SweepConfig(rounds=1, knobs=("color",)))
-    assert result.cost == "seconds"
     (effort, _), rows = Toy().stage().knobs, []
     for knobs, seconds in (({}, 2.0), ({"effort": 1}, 1.0)):
         timing = Timing(seconds=seconds, cpu_seconds=4.0, mib=1.0)
         rows.append([Record(stage="fusion", scene="a", knobs=knobs, timings=(timing,))])
     assert knobs_that_matter([effort], rows, rows[0], "seconds") == ["effort"]
     assert knobs_that_matter([effort], rows, rows[0], "cpu_seconds") == []
+
+
+def test_what_scenes_do_not_agree_on_is_noise_and_a_scene_without_things_says_nothing() -> None:
+    (effort, _) = Toy().stage().knobs
+
+    def row(*hits: int, **knobs: int) -> list[Record]:
+        scenes = [record(name, [1.0], {"acc_25": Score(n, 8)}, **knobs) for name, n in zip("abc", hits, strict=True)]
+        return [*scenes, record("d", [1.0], {"acc_25": Score(0, 0)}, **knobs)]
+
+    base = row(4, 4, 4)
+    assert knobs_that_matter([effort], [base, row(7, 2, 4, effort=1)], base, "bytes") == []
+    assert knobs_that_matter([effort], [base, row(6, 5, 6, effort=1)], base, "bytes") == ["effort"]
+
+
+points = st.integers(1, 12).flatmap(
+    lambda n: st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=n, max_size=n)
+)
+
+
+@given(points)
+@settings(deadline=None, max_examples=60)
+def test_a_rank_is_the_longest_chain_of_points_that_dominate_each_other(given: list[tuple[int, int]]) -> None:
+    costs = np.array(given, np.float64)
+    ranks = non_dominated_ranks(costs)
+
+    def chain(index: int) -> int:
+        better = [row for row, each in enumerate(given) if each != given[index] and np.all(costs[row] <= costs[index])]
+        return 1 + max(map(chain, better)) if better else 0
+
+    assert ranks.tolist() == [chain(index) for index in range(len(given))]
+    order = best_first(costs)
+    assert sorted(order) == list(range(len(given)))
+    assert (np.diff(ranks[order]) >= 0).all()
+    # Units do not change the order.
+    assert best_first(costs * [1e-3, 64.0]).tolist() == order.tolist()
+
+
+def test_what_was_not_measured_is_worse_than_anything_that_was() -> None:
+    assert non_dominated_ranks(np.array([(1.0, np.nan), (1.0, 5.0)])).tolist() == [1, 0]
+    assert non_dominated_ranks(np.array([(0.5, np.nan), (1.0, 5.0)])).tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("columns", [1, 3])
+def test_of_all_corners_of_a_cube_the_origin_alone_is_on_the_front(columns: int) -> None:
+    corners = list(itertools.product((0, 1), repeat=columns))
+    assert non_dominated_ranks(np.array(corners, np.float64)).tolist() == [sum(corner) for corner in corners]
+
+
+def test_the_ends_of_a_front_stand_alone_and_a_crowd_does_not() -> None:
+    line = np.array([(0, 10), (1, 9), (1.1, 8.9), (1.2, 8.8), (10, 0)], np.float64)
+    alone = crowding(line)
+    assert np.isinf(alone[[0, 4]]).all()
+    assert alone[2] == min(alone)
+    assert set(best_first(line)[:2].tolist()) == {0, 4}
+
+
+VALUES = {"size": (4, 1, 2, 8), "steps": (10, 1, 100)}
+
+
+@pytest.mark.parametrize("scenes", [1, 3, 10])
+def test_the_best_in_each_column_reaches_the_last_rung_without_noise(scenes: int) -> None:
+    def cost_and_error(knobs: dict[str, int]) -> tuple[float, float]:
+        return knobs["size"] * knobs["steps"], 1 / knobs["size"] + 1 / knobs["steps"]
+
+    drawn = draw_settings(VALUES, 100)
+    rungs = successive_halving(drawn, scenes, lambda some, _: [cost_and_error(dict(each)) for each in some])
+    costs = np.array([cost_and_error(each) for each in drawn])
+    for column in range(2):
+        assert drawn[int(costs[:, column].argmin())] in rungs[-1].settings
+
+
+def test_rungs_grow_in_scenes_and_shrink_in_settings_and_the_best_is_left() -> None:
+    losses, calls = np.random.default_rng(0).permutation(27), list[tuple[int, int]]()
+
+    def evaluate(some, scenes):  # type: ignore[no-untyped-def]
+        calls.append((len(some), scenes))
+        return [(float(losses[each["n"]]),) for each in some]
+
+    rungs = successive_halving([{"n": number} for number in range(27)], 12, evaluate)
+    assert calls == [(27, 1), (9, 3), (4, 9), (4, 12)]
+    assert [rung.scenes for rung in rungs] == [1, 3, 9, 12]
+    assert rungs[-1].survivors == tuple({"n": number} for number in np.argsort(losses)[:4])
+
+
+def test_settings_are_all_combinations_or_always_the_same_choice() -> None:
+    everything = draw_settings(VALUES, 12)
+    assert len(everything) == len({tuple(each.items()) for each in everything}) == 12
+    some = draw_settings(VALUES, 5)
+    assert some == draw_settings(VALUES, 5)
+    assert len({tuple(each.items()) for each in some}) == 5
+    assert all(each in everything for each in some)
+
+
+def test_times_are_medians_over_rounds_and_means_over_scenes_and_ratios_are_of_the_same_round() -> None:
+    base = [record(name, [1.0, 4.0, 16.0]) for name in "abc"]
+    shares = (0.5, 0.25, 0.7)
+    rows = [record(name, [share, 4 * share], views=1) for name, share in zip("abc", shares, strict=True)]
+    row = summarize(rows, base, "one at a time").row
+    middle = 2.5 * np.mean(shares)
+    assert (row["cpu_seconds"], row["seconds"]) == pytest.approx((middle, 2 * middle))
+    assert row["ratio"] == pytest.approx(np.prod(shares) ** (1 / 3))
+    assert row["ratio_error"] == pytest.approx(sem(np.log(shares)))
+
+
+def test_memory_is_that_of_the_largest_scene_bytes_a_mean_and_spread_a_median_over_scenes() -> None:
+    timings = (("a", [1.0, 1.0, 1.0], 30.0, 1), ("b", [1.0, 2.0, 4.0], 50.0, 2), ("c", [1.0, 9.0, 17.0], 10.0, 6))
+    rows = []
+    for name, cpu, mib, size in timings:
+        one = record(name, cpu)
+        rows.append(replace(one, timings=tuple(replace(each, mib=mib) for each in one.timings), bytes=size))
+    row = summarize(rows, rows, "base").row
+    assert (row["mib"], row["bytes"]) == (50.0, 3.0)
+    assert row["spread"] == pytest.approx(1.4826 * 0.5)
+
+
+def test_the_row_of_a_scene_has_medians_over_rounds_and_shares_of_its_things() -> None:
+    row = scene_row(record("a", [1.0, 2.0, 9.0], {"acc_25": Score(3, 4), "acc_50": Score(0, 0)}, views=1))
+    assert (row["setting"], row["scene"], row["cpu_seconds"], row["seconds"]) == ("views=1", "a", 2.0, 4.0)
+    assert (row["acc_25"], row["acc_25_things"], row["acc_50_things"]) == (0.75, 4, 0)
+    assert np.isnan(row["acc_50"])
+
+
+def test_a_score_counts_things_and_its_error_is_that_of_scenes() -> None:
+    value, error, things = estimate([Score(3, 4), Score(1, 4)])
+    assert (value, things) == (0.5, 8)
+    # With as many things in each scene it is the standard error of the mean of the scenes' shares.
+    assert error == pytest.approx(sem([0.75, 0.25]))
+    assert np.isnan(estimate([Score(3, 4)])[1])
+    assert np.isnan(estimate([Score(0, 0)])[0])
+    # A scene without things changes nothing but the number of scenes.
+    assert estimate([Score(3, 4), Score(1, 4), Score(0, 0)])[0] == 0.5
+
+
+def test_standard_errors_hold_the_truth_as_often_as_they_say() -> None:
+    generator = np.random.default_rng(0)
+    inside = 0
+    for _ in range(500):
+        chance = generator.beta(8, 2, size=40)
+        things = generator.integers(4, 15, size=40)
+        hits = generator.binomial(things, chance)
+        value, error, _ = estimate([Score(float(h), float(n)) for h, n in zip(hits, things, strict=True)])
+        inside += abs(value - 0.8) <= 1.96 * error
+    assert 0.91 < inside / 500 < 0.98
+
+
+def test_a_difference_of_scores_has_the_error_of_differences_of_scenes() -> None:
+    base = [Score(3, 4), Score(1, 4), Score(2, 4)]
+    # Every scene gains one thing, so that nothing about the gain is uncertain, whatever the scenes' scores are.
+    assert estimate([Score(4, 4), Score(2, 4), Score(3, 4)], base) == pytest.approx((0.25, 0.0, 12))
+    value, error, _ = estimate([Score(4, 4), Score(0, 4), Score(3, 4)], base)
+    assert (value, error) == pytest.approx((1 / 12, sem([0.25, -0.25, 0.25])))
+    assert np.isnan(estimate([], [])[0])
+
+
+def test_differences_are_of_the_scenes_that_both_have_scores_of() -> None:
+    base = [record("a", [1.0], {"acc_25": Score(1, 2)}), record("b", [1.0])]
+    other = [record("b", [1.0], {"acc_25": Score(2, 2)}, views=1), record("a", [1.0], {"acc_25": Score(2, 2)}, views=1)]
+    row = summarize(other, base, "grid").row
+    assert (row["acc_25_difference"], row["acc_25_things"]) == (0.5, 4)
+    assert "acc_25_difference" not in summarize(base, base, "base").row
+
+
+def test_the_front_is_drawn_among_settings_of_as_many_scenes() -> None:
+    results = []
+    for number, (cpu, error, scenes) in enumerate([(1.0, 0.3, 2), (2.0, 0.2, 2), (3.0, 0.25, 2), (0.1, 0.0, 1)]):
+        rows = [record(name, [cpu], {"error": Score(error)}, n=number) for name in "ab"[:scenes]]
+        results.append(summarize(rows, rows, "grid"))
+    mark_front(results, replace(Toy().stage(), cost="cpu_seconds"))
+    assert [each.row["on_front"] for each in results] == [True, True, False, False]
