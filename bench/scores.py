@@ -4,8 +4,7 @@
 
 Scenes are random: instances are runs of vertices, and every mask is one of them, moved and cut. In the first row a
 scene has as many vertices as `points`, in the second each instance has. Checking the masks, matching and scoring are
-timed, and not how the data is made; then reading the files of some scenes of the first kind, in ScanNet's text format
-and as .npz.
+timed, and not how the data is made; then reading the files of some scenes of the first kind.
 """
 
 import argparse
@@ -78,22 +77,23 @@ def main() -> None:
         size = f"{options.instances * mask:,} vertices, {options.instances} masks of {mask:,}"
         print(f"{options.scenes} scenes of {size}: matching {seconds:.2f} s, scores {last:.2f} s")
         figures[f"masks of {mask}: seconds"] = seconds + last
-        figures[f"masks of {mask}: AP"] = scores.overall.ap
-        print(f"    AP {scores.overall.ap:.3f}, AP50 {scores.overall.ap50:.3f}, AP25 {scores.overall.ap25:.3f}")
+        figures[f"masks of {mask}: AP"] = scores.overall["ap"]
+        print(
+            f"    AP {scores.overall['ap']:.3f}, AP50 {scores.overall['ap_50']:.3f}, AP25 {scores.overall['ap_25']:.3f}"
+        )
     with tempfile.TemporaryDirectory() as name:
-        for form in ("text", "npz"):
-            folders = Path(name) / form / "predictions", Path(name) / form / "truth"
-            for folder in folders:
-                folder.mkdir(parents=True)
-            for seed in range(FILE_SCENES):
-                ids, prediction = random_scene(seed, options.instances, kinds[0])
-                write_instance_prediction(folders[0], prediction, form=form)
-                write_whole_numbers(folders[1] / f"{prediction.scene}.txt", ids)
-            start = time.perf_counter()
-            instance_scores(list(match_instance_files(*folders, CLASSES)), CLASSES)
-            seconds = (time.perf_counter() - start) / FILE_SCENES
-            print(f"from files, {form}: {seconds:.3f} s a scene, {seconds * options.scenes:.1f} s for all")
-            figures[f"{form}: seconds"] = seconds * options.scenes
+        folders = Path(name) / "predictions", Path(name) / "truth"
+        for folder in folders:
+            folder.mkdir(parents=True)
+        for seed in range(FILE_SCENES):
+            ids, prediction = random_scene(seed, options.instances, kinds[0])
+            write_instance_prediction(folders[0], prediction)
+            write_whole_numbers(folders[1] / f"{prediction.scene}.txt", ids)
+        start = time.perf_counter()
+        instance_scores(list(match_instance_files(*folders, CLASSES)), CLASSES)
+        seconds = (time.perf_counter() - start) / FILE_SCENES
+        print(f"from files: {seconds:.3f} s a scene, {seconds * options.scenes:.1f} s for all")
+        figures["files: seconds"] = seconds * options.scenes
     write_figures(options.json, figures)
 
 

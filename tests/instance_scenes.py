@@ -1,8 +1,11 @@
 """Truths and masks of instances by runs of vertices, and their scores."""
 
+from pathlib import Path
+
 import numpy as np
 
 from gsencoder.data.labels.classes import ClassTable
+from gsencoder.data.labels.files import mask_bytes
 from gsencoder.evaluate.benchmarks.instances import (
     InstancePrediction,
     InstanceScores,
@@ -45,4 +48,17 @@ def scored(truth: np.ndarray, *masks: Mask, class_agnostic: bool = False) -> Ins
 
 
 def aps(scores: InstanceScores) -> tuple[float, float, float]:
-    return scores.overall.ap, scores.overall.ap50, scores.overall.ap25
+    return scores.overall["ap"], scores.overall["ap_50"], scores.overall["ap_25"]
+
+
+def write_text_prediction(folder: Path, prediction: InstancePrediction) -> Path:
+    """Writes the masks of a scene as ScanNet's script takes them."""
+    (folder / "predicted_masks").mkdir(exist_ok=True)
+    lines = []
+    for index, rows in enumerate(prediction.masks):
+        name = f"predicted_masks/{prediction.scene}_{index:03d}.txt"
+        mask = np.isin(np.arange(prediction.num_vertices), rows)
+        (folder / name).write_bytes(mask_bytes(mask))
+        lines.append(f"{name} {prediction.labels[index]} {float(prediction.scores[index])!r}\n")
+    (folder / f"{prediction.scene}.txt").write_text("".join(lines))
+    return folder / f"{prediction.scene}.txt"

@@ -5,7 +5,6 @@ model decodes them to text.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,6 @@ from torch import Tensor
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import EXTRA, load_companion, load_pretrained, quiet_transformers
-from gsencoder.evaluate.benchmarks.files import Pooling
-from gsencoder.evaluate.benchmarks.retrieval import view_scores
 
 LABEL = "captions"
 CONNECTORS = ("connector", "multi_modal_projector")
@@ -25,30 +22,21 @@ CONNECTORS = ("connector", "multi_modal_projector")
 MAX_TOKENS = 64
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RetrievedCaption:
-    """A caption of a pool, and its score with a view (`view_scores`)."""
-
-    caption: str
-    score: float
-
-
 def retrieve_captions(
-    cells: Float32[np.ndarray, "n D"],
-    captions: Sequence[str],
-    vectors: Float32[np.ndarray, "C D"],
-    *,
-    count: int = 1,
-    pooling: Pooling = "max",
-) -> list[RetrievedCaption]:
-    """The captions whose vectors fit the rendered features of a view best, best first; of equal ones the first."""
+    cells: Float32[np.ndarray, "n D"], captions: Sequence[str], vectors: Float32[np.ndarray, "C D"], *, count: int = 1
+) -> list[tuple[str, float]]:
+    """The captions of a pool whose vectors fit the rendered features of a view best, with their scores, best first; of
+    equal ones the first. The score is the largest cosine of a cell; vectors are compared as they are."""
     if not captions or len(captions) != len(vectors):
         raise InputError(f"{LABEL}: expected captions with a vector each, got {len(captions)} and {len(vectors)}")
-    scores = view_scores(cells, vectors, pooling)
+    first, second = (
+        each / np.linalg.norm(each, axis=1, keepdims=True)
+        for each in (cells.astype(np.float64), vectors.astype(np.float64))
+    )
+    scores = (first @ second.T).max(axis=0)
     if not np.isfinite(scores).all():
         raise InputError(f"{LABEL}: expected finite features and vectors of captions, got NaN or Inf")
-    order = np.argsort(-scores, kind="stable")[:count].tolist()
-    return [RetrievedCaption(caption=captions[row], score=float(scores[row])) for row in order]
+    return [(captions[row], float(scores[row])) for row in np.argsort(-scores, kind="stable")[:count]]
 
 
 def generate_from_features(
@@ -136,12 +124,8 @@ class FeatureDecoder:
         *,
         max_tokens: int = MAX_TOKENS,
     ) -> list[str]:
-        """What the model answers to each view, greedily.
-
-        Args:
-            tokens: of `gsencoder.infer.views.pictures.feature_tokens` on `grid` (see `generate_from_features`).
-            prompt: what is asked about the view.
-        """
+        """What the model answers to each view, greedily; `tokens` are those of
+        `gsencoder.infer.views.pictures.feature_tokens` on `grid` (see `generate_from_features`)."""
         if not torch.isfinite(tokens).all():
             raise InputError(f"{LABEL}: expected finite features, got NaN or Inf")
         inputs = self.inputs(prompt)

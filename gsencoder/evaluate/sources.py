@@ -9,22 +9,19 @@ of its blending weight falls, less what measured depth says is hidden.
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import Clock, Track, untracked
+from gsencoder.core.process import Clock
 from gsencoder.data.labels.mesh import nearest_rows
-from gsencoder.data.scenes import SceneConfig, load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.errors import sample_cells
-from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import VisibilityConfig, keep_visible
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, head_features, measure_heads
@@ -72,16 +69,11 @@ def space_of_words(encoder: Encoder, words: Words) -> str | None:
         return None
     text_encoder = words.space.text_encoder
     fitting = [name for name, space in encoder.spaces.items() if space.text_encoder == text_encoder]
-    if not fitting:
-        raise InputError(
-            f"no teacher of the encoder has the text encoder {text_encoder} ({', '.join(encoder.spaces)}); give the "
-            "words of one (teacher.words= or text=), or name it with space="
-        )
-    if len(fitting) > 1:
+    if len(fitting) != 1:
         listing = "; ".join(f"{name}: {space.describe()}" for name, space in encoder.spaces.items())
         raise InputError(
-            f"the words of {text_encoder} are those of {len(fitting)} of the encoder's teachers ({listing}); expected "
-            "those of one: give its words (teacher.words= or text=), or name it with space="
+            f"the words of {text_encoder} are those of {len(fitting)} of the encoder's teachers ({listing}); give the "
+            "words of one (teacher.words= or text=), or name it with space="
         )
     return fitting[0]
 
@@ -118,22 +110,6 @@ def fused_head_source(
         return through, {**clock.seconds, "head": time.perf_counter() - start}
 
     return outputs
-
-
-def load_scenes(
-    paths: Sequence[str | Path], data: SceneConfig = SceneConfig(), splat: str = "", track: Track = untracked
-) -> Iterator[tuple[Scene, float]]:
-    """Loads scenes one by one, with the seconds that it took.
-
-    Args:
-        paths: folders or files of the scenes.
-        splat: file of the Gaussians of each scene, relative to its folder; empty = those that the scene has.
-        track: wraps the loop to show progress.
-    """
-    for path in track([Path(path) for path in paths], "scenes"):
-        start = time.perf_counter()
-        scene = with_fitting_splat(load_scene(path, splat=splat or None, options=data), splat, data)
-        yield scene, time.perf_counter() - start
 
 
 def with_features(
@@ -284,14 +260,9 @@ EPS = 1e-12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RenderedErrors:
-    """Means over the cells of all pictures.
-
-    Attributes:
-        cosine: of features as they are. M3 prints 1 − cosine.
-        centered: after the mean of the space has been subtracted from both.
-        l2: squared distance, averaged over channels.
-        not_finite: pictures that were left out because a feature in them was not finite.
-    """
+    """Means over the cells of all pictures: cosine (M3 prints 1 − cosine), centered: after the mean of the space has
+    been subtracted from both, and l2: squared distance, averaged over channels. Pictures with a feature that is not
+    finite are left out, and counted."""
 
     cosine: float
     centered: float
@@ -302,17 +273,14 @@ class RenderedErrors:
 
 
 class RenderedTally:
-    """Adds up the errors of pictures."""
+    """Adds up the errors of pictures, about the mean of the space."""
 
     def __init__(self, mean: Float32[np.ndarray, " D"]) -> None:
-        """Args:
-        mean: of the space.
-        """
         self._mean = mean
         self._sums, self._cells, self._pictures, self._not_finite = np.zeros(3), 0, 0, 0
 
     def add(self, predicted: Float32[np.ndarray, "n D"], target: Float32[np.ndarray, "n D"]) -> None:
-        """Takes the cells of one picture; a picture with a feature that is not finite is counted and left out."""
+        """Takes the cells of one picture."""
         if not (np.isfinite(predicted).all() and np.isfinite(target).all()):
             self._not_finite += 1
             return
@@ -328,14 +296,8 @@ class RenderedTally:
         """The means; NaN where no cell was compared."""
         means = self._sums / self._cells if self._cells else np.full(3, np.nan)
         cosine, centered, l2 = means.tolist()
-        return RenderedErrors(
-            cosine=cosine,
-            centered=centered,
-            l2=l2,
-            cells=self._cells,
-            pictures=self._pictures,
-            not_finite=self._not_finite,
-        )
+        counts = {"cells": self._cells, "pictures": self._pictures, "not_finite": self._not_finite}
+        return RenderedErrors(cosine=cosine, centered=centered, l2=l2, **counts)
 
 
 def _cosines(a: Float32[np.ndarray, "n D"], b: Float32[np.ndarray, "n D"]) -> np.ndarray:

@@ -10,20 +10,13 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from gsencoder.core.errors import InputError
-
 PUBLISHED = Path(__file__).parent / "published"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultRow:
-    """The figures of one method.
-
-    Attributes:
-        source: "measured" by this program, or "published": copied from a paper.
-        group: heading that a paper gives the methods of a kind; empty = none.
-        values: percent by column; a column that is missing or NaN was not measured or not printed.
-    """
+    """The figures of one method, percent by column, "measured" by this program or "published" in a paper, which may
+    head the methods of a kind with a group. A column that is missing or NaN was not measured or not printed."""
 
     source: Literal["measured", "published"]
     method: str
@@ -33,13 +26,8 @@ class ResultRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResultTable:
-    """Rows under the same columns.
-
-    Attributes:
-        columns: names of the figures, in order; all are percent.
-        notes: what a reader must know, a sentence each, such as why a column is empty.
-        by_class: those of the columns that are of one class each; Markdown has them as rows of a second table.
-    """
+    """Rows under the same columns, and notes, a sentence each; columns `by_class` are of one class each, and are rows
+    of a second table in Markdown."""
 
     title: str
     columns: tuple[str, ...]
@@ -54,10 +42,6 @@ class ResultTable:
             | {column: _known(row.values.get(column)) for column in self.columns}
             for row in self.rows
         ]
-
-    def measured(self) -> "ResultTable":
-        """The table without the rows of papers."""
-        return replace(self, rows=tuple(row for row in self.rows if row.source == "measured"))
 
     def without_classes(self) -> "ResultTable":
         """The table without the columns that are of one class each."""
@@ -94,10 +78,9 @@ def table_of(
     notes: Iterable[str] = (),
     by_class: Iterable[str] = (),
 ) -> ResultTable:
-    """A table of measured shares, with a paper's rows below.
+    """A table of measured shares, by method and column, with a paper's rows below.
 
     Args:
-        measured: for each method, its figures as shares, where 1 is shown as 100 percent.
         published: name of a file of `published/`, without its ending; empty = none.
         columns: in order; empty = those of the measured rows, in order of first appearance.
     """
@@ -112,11 +95,7 @@ def table_of(
 
 def published_rows(name: str) -> tuple[ResultRow, ...]:
     """The rows of a paper's table, in percent, as printed."""
-    file = PUBLISHED / f"{name}.csv"
-    if not file.is_file():
-        tables = ", ".join(sorted(path.stem for path in PUBLISHED.glob("*.csv")))
-        raise InputError(f"published table {name!r}: there is none; there are {tables}")
-    with file.open(newline="", encoding="utf-8") as stream:
+    with (PUBLISHED / f"{name}.csv").open(newline="", encoding="utf-8") as stream:
         return tuple(
             ResultRow(
                 source="published",
@@ -146,6 +125,15 @@ def _line(cells: Iterable[str]) -> str:
     return "| " + " | ".join(cell.replace("|", "\\|").replace("\n", " ") for cell in cells) + " |"
 
 
+def grouped(rows: Iterable[Any], *names: str) -> dict[Any, list[Any]]:
+    """Rows, mappings or objects, by one or several of their values, in order of first appearance."""
+    groups: dict[Any, list[Any]] = {}
+    for row in rows:
+        values = tuple(row[name] if isinstance(row, Mapping) else getattr(row, name) for name in names)
+        groups.setdefault(values if len(names) > 1 else values[0], []).append(row)
+    return groups
+
+
 def mean_of(values: Sequence[float] | Float64[np.ndarray, " n"]) -> float:
     """The mean of the values that are numbers; NaN if none is."""
     array = np.asarray(values, np.float64)
@@ -155,14 +143,8 @@ def mean_of(values: Sequence[float] | Float64[np.ndarray, " n"]) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScoreReport:
-    """The scores of one protocol.
-
-    Attributes:
-        results: figures as JSON values, shares and not percent.
-        table: the main figures above those that papers print.
-        rows: rows of CSV files by their stem, such as "scenes" and "classes".
-        line: the main figures in one line.
-    """
+    """The scores of one protocol: figures as shares, the table with those that papers print, rows of CSV files by their
+    stem, such as "scenes" and "classes", and the main figures in one line."""
 
     results: Mapping[str, Any]
     table: ResultTable
@@ -171,17 +153,10 @@ class ScoreReport:
 
 
 def spread(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> dict[str, dict[str, float | int]]:
-    """Mean and standard deviation over scenes of some columns, and the number of scenes that have a value.
-
-    Args:
-        rows: one a scene; NaN and None are no values.
-    """
+    """Mean and standard deviation over scenes, the rows, of columns, and the number of scenes that have a value."""
     figures: dict[str, dict[str, float | int]] = {}
     for column in columns:
-        values = [row[column] for row in rows if row.get(column) is not None and not math.isnan(row[column])]
-        figures[column] = {
-            "scenes": len(values),
-            "mean": mean_of(values),
-            "std": float(np.std(values, ddof=1)) if len(values) > 1 else math.nan,
-        }
+        values = [value for row in rows if (value := _known(row.get(column))) is not None]
+        deviation = float(np.std(values, ddof=1)) if len(values) > 1 else math.nan
+        figures[column] = {"scenes": len(values), "mean": mean_of(values), "std": deviation}
     return figures

@@ -3,11 +3,11 @@
 The classes come from the training scenes: the vectors of a coded teacher's table, or clusters of a dense teacher's
 features. In each scene only the classes of its own targets are choices, and the score is averaged over classes, so that
 a floor counts no more than a spoon. A name that is in no training scene counts as the nearest one that is; the naming
-protocol (`protocols.naming`) does not have this limit.
+protocol does not have this limit.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -32,23 +32,22 @@ PICTURED_SCENES = 3
 """Held-out scenes of which a view is drawn at each validation during training."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ClassAccuracy:
-    """Classification accuracy of Gaussians by the class of their target, over several scenes.
+    """Classification accuracy of Gaussians by the class of their target, counted scene by scene.
 
     Attributes:
-        correct: for each row of the codebook, the Gaussians with this target that are classified correctly.
-        total: for each row of the codebook, the Gaussians with this target.
-        cosine_named: mean cosine of predicted and target features about the mean of the space, over named Gaussians:
-            those whose target is at least half the root mean square distance from the mean.
-        sheet: for each of the first scenes, one view in color and its target and predicted features in false colors;
-            None if no scene is drawn.
+        correct, total: for each row of the codebook, the Gaussians with this target: those that are classified
+            correctly, and all.
+        scenes: that were added.
     """
 
-    correct: Float64[np.ndarray, " C"]
-    total: Float64[np.ndarray, " C"]
-    cosine_named: float
-    sheet: UInt8[np.ndarray, "H W 3"] | None = None
+    def __init__(self, space: OutputSpace, codebook: Float32[np.ndarray, "C channels"], *, pictured: int = 0) -> None:
+        self.scenes = 0
+        self.correct, self.total = np.zeros(len(codebook)), np.zeros(len(codebook))
+        self._space, self._codebook, self._pictured = space, codebook, pictured
+        self._pictures: list[np.ndarray] = []
+        self._titles: list[str] = []
+        self._cosines, self._named = 0.0, 0
 
     def accuracies(self) -> Float64[np.ndarray, " C"]:
         """The accuracy of each class; NaN for classes that do not occur."""
@@ -59,6 +58,45 @@ class ClassAccuracy:
     def score(self) -> float:
         """The accuracy averaged over the classes that occur."""
         return float(np.nanmean(self.accuracies()))
+
+    @property
+    def cosine_named(self) -> float:
+        """Mean cosine of predicted and target features about the mean of the space, over Gaussians whose target is at
+        least half the root mean square distance from the mean."""
+        return self._cosines / max(self._named, 1)
+
+    @property
+    def sheet(self) -> UInt8[np.ndarray, "H W 3"] | None:
+        """For each of the first scenes, one view in color and its target and predicted features in false colors."""
+        return contact_sheet(self._pictures, self._titles, columns=3, width=400) if self._pictures else None
+
+    def add(self, scene: PreparedScene, features: Float32[np.ndarray, "N D"]) -> None:
+        """Classifies the targets of a scene's seen Gaussians and the features predicted for them."""
+        space, codebook = self._space, self._codebook
+        rows = np.flatnonzero(scene.weights)
+        predicted, targets = space.standardize(features[rows]), scene.targets(rows)
+        if self.scenes < self._pictured:
+            self._pictures += draw_middle_view(scene, rows, targets, predicted)
+            self._titles += [f"{scene.name}: {content}" for content in ("colors", "fused", "predicted")]
+        true_codes = nearest_codes(codebook, targets)
+        predicted_codes = nearest_classes(predicted, codebook, np.unique(true_codes))
+        self.correct += np.bincount(true_codes, weights=predicted_codes == true_codes, minlength=len(codebook))
+        self.total += np.bincount(true_codes, minlength=len(codebook))
+        targets, predicted = space.standard_units(targets), space.standard_units(predicted)
+        lengths = np.sqrt(np.square(targets).sum(axis=1))
+        directed = lengths >= 0.5 * space.channels**0.5
+        dots = (targets[directed] * predicted[directed]).sum(axis=1)
+        norms = lengths[directed] * np.sqrt(np.square(predicted[directed]).sum(axis=1) + 1e-12)
+        self._cosines += float((dots / norms).sum())
+        self._named += int(directed.sum())
+        self.scenes += 1
+
+    def sum_over_processes(self) -> None:
+        """Adds what the other processes counted."""
+        counts = summed_array(np.concatenate([self.correct, self.total, [self._cosines, self._named, self.scenes]]))
+        classes = len(self._codebook)
+        self.correct, self.total = counts[:classes], counts[classes : 2 * classes]
+        self._cosines, self._named, self.scenes = float(counts[-3]), int(counts[-2]), int(counts[-1])
 
 
 def nearest_classes(
@@ -87,10 +125,8 @@ def validate_encoder(
     scenes, and the first one has the pictures.
 
     Args:
-        scenes: prepared scenes, with a part for each of the teachers that they have.
         codebooks: the target classes of each teacher, in standard units, in the order of the scenes' parts.
         pictured: number of scenes of which a view is drawn for each teacher.
-        track: wraps the loop over scenes to show progress.
 
     Returns:
         The accuracy for each teacher; teachers that all scenes lack are left out.
@@ -99,8 +135,8 @@ def validate_encoder(
     # The first process takes the scenes that are drawn, and all take turns with the others.
     with_pictures = scenes[:pictured] if process.is_first else []
     share = [*with_pictures, *scenes[pictured:][process.rank :: process.world_size]]
-    tallies = {
-        teacher: _Tally(outputs[teacher], codebook, pictured=len(with_pictures))
+    accuracies = {
+        teacher: ClassAccuracy(outputs[teacher], codebook, pictured=len(with_pictures))
         for teacher, codebook in codebooks.items()
     }
     for scene in track(share, "validation"):
@@ -108,60 +144,13 @@ def validate_encoder(
         with about(f"scene {scene.name}"):
             unit = scene.first.metres_per_unit or 1.0
             encoded = encode_spaces(gaussians, encoder, outputs, config, metres_per_unit=unit)
-        for (teacher, tally), part in zip(tallies.items(), scene.parts, strict=True):
+        for (teacher, accuracy), part in zip(accuracies.items(), scene.parts, strict=True):
             if part is not None:
-                tally.add(part, encoded[teacher].features)
+                accuracy.add(part, encoded[teacher].features)
         scene.close()
-    for tally in tallies.values():
-        tally.sum_over_processes()
-    return {teacher: tally.accuracy() for teacher, tally in tallies.items() if tally.scenes}
-
-
-class _Tally:
-    """Counts how a teacher's targets and the features predicted for them are classified, scene by scene."""
-
-    def __init__(self, space: OutputSpace, codebook: Float32[np.ndarray, "C channels"], *, pictured: int) -> None:
-        self.scenes = 0
-        self._space, self._codebook, self._pictured = space, codebook, pictured
-        self._pictures: list[np.ndarray] = []
-        self._titles: list[str] = []
-        self._correct, self._total = np.zeros(len(codebook)), np.zeros(len(codebook))
-        self._cosines, self._named = 0.0, 0
-
-    def add(self, scene: PreparedScene, features: Float32[np.ndarray, "N D"]) -> None:
-        """Classifies the targets of a scene's seen Gaussians and the features predicted for them."""
-        space, codebook = self._space, self._codebook
-        rows = np.flatnonzero(scene.weights)
-        predicted, targets = space.standardize(features[rows]), scene.targets(rows)
-        if self.scenes < self._pictured:
-            self._pictures += draw_middle_view(scene, rows, targets, predicted)
-            self._titles += [f"{scene.name}: {content}" for content in ("colors", "fused", "predicted")]
-        true_codes = nearest_codes(codebook, targets)
-        predicted_codes = nearest_classes(predicted, codebook, np.unique(true_codes))
-        self._correct += np.bincount(true_codes, weights=predicted_codes == true_codes, minlength=len(codebook))
-        self._total += np.bincount(true_codes, minlength=len(codebook))
-        targets, predicted = space.standard_units(targets), space.standard_units(predicted)
-        lengths = np.sqrt(np.square(targets).sum(axis=1))
-        directed = lengths >= 0.5 * space.channels**0.5
-        dots = (targets[directed] * predicted[directed]).sum(axis=1)
-        norms = lengths[directed] * np.sqrt(np.square(predicted[directed]).sum(axis=1) + 1e-12)
-        self._cosines += float((dots / norms).sum())
-        self._named += int(directed.sum())
-        self.scenes += 1
-
-    def sum_over_processes(self) -> None:
-        """Adds what the other processes counted."""
-        classes = len(self._codebook)
-        counts = np.concatenate([self._correct, self._total, [self._cosines, self._named, self.scenes]])
-        counts = summed_array(counts)
-        self._correct, self._total = counts[:classes], counts[classes : 2 * classes]
-        self._cosines, self._named, self.scenes = float(counts[-3]), int(counts[-2]), int(counts[-1])
-
-    def accuracy(self) -> ClassAccuracy:
-        """The accuracy over the scenes added."""
-        sheet = contact_sheet(self._pictures, self._titles, columns=3, width=400) if self._pictures else None
-        cosine = self._cosines / max(self._named, 1)
-        return ClassAccuracy(correct=self._correct, total=self._total, cosine_named=cosine, sheet=sheet)
+    for accuracy in accuracies.values():
+        accuracy.sum_over_processes()
+    return {teacher: accuracy for teacher, accuracy in accuracies.items() if accuracy.scenes}
 
 
 def validate_names(

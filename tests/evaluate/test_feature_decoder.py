@@ -20,18 +20,11 @@ AXES = np.eye(3, 4, dtype=np.float32)
 def test_the_best_captions_come_first() -> None:
     cells = np.array([[0.1, 0.9, 0, 0], [0.8, 0, 0, 0.6]], np.float32)
     best = retrieve_captions(cells, CAPTIONS, AXES, count=5)
-    assert [each.caption for each in best] == ["a chair", "a mug", "a red box"]
-    assert best[0].score == pytest.approx(0.9 / np.sqrt(0.82))
-    assert [each.score for each in best[1:]] == pytest.approx([0.8, 0])
-    (mean,) = retrieve_captions(cells, CAPTIONS, AXES, pooling="mean")
-    assert mean.caption == "a chair"
-    assert mean.score == pytest.approx(0.45 / np.sqrt(0.82))
-
-
-def test_of_equal_captions_the_first_comes_first() -> None:
-    cells = np.array([[1, 1, 1, 0]], np.float32)
-    assert [each.caption for each in retrieve_captions(cells, CAPTIONS, AXES, count=3)] == CAPTIONS
-    assert [each.caption for each in retrieve_captions(cells[:1], CAPTIONS[:1], AXES[:1])] == ["a mug"]
+    assert [caption for caption, _ in best] == ["a chair", "a mug", "a red box"]
+    assert [score for _, score in best] == pytest.approx([0.9 / np.sqrt(0.82), 0.8, 0])
+    # Of equal ones the first comes first.
+    alike = retrieve_captions(np.array([[1, 1, 1, 0]], np.float32), CAPTIONS, AXES, count=2)
+    assert [caption for caption, _ in alike] == CAPTIONS[:2]
 
 
 def test_pools_and_features_that_do_not_fit_are_refused() -> None:
@@ -84,7 +77,7 @@ def own_answer(decoder: FeatureDecoder, inputs: dict[str, Any], count: int = 12)
 def test_a_model_generates_from_its_towers_features_what_it_generates_from_the_picture(decoder: FeatureDecoder) -> None:
     assert decoder.grid == (SIDE // PATCH, SIDE // PATCH)
     prompt, answers = "what is this ?", []
-    for seed in range(4):
+    for seed in range(2):
         inputs = decoder.inputs(prompt, picture(seed))
         own, tokens = own_answer(decoder, inputs), tower_of(decoder, inputs)
         assert tokens.shape == (1, decoder.grid[0] * decoder.grid[1], 32)
@@ -110,7 +103,7 @@ def test_views_together_are_decoded_as_one_by_one_and_the_model_stays_as_it_was(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["llava", "paligemma", "gemma3", "idefics3", "smolvlm"])
+@pytest.mark.parametrize("kind", ["llava", "paligemma", "gemma3", "idefics3"])
 def test_other_models_take_their_towers_features_too(kind: str) -> None:
     pytest.importorskip("transformers")
     from vision_towers import MAKERS, SIDE
@@ -123,7 +116,7 @@ def test_other_models_take_their_towers_features_too(kind: str) -> None:
         made = type(made)(made.config)
     model = enlarge(made)
     pixels = 3 * torch.randn(6, 1, 3, 1, 1) + torch.randn(6, 1, 3, SIDE, SIDE)
-    if kind not in ("idefics3", "smolvlm"):
+    if kind != "idefics3":
         pixels = pixels[:, 0]
     with torch.inference_mode():
         inner = model.model

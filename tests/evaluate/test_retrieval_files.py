@@ -6,18 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from sklearn.metrics import top_k_accuracy_score
 
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.benchmarks.files import ScoreOptions
 from gsencoder.evaluate.benchmarks.retrieval import (
     ScoredPairs,
-    ViewCaption,
+    draw,
+    rank_of_first,
     read_texts,
     read_view_captions,
     retrieve,
     score,
     write_scored_pairs,
-    write_view_captions,
 )
 
 NAMES = [f"room/frame_{number}" for number in range(7)]
@@ -28,8 +29,8 @@ def vectors(*shape: int, seed: int) -> np.ndarray:
 
 
 def captions(folder: Path, texts: list[str]) -> Path:
-    rows = [ViewCaption(scene="room", view=f"frame_{number}", caption=text) for number, text in enumerate(texts)]
-    write_view_captions(folder / "truth.json", rows)
+    rows = [{"scene_id": "room", "view": f"frame_{number}", "caption": text} for number, text in enumerate(texts)]
+    (folder / "truth.json").write_text(json.dumps(rows))
     return folder / "truth.json"
 
 
@@ -58,6 +59,41 @@ def test_a_score_that_is_not_finite_comes_last() -> None:
     there, back = retrieve(scored([[np.nan, 0.1], [0.2, 0.3]]), ["a", "b"])
     assert (there.ranks.tolist(), back.ranks.tolist()) == ([2, 1], [2, 1])
     assert there.not_finite == back.not_finite == 1
+    assert rank_of_first(np.array([0.5, np.nan, 0.1])) == 2
+
+
+def test_ties_count_against_what_belongs_to_the_query_but_for_rounding() -> None:
+    there, back = retrieve(scored(np.ones((3, 9)), np.ones((5, 3))), ["a", "b", "c"])
+    assert (there.ranks.tolist(), back.ranks.tolist()) == ([7] * 3, [6] * 3)
+    assert (there.distractors, back.distractors) == (6, 5)
+    assert rank_of_first(np.array([0.5, 0.5 - 1e-12, 0.5 - 1e-6])) == 2
+
+
+@pytest.mark.parametrize("k", [1, 5, 10])
+def test_recalls_over_whole_pools_are_those_of_scikit_learn(k: int) -> None:
+    scores, distractors = vectors(7, 47, seed=1), vectors(40, 7, seed=2)
+    there, back = retrieve(scored(scores, distractors), NAMES)
+    own = np.diag(scores)[:, None]
+    for result, others in ((there, scores[:, 7:]), (back, distractors.T)):
+        expected = top_k_accuracy_score(np.zeros(7), np.concatenate([own, others], 1), k=k, labels=np.arange(41))
+        assert (result.ranks <= k).mean() == pytest.approx(expected)
+
+
+def test_a_pool_holds_what_the_name_draws() -> None:
+    pairs = scored(vectors(7, 47, seed=1), vectors(40, 7, seed=2))
+    there, back = retrieve(pairs, NAMES, count=15)
+    for number, name in enumerate(NAMES):
+        drawn, own = draw(name, 40, 15), pairs.scores[number, number]
+        assert there.ranks[number] == 1 + (pairs.scores[number, 7 + drawn] >= own).sum()
+        assert back.ranks[number] == 1 + (pairs.distractors[drawn, number] >= own).sum()
+
+
+def test_draws_are_of_different_distractors_and_each_is_drawn_as_often_as_any_other() -> None:
+    assert len(set(draw("frame 1", 50, 20).tolist())) == 20
+    assert np.array_equal(draw("frame 1", 50, 20), draw("frame 1", 50, 20))
+    counts = np.bincount(np.concatenate([draw(f"query {number}", 20, 5) for number in range(1000)]), minlength=20)
+    # 19 degrees of freedom: above with a probability of 0.001.
+    assert ((counts - 250) ** 2 / 250).sum() < 45
 
 
 def test_the_order_of_queries_in_the_file_does_not_matter(tmp_path: Path) -> None:
@@ -90,11 +126,6 @@ def test_the_order_of_queries_in_the_file_does_not_matter(tmp_path: Path) -> Non
         ({"scores": np.ones((3, 2))}, "3 queries need scores of 3 × 3 or more.*got 3 × 2"),
         ({"queries": [NAMES[0]] * 3, "scores": np.ones((3, 3))}, "'room/frame_0' is there twice"),
         ({"scores": np.ones((3, 3), int)}, "scores: expected 2 axes of floating point, got 3 × 3 of int64"),
-        ({"views": np.ones((3, 1, 2))}, "texts is missing"),
-        ({"scores": np.ones((3, 3)), "texts": np.ones((3, 2))}, "expected an .npz with queries and scores, or"),
-        ({}, "holds queries; expected an .npz with queries and scores"),
-        ({"views": np.ones((3, 1, 2)), "texts": np.ones((2, 2))}, "3 queries, 3 views and 2 texts"),
-        ({"views": np.ones((3, 1, 2)), "texts": np.ones((3, 4))}, "expected cells of 4 channels"),
     ],
 )
 def test_predictions_that_do_not_fit_are_refused(arrays: dict[str, Any], message: str, tmp_path: Path) -> None:

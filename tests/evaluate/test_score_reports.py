@@ -11,7 +11,7 @@ import pytest
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable, write_classes
 from gsencoder.data.labels.files import write_whole_numbers
-from gsencoder.evaluate.benchmarks import answers, captions, recognition, referring
+from gsencoder.evaluate.benchmarks import recognition, referring
 from gsencoder.evaluate.benchmarks.files import ScoreOptions
 from gsencoder.evaluate.benchmarks.instances import prediction_of_masks, score_instances, write_instance_prediction
 from gsencoder.evaluate.benchmarks.semantics import score_semantics
@@ -30,7 +30,7 @@ def written(path: Path, content: Any) -> Path:
 
 def table(report: Any) -> dict[str, dict[str, float]]:
     """The measured figures of a report's table, percent."""
-    return {row.method: dict(row.values) for row in report.table.measured().rows}
+    return {row.method: dict(row.values) for row in report.table.rows if row.source == "measured"}
 
 
 def test_the_spread_is_over_scenes_that_have_a_value() -> None:
@@ -258,30 +258,3 @@ def test_boxes_of_sentences_are_reported_by_kind_threshold_and_number(tmp_path: 
 
 
 # Defaults
-
-
-def test_what_is_scored_where_nothing_else_is_asked_for(tmp_path: Path) -> None:
-    truth = written(tmp_path / "t.json", [{"scene_id": "s", "object_id": 1, "label": "bed"}])
-    ranked = written(tmp_path / "p.json", [{"scene_id": "s", "object_id": 1, "labels": ["bed"]}])
-    none = written(tmp_path / "n.json", [])
-    results = recognition.score(ranked, truth, ScoreOptions()).results
-    assert {name for name in results if name.startswith(("mean_", "overall_"))} == {
-        f"{kind}_{k}" for kind in ("mean", "overall") for k in (1, 5)
-    }
-    with pytest.raises(InputError, match="object 1 of s has no prediction"):
-        recognition.score(none, truth, ScoreOptions())
-    keys = {"scene_id": "s", "object_id": 1, "ann_id": "0"}
-    expressions = written(
-        tmp_path / "d.json", [keys | {"object_name": "x", "description": "x", "token": [], "bbox": cube(0)}]
-    )
-    boxes = referring.score(written(tmp_path / "b.json", [keys | {"bbox": cube(0)}]), expressions, ScoreOptions())
-    assert set(boxes.results["best_of"]) == {"5", "all"}
-    with pytest.raises(InputError, match="sentence 0 about object 1 of s has no prediction"):
-        referring.score(none, expressions, ScoreOptions())
-    questions = written(tmp_path / "q.json", [{"scene_id": "s", "question_id": "q", "question": "x", "answers": ["a"]}])
-    with pytest.raises(InputError, match="1 question without a prediction, first q; allow_missing=true counts"):
-        answers.score(none, questions, ScoreOptions(java=False))
-    with pytest.raises(InputError, match="1 object without a prediction, first 1 of s"):
-        captions.score(written(tmp_path / "c.json", {}), expressions, ScoreOptions(java=False))
-    silent = captions.score(tmp_path / "c.json", expressions, ScoreOptions(java=False, allow_missing=True))
-    assert silent.results["missing"] == 1

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from splats import random_gaussians
 
-from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.evaluate.benchmarks.semantics import SemanticsProtocol, class_ids, predict_semantics
+from gsencoder.evaluate.benchmarks.semantics import class_ids, predict_semantics
 from gsencoder.evaluate.sources import LabeledPoints, labeled_points
 from gsencoder.text.table import make_text_table
 from gsencoder.types import GaussianFeatures, Gaussians, MeshLabels, Scene
@@ -45,8 +44,7 @@ def points_at(positions: list[float] | None, count: int) -> LabeledPoints:
 def classes_at(positions: list[float] | None, kinds: list[int], voters: int) -> list[int]:
     gaussians, features = line_of(kinds)
     points = points_at(positions, len(kinds) if positions is None else len(positions))
-    protocol = SemanticsProtocol(voters=voters)
-    return predict_semantics(points, gaussians, features, CLASSES, WORDS, protocol).tolist()
+    return predict_semantics(points, gaussians, features, CLASSES, WORDS, voters).tolist()
 
 
 def test_a_vertex_has_the_class_of_most_of_the_nearest_gaussians() -> None:
@@ -65,11 +63,6 @@ def test_gaussians_that_were_not_seen_do_not_vote_and_no_distance_is_too_large()
 def test_gaussians_that_are_the_points_have_their_own_class_however_many_vote() -> None:
     kinds = [BED, CHAIR, UNSEEN, CHAIR, BED]
     assert classes_at(None, kinds, 1) == classes_at(None, kinds, 25) == [4, 5, 0, 5, 4]
-
-
-def test_fewer_than_one_voter_is_refused() -> None:
-    with pytest.raises(InputError, match="voters: expected 1 or more, got 0"):
-        SemanticsProtocol(voters=0)
 
 
 def test_vertices_lie_in_the_frame_of_the_gaussians_and_take_masks_from_the_nearest_one_that_is_near() -> None:

@@ -10,7 +10,6 @@ import pytest
 from splats import random_gaussians
 
 from gsencoder.app.commands import evaluate as evaluate_sources
-from gsencoder.app.main import main
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, space_of_words
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
@@ -59,6 +58,10 @@ def test_the_space_is_that_which_is_named_or_that_of_the_words(
     encoder: Any = Stub()
     assert asked(encoder_source(encoder, space=name)) == name
     assert space_of_words(encoder, WORDS[name]) == name
+    twin: Any = Stub()
+    twin.spaces["c"] = replace(twin.spaces["c"], text_encoder="a-words")
+    with pytest.raises(InputError, match="those of 2 of the encoder's teachers"):
+        space_of_words(twin, WORDS["a"])
     monkeypatch.setattr(evaluate_sources, "load_encoder", lambda *_: encoder)
     source, words = evaluate_sources.teacher_or_encoder(
         evaluate_sources.EvaluateConfig(paths=("s",), weights="w", space=name)
@@ -75,19 +78,6 @@ def test_the_space_is_that_which_is_named_or_that_of_the_words(
     assert words.trained == ("cup",)
 
 
-def test_two_spaces_of_one_text_encoder_are_told_apart_by_their_name_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    encoder: Any = Stub(TRAINED | {"b": TRAINED["a"]})
-    encoder.spaces["b"] = replace(encoder.spaces["b"], text_encoder="a-words")
-    with pytest.raises(InputError, match="those of 2 of the encoder's teachers"):
-        space_of_words(encoder, WORDS["a"])
-    monkeypatch.setattr(evaluate_sources, "load_encoder", lambda *_: encoder)
-    for name in ("a", "b"):
-        source, _ = evaluate_sources.teacher_or_encoder(
-            evaluate_sources.EvaluateConfig(paths=("s",), weights="w", space=name)
-        )
-        assert asked(source) == name
-
-
 def test_words_state_the_names_trained_on_where_the_table_beside_them_does() -> None:
     assert with_training_names(WORDS["a"], TRAINED["a"]).trained == ("cup",)  # type: ignore[union-attr]
     other = replace(TRAINED["b"], trained=("mug",))
@@ -95,9 +85,3 @@ def test_words_state_the_names_trained_on_where_the_table_beside_them_does() -> 
     assert with_training_names(other, TRAINED["a"]).trained == ("mug",)  # type: ignore[union-attr]
     for table in (WORDS["a"], None):
         assert with_training_names(WORDS["a"], table).trained is None  # type: ignore[union-attr]
-
-
-def test_a_space_without_weights_and_features_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    assert main(["evaluate", str(tmp_path), "space=a", f"out={tmp_path / 'out'}"]) == 2
-    assert capsys.readouterr().err.startswith("error: space: names a teacher of weights= or features=")
-    assert not (tmp_path / "out").exists()

@@ -3,8 +3,10 @@
 Several processes (torchrun, SLURM) share the scenes: each predicts its own, and the first one scores all.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +23,16 @@ from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig, check_names, find_scenes, load_scene, scene_name
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.splats.files import READABLE
+from gsencoder.evaluate.benchmarks.absent import AbsentProtocol
+from gsencoder.evaluate.benchmarks.grounding import GroundingProtocol
+from gsencoder.evaluate.benchmarks.instances import InstancesProtocol
 from gsencoder.evaluate.benchmarks.localization import LocalizationProtocol
+from gsencoder.evaluate.benchmarks.naming import NamingProtocol
 from gsencoder.evaluate.benchmarks.protocol import Evaluation, SceneResult, predict_scenes
-from gsencoder.evaluate.benchmarks.protocols import AnyProtocol
+from gsencoder.evaluate.benchmarks.recognition import RecognitionProtocol
+from gsencoder.evaluate.benchmarks.referring import ReferringProtocol
+from gsencoder.evaluate.benchmarks.retrieval import RetrievalProtocol
+from gsencoder.evaluate.benchmarks.semantics import SemanticsProtocol
 from gsencoder.evaluate.sources import (
     FeatureSource,
     encoder_source,
@@ -31,9 +40,9 @@ from gsencoder.evaluate.sources import (
     fused_head_source,
     fusion_source,
     head_source,
-    load_scenes,
     space_of_words,
 )
+from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.folder import find_heads, load_features
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.measured_heads import find_head, load_heads
@@ -45,6 +54,18 @@ from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, with_training_names, words_of_table
 from gsencoder.train.distributed import fail_together, value_of_first, values_of_all
 from gsencoder.types import QueryMemory, Scene
+
+AnyProtocol = (
+    LocalizationProtocol
+    | NamingProtocol
+    | AbsentProtocol
+    | GroundingProtocol
+    | RecognitionProtocol
+    | InstancesProtocol
+    | SemanticsProtocol
+    | ReferringProtocol
+    | RetrievalProtocol
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,6 +119,9 @@ def run(config: EvaluateConfig, run: Run) -> None:
     check_names(paths)
     source, words = source_and_words(config)
     out = run.out("evaluate", config.protocol.name)
+    method = "encoded" if config.weights else "fused"
+    if config.features:
+        method = Path(config.features).resolve().name
     with run.processes("cpu", out) as group:
         process, folder = group.process, None
         with fail_together():
@@ -110,12 +134,12 @@ def run(config: EvaluateConfig, run: Run) -> None:
                     scenes=lambda: (load_scene(path, options=config.data) for path in paths),
                     scene_names=tuple(map(scene_name, paths)),
                     folder=shared,
-                    method=method_name(config),
+                    method=method,
                     classes=config.classes,
                     label_map=config.label_map,
                     fusion=config.fusion,
                     localization=config.localize,
-                    memory_of=lambda scene: stored_memory(config, scene),
+                    memory_of=partial(stored_memory, config),
                 )
             )
             scenes = scenes_of(config, paths[process.rank :: process.world_size], quiet=not process.is_first)
@@ -135,9 +159,13 @@ def run(config: EvaluateConfig, run: Run) -> None:
 
 def source_and_words(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     """The source of the features, and the words that they are compared with."""
-    if config.features:
-        return stored_features(config)
-    return source_of_head(config) if config.head else teacher_or_encoder(config)
+    if not config.features:
+        return source_of_head(config) if config.head else teacher_or_encoder(config)
+    if config.weights or config.splat or config.teacher != LabelsConfig():
+        raise InputError("features: a folder has its own Gaussians and words; leave out weights=, splat= and teacher=")
+    folder = folder_of(config.features, scene_name(find_scenes(config.paths)[0]))
+    _, words = queried_scene(load_features(folder), folder, head=config.head, space=config.space, text=config.text)
+    return lambda scene: (next(iter(scene.features.values())), {}), words
 
 
 def teacher_or_encoder(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
@@ -156,15 +184,6 @@ def teacher_or_encoder(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
     space = config.space or space_of_words(encoder, words)
     words = with_training_names(words, find_table(encoder, space))
     return encoder_source(encoder, config.encode, space), words
-
-
-def stored_features(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
-    """Features of a folder, and its words."""
-    if config.weights or config.splat or config.teacher != LabelsConfig():
-        raise InputError("features: a folder has its own Gaussians and words; leave out weights=, splat= and teacher=")
-    folder = folder_of(config.features, scene_name(find_scenes(config.paths)[0]))
-    _, words = queried_scene(load_features(folder), folder, head=config.head, space=config.space, text=config.text)
-    return lambda scene: (next(iter(scene.features.values())), {}), words
 
 
 def _given_words(config: EvaluateConfig) -> Words:
@@ -199,20 +218,19 @@ def source_of_head(config: EvaluateConfig) -> tuple[FeatureSource, Words]:
 
 
 def scenes_of(config: EvaluateConfig, paths: Sequence[Path], *, quiet: bool) -> Iterator[tuple[Scene, float]]:
-    """Scenes with their features where these are stored, and the seconds of loading."""
-    scenes = load_scenes(paths, config.data, config.splat, Progress(quiet=config.quiet or quiet))
-    return with_stored_features(scenes, config) if config.features else scenes
-
-
-def with_stored_features(
-    scenes: Iterable[tuple[Scene, float]], config: EvaluateConfig
-) -> Iterator[tuple[Scene, float]]:
-    """Labeled scenes with the Gaussians and features of a folder, as `load_scenes` yields scenes.
+    """Scenes, with the Gaussians and features of a folder where they are stored, and the seconds of loading.
 
     The features may have been made from other views of the scene, such as all but those that are evaluated; the origin,
     which is the mean of the cameras, is then another one.
     """
-    for scene, seconds in scenes:
+    for path in Progress(quiet=config.quiet or quiet)(list(paths), "scenes"):
+        start = time.perf_counter()
+        scene = load_scene(path, splat=config.splat or None, options=config.data)
+        scene = with_fitting_splat(scene, config.splat, config.data)
+        seconds = time.perf_counter() - start
+        if not config.features:
+            yield scene, seconds
+            continue
         folder = folder_of(config.features, scene.name)
         stored = load_features(folder)
         if stored.name != scene.name:
@@ -231,10 +249,3 @@ def stored_memory(config: EvaluateConfig, scene: Scene) -> QueryMemory | None:
     """The memory that the features of a scene were read from. Outputs of a head are features of their own; it holds
     those of the teacher."""
     return memory_of(folder_of(config.features, scene.name), scene) if config.features and not config.head else None
-
-
-def method_name(config: EvaluateConfig) -> str:
-    """What the row of the table is called."""
-    if config.features:
-        return Path(config.features).resolve().name
-    return "encoded" if config.weights else "fused"

@@ -86,7 +86,8 @@ def print_report(out: Path, report: ScoreReport, run: Run) -> None:
     """Prints the names with the lowest scores, the measured rows and the main figures."""
     if names := report.rows.get("names"):
         run.print(_names_table(names))
-    table = report.table.measured().without_classes()
+    table = report.table.without_classes()
+    table = replace(table, rows=tuple(row for row in table.rows if row.source == "measured"))
     if report.table.by_class:
         run.print(f"The figures of {counted(len(report.table.by_class), 'class', 'classes')} are in {TABLE}.")
     if len(table.columns) > MOST_COLUMNS:

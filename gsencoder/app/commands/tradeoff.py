@@ -19,7 +19,7 @@ from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.tradeoff.measure import Records
 from gsencoder.evaluate.tradeoff.plots import page, picture, to_json
 from gsencoder.evaluate.tradeoff.scaling import ScalingConfig, scaling
-from gsencoder.evaluate.tradeoff.stages import HIGHER_IS_BETTER, STAGES, Inputs, StageName
+from gsencoder.evaluate.tradeoff.stages import HIGHER_IS_BETTER, STAGES, Inputs, StageName, make_stage
 from gsencoder.evaluate.tradeoff.sweep import (
     HalvingConfig,
     SettingResult,
@@ -59,7 +59,7 @@ class TradeoffConfig(Inputs, CommonConfig):
 
 def run(config: TradeoffConfig, run: Run) -> None:
     """Measures all settings, prints and writes tables and plots."""
-    stages = [STAGES[name](config) for name in config.stages]
+    stages = [make_stage(name, config) for name in config.stages]
     check_sweep(stages, config.sweep)
     paths = [Path(os.path.realpath(path)) for path in find_scenes(config.paths)]
     if repeated := first_repeated([path.name for path in paths]):

@@ -9,7 +9,7 @@ which the scene has only objects that are hardly seen is in neither group. The p
 import math
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from gsencoder.core.settings import option
 from gsencoder.data.labels.scans import with_counted_views
 from gsencoder.evaluate.benchmarks.localization import is_seen
 from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult, names_of
-from gsencoder.evaluate.tables import ScoreReport, mean_of, table_of
+from gsencoder.evaluate.tables import ScoreReport, grouped, mean_of, table_of
 from gsencoder.infer.localize import localize
 from gsencoder.text.vocabulary import check_known
 from gsencoder.types import GaussianFeatures, Scene, SceneObject
@@ -46,13 +46,8 @@ class AbsentProtocol(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AskedWord:
-    """One word asked in one scene.
-
-    Attributes:
-        present: whether the scene has an object of this name.
-        probability: that it does, as `localize` says.
-        boxed: whether it was given a box.
-    """
+    """One word asked in one scene: whether an object has this name, the probability by `localize`, and whether there is
+    a box."""
 
     word: str
     present: bool
@@ -100,17 +95,7 @@ class AbsentBenchmark(Benchmark[Asked]):
             table=table_of("Absent words", {self.evaluation.method: {name: scores[name] for name in shares}}),
             rows={
                 "names": [{"name": name, **row} for name, row in names.items()],
-                "words": [
-                    {
-                        "scene": result.scene,
-                        "word": word.word,
-                        "present": word.present,
-                        "probability": word.probability,
-                        "boxed": word.boxed,
-                    }
-                    for result in results
-                    for word in result.value
-                ],
+                "words": [{"scene": result.scene, **asdict(word)} for result in results for word in result.value],
             },
             line=f"{scores['present']} present and {counted(scores['absent'], 'absent word')} in "
             f"{counted(len(results), 'scene')}: AUROC {scores['auroc']:.3f} ± {scores['auroc_se']:.3f}, calibration "
@@ -130,14 +115,10 @@ def words_to_ask(
 
 def auroc(present: Bool[np.ndarray, " n"], probability: Float64[np.ndarray, " n"]) -> float:
     """Area under the ROC curve: the share of pairs (present, absent) in which the present word is more probable, ties
-    counting one half (the statistic of Mann and Whitney); NaN where one group is empty."""
-    positive, negative = int(present.sum()), int((~present).sum())
-    if not positive or not negative:
-        return math.nan
-    _, inverse, counts = np.unique(probability, return_inverse=True, return_counts=True)
-    # Equal values share the mean of their ranks, which count from 1.
-    ranks = (counts.cumsum() - (counts - 1) / 2)[inverse]
-    return float((ranks[present].sum() - positive * (positive + 1) / 2) / (positive * negative))
+    counting one half; NaN where one group is empty."""
+    from sklearn.metrics import roc_auc_score
+
+    return float(roc_auc_score(present, probability)) if present.any() and not present.all() else math.nan
 
 
 def auroc_standard_error(
@@ -217,18 +198,15 @@ def absent_scores(scenes: Sequence[Asked]) -> dict[str, Any]:
 def probabilities_by_word(scenes: Sequence[Asked]) -> dict[str, dict[str, Any]]:
     """For each word the numbers of scenes in which it is present and absent, and its mean probability in both; the
     words that these tell least apart come first. Means without scenes are NaN."""
-    words: dict[str, tuple[list[float], list[float]]] = {}
-    for asked in (word for scene in scenes for word in scene):
-        words.setdefault(asked.word, ([], []))[0 if asked.present else 1].append(asked.probability)
-    table = {
-        word: {
+    table = {}
+    for word, asked in grouped((word for scene in scenes for word in scene), "word").items():
+        present, absent = ([each.probability for each in asked if each.present == there] for there in (True, False))
+        table[word] = {
             "present": len(present),
             "absent": len(absent),
             "probability_present": mean_of(present),
             "probability_absent": mean_of(absent),
         }
-        for word, (present, absent) in words.items()
-    }
 
     def gap(word: str) -> float:
         row = table[word]

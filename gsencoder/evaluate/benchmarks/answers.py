@@ -5,7 +5,7 @@
 - EM and refined EM of cleaned answers (LEO, evaluator/scanqa_eval.py; the columns EM and EM-R of later papers): both
   sides go through `clean_answer`, then the right answers are gone through in order, and the first that is equal, or
   contains or is contained without blanks, decides. So EM can be 0 where a later right answer is equal, and an answer
-  that is empty when cleaned is refined right, since every text contains it: `AnswerScores.blank` counts those.
+  that is empty when cleaned is refined right, since every text contains it; a note counts those.
 - The F-value and the sentence scores of `gsencoder.evaluate.benchmarks.text_metrics`.
 
 A question without a prediction scores 0 everywhere, and counts.
@@ -19,10 +19,9 @@ these five, or by a question_id where there is one; equal questions are answered
 import math
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from gsencoder.core.errors import InputError, SceneWarning, counted
 from gsencoder.data.labels.files import (
@@ -49,7 +48,7 @@ from gsencoder.evaluate.benchmarks.text_metrics import (
     sentence_figures,
     wordnet_lemmatizer,
 )
-from gsencoder.evaluate.tables import ScoreReport, spread, table_of
+from gsencoder.evaluate.tables import ScoreReport, grouped, mean_of, spread, table_of
 
 OPTIONS = ("java", "allow_missing")
 TOP = 10
@@ -89,77 +88,16 @@ _CLEANING = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerRow:
-    """The scores of one question; all are 0 without an answer.
-
-    Attributes:
-        predicted: whether there is an answer.
-        em1: whether the first answer is right, letter for letter.
-        em10: whether one of at most ten is.
-        em_cleaned: LEO's exact match.
-        em_refined: LEO's refined exact match.
-        f_value: None where WordNet is missing.
-    """
-
-    question_id: str
-    scene: str
-    kind: str
-    predicted: bool
-    em1: bool
-    em10: bool
-    em_cleaned: bool
-    em_refined: bool
-    f_value: float | None
+AnswerRow = dict[str, Any]
+"""The scores of one question: em1, em10 (whether the first answer, or one of ten, is right letter for letter),
+em_cleaned, em_refined (LEO's matches) and f_value (None where WordNet is missing); all are 0 without an answer."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AnswerMeans:
-    """Means of `AnswerRow`s over some questions; fractions, NaN without questions.
+class AnswerScores(NamedTuple):
+    """Scores of a question set: a row a question, in their order, those of the first answers as sentences, and why a
+    column has no value."""
 
-    Attributes:
-        missing: questions without an answer.
-        f_value: NaN where WordNet is missing.
-    """
-
-    count: int
-    missing: int
-    em1: float
-    em10: float
-    em_cleaned: float
-    em_refined: float
-    f_value: float
-
-    def figures(self) -> dict[str, float]:
-        """The means by column."""
-        return {
-            "em_1": self.em1,
-            "em_10": self.em10,
-            "em_cleaned": self.em_cleaned,
-            "em_refined": self.em_refined,
-            "f_value": self.f_value,
-        }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AnswerScores:
-    """Scores of a question set.
-
-    Attributes:
-        rows: one a question, in the order of the questions.
-        overall: means over all.
-        by_kind: means over each kind of question, in the order of the kinds; kinds without questions are not there.
-        by_scene: means over each scene, by name.
-        blank: answers that are empty when cleaned, and count as right in the refined match.
-        sentences: of the first answers.
-        absent: why a column has no value.
-    """
-
-    rows: tuple[AnswerRow, ...]
-    overall: AnswerMeans
-    by_kind: dict[str, AnswerMeans]
-    by_scene: dict[str, AnswerMeans]
-    blank: int
+    rows: list[AnswerRow]
     sentences: SentenceScores
     absent: dict[str, str]
 
@@ -170,25 +108,32 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
     if not questions:
         raise InputError(f"{labels}: nothing to score: it holds no questions")
     answers = read_answer_predictions(predictions, questions)
-    refuse_missing([each.id for each in questions if each.id not in answers], "question", predictions, options)
+    missing = [each.id for each in questions if each.id not in answers]
+    refuse_missing(missing, "question", predictions, options)
     tools = None if options.java else "Java was not asked for (java=false)"
-    scores = score_answers(questions, answers, tokens="auto" if options.java else "python", tools=tools)
-    means = scores.overall.figures() | ({"em_10": math.nan} if "EM@10" in scores.absent else {})
-    overall = means | sentence_figures(scores.sentences)
-    by_scene = [{"scene": name, "questions": each.count, **each.figures()} for name, each in scores.by_scene.items()]
-    by_kind = [{"kind": name, "questions": each.count, **each.figures()} for name, each in scores.by_kind.items()]
-    notes = [f"{column} is absent: {reason}." for column, reason in scores.absent.items()]
-    if scores.blank:
-        notes.append(f"{counted(scores.blank, 'answer')} without a word once cleaned: right in the refined match.")
+    rows, sentences, absent = score_answers(
+        questions, answers, tokens="auto" if options.java else "python", tools=tools
+    )
+    means = mean_answers(rows) | ({"em_10": math.nan} if "EM@10" in absent else {})
+    overall = means | sentence_figures(sentences)
+    by_scene, by_kind = (
+        [{name: key, "questions": len(each), **mean_answers(each)} for key, each in grouped(rows, name).items()]
+        for name in ("scene", "kind")
+    )
+    by_scene.sort(key=lambda row: row["scene"])
+    by_kind.sort(key=lambda row: KINDS.index(row["kind"]))
+    notes = [f"{column} is absent: {reason}." for column, reason in absent.items()]
+    if blank := sum(not clean_answer(each[0]).split() for each in answers.values()):
+        notes.append(f"{counted(blank, 'answer')} without a word once cleaned: right in the refined match.")
     # Measured columns, then those of papers that rest on other tokens.
     columns = dict.fromkeys((*overall, "em_1", "em_refined", "bleu_4", "meteor", "rouge_l", "cider"))
     return ScoreReport(
         results={
             "protocol": "answers",
-            "questions": scores.overall.count,
-            "missing": scores.overall.missing,
-            "tokens": scores.sentences.tokens,
-            "absent": dict(scores.absent),
+            "questions": len(rows),
+            "missing": len(missing),
+            "tokens": sentences.tokens,
+            "absent": absent,
             **overall,
             "kinds": {row["kind"]: row for row in by_kind},
             "spread": spread(by_scene, list(means)),
@@ -196,9 +141,9 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
         table=table_of(
             "Answers", {options.method: overall}, published="splatdistill_3_answers", columns=columns, notes=notes
         ),
-        rows={"scenes": by_scene, "kinds": by_kind, "questions": [asdict(row) for row in scores.rows]},
-        line=f"{counted(scores.overall.count, 'question')}, {scores.overall.missing} without an answer: EM@1 "
-        f"{overall['em_1']:.3f}, refined {overall['em_refined']:.3f}, CIDEr {100 * scores.sentences.cider:.1f}",
+        rows={"scenes": by_scene, "kinds": by_kind, "questions": rows},
+        line=f"{counted(len(rows), 'question')}, {len(missing)} without an answer: EM@1 {overall['em_1']:.3f}, refined "
+        f"{overall['em_refined']:.3f}, CIDEr {100 * sentences.cider:.1f}",
     )
 
 
@@ -244,7 +189,7 @@ _SCANQA = (
     ("Object nature", ("What shape", "What type", "What kind")),
     ("Object", ("What is",)),
 )
-SCANQA_KINDS = tuple(kind for kind, _ in _SCANQA)
+KINDS = (*SQA3D_KINDS, *(kind for kind, _ in _SCANQA), "other", "Other")
 
 
 def score_answers(
@@ -260,72 +205,43 @@ def score_answers(
     Args:
         questions: with right answers, each id once.
         predictions: by the id of the question, one to ten answers, best first; a question that is missing scores 0.
-        tokens: see `Tokens`.
         tools: see `score_sentences`.
         lemmatize: of `wordnet_lemmatizer`, a reason for going without, or None = look for it.
     """
     lemmatize = wordnet_lemmatizer() if lemmatize is None else lemmatize
-    rows = tuple(_row(each, predictions.get(each.id, ()), lemmatize) for each in questions)
     absent = {"F-value": lemmatize} if isinstance(lemmatize, str) else {}
     if all(len(answers) == 1 for answers in predictions.values()):
         absent["EM@10"] = "no question has more than one predicted answer"
-    spoken = [str(predictions[each.id][0]) if each.id in predictions else "" for each in questions]
-    sentences = score_sentences(spoken, [each.answers for each in questions], tokens=tokens, tools=tools)
-    absent |= sentences.absent
-    kinds = [*SQA3D_KINDS, *SCANQA_KINDS, "other", "Other"]
-    return AnswerScores(
-        rows=rows,
-        overall=mean_answers(rows),
-        by_kind=dict(sorted(_grouped(rows, lambda row: row.kind).items(), key=lambda item: kinds.index(item[0]))),
-        by_scene=dict(sorted(_grouped(rows, lambda row: row.scene).items())),
-        blank=sum(not clean_answer(answers[0]).split() for answers in predictions.values()),
-        sentences=sentences,
-        absent=absent,
-    )
+    rows, first_answers = [], []
+    for each in questions:
+        answers = predictions.get(each.id, ())
+        first = answers[0] if answers else ""
+        cleaned, refined = match_cleaned(first, each.answers) if answers else (False, False)
+        value = None if isinstance(lemmatize, str) else f_value(first, each.answers, lemmatize) if answers else 0.0
+        rows.append(
+            {
+                "question_id": each.id,
+                "scene": each.scene,
+                "kind": sqa3d_kind(each.text) if each.dataset == "sqa3d" else scanqa_kind(each.text),
+                "predicted": bool(answers),
+                "em1": bool(answers) and first in each.answers,
+                "em10": any(answer in each.answers for answer in answers),
+                "em_cleaned": cleaned,
+                "em_refined": refined,
+                "f_value": value,
+            }
+        )
+        first_answers.append(first)
+    sentences = score_sentences(first_answers, [each.answers for each in questions], tokens=tokens, tools=tools)
+    return AnswerScores(rows, sentences, absent | sentences.absent)
 
 
-def mean_answers(rows: Sequence[AnswerRow]) -> AnswerMeans:
-    """Means over questions, of one scene or kind, say."""
-    count = len(rows)
-
-    def mean(values: Sequence[float | bool]) -> float:
-        return sum(values) / count if count else float("nan")
-
-    values = [row.f_value for row in rows if row.f_value is not None]
-    return AnswerMeans(
-        count=count,
-        missing=sum(not row.predicted for row in rows),
-        em1=mean([row.em1 for row in rows]),
-        em10=mean([row.em10 for row in rows]),
-        em_cleaned=mean([row.em_cleaned for row in rows]),
-        em_refined=mean([row.em_refined for row in rows]),
-        f_value=mean(values) if len(values) == count else math.nan,
-    )
-
-
-def _row(question: Question, answers: Sequence[str], lemmatize: Lemmatize | str) -> AnswerRow:
-    cleaned, refined = match_cleaned(answers[0], question.answers) if answers else (False, False)
-    value = None
-    if not isinstance(lemmatize, str):
-        value = f_value(answers[0], question.answers, lemmatize) if answers else 0.0
-    return AnswerRow(
-        question_id=question.id,
-        scene=question.scene,
-        kind=sqa3d_kind(question.text) if question.dataset == "sqa3d" else scanqa_kind(question.text),
-        predicted=bool(answers),
-        em1=bool(answers) and answers[0] in question.answers,
-        em10=any(answer in question.answers for answer in answers),
-        em_cleaned=cleaned,
-        em_refined=refined,
-        f_value=value,
-    )
-
-
-def _grouped(rows: Sequence[AnswerRow], key: Callable[[AnswerRow], str]) -> dict[str, AnswerMeans]:
-    groups: dict[str, list[AnswerRow]] = {}
-    for row in rows:
-        groups.setdefault(key(row), []).append(row)
-    return {name: mean_answers(group) for name, group in groups.items()}
+def mean_answers(rows: Sequence[AnswerRow]) -> dict[str, float]:
+    """Means over questions, of one scene or kind, say; NaN without any."""
+    columns = {"em_1": "em1", "em_10": "em10", "em_cleaned": "em_cleaned", "em_refined": "em_refined"}
+    means = {column: mean_of([float(row[name]) for row in rows]) for column, name in columns.items()}
+    values = [math.nan if row["f_value"] is None else row["f_value"] for row in rows]
+    return means | {"f_value": mean_of(values)}
 
 
 EXPECTED = "question_id and answer_top10, or scene_id, situation, question and answer"
@@ -343,19 +259,25 @@ def read_answer_predictions(path: Path, questions: Sequence[Question]) -> dict[s
             f"{path}: expected a list of objects with {EXPECTED}, got SQA3D's truth; were predictions and truth "
             "swapped?"
         )
-    finder = _Finder(questions)
-    answers = [
-        (finder.question(entry, where).id, _answers(entry, where)) for entry, where in entries_of(rows, path, EXPECTED)
-    ]
-    if finder.equal:
+    by_id, by_words = {each.id: each for each in questions}, grouped(questions, "scene", "situation", "text")
+    answers: dict[str, tuple[str, ...]] = {}
+    names, equal = [], 0
+    for entry, where in entries_of(rows, path, EXPECTED):
+        fitting = _questions_of(entry, where, by_id, by_words)
+        # SQA3D's test split has pairs of questions that differ in nothing but their ids.
+        equal += len(fitting) > 1
+        name = next((each.id for each in fitting if each.id not in answers), fitting[0].id)
+        names.append(name)
+        answers[name] = _answers(entry, where)
+    if equal:
         warnings.warn(
-            f"{path}: {counted(finder.equal, 'entry', 'entries')} without question_id could be those of several equal "
+            f"{path}: {counted(equal, 'entry', 'entries')} without question_id could be those of several equal "
             "questions, and were taken in the order of the truth",
             SceneWarning,
             stacklevel=2,
         )
-    refuse_repeated(path, [name for name, _ in answers], lambda name: name[:60], what="question_id")
-    return dict(answers)
+    refuse_repeated(path, names, lambda name: name[:60], what="question_id")
+    return answers
 
 
 def _answers(entry: Mapping[str, Any], where: str) -> tuple[str, ...]:
@@ -372,53 +294,35 @@ def _answers(entry: Mapping[str, Any], where: str) -> tuple[str, ...]:
     return answers
 
 
-class _Finder:
-    """Finds the question that an entry is about."""
-
-    def __init__(self, questions: Sequence[Question]) -> None:
-        self.by_id = {each.id: each for each in questions}
-        self.scenes = {each.scene for each in questions}
-        self.equal = 0
-        self._answered: set[str] = set()
-        self.by_words: dict[tuple[str, str | None, str], list[Question]] = {}
-        for each in questions:
-            self.by_words.setdefault((each.scene, each.situation, each.text), []).append(each)
-
-    def question(self, entry: Mapping[str, Any], where: str) -> Question:
-        scene = scene_name(entry["scene_id"], where) if "scene_id" in entry else None
-        if scene is not None and scene not in self.scenes:
-            raise InputError(f"{where}: is about {scene}, of which the truth has no questions")
-        if "question_id" not in entry:
-            return self._by_words(entry, scene, where)
+def _questions_of(
+    entry: Mapping[str, Any], where: str, by_id: Mapping[str, Question], by_words: Mapping[Any, Sequence[Question]]
+) -> Sequence[Question]:
+    """The question that an entry is about, or several that differ in nothing but their ids."""
+    scene = scene_name(entry["scene_id"], where) if "scene_id" in entry else None
+    if scene is not None and scene not in {key[0] for key in by_words}:
+        raise InputError(f"{where}: is about {scene}, of which the truth has no questions")
+    if "question_id" in entry:
         name = id_value(entry["question_id"], where, "question_id")
-        question = self.by_id.get(name)
-        if question is None:
+        if name not in by_id:
             raise InputError(f"{where}: question_id {name[:60]} is not in the truth")
-        if scene not in (None, question.scene):
-            raise InputError(f"{where}: question {name[:60]} is about {question.scene}, got {scene}")
-        return question
-
-    def _by_words(self, entry: Mapping[str, Any], scene: str | None, where: str) -> Question:
-        if scene is None or "question" not in entry or "situation" not in entry:
-            raise InputError(f"{where}: says not which question it answers; expected {EXPECTED}")
-        text = text_value(entry["question"], where, "question")
-        situation = text_value(entry["situation"], where, "situation")
-        position = _numbers(entry, "agent_pos", ("x", "y", "z"), where)
-        turns = _numbers(entry, "agent_rot", ("_w", "_x", "_y", "_z"), where)
-        fitting = [
-            each
-            for each in self.by_words.get((scene, situation, text), [])
-            if None in (position, each.position) or (position == each.position and turns in (None, each.rotation))
-        ]
-        # SQA3D's test split has pairs of questions that differ in nothing but their ids.
-        if len(fitting) > 1 and len({(each.position, each.rotation) for each in fitting}) == 1:
-            self.equal += 1
-            fitting = [each for each in fitting if each.id not in self._answered][:1] or fitting[:1]
-            self._answered.add(fitting[0].id)
-        if len(fitting) != 1:
-            fault = f"{len(fitting)} questions; give its question_id" if fitting else "no question of the truth"
-            raise InputError(f"{where}: scene, situation, question and place are those of {fault}: {shown(text)}")
-        return fitting[0]
+        if scene not in (None, by_id[name].scene):
+            raise InputError(f"{where}: question {name[:60]} is about {by_id[name].scene}, got {scene}")
+        return [by_id[name]]
+    if scene is None or "question" not in entry or "situation" not in entry:
+        raise InputError(f"{where}: says not which question it answers; expected {EXPECTED}")
+    text = text_value(entry["question"], where, "question")
+    situation = text_value(entry["situation"], where, "situation")
+    position = _numbers(entry, "agent_pos", ("x", "y", "z"), where)
+    turns = _numbers(entry, "agent_rot", ("_w", "_x", "_y", "_z"), where)
+    fitting = [
+        each
+        for each in by_words.get((scene, situation, text), ())
+        if None in (position, each.position) or (position == each.position and turns in (None, each.rotation))
+    ]
+    if len({(each.position, each.rotation) for each in fitting}) != 1:
+        fault = f"{len(fitting)} questions; give its question_id" if fitting else "no question of the truth"
+        raise InputError(f"{where}: scene, situation, question and place are those of {fault}: {shown(text)}")
+    return fitting
 
 
 def _numbers(entry: Mapping[str, Any], key: str, names: Sequence[str], where: str) -> tuple[float, ...] | None:

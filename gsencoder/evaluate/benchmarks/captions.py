@@ -18,7 +18,7 @@ probabilities decide nothing; or its captions of given objects (lib/eval_helper.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -27,7 +27,6 @@ from gsencoder.core.errors import InputError, counted
 from gsencoder.data.labels.expressions import Expression, read_scanrefer, wrapped_caption
 from gsencoder.data.labels.files import (
     Corner,
-    Entry,
     box_ious,
     corner_bounds,
     entries_of,
@@ -40,7 +39,7 @@ from gsencoder.data.labels.files import (
 )
 from gsencoder.evaluate.benchmarks.files import ScoreOptions, refuse_missing
 from gsencoder.evaluate.benchmarks.text_metrics import JavaTools, SentenceScores, score_sentences, sentence_figures
-from gsencoder.evaluate.tables import ScoreReport, spread, table_of
+from gsencoder.evaluate.tables import ScoreReport, grouped, spread, table_of
 
 OPTIONS = ("min_iou", "java", "allow_missing")
 MAX_TOKENS = 30
@@ -53,13 +52,8 @@ EXPECTED = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaptionedObject:
-    """A labeled object and what was written of it.
-
-    Attributes:
-        object_id: `objectId` of ScanNet's aggregation file, from 0.
-        captions: wrapped in sos and eos, tokens with blanks between them.
-        aabb: lower and upper corner; None where the labels have no boxes.
-    """
+    """A labeled object, its captions, wrapped in sos and eos, tokens with blanks between them, and the lower and upper
+    corner of its box; None where the labels have no boxes."""
 
     scene: str
     object_id: int
@@ -72,33 +66,15 @@ class CaptionedObject:
         return self.scene, self.object_id
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CaptionedBox:
-    """A predicted box and its caption, with or without sos and eos."""
-
-    scene: str
-    caption: str
-    aabb: tuple[Corner, Corner]
+BoxCaptions = dict[str, list[tuple[str, tuple[Corner, Corner]]]]
+"""Predicted boxes of each scene: a caption, with or without sos and eos, and the lower and the upper corner."""
+NamedCaptions = dict[tuple[str, int], str]
+"""Predicted captions of labeled objects, by scene and id, where proposals are given and no boxes are predicted."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NamedCaption:
-    """A predicted caption of a labeled object, where proposals are given and no boxes are predicted."""
-
-    scene: str
-    object_id: int
-    caption: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DenseCaptionScores:
-    """Scores of captions; one sample an object, in their order.
-
-    Attributes:
-        missing: objects whose caption counts as empty: no box overlaps them enough, or none is predicted for their id.
-        ious: of each object and its best box, 0 without one; None where captions belong to objects by their ids.
-        sentences: scores of the corpus and of each object.
-    """
+class DenseCaptionScores(NamedTuple):
+    """Scores of captions, one sample an object, in their order: the number of objects whose caption is empty, and
+    the IoU of each with its best box, 0 without one; None where captions belong to objects by their ids."""
 
     missing: int
     ious: Float64[np.ndarray, "N"] | None
@@ -110,17 +86,14 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
     objects = captioned_objects(read_scanrefer(labels))
     if not objects:
         raise InputError(f"{labels}: nothing to score: it holds no descriptions")
-    captions = read_caption_predictions(predictions, objects)
+    boxes, named = read_caption_predictions(predictions, objects)
     tools = None if options.java else "Java was not asked for (java=false)"
-    boxes = [each for each in captions if isinstance(each, CaptionedBox)]
     if boxes:
-        silent = sorted({each.scene for each in objects} - {each.scene for each in boxes})
+        silent = sorted({each.scene for each in objects} - boxes.keys())
         refuse_missing(silent, "scene", predictions, options)
         scores = score_box_captions(objects, boxes, min_iou=options.min_iou, tools=tools)
     else:
-        named = [each for each in captions if isinstance(each, NamedCaption)]
-        keys = {(each.scene, each.object_id) for each in named}
-        missing = [f"{each.object_id} of {each.scene}" for each in objects if each.key not in keys]
+        missing = [f"{each.object_id} of {each.scene}" for each in objects if each.key not in named]
         refuse_missing(missing, "object", predictions, options)
         scores = score_named_captions(objects, named, tools=tools)
     sentences = scores.sentences
@@ -138,23 +111,22 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
         }
         for row, each in enumerate(objects)
     ]
+    names = ("cider", "rouge_l", "bleu_4")
     by_scene = [
-        {"scene": scene, "objects": len(of_scene)}
-        | {name: float(np.mean([row[name] for row in of_scene])) for name in ("cider", "rouge_l", "bleu_4")}
-        for scene in dict.fromkeys(row["scene"] for row in rows)
-        for of_scene in ([row for row in rows if row["scene"] == scene],)
+        {"scene": scene, "objects": len(each), **{name: float(np.mean([row[name] for row in each])) for name in names}}
+        for scene, each in grouped(rows, "scene").items()
     ]
     return ScoreReport(
         results={
             "protocol": "captions",
             "objects": len(objects),
-            "predictions": len(captions),
+            "predictions": sum(map(len, boxes.values())) + len(named),
             "missing": scores.missing,
             "min_iou": options.min_iou if boxes else None,
             "tokens": sentences.tokens,
-            "absent": dict(sentences.absent),
+            "absent": sentences.absent,
             **overall,
-            "spread": spread(by_scene, ["cider", "rouge_l", "bleu_4"]),
+            "spread": spread(by_scene, names),
         },
         table=table_of(
             f"Captions at an IoU of {options.min_iou:g}" if boxes else "Captions of given objects",
@@ -170,9 +142,7 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
 
 def captioned_objects(expressions: Sequence[Expression]) -> tuple[CaptionedObject, ...]:
     """The objects of expressions with all their captions, each cut to `MAX_TOKENS`, in the order of the first ones."""
-    objects: dict[tuple[str, int], list[Expression]] = {}
-    for each in expressions:
-        objects.setdefault((each.scene, each.object_id), []).append(each)
+    objects = grouped(expressions, "scene", "object_id")
     return tuple(
         CaptionedObject(
             scene=scene,
@@ -187,34 +157,31 @@ def captioned_objects(expressions: Sequence[Expression]) -> tuple[CaptionedObjec
 
 def score_box_captions(
     objects: Sequence[CaptionedObject],
-    boxes: Sequence[CaptionedBox],
+    boxes: BoxCaptions,
     *,
     min_iou: float = 0.5,
     tools: JavaTools | str | None = None,
 ) -> DenseCaptionScores:
-    """m@kIoU of predicted boxes with captions.
-
-    Args:
-        objects: with boxes, each once.
-        boxes: of the same scenes, any number a scene, in any order.
-        min_iou: k.
-        tools: see `score_sentences`.
-    """
-    bare = next((each for each in objects if each.aabb is None), None)
-    if bare is not None:
-        raise InputError(f"object {bare.object_id} of {bare.scene} has no box; captions of boxes need true boxes")
-    ious, best = _best_boxes(objects, boxes)
-    captions = [boxes[row].caption if iou > min_iou else None for row, iou in zip(best, ious, strict=True)]
+    """m@kIoU of predicted boxes with captions; k is `min_iou`, `tools` as of `score_sentences`."""
+    ious = np.zeros(len(objects))
+    captions: list[str | None] = []
+    for row, each in enumerate(objects):
+        if each.aabb is None:
+            raise InputError(f"object {each.object_id} of {each.scene} has no box; captions of boxes need true boxes")
+        captions.append(None)
+        if there := boxes.get(each.scene):
+            values = box_ious(np.array([aabb for _, aabb in there], np.float64), np.array(each.aabb, np.float64))
+            ious[row] = values.max()
+            if ious[row] > min_iou:
+                captions[row] = there[int(values.argmax())][0]
     return _scores(objects, captions, ious, tools)
 
 
 def score_named_captions(
-    objects: Sequence[CaptionedObject], captions: Sequence[NamedCaption], *, tools: JavaTools | str | None = None
+    objects: Sequence[CaptionedObject], captions: NamedCaptions, *, tools: JavaTools | str | None = None
 ) -> DenseCaptionScores:
-    """The same scores where every caption says which object it is about, at most one an object, and none is dropped for
-    its box."""
-    caption_of = {(each.scene, each.object_id): each.caption for each in captions}
-    return _scores(objects, [caption_of.get(each.key) for each in objects], None, tools)
+    """The same scores where every caption says which object it is about, and none is dropped for its box."""
+    return _scores(objects, [captions.get(each.key) for each in objects], None, tools)
 
 
 def _scores(
@@ -223,68 +190,44 @@ def _scores(
     ious: np.ndarray | None,
     tools: JavaTools | str | None,
 ) -> DenseCaptionScores:
-    spoken = [EMPTY if caption is None else wrapped_caption(caption) for caption in captions]
-    return DenseCaptionScores(
-        missing=sum(caption is None for caption in captions),
-        ious=ious,
-        sentences=score_sentences(spoken, [each.captions for each in objects], tokens="given", tools=tools),
-    )
+    wrapped = [EMPTY if caption is None else wrapped_caption(caption) for caption in captions]
+    sentences = score_sentences(wrapped, [each.captions for each in objects], tokens="given", tools=tools)
+    return DenseCaptionScores(sum(caption is None for caption in captions), ious, sentences)
 
 
-def _best_boxes(objects: Sequence[CaptionedObject], boxes: Sequence[CaptionedBox]) -> tuple[np.ndarray, np.ndarray]:
-    """For each object the IoU with its best box, and the row of that box; 0 and −1 in scenes without boxes."""
-    ious, best = np.zeros(len(objects)), np.full(len(objects), -1)
-    rows: dict[str, list[int]] = {}
-    for row, box in enumerate(boxes):
-        rows.setdefault(box.scene, []).append(row)
-    corners = np.array([box.aabb for box in boxes], np.float64).reshape(len(boxes), 2, 3)
-    for index, each in enumerate(objects):
-        if each.scene in rows:
-            there = np.array(rows[each.scene])
-            values = box_ious(corners[there], np.array(each.aabb, np.float64))
-            best[index], ious[index] = there[values.argmax()], values.max()
-    return ious, best
-
-
-def read_caption_predictions(
-    path: Path, objects: Sequence[CaptionedObject]
-) -> tuple[CaptionedBox, ...] | tuple[NamedCaption, ...]:
-    """Reads predicted captions of boxes or of given objects, by what is in the file, for labeled objects."""
+def read_caption_predictions(path: Path, objects: Sequence[CaptionedObject]) -> tuple[BoxCaptions, NamedCaptions]:
+    """Reads predicted captions of boxes or of given objects, by what is in the file, for labeled objects; one of both
+    is empty."""
     content = read_benchmark_json(path)
     if not isinstance(content, dict):
         swapped = isinstance(content, list) and content and isinstance(content[0], dict) and "ann_id" in content[0]
         hint = "; this is truth: were predictions and truth swapped?" if swapped else ""
         raise InputError(f"{path}: expected {EXPECTED}, got {shown(content)}{hint}")
     if any("|" in key for key in content):
-        return _named(content, path, objects)
+        return {}, _named(content, path, objects)
     scenes = {each.scene for each in objects}
-    boxes = []
+    boxes: BoxCaptions = {}
     for key, rows in content.items():
         where = f"{path}: {shown(key)}"
         if scene_name(key, where) not in scenes:
             raise InputError(f"{where}: is no scene of the truth")
-        boxes += [_box(row, key) for row in entries_of(rows, path, "caption and box", key=key)]
-    return tuple(boxes)
+        for entry, place in entries_of(rows, path, "caption and box", key=key):
+            caption = text_value(entry.get("caption"), place, "caption", empty=True)
+            boxes.setdefault(key, []).append((caption, corner_bounds(entry.get("box"), place, "box")))
+    return boxes, {}
 
 
-def _box(row: Entry, scene: str) -> CaptionedBox:
-    entry, where = row
-    caption = text_value(entry.get("caption"), where, "caption", empty=True)
-    return CaptionedBox(scene=scene, caption=caption, aabb=corner_bounds(entry.get("box"), where, "box"))
-
-
-def _named(content: Mapping[str, Any], path: Path, objects: Sequence[CaptionedObject]) -> tuple[NamedCaption, ...]:
+def _named(content: Mapping[str, Any], path: Path, objects: Sequence[CaptionedObject]) -> NamedCaptions:
     names = {each.key: each.object_name for each in objects}
-    scenes = {scene for scene, _ in names}
     key_of: dict[tuple[str, int], str] = {}
-    captions = []
+    captions: NamedCaptions = {}
     for key, value in content.items():
         where = f"{path}: {shown(key)}"
         scene, _, rest = key.partition("|")
         number_text, _, name = rest.partition("|")
         identity = scene_name(scene, where), object_id(number_text, where)
         if identity not in names:
-            raise InputError(f"{where}: is no {'object' if scene in scenes else 'scene'} of the truth")
+            raise InputError(f"{where}: is no object of the truth")
         if name and name != names[identity]:
             raise InputError(f"{where}: the truth calls this object {shown(names[identity])}")
         if identity in key_of:
@@ -293,5 +236,5 @@ def _named(content: Mapping[str, Any], path: Path, objects: Sequence[CaptionedOb
         if len(sentences) != 1:
             raise InputError(f"{where}: has {len(sentences)} captions, expected one")
         key_of[identity] = key
-        captions.append(NamedCaption(scene=scene, object_id=identity[1], caption=sentences[0]))
-    return tuple(captions)
+        captions[identity] = sentences[0]
+    return captions

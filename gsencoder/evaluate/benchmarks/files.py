@@ -4,16 +4,14 @@ import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import NamedTuple
 
 from gsencoder.core.errors import InputError, counted, listed, readable
 from gsencoder.core.files import check_foreign
 from gsencoder.core.settings import option
 from gsencoder.data.labels.classes import ids_of_raw_names
-from gsencoder.data.labels.files import PICKLE_SUFFIXES, read_split
+from gsencoder.data.labels.files import read_split
 from gsencoder.data.labels.scans import AGGREGATION, ANNOTATION
-
-Pooling = Literal["max", "mean"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +42,6 @@ class ScoreOptions:
     distractors: int = option(
         0, "of retrieval: texts or pictures of others in a query's pool, drawn by its name; 0 = all", ge=0
     )
-    pooling: Pooling = option("max", "of retrieval, where predictions are features: over the cells of a view")
     java: bool = option(
         True, "of answers and captions: use Java's tokenizer and METEOR where they are there; without, columns say so"
     )
@@ -77,8 +74,7 @@ RESULT_FILES = ("semantic_instance_evaluation.txt", "semantic_label_evaluation.t
 """What ScanNet's scripts write into the folder of the predictions."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SceneFiles:
+class SceneFiles(NamedTuple):
     """The prediction of one scene, and its labels: a file, or the folder of a scan."""
 
     scene: str
@@ -97,11 +93,9 @@ def scene_files(
     """Finds the files of every scene to score, in the order of the names.
 
     ScanNet's scripts score the scenes that have predictions, and pass over the others. Here those are refused: the
-    scores of a method that got through some scenes cannot stand beside those of one that got through all.
+    scores of a method that got through some scenes do not compare with those of one that got through all.
 
     Args:
-        predictions: folder with SCENE.txt, or what `suffixes` allows.
-        labels: folder with SCENE.txt, or of scans.
         scenes: those to score, such as the ones of a split; None = all of the labels.
         suffixes: of prediction files.
         scans: whether `labels` has the folders of ScanNet's scans, each with the label files of its scene.
@@ -119,10 +113,8 @@ def scene_files(
             )
         predicted[path.stem] = path
     if not predicted:
-        pickled = [path.name for path in sorted(predictions.iterdir()) if path.suffix.lower() in PICKLE_SUFFIXES]
-        because = f"; {pickled[0]} is a pickle, which is refused since reading it can run code" if pickled else ""
         expected = " or ".join(f"SCENE{suffix}" for suffix in suffixes)
-        raise InputError(f"{predictions}: no predictions; expected {expected} for each scene{because}")
+        raise InputError(f"{predictions}: no predictions; expected {expected} for each scene (pickles are refused)")
     label_files = _label_files(labels, scans)
     foreign = [scene for scene in predicted if scene not in label_files]
     if foreign:
@@ -135,7 +127,7 @@ def scene_files(
     missing = [scene for scene in names if scene not in predicted]
     if missing:
         raise InputError(f"{predictions}: no prediction of {counted(len(missing), 'scene')}: {listed(missing)}")
-    return tuple(SceneFiles(scene=s, prediction=predicted[s], labels=label_files[s]) for s in names)
+    return tuple(SceneFiles(scene, predicted[scene], label_files[scene]) for scene in names)
 
 
 def _label_files(labels: Path, scans: bool) -> dict[str, Path]:
@@ -147,18 +139,12 @@ def _label_files(labels: Path, scans: bool) -> dict[str, Path]:
         if any(os.path.lexists(path / name) for name in (f"{path.name}{AGGREGATION}", f"scans/{ANNOTATION}"))
     }
     if scans and not folders:
-        instead = "; SCENE.txt has ids of classes and needs no label map" if files else ""
         raise InputError(
-            f"{labels}: no scans; expected SCENE/SCENE{AGGREGATION} or SCENE/scans/{ANNOTATION}, and the files beside "
-            f"it{instead}"
+            f"{labels}: no scans; expected SCENE/SCENE{AGGREGATION} or SCENE/scans/{ANNOTATION} (SCENE.txt has ids of "
+            "classes and needs no label_map=)"
         )
     if not scans and not files:
-        instead = (
-            f"; the labels of {counted(len(folders), 'scan')} that it holds become truth by "
-            "scannetv2-labels.combined.tsv or ScanNet++'s map_benchmark.csv (label_map=)"
-            if folders
-            else ""
-        )
+        instead = " (labels of scans need label_map=)" if folders else ""
         raise InputError(f"{labels}: no truth; expected SCENE.txt for each scene{instead}")
     return folders if scans else files
 

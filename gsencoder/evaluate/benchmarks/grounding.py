@@ -6,22 +6,20 @@ pixels. The ground truth is the union of all instances of a name. M3 prints the 
 """
 
 import math
-import warnings
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32
 
-from gsencoder.core.errors import InputError, SceneWarning, counted
+from gsencoder.core.errors import InputError, counted
 from gsencoder.core.settings import option
-from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult
-from gsencoder.evaluate.tables import ScoreReport, mean_of, table_of
+from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult, warn_of_gaps
+from gsencoder.evaluate.tables import ScoreReport, grouped, mean_of, table_of
 from gsencoder.infer.pictures import pixel_features
 from gsencoder.infer.relevancy import GaussianProducts, word_directions
 from gsencoder.render import blend
-from gsencoder.render.rays import strided_lattice
 from gsencoder.text.table import TextEncoder, check_space
 from gsencoder.types import GaussianFeatures, QueryMemory, Scene, SceneObject
 
@@ -34,12 +32,10 @@ SHARES = ("miou", "ciou", "p50", "p60")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroundingProtocol(Protocol):
-    """Selection of the pairs of a view and a name, and of the pixels that are compared."""
+    """Selection of the pairs of a view and a name."""
 
     name: Literal["grounding"] = "grounding"
-    stride: int = option(1, "pixels from one rendered pixel to the next, along both sides of a view", ge=1)
     min_pixels: int = option(60, "smallest area that the objects of a name must have in a view to be looked for", ge=1)
-    furniture: bool = option(True, "whether furniture is looked for, and not the small objects alone")
 
     def start(self, evaluation: Evaluation) -> "GroundingBenchmark":
         return GroundingBenchmark(self, evaluation)
@@ -47,13 +43,8 @@ class GroundingProtocol(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroundedPair:
-    """One phrase in one view.
-
-    Attributes:
-        intersection: pixels of the mask that were found.
-        union: pixels of the mask, and those that were found and are not of the mask.
-        finite: whether the map was finite; nothing is found in one that was not.
-    """
+    """One phrase in one view: pixels of its mask that were found, pixels of the mask or found, and whether the map was
+    finite; nothing is found in one that was not."""
 
     view: str
     phrase: str
@@ -66,37 +57,12 @@ class GroundedPair:
         return self.intersection / self.union
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GroundingScores:
-    """Scores of pairs of a view and a phrase; NaN without pairs.
-
-    Attributes:
-        pairs: that were scored.
-        not_finite: of them, those whose map was not finite. Their IoU is 0, so that no method gains by failing.
-        miou: mean IoU of the pairs.
-        ciou: sum of the intersections by the sum of the unions: each pixel counts the same, and large masks most.
-        p50: share of the pairs with an IoU of 0.5 or more.
-        p60: share of the pairs with an IoU of 0.6 or more.
-    """
-
-    pairs: int
-    not_finite: int
-    miou: float
-    ciou: float
-    p50: float
-    p60: float
+Grounded = tuple[list[GroundedPair], int, int]
+"""The pairs of a scene, view by view, the number that were left out because they have too few pixels, and that of its
+views."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GroundedScene:
-    """The pairs of a scene, the number that were left out as too small, and that of its views."""
-
-    pairs: tuple[GroundedPair, ...]
-    small: int
-    views: int
-
-
-class GroundingBenchmark(Benchmark[GroundedScene]):
+class GroundingBenchmark(Benchmark[Grounded]):
     def __init__(self, protocol: GroundingProtocol, evaluation: Evaluation) -> None:
         self.protocol, self.evaluation = protocol, evaluation
 
@@ -108,34 +74,40 @@ class GroundingBenchmark(Benchmark[GroundedScene]):
             )
         return scene
 
-    def predict(self, scene: Scene, features: GaussianFeatures) -> GroundedScene:
-        assert scene.views is not None
+    def predict(self, scene: Scene, features: GaussianFeatures) -> Grounded:
         memory = self.evaluation.memory_of(scene)
-        pairs, small = ground_scene(scene, features, self.evaluation.words, self.protocol, memory=memory)
-        return GroundedScene(pairs=tuple(pairs), small=small, views=len(scene.views))
+        return ground_scene(scene, features, self.evaluation.words, self.protocol, memory=memory)
 
-    def report(self, results: Sequence[SceneResult[GroundedScene]]) -> ScoreReport:
-        small = sum(result.value.small for result in results)
-        self._warn_about_gaps(results, small)
-        pairs = [pair for result in results for pair in result.value.pairs]
-        scores, names = grounding_scores(pairs), scores_by_phrase(pairs)
+    def report(self, results: Sequence[SceneResult[Grounded]]) -> ScoreReport:
+        small = sum(result.value[1] for result in results)
+        warn_of_gaps(
+            [(result.scene, len(result.value[0])) for result in results],
+            f"view that shows a named object with {self.protocol.min_pixels} pixels",
+            f" ({small} pairs have fewer); lower protocol.min_pixels, or name objects",
+        )
+        pairs = [pair for result in results for pair in result.value[0]]
+        scores = grounding_scores(pairs)
+        names = {name: grounding_scores(each) for name, each in grouped(pairs, "phrase").items()}
+        names = dict(sorted(names.items(), key=lambda item: (item[1]["miou"], item[0])))
+        # Each name counts the same, in however many views it is.
+        miou_names = mean_of([row["miou"] for row in names.values()])
         by_scene = [
             {
                 "scene": result.scene,
-                "views": result.value.views,
+                "views": result.value[2],
                 "gaussians": result.gaussians,
-                "small": result.value.small,
-                **asdict(grounding_scores(result.value.pairs)),
+                "small": result.value[1],
+                **grounding_scores(result.value[0]),
             }
             for result in results
         ]
-        shares = {name: getattr(scores, name) for name in SHARES}
-        faults = f", {counted(scores.not_finite, 'map')} not finite" if scores.not_finite else ""
+        shares = {name: scores[name] for name in SHARES}
+        faults = f", {counted(scores['not_finite'], 'map')} not finite" if scores["not_finite"] else ""
         return ScoreReport(
             results={
                 "protocol": "grounding",
-                **asdict(scores),
-                "miou_names": phrase_mean(names),
+                **scores,
+                "miou_names": miou_names,
                 "small": small,
                 "names": names,
                 "scenes": by_scene,
@@ -148,29 +120,14 @@ class GroundingBenchmark(Benchmark[GroundedScene]):
                 "pairs": [
                     {"scene": each.scene, "view": p.view, "name": p.phrase, "iou": p.iou, "finite": p.finite}
                     for each in results
-                    for p in each.value.pairs
+                    for p in each.value[0]
                 ],
                 "scenes": by_scene,
             },
             line=f"{counted(len(pairs), 'pair')} of a view and a name in {counted(len(results), 'scene')}: mIoU "
-            f"{scores.miou:.3f} (averaged over names {phrase_mean(names):.3f}), cIoU {scores.ciou:.3f}, P@0.5 "
-            f"{scores.p50:.3f}, P@0.6 {scores.p60:.3f}; {counted(small, 'pair')} too small{faults}",
+            f"{scores['miou']:.3f} (averaged over names {miou_names:.3f}), cIoU {scores['ciou']:.3f}, P@0.5 "
+            f"{scores['p50']:.3f}, P@0.6 {scores['p60']:.3f}; {counted(small, 'pair')} too small{faults}",
         )
-
-    def _warn_about_gaps(self, results: Sequence[SceneResult[GroundedScene]], small: int) -> None:
-        empty = [result.scene for result in results if not result.value.pairs]
-        least = self.protocol.min_pixels
-        if len(empty) == len(results):
-            raise InputError(
-                f"grounding: no view of {len(results)} scenes shows a named object with {least} pixels ({small} have "
-                "fewer); lower protocol.min_pixels, or name objects"
-            )
-        if empty:
-            warnings.warn(
-                f"{len(empty)} of {len(results)} scenes show no named object with {least} pixels (first: {empty[0]!r})",
-                SceneWarning,
-                stacklevel=3,
-            )
 
 
 def otsu_threshold(values: Float32[np.ndarray, "*shape"]) -> float:
@@ -208,10 +165,7 @@ def ground(
     """Compares what lies above Otsu's threshold of a map with a mask.
 
     Args:
-        relevancy: of the phrase. With a value that is not finite, nothing is found, and the pair says so.
         truth: pixels of what the phrase means, one or more.
-        view: its name.
-        phrase: that the map is of.
     """
     if relevancy.shape != truth.shape or not truth.any():
         raise InputError(
@@ -224,19 +178,24 @@ def ground(
     return GroundedPair(view=view, phrase=phrase, intersection=intersection, union=union, finite=finite)
 
 
-def grounding_scores(pairs: Sequence[GroundedPair]) -> GroundingScores:
-    """The scores of pairs of any views and phrases."""
+def grounding_scores(pairs: Sequence[GroundedPair]) -> dict[str, Any]:
+    """The scores of pairs of any views and phrases; NaN without pairs.
+
+    Returns:
+        pairs, and of them not_finite: those whose map was not finite. Their IoU is 0, so that no method gains by
+        failing. miou: mean IoU of the pairs. ciou: sum of the intersections by that of the unions: each pixel counts
+        the same, and large masks most. p50, p60: shares of the pairs with an IoU of 0.5, or 0.6, or more.
+    """
     ious = np.array([pair.iou for pair in pairs], np.float64)
-    union = sum(pair.union for pair in pairs)
-    half, more = (float((ious >= least).mean()) if pairs else math.nan for least in PRECISION_IOUS)
-    return GroundingScores(
-        pairs=len(pairs),
-        not_finite=sum(not pair.finite for pair in pairs),
-        miou=float(ious.mean()) if pairs else math.nan,
-        ciou=sum(pair.intersection for pair in pairs) / union if pairs else math.nan,
-        p50=half,
-        p60=more,
-    )
+    half, more = (mean_of((ious >= least).astype(np.float64)) for least in PRECISION_IOUS)
+    return {
+        "pairs": len(pairs),
+        "not_finite": sum(not pair.finite for pair in pairs),
+        "miou": mean_of(ious),
+        "ciou": sum(pair.intersection for pair in pairs) / sum(pair.union for pair in pairs) if pairs else math.nan,
+        "p50": half,
+        "p60": more,
+    }
 
 
 def ground_scene(
@@ -246,30 +205,27 @@ def ground_scene(
     protocol: GroundingProtocol = GroundingProtocol(),
     *,
     memory: QueryMemory | None = None,
-) -> tuple[list[GroundedPair], int]:
+) -> Grounded:
     """Looks for the names of a scene's objects in features of its Gaussians, in each view that shows them.
 
     Pixels that show no Gaussian with a feature have a relevancy of 0.
-
-    Returns:
-        The pairs, view by view, and the number of pairs that were left out because they have too few pixels.
     """
     assert scene.gaussians is not None
     assert scene.views is not None
     assert scene.views.instances is not None
     check_space(features.space, words.space)
-    ids = ids_by_name(scene.objects, furniture=protocol.furniture)
+    ids = ids_by_name(scene.objects)
     if not ids:
-        return [], 0
+        return [], 0, len(scene.views)
     directions = dict(zip(ids, word_directions(words.encode(list(ids)), words.mean), strict=True))
     products = GaussianProducts(features)
     pairs, small = [], 0
     for view, name in enumerate(scene.views.names):
-        masks, left_out = masks_of(scene.views.instances[view], ids, protocol)
+        masks, left_out = masks_of(scene.views.instances[view], ids, protocol.min_pixels)
         small += left_out
         if not masks:
             continue
-        b = blend(scene.gaussians, scene.views.cameras, view, stride=protocol.stride)
+        b = blend(scene.gaussians, scene.views.cameras, view)
         pixels = pixel_features(products, b, memory=memory)
         cosines = np.clip(pixels.cosines(np.stack([directions[phrase] for phrase in masks])), -1, 1)
         maps = np.where(pixels.alpha > 0, cosines, 0).reshape(-1, *b.shape)
@@ -277,48 +233,20 @@ def ground_scene(
             ground(relevancy, mask, view=name, phrase=phrase)
             for (phrase, mask), relevancy in zip(masks.items(), maps, strict=True)
         ]
-    return pairs, small
+    return pairs, small, len(scene.views)
 
 
-def ids_by_name(objects: Sequence[SceneObject], *, furniture: bool = True) -> dict[str, list[int]]:
+def ids_by_name(objects: Sequence[SceneObject]) -> dict[str, list[int]]:
     """The values in instance maps of the objects of each name, in alphabetical order of the names."""
-    ids: dict[str, list[int]] = {}
-    for each in objects:
-        if each.name and (furniture or each.placed):
-            ids.setdefault(each.name, []).append(each.id)
-    return dict(sorted(ids.items()))
+    with_names = grouped([each for each in objects if each.name], "name")
+    return {name: [each.id for each in same] for name, same in sorted(with_names.items())}
 
 
 def masks_of(
-    instances: Int32[np.ndarray, "H W"], ids: dict[str, list[int]], protocol: GroundingProtocol
-) -> tuple[dict[str, Bool[np.ndarray, "h w"]], int]:
-    """The mask of each name in a view at the rendered pixels, and the number of names that it shows with too few.
-
-    Names that the view does not show are neither. A mask that has pixels, but none of those that are rendered, has too
-    few.
-    """
-    lattice = strided_lattice(instances.shape[1], instances.shape[0], protocol.stride)
-    rows, columns = (slice(int(first), None, protocol.stride) for first in (lattice.y0, lattice.x0))
-    masks, small = {}, 0
-    for name, values in ids.items():
-        full_mask = np.isin(instances, values)
-        mask = full_mask[rows, columns]
-        if full_mask.sum() >= protocol.min_pixels and mask.any():
-            masks[name] = mask
-        elif full_mask.any():
-            small += 1
-    return masks, small
-
-
-def scores_by_phrase(pairs: Sequence[GroundedPair]) -> dict[str, dict[str, Any]]:
-    """The scores of each phrase separately, in ascending order of mean IoU."""
-    phrases: dict[str, list[GroundedPair]] = {}
-    for pair in pairs:
-        phrases.setdefault(pair.phrase, []).append(pair)
-    table = {phrase: asdict(grounding_scores(group)) for phrase, group in phrases.items()}
-    return dict(sorted(table.items(), key=lambda item: (item[1]["miou"], item[0])))
-
-
-def phrase_mean(table: dict[str, dict[str, Any]]) -> float:
-    """Mean over phrases of their mean IoU: each name counts the same, in however many views it is; NaN without any."""
-    return mean_of([row["miou"] for row in table.values()])
+    instances: Int32[np.ndarray, "H W"], ids: dict[str, list[int]], min_pixels: int
+) -> tuple[dict[str, Bool[np.ndarray, "H W"]], int]:
+    """The mask of each name in a view, and the number of names that it shows with fewer pixels."""
+    masks = {name: np.isin(instances, values) for name, values in ids.items()}
+    pixels = {name: int(mask.sum()) for name, mask in masks.items()}
+    large = {name: mask for name, mask in masks.items() if pixels[name] >= min_pixels}
+    return large, sum(0 < count < min_pixels for count in pixels.values())

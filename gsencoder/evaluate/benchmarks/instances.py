@@ -36,7 +36,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -54,7 +54,6 @@ from gsencoder.data.labels.classes import (
     write_classes,
 )
 from gsencoder.data.labels.files import (
-    mask_bytes,
     read_checked_text,
     read_mask,
     read_whole_numbers,
@@ -118,7 +117,7 @@ class InstancesBenchmark(Benchmark[None]):
         for name in (LABELS, PREDICTIONS):
             self.evaluation.file(name).mkdir(exist_ok=True)
         write_whole_numbers(self.evaluation.file(LABELS) / f"{scene.name}.txt", ids)
-        write_instance_prediction(self.evaluation.file(PREDICTIONS), masks, form="npz")
+        write_instance_prediction(self.evaluation.file(PREDICTIONS), masks)
 
     def report(self, results: Sequence[SceneResult[None]]) -> ScoreReport:  # noqa: ARG002 - files hold all
         write_classes(self.evaluation.file(CLASS_IDS), self.classes.table)
@@ -133,15 +132,8 @@ class InstancesBenchmark(Benchmark[None]):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InstancePrediction:
-    """Masks of a scene, each with a class and a score; masks may overlap.
-
-    Attributes:
-        scene: its name.
-        num_vertices: of the scene, V.
-        masks: the vertices of each, ascending, each once.
-        labels: class ids.
-        scores: finite; predictions are ranked by them.
-    """
+    """Masks of a scene of V vertices, each with a class id and a finite score; masks may overlap, and hold the vertices
+    of each, ascending, each once."""
 
     scene: str
     num_vertices: int
@@ -185,8 +177,7 @@ def predict_instances(
     """Masks of a scene's points, each with a class and a score.
 
     Args:
-        classes: whose names are looked for.
-        localization: settings of `localize`, for clusters.
+        localization: for clusters.
     """
     ids = classes.id_of
     if protocol.proposals == "clusters":
@@ -240,15 +231,15 @@ def score_instances(
             f"{labels}: nothing to score: no object of the {len(classes.names)} classes has {MIN_REGION} vertices or "
             f"more in {counted(len(matches), 'scene')}; compare its ids with those of classes="
         )
-    overall = _precisions(scores.overall)
-    groups = {f"ap_{group}": values.ap for group, values in scores.groups.items()}
+    overall = scores.overall
+    groups = {f"ap_{group}": values["ap"] for group, values in scores.groups.items()}
     by_scene = [
-        {"scene": each.scene, **_precisions(alone.overall), "truths": int(alone.instances.sum())}
+        {"scene": each.scene, **alone.overall, "truths": int(alone.instances.sum())}
         for each in matches
         for alone in (instance_scores([each], classes),)
     ]
     by_class = [
-        {"class": name, **_precisions(values), "truths": int(number), "predictions": int(count)}
+        {"class": name, **values, "truths": int(number), "predictions": int(count)}
         for (name, values), number, count in zip(
             scores.classes.items(), scores.instances, scores.predictions, strict=True
         )
@@ -297,10 +288,6 @@ def score_instances(
     )
 
 
-def _precisions(averages: "InstanceAverages") -> dict[str, float]:
-    return {"ap_25": averages.ap25, "ap_50": averages.ap50, "ap": averages.ap}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneMatches:
     """Which predictions of a scene are right, at each threshold: all that scores need of it.
@@ -327,14 +314,6 @@ class SceneMatches:
     thresholds: Int64[np.ndarray, " K"]
     hits: Bool[np.ndarray, " K"]
     outcome_scores: Float64[np.ndarray, " K"]
-
-
-class _Pairs(NamedTuple):
-    """Pairs of a prediction and an instance of its class that have vertices in common."""
-
-    predictions: Int64[np.ndarray, " P"]
-    instances: Int64[np.ndarray, " P"]
-    ious: Float64[np.ndarray, " P"]
 
 
 def match_instances(
@@ -372,16 +351,17 @@ def match_instances(
     same = rows[:, None] == instance_rows
     first, second = np.nonzero(same & (common > 0))
     shared = common[first, second]
-    pairs = _Pairs(first, second, shared / (sizes[second] + areas[first] - shared))
+    ious = shared / (sizes[second] + areas[first] - shared)
     # The official script adds an instance that is small and a group (an id below 1000) twice.
     small = same & (sizes < MIN_REGION)
     groups = same & (ids < IDS_PER_CLASS)
     ignored = (common * (void + small.astype(np.int64) + groups)).sum(axis=1) / np.maximum(areas, 1)
 
-    outcomes = [_outcomes(pairs, in_score, scores, ignored, overlap) for overlap in OVERLAPS]
+    scored = in_score[second]
+    outcomes = [_outcomes(first, second, ious > overlap, scored, scores, ignored <= overlap) for overlap in OVERLAPS]
     of_instance = np.concatenate([owners for owners, _, _ in outcomes])
     hits = np.concatenate([right for _, right, _ in outcomes])
-    multiple = np.bincount(pairs.predictions[(pairs.ious > OVERLAPS.min()) & in_score[pairs.instances]], minlength=1)
+    multiple = np.bincount(first[(ious > OVERLAPS.min()) & scored], minlength=1)
     return SceneMatches(
         scene=prediction.scene,
         class_agnostic=class_agnostic,
@@ -398,22 +378,27 @@ def match_instances(
 
 
 def _outcomes(
-    pairs: _Pairs,
-    in_score: Bool[np.ndarray, " I"],
+    predictions: Int64[np.ndarray, " P"],
+    instances: Int64[np.ndarray, " P"],
+    above: Bool[np.ndarray, " P"],
+    scored: Bool[np.ndarray, " P"],
     scores: Float64[np.ndarray, " M"],
-    ignored: Float64[np.ndarray, " M"],
-    overlap: float,
+    counts: Bool[np.ndarray, " M"],
 ) -> tuple[Int64[np.ndarray, " K"], Bool[np.ndarray, " K"], Float64[np.ndarray, " K"]]:
-    """The outcomes at one threshold: a prediction of the class of each, whether it is a match, and its score."""
-    above = pairs.ious > overlap
-    candidates = np.flatnonzero(above & in_score[pairs.instances])
-    candidates = candidates[np.lexsort((pairs.predictions[candidates], pairs.instances[candidates]))]
+    """The outcomes at one threshold: a prediction of the class of each, whether it is a match, and its score.
+
+    Args:
+        predictions, instances: pairs of one class that have vertices in common.
+        above: whether the IoU of a pair is above the threshold.
+        scored: whether the instance of a pair counts.
+        counts: whether a prediction that is above it with no instance is a false positive.
+    """
+    candidates = np.flatnonzero(above & scored)
+    candidates = candidates[np.lexsort((predictions[candidates], instances[candidates]))]
     used_predictions: set[int] = set()
     matched: dict[int, tuple[int, float]] = {}
     wrong: list[tuple[int, float]] = []
-    for prediction, instance in zip(
-        pairs.predictions[candidates].tolist(), pairs.instances[candidates].tolist(), strict=True
-    ):
+    for prediction, instance in zip(predictions[candidates].tolist(), instances[candidates].tolist(), strict=True):
         if prediction in used_predictions:
             continue
         score = float(scores[prediction])
@@ -426,8 +411,8 @@ def _outcomes(
             used_predictions.add(prediction)
             matched[instance] = prediction, score
     alone = np.ones(len(scores), bool)
-    alone[pairs.predictions[above]] = False
-    false = np.flatnonzero(alone & (ignored <= overlap))
+    alone[predictions[above]] = False
+    false = np.flatnonzero(alone & counts)
     owned = [*matched.values(), *wrong]
     return (
         np.concatenate([np.array([owner for owner, _ in owned], np.int64), false]),
@@ -436,13 +421,8 @@ def _outcomes(
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InstanceAverages:
-    """AP over 0.5 to 0.9, at 0.5 and at 0.25; NaN without instances."""
-
-    ap: float
-    ap50: float
-    ap25: float
+Averages = dict[str, float]
+"""ap_25, ap_50 and ap, which is over 0.5 to 0.9; NaN without instances."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -450,9 +430,8 @@ class InstanceScores:
     """The scores of scenes.
 
     Attributes:
-        overall: mean over the classes that have instances.
+        overall, groups: means over the classes that have instances, all and those of each group.
         classes: by name; the one class of a class-agnostic score is called "any".
-        groups: mean over the classes of each group that have instances.
         equal_scores: whether there are several predictions, all with one score. Their ranking is then undefined, and AP
             is recall · (precision + 1) / 2 at each threshold.
         shared: predictions that are above 0.25 with several instances; AP25 depends on the order of the predictions
@@ -460,9 +439,9 @@ class InstanceScores:
     """
 
     scenes: int
-    overall: InstanceAverages
-    classes: dict[str, InstanceAverages]
-    groups: dict[str, InstanceAverages]
+    overall: Averages
+    classes: dict[str, Averages]
+    groups: dict[str, Averages]
     instances: Int64[np.ndarray, " C"]
     predictions: Int64[np.ndarray, " C"]
     equal_scores: bool
@@ -482,12 +461,7 @@ def average_precision(scores: Float64[np.ndarray, " n"], hits: Bool[np.ndarray, 
 
 
 def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> InstanceScores:
-    """The scores of scenes together; of one scene, its own.
-
-    Args:
-        matches: of one scene or more, in any order, each once.
-        classes: with which they were matched.
-    """
+    """The scores of scenes together, which were matched with these classes."""
     agnostic = matches[0].class_agnostic
     labels = ("any",) if agnostic else classes.names
     instances = np.sum([m.instances for m in matches], axis=0)
@@ -518,17 +492,13 @@ def instance_scores(matches: Sequence[SceneMatches], classes: ClassTable) -> Ins
     )
 
 
-def _averages(table: Float64[np.ndarray, "c T"]) -> InstanceAverages:
+def _averages(table: Float64[np.ndarray, "c T"]) -> Averages:
     """Means over the classes of a table that have instances."""
     present = table[~np.isnan(table[:, 0])]
-    if not len(present):
-        return InstanceAverages(ap=math.nan, ap50=math.nan, ap25=math.nan)
-    strict, half, quarter = OVERLAPS >= 0.5, OVERLAPS == 0.5, OVERLAPS == 0.25
-    ap, ap50, ap25 = (float(present[:, which].mean()) for which in (strict, half, quarter))
-    return InstanceAverages(ap=ap, ap50=ap50, ap25=ap25)
+    columns = {"ap_25": OVERLAPS == 0.25, "ap_50": OVERLAPS == 0.5, "ap": OVERLAPS >= 0.5}
+    return {name: float(present[:, which].mean()) if len(present) else math.nan for name, which in columns.items()}
 
 
-MASK_FOLDER = "predicted_masks"
 MAX_LIST_BYTES = 64 << 20
 """Largest size of the list of a scene's masks."""
 MAX_PATH = 1000
@@ -614,30 +584,14 @@ def read_instance_prediction(path: Path, *, num_vertices: int) -> InstancePredic
     )
 
 
-def write_instance_prediction(
-    folder: Path, prediction: InstancePrediction, *, form: Literal["text", "npz"] = "text"
-) -> Path:
-    """Writes the masks of a scene as ScanNet's script takes them, or as one .npz, which is much smaller.
-
-    Returns:
-        The file SCENE.txt or SCENE.npz.
-    """
-    masks = np.zeros((len(prediction.labels), prediction.num_vertices), bool)
-    for index, mask in enumerate(masks):
-        mask[prediction.masks[index]] = True
-    if form == "npz":
-        data = io.BytesIO()
-        np.savez_compressed(data, pred_masks=masks.T, pred_classes=prediction.labels, pred_scores=prediction.scores)
-        write_bytes(folder / f"{prediction.scene}.npz", data.getvalue())
-        return folder / f"{prediction.scene}.npz"
-    (folder / MASK_FOLDER).mkdir(exist_ok=True)
-    lines = []
-    for index, mask in enumerate(masks):
-        name = f"{MASK_FOLDER}/{prediction.scene}_{index:03d}.txt"
-        (folder / name).write_bytes(mask_bytes(mask))
-        lines.append(f"{name} {prediction.labels[index]} {float(prediction.scores[index])!r}\n")
-    write_bytes(folder / f"{prediction.scene}.txt", "".join(lines).encode())
-    return folder / f"{prediction.scene}.txt"
+def write_instance_prediction(folder: Path, prediction: InstancePrediction) -> None:
+    """Writes the masks of a scene as SCENE.npz."""
+    masks = np.zeros((prediction.num_vertices, len(prediction.labels)), bool)
+    for index, rows in enumerate(prediction.masks):
+        masks[rows, index] = True
+    data = io.BytesIO()
+    np.savez_compressed(data, pred_masks=masks, pred_classes=prediction.labels, pred_scores=prediction.scores)
+    write_bytes(folder / f"{prediction.scene}.npz", data.getvalue())
 
 
 def _read_npz(path: Path, num_vertices: int) -> InstancePrediction:
@@ -663,21 +617,21 @@ def _read_npz(path: Path, num_vertices: int) -> InstancePrediction:
 def _label(word: str, where: str) -> int:
     """A class id; ScanNet's script takes 5.0 for 5."""
     value = _number(word)
-    if value is None or not abs(value) <= MAX_ID or value != int(value):
+    if not abs(value) <= MAX_ID or value != int(value):
         raise InputError(f"{where}: expected a whole number as the class id, got {word[:40]!r}")
     return int(value)
 
 
 def _score(word: str, where: str) -> float:
     value = _number(word)
-    if value is None or not np.isfinite(value):
+    if not math.isfinite(value):
         raise InputError(f"{where}: expected a finite number as the score, got {word[:40]!r}")
     return value
 
 
-def _number(word: str) -> float | None:
+def _number(word: str) -> float:
+    """A number, NaN where it is none: Python reads 1_000 as one, and other tools do not."""
     try:
-        # Python reads 1_000 as a number, and other tools do not.
-        return None if "_" in word else float(word)
+        return math.nan if "_" in word else float(word)
     except ValueError:
-        return None
+        return math.nan

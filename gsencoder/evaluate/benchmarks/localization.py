@@ -6,7 +6,7 @@ oracle_, the best of all boxes of a name counts, as in SplatDistill's tables; a 
 """
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -16,11 +16,11 @@ from jaxtyping import Float64
 from gsencoder.core.errors import InputError, SceneWarning, counted
 from gsencoder.core.settings import option
 from gsencoder.data.labels.scans import with_counted_views
-from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult
-from gsencoder.evaluate.tables import ScoreReport, mean_of, table_of
+from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult, warn_of_gaps
+from gsencoder.evaluate.tables import ScoreReport, grouped, mean_of, table_of
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.text.vocabulary import Words
-from gsencoder.types import Box, GaussianFeatures, Localization, Scene, SceneObject
+from gsencoder.types import GaussianFeatures, Localization, Scene, SceneObject
 
 IOU_THRESHOLDS = (0.25, 0.5)
 """IoUs from which on an object counts as localized."""
@@ -40,14 +40,8 @@ class LocalizationProtocol(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hit:
-    """The result of querying the name of one object.
-
-    Attributes:
-        scene: name of the scene.
-        name: of the object.
-        iou: of the first box; 0 if there is none.
-        oracle_iou: the largest of all boxes for the name.
-    """
+    """The result of querying the name of one object: the IoU of the first box, 0 if there is none, and the largest of
+    all boxes for the name."""
 
     scene: str
     name: str
@@ -84,7 +78,14 @@ class LocalizationBenchmark(Benchmark[SceneHits]):
     def report(self, results: Sequence[SceneResult[SceneHits]]) -> ScoreReport:
         hits = [hit for result in results for hit in result.value.hits]
         boxless = sum(result.value.boxless for result in results)
-        _warn_about_gaps(results, len(hits), boxless)
+        warn_of_gaps(
+            [(result.scene, len(result.value.hits)) for result in results],
+            "object to query",
+            "; expected placed, named objects that are seen well enough (see protocol.min_views and "
+            "protocol.min_pixels), in an objects.json or in the label files of ScanNet or ScanNet++",
+        )
+        if boxless:
+            warnings.warn(f"{boxless} names have no box ({len(hits)} objects were queried)", SceneWarning, stacklevel=2)
         overall, names = scores(hits), scores_by_name(hits)
         by_scene = [
             {
@@ -113,32 +114,11 @@ class LocalizationBenchmark(Benchmark[SceneHits]):
         )
 
 
-def _warn_about_gaps(results: Sequence[SceneResult[SceneHits]], queried: int, boxless: int) -> None:
-    empty = [result.scene for result in results if not result.value.hits]
-    if len(empty) == len(results):
-        raise InputError(
-            f"evaluate: none of {len(results)} scenes has an object to query; expected placed, named objects that are "
-            "seen well enough (see protocol.min_views and protocol.min_pixels), in an objects.json or in the label "
-            "files of ScanNet or ScanNet++"
-        )
-    if empty:
-        warnings.warn(
-            f"{len(empty)} of {len(results)} scenes have no object to query (first: {empty[0]!r})",
-            SceneWarning,
-            stacklevel=3,
-        )
-    if boxless:
-        warnings.warn(f"{boxless} names have no box ({queried} objects were queried)", SceneWarning, stacklevel=3)
-
-
 def score_queries(
     scene: Scene, features: GaussianFeatures, words: Words, protocol: LocalizationProtocol, localization: LocalizeConfig
 ) -> tuple[list[Hit], int]:
-    """Localizes the name of each object to query in features of the scene's Gaussians.
-
-    Returns:
-        One hit for each object, and the number of names without a box.
-    """
+    """One hit for each object that is queried in features of the scene's Gaussians, and the number of names without a
+    box."""
     targets = queryable_objects(scene.objects, min_views=protocol.min_views, min_pixels=protocol.min_pixels)
     names = list(dict.fromkeys(target.name for target in targets if target.name))
     if not names:
@@ -184,40 +164,30 @@ def is_seen(scene_object: SceneObject, *, min_views: int, min_pixels: int) -> bo
 
 def score_boxes(scene: Scene, localization: Localization, targets: Sequence[SceneObject]) -> list[Hit]:
     """Compares the boxes for each target's name with all objects of that name; one hit per target."""
-    boxes: dict[str, list[Box]] = {}
-    for box in localization.boxes:
-        boxes.setdefault(box.query, []).append(box)
+    boxes = grouped(localization.boxes, "query")
     hits = []
     for target in targets:
         assert target.name is not None
         same = [o for o in scene.objects if o.name == target.name]
         ranked = sorted(boxes.get(target.name, []), key=lambda box: box.rank)
         ious = [max(aabb_iou(b.aabb_min, b.aabb_max, o.aabb_min, o.aabb_max) for o in same) for b in ranked]
-        hits.append(
-            Hit(scene=scene.name, name=target.name, iou=ious[0] if ious else 0.0, oracle_iou=max(ious, default=0.0))
-        )
+        first, best = ious[0] if ious else 0.0, max(ious, default=0.0)
+        hits.append(Hit(scene=scene.name, name=target.name, iou=first, oracle_iou=best))
     return hits
 
 
-def accuracy(hits: Iterable[Hit], threshold: float, *, oracle: bool = False) -> float:
-    """The share of hits whose IoU is at least `threshold`; NaN without hits."""
-    ious = [hit.oracle_iou if oracle else hit.iou for hit in hits]
-    return mean_of([float(iou >= threshold) for iou in ious])
-
-
 def scores(hits: Sequence[Hit]) -> dict[str, Any]:
-    """Number of objects, accuracy at each threshold and mean IoU: of first boxes, and with oracle_ of the best."""
+    """Number of objects, accuracy at each threshold and mean IoU: of first boxes, and with oracle_ of the best; NaN
+    without hits."""
     row: dict[str, Any] = {"objects": len(hits)}
-    for prefix, oracle in (("", False), ("oracle_", True)):
-        row |= {f"{prefix}acc_{round(100 * least)}": accuracy(hits, least, oracle=oracle) for least in IOU_THRESHOLDS}
-        row[f"{prefix}mean_iou"] = mean_of([hit.oracle_iou if oracle else hit.iou for hit in hits])
+    for prefix, ious in (("", [hit.iou for hit in hits]), ("oracle_", [hit.oracle_iou for hit in hits])):
+        for least in IOU_THRESHOLDS:
+            row[f"{prefix}acc_{round(100 * least)}"] = mean_of([float(iou >= least) for iou in ious])
+        row[f"{prefix}mean_iou"] = mean_of(ious)
     return row
 
 
 def scores_by_name(hits: Sequence[Hit]) -> dict[str, dict[str, Any]]:
     """`scores` of each name separately, in ascending order of mean IoU."""
-    names: dict[str, list[Hit]] = {}
-    for hit in hits:
-        names.setdefault(hit.name, []).append(hit)
-    table = {name: scores(group) for name, group in names.items()}
+    table = {name: scores(each) for name, each in grouped(hits, "name").items()}
     return dict(sorted(table.items(), key=lambda item: (item[1]["mean_iou"], item[0])))

@@ -5,6 +5,7 @@ is the class nearest to the feature fused from the maps of the labels teacher. O
 all names count equally, however many Gaussians they have.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -14,7 +15,7 @@ from jaxtyping import Float32, Int64
 
 from gsencoder.core.errors import InputError, counted
 from gsencoder.evaluate.benchmarks.protocol import Benchmark, Evaluation, Protocol, SceneResult
-from gsencoder.evaluate.tables import ScoreReport, table_of
+from gsencoder.evaluate.tables import ScoreReport, mean_of, table_of
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.fuse import fuse
 from gsencoder.teachers.build import build_teacher
@@ -37,13 +38,8 @@ class NamingProtocol(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NamingCounts:
-    """Numbers of Gaussians of each name in one scene, and of those classified correctly.
-
-    Attributes:
-        total: for each name, the Gaussians whose fused feature is nearest to it.
-        correct: for each name, those of them whose evaluated feature is nearest to it too.
-        cosine: mean cosine of evaluated and fused features about the mean of the space; NaN between different spaces.
-    """
+    """For each name of one scene the Gaussians whose fused feature is nearest to it, those of them whose evaluated
+    feature is too, and the mean centered cosine of both features; NaN between different spaces."""
 
     total: dict[str, int]
     correct: dict[str, int]
@@ -94,8 +90,6 @@ def compare_names(truth: GaussianFeatures, features: GaussianFeatures, teacher: 
 
     Args:
         truth: features fused from the teacher's maps; Gaussians not seen in them do not count.
-        features: to evaluate, of the same Gaussians.
-        teacher: labels teacher of the scene.
     """
     rows = np.flatnonzero(truth.seen)
     true_codes, predicted_codes = (nearest_words(values, rows, teacher.vectors) for values in (truth, features))
@@ -124,20 +118,17 @@ def nearest_words(
 def naming_scores(scenes: Sequence[NamingCounts]) -> dict[str, Any]:
     """Accuracy averaged over names including "other", over names of objects, and over Gaussians; mean cosine; and the
     accuracy of each name, in ascending order."""
-    total: dict[str, int] = {}
-    correct: dict[str, int] = {}
+    total, correct = Counter[str](), Counter[str]()
     for scene in scenes:
-        for name, count in scene.total.items():
-            total[name] = total.get(name, 0) + count
-            correct[name] = correct.get(name, 0) + scene.correct[name]
+        total.update(scene.total)
+        correct.update(scene.correct)
     if not total:
         raise InputError("naming: the views of no scene show a Gaussian; give scenes with instance maps")
     accuracies = {name: correct[name] / count for name, count in total.items()}
-    of_names = [accuracy for name, accuracy in accuracies.items() if name != "other"]
     order = sorted(accuracies, key=lambda name: (accuracies[name], name))
     return {
-        "accuracy": float(np.mean(list(accuracies.values()))),
-        "accuracy_named": float(np.mean(of_names)) if of_names else float("nan"),
+        "accuracy": mean_of(list(accuracies.values())),
+        "accuracy_named": mean_of([each for name, each in accuracies.items() if name != "other"]),
         "accuracy_gaussians": sum(correct.values()) / sum(total.values()),
         "cosine": float(np.mean([scene.cosine for scene in scenes])),
         "names": {name: {"gaussians": total[name], "accuracy": accuracies[name]} for name in order},

@@ -1,12 +1,13 @@
 """What the protocols of `evaluate` share: what they are given, how they answer, and the loop over scenes."""
 
 import time
+import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from gsencoder.core.errors import InputError, advised
+from gsencoder.core.errors import InputError, SceneWarning, advised, counted
 from gsencoder.core.settings import check_limits
 from gsencoder.data.labels.classes import ClassTable, ids_of_raw_names, is_scannetpp_map, load_classes
 from gsencoder.data.labels.scans import find_labels
@@ -28,18 +29,16 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Evaluation:
-    """What a protocol is given beside its own settings.
+    """What a protocol is given next to its own settings.
 
     Attributes:
         words: turn names and sentences into the features' space.
         scenes: loads all scenes one by one, for what must be known before the first is evaluated.
-        scene_names: of all scenes.
         folder: an existing one, for predictions and labels; None for protocols that write neither.
         method: name of the row of the features in tables.
         classes: see `load_classes`; empty = the names of the scenes' objects.
         label_map: file that gives raw names of objects a class; empty = they are names of classes.
-        fusion: of the ground truth, where it is fused.
-        localization: settings of `localize`.
+        fusion: of the labels, where they are fused.
         memory_of: the memory that the features of a scene come from, whose queries are rendered and attend to its bank
             at each pixel; None where there is none.
     """
@@ -63,14 +62,7 @@ class Evaluation:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SceneResult(Generic[Result]):
-    """What a protocol says of one scene.
-
-    Attributes:
-        scene: its name.
-        gaussians: their number.
-        seconds: of each step.
-        value: the protocol's own.
-    """
+    """What a protocol says of one scene; the value is its own."""
 
     scene: str
     gaussians: int
@@ -114,14 +106,8 @@ def predict_scenes(
     source: FeatureSource,
     seeds: SeedConfig = SeedConfig(),
 ) -> list[SceneResult[Result]]:
-    """The results of scenes, one of which is in memory at a time.
-
-    Args:
-        benchmark: a protocol that was started.
-        scenes: and the seconds of loading, as `load_scenes` yields them.
-        source: computes the features of a scene.
-        seeds: how Gaussians are made for scenes without.
-    """
+    """The results of scenes, one of which is in memory at a time; scenes come with the seconds of loading,
+    and `seeds` makes Gaussians for those without."""
     results = []
     for loaded, load_seconds in scenes:
         scene, features, seconds = with_features(benchmark.check(loaded), source, seeds)
@@ -130,6 +116,22 @@ def predict_scenes(
         seconds = {"load": load_seconds, **seconds, "predict": time.perf_counter() - start}
         results.append(SceneResult(scene=scene.name, gaussians=len(features), seconds=seconds, value=value))
     return results
+
+
+def warn_of_gaps(counts: Sequence[tuple[str, int]], what: str, advice: str) -> None:
+    """Warns of scenes that have nothing to evaluate, and refuses them if there are no others.
+
+    Args:
+        counts: names of the scenes, and how much each has.
+        what: that, after "no".
+    """
+    empty = [scene for scene, count in counts if not count]
+    if len(empty) == len(counts):
+        raise InputError(f"evaluate: no {what} in {counted(len(counts), 'scene')}{advice}")
+    if empty:
+        warnings.warn(
+            f"no {what} in {len(empty)} of {len(counts)} scenes (first: {empty[0]!r})", SceneWarning, stacklevel=3
+        )
 
 
 def names_of(scenes: Iterable[Scene]) -> list[str]:
@@ -160,27 +162,18 @@ class PredictedClasses:
 
 def predicted_classes(evaluation: Evaluation, *, instances: bool = False) -> PredictedClasses:
     """The classes that an evaluation asks for, all of which its words know."""
-    classes = _classes(evaluation, instances)
-    with advised("give words that know all classes, or the classes that they know as classes=FILE"):
-        check_known(evaluation.words, classes.table.names)
-    return classes
-
-
-def _classes(evaluation: Evaluation, instances: bool) -> PredictedClasses:
-    if not evaluation.classes:
-        if evaluation.label_map:
-            raise InputError(
-                "label_map: leads to the classes of a benchmark; give classes=scannet20, classes=scannet200 or, of "
-                "ScanNet++, classes=top100.txt"
-            )
+    class_of, labeled = None, None
+    if evaluation.classes:
+        table = load_classes(evaluation.classes, instances=instances)
+    elif evaluation.label_map:
+        raise InputError("label_map: gives objects a class of classes=, such as scannet20, scannet200 or top100.txt")
+    else:
         names = names_of(evaluation.scenes())
-        return PredictedClasses(table=ClassTable(names=tuple(names), ids=tuple(range(1, len(names) + 1))))
-    table = load_classes(evaluation.classes, instances=instances)
-    if not evaluation.label_map:
-        return PredictedClasses(table=table)
-    name_of, ids = table.name_of, ids_of_raw_names(evaluation.label_map, evaluation.classes)
-    return PredictedClasses(
-        table=table,
-        class_of={raw: name_of[number] for raw, number in ids.items() if number in name_of},
-        labeled=list(ids) if is_scannetpp_map(evaluation.label_map) else None,
-    )
+        table = ClassTable(names=tuple(names), ids=tuple(range(1, len(names) + 1)))
+    if evaluation.label_map:
+        name_of, ids = table.name_of, ids_of_raw_names(evaluation.label_map, evaluation.classes)
+        class_of = {raw: name_of[number] for raw, number in ids.items() if number in name_of}
+        labeled = list(ids) if is_scannetpp_map(evaluation.label_map) else None
+    with advised("give words that know all classes, or the classes that they know as classes=FILE"):
+        check_known(evaluation.words, table.names)
+    return PredictedClasses(table=table, class_of=class_of, labeled=labeled)

@@ -14,11 +14,11 @@ Files (there is no official format) are lists of JSON objects:
 Gaussians.
 """
 
-from collections import defaultdict
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from gsencoder.core.errors import InputError, about, counted
 from gsencoder.core.files import write_json
 from gsencoder.data.labels.classes import load_classes, write_classes
 from gsencoder.data.labels.files import (
-    Entry,
     entries_of,
     name_value,
     object_id,
@@ -48,7 +47,7 @@ from gsencoder.evaluate.benchmarks.protocol import (
     predicted_classes,
 )
 from gsencoder.evaluate.sources import LabeledPoints, class_cosines
-from gsencoder.evaluate.tables import ScoreReport, mean_of, spread, table_of
+from gsencoder.evaluate.tables import ScoreReport, grouped, mean_of, spread, table_of
 from gsencoder.text.table import TextEncoder
 from gsencoder.types import GaussianFeatures, Scene
 
@@ -59,64 +58,33 @@ RANKED = 10
 """Names that are predicted for each object."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ObjectKey:
-    """An object of a scene, by its id there."""
+ObjectKey = tuple[str, str]
+"""Scene and id of an object."""
+RankedNames = Mapping[ObjectKey, tuple[str, ...]]
+"""The classes predicted for objects, the likeliest first, each once; none where the method has no answer."""
+
+
+class RecognizedInstance(NamedTuple):
+    """A labeled object, and the rank of its class among the predicted names, from 1; 0 if it is not among them."""
 
     scene: str
-    object: str
-
-    @property
-    def key(self) -> tuple[str, str]:
-        return self.scene, self.object
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NamedInstance(ObjectKey):
-    """A labeled object and its class."""
-
     name: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RankedNames(ObjectKey):
-    """The classes predicted for an object, the likeliest first, each once; none where the method has no answer."""
-
-    names: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecognizedInstance(NamedInstance):
-    """A labeled object with its place in the ranking.
-
-    Attributes:
-        rank: of its class among the predicted names, from 1; 0 if it is not among them.
-        answered: whether any name is predicted.
-    """
-
     rank: int
     answered: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecognitionScores:
-    """The scores of instances; NaN without any.
+class RecognitionScores(NamedTuple):
+    """The accuracies of instances, for each k; NaN without any.
 
     Attributes:
-        instances: their number.
-        unanswered: of them, those that have no prediction; they count as wrong.
-        classes: for each k, accuracy by name of the class; NaN for classes without instances.
-        mean: for each k, the mean over the classes that have instances.
-        overall: for each k, the mean over instances.
-        counts: instances by name of the class.
+        classes: by name of the class.
+        mean: over the classes that have instances.
+        overall: over instances.
     """
 
-    instances: int
-    unanswered: int
     classes: dict[int, dict[str, float]]
     mean: dict[int, float]
     overall: dict[int, float]
-    counts: dict[str, int]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,7 +97,7 @@ class RecognitionProtocol(Protocol):
         return RecognitionBenchmark(evaluation)
 
 
-Recognized = tuple[list[NamedInstance], list[RankedNames]]
+Recognized = tuple[Mapping[ObjectKey, str], RankedNames]
 
 
 class RecognitionBenchmark(Benchmark[Recognized]):
@@ -138,80 +106,60 @@ class RecognitionBenchmark(Benchmark[Recognized]):
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> Recognized:
         points = self.classes.points(scene)
-        instances = named_instances(points)
-        return instances, predict_recognition(
-            points, features, instances, self.classes.table.names, self.evaluation.words
-        )
+        labels = {(scene.name, str(number)): name for number, name in points.named_ids().items()}
+        return labels, predict_recognition(points, features, self.classes.table.names, self.evaluation.words)
 
     def report(self, results: Sequence[SceneResult[Recognized]]) -> ScoreReport:
         """Writes and scores both lists."""
-        ordered = sorted(results, key=lambda result: result.scene)
         labels, predictions = (self.evaluation.file(f"{name}.json") for name in (LABELS, PREDICTIONS))
-        write_recognition_labels(labels, [each for result in ordered for each in result.value[0]])
-        write_recognition_predictions(predictions, [each for result in ordered for each in result.value[1]])
+        for side, path, key in ((0, labels, "label"), (1, predictions, "labels")):
+            values = [each for result in sorted(results, key=lambda r: r.scene) for each in result.value[side].items()]
+            write_json(path, [{"scene_id": scene, "object_id": number, key: v} for (scene, number), v in values])
         write_classes(self.evaluation.file(CLASS_IDS), self.classes.table)
         options = ScoreOptions(method=self.evaluation.method, classes=str(self.evaluation.file(CLASS_IDS)))
         return score(predictions, labels, options)
 
 
-def named_instances(points: LabeledPoints) -> list[NamedInstance]:
-    """The named objects of a scene that have points, by ascending id."""
-    return [
-        NamedInstance(scene=points.scene, object=str(number), name=name) for number, name in points.named_ids().items()
-    ]
-
-
 def predict_recognition(
-    points: LabeledPoints,
-    features: GaussianFeatures,
-    instances: Sequence[NamedInstance],
-    names: Sequence[str],
-    text: TextEncoder,
-) -> list[RankedNames]:
-    """The classes nearest to the mean feature of each object's Gaussians, the nearest first; none for an object of
-    which no Gaussian was seen."""
-    parts = [points.rows_of(int(each.object)) for each in instances]
-    cosines = class_cosines(features, parts, names, text)
-    return [
-        RankedNames(
-            scene=each.scene,
-            object=each.object,
-            names=()
-            if np.isnan(row).any()
-            else tuple(names[number] for number in np.argsort(-row, kind="stable")[:RANKED]),
-        )
-        for each, row in zip(instances, cosines, strict=True)
-    ]
+    points: LabeledPoints, features: GaussianFeatures, names: Sequence[str], text: TextEncoder
+) -> RankedNames:
+    """The classes nearest to the mean feature of each named object's Gaussians, the nearest first; none for an object
+    of which no Gaussian was seen."""
+    numbers = list(points.named_ids())
+    cosines = class_cosines(features, [points.rows_of(number) for number in numbers], names, text)
+    return {
+        (points.scene, str(number)): ()
+        if np.isnan(row).any()
+        else tuple(names[each] for each in np.argsort(-row, kind="stable")[:RANKED])
+        for number, row in zip(numbers, cosines, strict=True)
+    }
 
 
 def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport:
     """Accuracy of the classes of given objects."""
-    instances = read_recognition_labels(labels)
-    names = load_classes(options.classes).names if options.classes else sorted({each.name for each in instances})
+    true_names = read_recognition_labels(labels)
+    names = load_classes(options.classes).names if options.classes else sorted(set(true_names.values()))
     ranked = read_recognition_predictions(predictions)
     with about(predictions):
-        recognized, skipped = recognize(ranked, instances, names, allow_missing=options.allow_missing)
+        recognized = recognize(ranked, true_names, names, allow_missing=options.allow_missing)
     if not recognized:
         raise InputError(f"{labels}: nothing to score: it holds no object of the {len(names)} classes")
     scores = recognition_scores(recognized, names)
-    of_scene = defaultdict(list)
-    for each in recognized:
-        of_scene[each.scene].append(each)
+    counts = Counter(each.name for each in recognized)
     by_scene = [
         {"scene": scene, "objects": len(each)}
         | {f"top_{k}": value for k, value in recognition_scores(each, names).overall.items()}
-        for scene, each in of_scene.items()
+        for scene, each in grouped(recognized, "scene").items()
     ]
     by_class = [
-        {"class": name, "objects": scores.counts[name]} | {f"top_{k}": scores.classes[k][name] for k in KS}
-        for name in names
+        {"class": name, "objects": counts[name]} | {f"top_{k}": scores.classes[k][name] for k in KS} for name in names
     ]
     return ScoreReport(
         results={
             "protocol": "recognition",
-            "objects": scores.instances,
-            "unanswered": scores.unanswered,
-            "other_classes": skipped,
+            "objects": len(recognized),
+            "unanswered": sum(not each.answered for each in recognized),
+            "other_classes": len(true_names) - len(recognized),
             **{f"mean_{k}": value for k, value in scores.mean.items()},
             **{f"overall_{k}": value for k, value in scores.overall.items()},
             "spread": spread(by_scene, [f"top_{k}" for k in KS]),
@@ -223,70 +171,52 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
             by_class=names,
         ),
         rows={"scenes": by_scene, "classes": by_class},
-        line=f"{counted(scores.instances, 'object')}, averaged over classes (over objects): "
+        line=f"{counted(len(recognized), 'object')}, averaged over classes (over objects): "
         + ", ".join(f"top-{k} {scores.mean[k]:.3f} ({scores.overall[k]:.3f})" for k in KS),
     )
 
 
 def recognize(
-    predictions: Sequence[RankedNames],
-    instances: Sequence[NamedInstance],
-    classes: Sequence[str],
-    *,
-    allow_missing: bool = False,
-) -> tuple[tuple[RecognizedInstance, ...], int]:
-    """Looks up every labeled object among the predictions.
+    predictions: RankedNames, labels: Mapping[ObjectKey, str], classes: Sequence[str], *, allow_missing: bool = False
+) -> list[RecognizedInstance]:
+    """Looks up every labeled object of the classes among the predictions, in the order of the labels; objects of other
+    classes are not scored, whether they are predicted or not.
 
     Args:
-        predictions: in any order.
-        instances: labeled ones, in any order, each once.
-        classes: that can be predicted. Instances of other classes are not scored, whether they are predicted or not.
         allow_missing: count instances without a prediction as wrong, instead of refusing them.
-
-    Returns:
-        The instances of the classes, in the order of the labels, and the number of instances of other classes.
     """
-    keys, names = {item.key for item in instances}, set(classes)
-    for item in predictions:
-        if item.key not in keys:
-            raise InputError(f"{described(item.key)} is predicted, and not in the truth")
-        wrong = next((name for name in item.names if name not in names), None)
+    for key, names in predictions.items():
+        if key not in labels:
+            raise InputError(f"{described(key)} is predicted, and not in the truth")
+        wrong = next((name for name in names if name not in classes), None)
         if wrong is not None:
-            raise InputError(f"{described(item.key)} is predicted as {wrong[:40]!r}, which is no class")
-        if first_repeated(item.names):
-            raise InputError(f"{described(item.key)} has a name twice; expected each once")
-    answers = {item.key: item.names for item in predictions}
-    scored = [instance for instance in instances if instance.name in names]
-    missing = next((instance for instance in scored if instance.key not in answers), None)
-    if missing is not None and not allow_missing:
-        raise InputError(f"{described(missing.key)} has no prediction")
+            raise InputError(f"{described(key)} is predicted as {wrong[:40]!r}, which is no class")
+        if first_repeated(names):
+            raise InputError(f"{described(key)} has a name twice; expected each once")
     results = []
-    for each in scored:
-        ranked = answers.get(each.key, ())
-        rank = ranked.index(each.name) + 1 if each.name in ranked else 0
-        results.append(
-            RecognizedInstance(scene=each.scene, object=each.object, name=each.name, rank=rank, answered=bool(ranked))
-        )
-    return tuple(results), len(instances) - len(results)
+    for key, name in labels.items():
+        if name not in classes:
+            continue
+        if key not in predictions and not allow_missing:
+            raise InputError(f"{described(key)} has no prediction")
+        ranked = predictions.get(key, ())
+        rank = ranked.index(name) + 1 if name in ranked else 0
+        results.append(RecognizedInstance(key[0], name, rank, bool(ranked)))
+    return results
 
 
 def recognition_scores(
     instances: Sequence[RecognizedInstance], classes: Sequence[str], *, ks: Sequence[int] = KS
 ) -> RecognitionScores:
     """The scores of instances of any scenes, as `recognize` gives them."""
-    ranks_of: dict[str, list[int]] = {name: [] for name in classes}
-    for item in instances:
-        ranks_of[item.name].append(item.rank)
-    table = {k: {name: _share(ranks, k) for name, ranks in ranks_of.items()} for k in ks}
-    everything = [item.rank for item in instances]
-    return RecognitionScores(
-        instances=len(instances),
-        unanswered=sum(not item.answered for item in instances),
-        classes=table,
-        mean={k: mean_of(list(row.values())) for k, row in table.items()},
-        overall={k: _share(everything, k) for k in ks},
-        counts={name: len(ranks) for name, ranks in ranks_of.items()},
-    )
+    of_name = grouped(instances, "name")
+
+    def share(rows: Sequence[RecognizedInstance], k: int) -> float:
+        return mean_of([float(1 <= each.rank <= k) for each in rows])
+
+    table = {k: {name: share(of_name.get(name, ()), k) for name in classes} for k in ks}
+    mean = {k: mean_of(list(row.values())) for k, row in table.items()}
+    return RecognitionScores(table, mean, {k: share(instances, k) for k in ks})
 
 
 def described(key: tuple[str, str]) -> str:
@@ -294,57 +224,33 @@ def described(key: tuple[str, str]) -> str:
     return f"object {key[1]} of {key[0]}"
 
 
-def _share(ranks: list[int], k: int) -> float:
-    return mean_of([float(1 <= rank <= k) for rank in ranks])
-
-
-def read_recognition_labels(path: Path) -> tuple[NamedInstance, ...]:
+def read_recognition_labels(path: Path) -> dict[ObjectKey, str]:
     """Reads the class of each object."""
-    instances = tuple(
-        NamedInstance(**_key(entry, where), name=name_value(entry.get("label"), where, "label"))
-        for entry, where in _entries(path, "scene_id, object_id and label", foreign="labels")
-    )
-    refuse_repeated(path, [each.key for each in instances], described)
-    return instances
+    rows = _entries(path, "scene_id, object_id and label", foreign="labels")
+    return {key: name_value(entry.get("label"), where, "label") for key, entry, where in rows}
 
 
-def read_recognition_predictions(path: Path) -> tuple[RankedNames, ...]:
+def read_recognition_predictions(path: Path) -> dict[ObjectKey, tuple[str, ...]]:
     """Reads the names predicted for each object."""
-    predictions = tuple(
-        RankedNames(**_key(entry, where), names=_names(entry, where))
-        for entry, where in _entries(path, "scene_id, object_id and labels", foreign="label")
-    )
-    refuse_repeated(path, [each.key for each in predictions], described)
+    predictions: dict[ObjectKey, tuple[str, ...]] = {}
+    for key, entry, where in _entries(path, "scene_id, object_id and labels", foreign="label"):
+        values = entry.get("labels")
+        if values is None and "labels" in entry:
+            values = []
+        if not isinstance(values, list):
+            raise InputError(f"{where}: labels must be a list of names, got {shown(values)}")
+        names = (name_value(value, where, f"labels[{index}]") for index, value in enumerate(values))
+        predictions[key] = tuple(names)
     return predictions
 
 
-def write_recognition_labels(path: Path, instances: Sequence[NamedInstance]) -> None:
-    """Writes the class of each object."""
-    write_json(path, [{"scene_id": i.scene, "object_id": i.object, "label": i.name} for i in instances])
-
-
-def write_recognition_predictions(path: Path, predictions: Sequence[RankedNames]) -> None:
-    """Writes the names predicted for each object."""
-    write_json(path, [{"scene_id": p.scene, "object_id": p.object, "labels": p.names} for p in predictions])
-
-
-def _key(entry: Mapping[str, Any], where: str) -> dict[str, str]:
-    number = object_id(entry.get("object_id"), where)
-    return {"scene": scene_name(entry.get("scene_id"), where), "object": str(number)}
-
-
-def _entries(path: Path, expected: str, *, foreign: str) -> tuple[Entry, ...]:
-    entries = entries_of(read_benchmark_json(path), path, expected)
-    for entry, where in entries:
+def _entries(path: Path, expected: str, *, foreign: str) -> list[tuple[ObjectKey, Mapping[str, Any], str]]:
+    """The entries of a file about different objects, and where they stand."""
+    rows = []
+    for entry, where in entries_of(read_benchmark_json(path), path, expected):
         if foreign in entry:
             raise InputError(f"{where}: unexpected key {foreign!r}; predictions and truth may be swapped")
-    return entries
-
-
-def _names(entry: Mapping[str, Any], where: str) -> tuple[str, ...]:
-    values = entry.get("labels")
-    if values is None and "labels" in entry:
-        return ()
-    if not isinstance(values, list):
-        raise InputError(f"{where}: labels must be a list of names, got {shown(values)}")
-    return tuple(name_value(value, where, f"labels[{index}]") for index, value in enumerate(values))
+        number = object_id(entry.get("object_id"), where)
+        rows.append(((scene_name(entry.get("scene_id"), where), str(number)), entry, where))
+    refuse_repeated(path, [key for key, _, _ in rows], described)
+    return rows

@@ -24,9 +24,9 @@ scene's objects are asked, one sentence an object.
 
 import math
 import warnings
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -47,7 +47,6 @@ from gsencoder.data.labels.expressions import (
     write_scanrefer,
 )
 from gsencoder.data.labels.files import (
-    Corner,
     Entry,
     annotation_id,
     box_corners,
@@ -64,7 +63,7 @@ from gsencoder.data.labels.files import (
 from gsencoder.data.labels.scans import find_labels, find_scannet_files
 from gsencoder.evaluate.benchmarks.files import ScoreOptions
 from gsencoder.evaluate.benchmarks.protocol import LABELS, PREDICTIONS, Benchmark, Evaluation, Protocol, SceneResult
-from gsencoder.evaluate.tables import ScoreReport, spread, table_of
+from gsencoder.evaluate.tables import ScoreReport, grouped, spread, table_of
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.text.question_words import words_in
 from gsencoder.text.vocabulary import Words, closed_table
@@ -106,13 +105,8 @@ class ReferringProtocol(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedBoxes:
-    """The boxes predicted for one sentence, which is known by scene, object and annotation as `Expression` is.
-
-    Attributes:
-        boxes: lower and upper corners, the likeliest box first; none where there is none.
-        multiple: what the prediction's file says of the sentence's `multiple`, as ScanRefer's own files do.
-        others: the same of `others`.
-    """
+    """The boxes predicted for one sentence, lower and upper corners, the likeliest first, and what its file
+    says of `multiple` and `others`, as ScanRefer's own files do."""
 
     scene: str
     object_id: int
@@ -227,27 +221,26 @@ def predict_referring(
         aligned_from_world: rigid transform into the frame in which true boxes are axis-aligned; None = the world.
     """
     table = closed_table(text)
-    queries_of = {
-        each: (each.text,) if protocol.query == "sentence" else words_in(each.text, table) for each in expressions
+    # Each sentence has the boxes of its first known word, or of itself.
+    words = {
+        each: each.text if protocol.query == "sentence" else next(iter(words_in(each.text, table)), "")
+        for each in expressions
     }
-    words = list(dict.fromkeys(words[0] for words in queries_of.values() if words))
+    asked = list(dict.fromkeys(filter(None, words.values())))
     corners: dict[str, list[Float64[np.ndarray, "2 3"]]] = {}
-    if words:
+    if asked:
         with_features = replace(scene, features={features.space.name: features})
         with warnings.catch_warnings():
             # Sentences without a box are counted in the result.
             warnings.simplefilter("ignore", SceneWarning)
-            localized = localize(with_features, words, text, localization)
+            localized = localize(with_features, asked, text, localization)
         corners = corners_of_words(scene, localized, aligned_from_world)
-    boxes = {
-        each: corners.get(queries_of[each][0], [])[:CANDIDATES] if queries_of[each] else [] for each in expressions
-    }
     return [
         PredictedBoxes(
             scene=each.scene,
             object_id=each.object_id,
             annotation=each.annotation,
-            boxes=np.array(boxes[each], np.float64).reshape(-1, 2, 3),
+            boxes=np.array(corners.get(words[each], [])[:CANDIDATES], np.float64).reshape(-1, 2, 3),
         )
         for each in expressions
     ]
@@ -272,13 +265,8 @@ def corners_of_words(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReferringResult:
-    """One sentence, scored.
-
-    Attributes:
-        ious: of the predicted boxes with that of the object, in the order of the predictions.
-        multiple: whether its scene has several objects of its class; None if that is not known.
-        others: whether its class is none of the named ones; None if that is not known.
-    """
+    """One sentence, scored: the IoUs of the predicted boxes with that of its object, whether its scene has several
+    objects of its class, and whether its class is none of the named ones; None if that is not known."""
 
     scene: str
     object_id: int
@@ -288,34 +276,9 @@ class ReferringResult:
     others: bool | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReferringCell:
-    """The accuracy of some sentences; NaN without any, where the official script prints 0."""
-
-    sentences: int
-    acc25: float
-    acc50: float
-
-
-ReferringTable = dict[str, dict[str, ReferringCell]]
-"""Cells by "unique", "multiple" and "overall", and there by "not_in_others", "in_others" and "overall"."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReferringScores:
-    """The scores of sentences.
-
-    Attributes:
-        without_box: sentences without a predicted box.
-        top1: of the first box.
-        best_of: of the best among the first k boxes, by k.
-        best: of the best among all boxes.
-    """
-
-    without_box: int
-    top1: ReferringTable
-    best_of: dict[int, ReferringTable]
-    best: ReferringTable
+ReferringTable = dict[str, dict[str, dict[str, Any]]]
+"""Accuracies by "unique", "multiple" and "overall", and there by "not_in_others", "in_others" and "overall": sentences,
+acc25 and acc50, which are NaN without sentences, where the official script prints 0."""
 
 
 def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport:
@@ -330,18 +293,15 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
         sentences = compare_boxes(boxes, expressions, allow_missing=options.allow_missing)
     if not sentences:
         raise InputError(f"{labels}: nothing to score: it holds no sentence about an object with a box")
-    scores = referring_scores(sentences)
-    of_scene = defaultdict(list)
-    for each in sentences:
-        of_scene[each.scene].append(each)
+    first, best_of, best = (referring_scores(sentences, k) for k in (1, BEST_OF, None))
     by_scene = [
-        {"scene": scene, "sentences": len(each), **_accuracies(referring_scores(each).top1)}
-        for scene, each in of_scene.items()
+        {"scene": scene, "sentences": len(each), **_accuracies(referring_scores(each))}
+        for scene, each in grouped(sentences, "scene").items()
     ]
-    best_of = scores.best_of[BEST_OF]
-    tables = {"": scores.top1, f", best of {BEST_OF}": best_of, ", best of all": scores.best}
+    tables = {"": first, f", best of {BEST_OF}": best_of, ", best of all": best}
     measured = {f"{options.method}{kind}": _accuracies(each) | _by_uniqueness(each) for kind, each in tables.items()}
-    overall, best = measured[options.method], measured[f"{options.method}, best of all"]
+    overall = measured[options.method]
+    without_box = sum(not each.ious for each in sentences)
     unscored = {NO_BOX: len(expressions) - len(sentences)} if len(sentences) < len(expressions) else {}
     notes = [f"{counted(count, 'sentence')} not scored: {reason}." for reason, count in unscored.items()]
     if unknown := sum(each.multiple is None for each in sentences):
@@ -353,12 +313,12 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
         results={
             "protocol": "referring",
             "sentences": len(sentences),
-            "without_box": scores.without_box,
+            "without_box": without_box,
             "not_scored": unscored,
             "thresholds": list(IOUS),
             **overall,
-            "best_of": {str(BEST_OF): _accuracies(best_of), "all": _accuracies(scores.best)},
-            "tables": {"top_1": _plain(scores.top1), "best": _plain(scores.best)},
+            "best_of": {str(BEST_OF): _accuracies(best_of), "all": _accuracies(best)},
+            "tables": {"top_1": first, "best": best},
             "spread": spread(by_scene, ["acc_25", "acc_50"]),
         },
         table=table_of("Referring", measured, published="splatdistill_5_referring", notes=notes),
@@ -377,26 +337,18 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
             ],
         },
         line=f"{counted(len(sentences), 'sentence')}: Acc@0.25 {overall['acc_25']:.3f}, Acc@0.5 "
-        f"{overall['acc_50']:.3f}; {scores.without_box} without a box; of all boxes the best: {best['acc_25']:.3f}, "
-        f"{best['acc_50']:.3f}",
+        f"{overall['acc_50']:.3f}; {without_box} without a box; of all boxes the best: "
+        + ", ".join(f"{value:.3f}" for value in _accuracies(best).values()),
     )
 
 
 def _accuracies(table: ReferringTable) -> dict[str, float]:
     cell = table["overall"]["overall"]
-    return {"acc_25": cell.acc25, "acc_50": cell.acc50}
+    return {"acc_25": cell["acc25"], "acc_50": cell["acc50"]}
 
 
 def _by_uniqueness(table: ReferringTable) -> dict[str, float]:
-    return {
-        f"{kind}_{name}": getattr(table[kind]["overall"], field)
-        for kind in ("unique", "multiple")
-        for name, field in (("25", "acc25"), ("50", "acc50"))
-    }
-
-
-def _plain(table: ReferringTable) -> dict[str, Any]:
-    return {kind: {subset: asdict(cell) for subset, cell in cells.items()} for kind, cells in table.items()}
+    return {f"{kind}_{k}": table[kind]["overall"][f"acc{k}"] for kind in ("unique", "multiple") for k in (25, 50)}
 
 
 def compare_boxes(
@@ -438,24 +390,26 @@ def compare_boxes(
     return tuple(results)
 
 
-def referring_scores(results: Sequence[ReferringResult], *, ks: Sequence[int] = (BEST_OF,)) -> ReferringScores:
-    """The scores of sentences of any scenes. Those whose `multiple` or `others` is not known count in "overall" alone.
+def referring_scores(results: Sequence[ReferringResult], k: int | None = 1) -> ReferringTable:
+    """The scores of sentences of any scenes, by the best of the first k boxes of each; None = of all.
 
-    Args:
-        results: as `compare_boxes` gives them.
-        ks: numbers of boxes of which the best counts.
+    Those whose `multiple` or `others` is not known count in "overall" alone.
     """
+    ious = np.array([max(each.ious[:k], default=0.0) for each in results], np.float64)
+    multiple, others = ([getattr(each, name) for each in results] for name in ("multiple", "others"))
 
-    def table(k: int | None) -> ReferringTable:
-        ious = np.array([max(item.ious[:k], default=0.0) for item in results], np.float64)
-        return _table(ious, results)
+    def cell(rows: list[bool]) -> dict[str, Any]:
+        inside = ious[np.array(rows, bool)]
+        acc25, acc50 = (float((inside >= least).mean()) if len(inside) else math.nan for least in IOUS)
+        return {"sentences": len(inside), "acc25": acc25, "acc50": acc50}
 
-    return ReferringScores(
-        without_box=sum(not item.ious for item in results),
-        top1=table(1),
-        best_of={k: table(k) for k in ks},
-        best=table(None),
-    )
+    return {
+        subset: {
+            kind: cell([row in subsets and each in kinds for row, each in zip(multiple, others, strict=True)])
+            for kind, kinds in (("not_in_others", [False]), ("in_others", [True]), ("overall", [False, True, None]))
+        }
+        for subset, subsets in (("unique", [False]), ("multiple", [True]), ("overall", [False, True, None]))
+    }
 
 
 def _agreed(true: bool | None, predicted: bool | None, subject: str, key: tuple[str, int, str]) -> bool | None:
@@ -464,29 +418,6 @@ def _agreed(true: bool | None, predicted: bool | None, subject: str, key: tuple[
             f"{described(key)}: {subject} is {int(predicted)} in the prediction, and {int(true)} in the truth"
         )
     return predicted if true is None else true
-
-
-def _table(ious: Float64[np.ndarray, " n"], results: Sequence[ReferringResult]) -> ReferringTable:
-    everything = np.ones(len(results), bool)
-    subsets = {
-        "unique": np.array([item.multiple is False for item in results], bool),
-        "multiple": np.array([item.multiple is True for item in results], bool),
-        "overall": everything,
-    }
-    kinds: Mapping[str, np.ndarray] = {
-        "not_in_others": np.array([item.others is False for item in results], bool),
-        "in_others": np.array([item.others is True for item in results], bool),
-        "overall": everything,
-    }
-    return {
-        subset: {kind: _cell(ious[inside & of_kind]) for kind, of_kind in kinds.items()}
-        for subset, inside in subsets.items()
-    }
-
-
-def _cell(ious: Float64[np.ndarray, " n"]) -> ReferringCell:
-    acc25, acc50 = (float((ious >= least).mean()) if len(ious) else math.nan for least in IOUS)
-    return ReferringCell(sentences=len(ious), acc25=acc25, acc50=acc50)
 
 
 def named_classes(names: Iterable[str], nyu40_ids: Mapping[str, int]) -> dict[str, str]:
@@ -518,11 +449,7 @@ def with_kinds(expressions: Sequence[Expression], class_of: Mapping[str, str]) -
 
 
 def several_of_their_class(objects: Sequence[tuple[str, str, str]]) -> tuple[bool, ...]:
-    """Whether the scene of each sentence has several objects of its class, as ScanRefer counts them.
-
-    Returns:
-        For each sentence, whether the objects of its scene that are of its class are not exactly one.
-    """
+    """Whether the objects of the class of each sentence in its scene are not exactly one, as ScanRefer counts them."""
     first: dict[tuple[str, str], str] = {}
     for scene, item, name in objects:
         first.setdefault((scene, item), name)
@@ -575,7 +502,7 @@ def write_referring_predictions(path: Path, predictions: Sequence[PredictedBoxes
     `multiple` and `others`."""
     rows = []
     for item in predictions:
-        corners = [box_corners(_corner(lower), _corner(upper)) for lower, upper in item.boxes]
+        corners = [box_corners(tuple(lower), tuple(upper)) for lower, upper in item.boxes.tolist()]
         flags = {"unique_multiple": item.multiple, "others": item.others}
         rows.append(
             {
@@ -588,11 +515,6 @@ def write_referring_predictions(path: Path, predictions: Sequence[PredictedBoxes
             }
         )
     write_json(path, rows)
-
-
-def _corner(values: Float64[np.ndarray, "3"]) -> Corner:
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 def _boxes(row: Entry) -> Float64[np.ndarray, "K 2 3"]:

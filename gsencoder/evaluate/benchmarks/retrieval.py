@@ -11,29 +11,20 @@ Labels are a list of {scene_id, view, caption}. Predictions are an .npz (there i
                         of other pictures
     distractor_scores   float [M', Q], optional: other pictures, each with the captions of the queries
 
-or of features, whose cosines are the scores:
-
-    queries             the same
-    views               float [Q, n, D]: n cells of each view
-    texts               float [Q, D]: of the captions
-    text_distractors    float [M, D], optional: of texts of other pictures
-    view_distractors    float [M', n', D], optional: cells of other pictures
-
 `evaluate protocol=retrieval` scores the pixels of views with the captions of all views, and with distractors where a
 file has them.
 """
 
 import hashlib
 import io
-import math
 import warnings
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float32, Float64, Int64
+from jaxtyping import Float64, Int64
 
 from gsencoder.core.archive import read_npz
 from gsencoder.core.arrays import first_repeated
@@ -51,9 +42,9 @@ from gsencoder.data.labels.files import (
     scene_name,
     text_value,
 )
-from gsencoder.evaluate.benchmarks.files import Pooling, ScoreOptions
+from gsencoder.evaluate.benchmarks.files import ScoreOptions
 from gsencoder.evaluate.benchmarks.protocol import LABELS, PREDICTIONS, Benchmark, Evaluation, Protocol, SceneResult
-from gsencoder.evaluate.tables import ScoreReport, spread, table_of
+from gsencoder.evaluate.tables import ScoreReport, grouped, spread, table_of
 from gsencoder.infer.pictures import pixel_features
 from gsencoder.infer.relevancy import GaussianProducts, Mode, word_directions
 from gsencoder.render import blend
@@ -61,17 +52,14 @@ from gsencoder.text.table import check_space
 from gsencoder.text.vocabulary import check_known
 from gsencoder.types import GaussianFeatures, QueryMemory, Scene
 
-OPTIONS = ("distractors", "pooling")
+OPTIONS = ("distractors",)
 RECALLS = (1, 5, 10)
 NAMES = tuple(f"{direction}_{k}" for direction in ("i2t", "t2i") for k in RECALLS)
 TIE = 1e-9
 """Cosines of float32 vectors that differ by less are the same but for rounding."""
-CHUNK_VALUES = 1 << 22
-"""Cosines that are in memory at a time."""
 BLOCK_TEXTS = 64
 """Texts whose cosines with all pixels of a view are in memory at a time."""
-EPS = 1e-60
-EXPECTED = "an .npz with queries and scores, or with queries, views and texts"
+EXPECTED = "an .npz with queries and scores"
 CAPTION_KEYS = "scene_id, view and caption"
 MAX_LIST_BYTES = 256 << 20
 
@@ -87,7 +75,7 @@ class RetrievalProtocol(Protocol):
     )
     count: int = option(0, "of these, texts in a view's pool, drawn by its name; 0 = all", ge=0)
     stride: int = option(4, "pixels from one rendered pixel to the next, along both sides of a view", ge=1)
-    pooling: Pooling = option("max", "of the cosines of a view's pixels: max (M3) or mean")
+    pooling: Literal["max", "mean"] = option("max", "of the cosines of a view's pixels: max (M3) or mean")
     mode: Mode = option("centered", "cosines less the mean of features and words, or raw as in M3")
 
     def start(self, evaluation: Evaluation) -> "RetrievalBenchmark":
@@ -96,11 +84,7 @@ class RetrievalProtocol(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewCaption:
-    """What was written of a view.
-
-    Attributes:
-        view: name of the view in it, as transforms.json or its image file has it.
-    """
+    """What was written of a view, whose name is that in transforms.json or of its image file."""
 
     scene: str
     view: str
@@ -116,22 +100,13 @@ Retrieved = tuple[tuple[ViewCaption, ...], Float64[np.ndarray, "Q T"]]
 """The captions of a scene's views, and the scores of these views with all texts."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Retrieval:
-    """The results of queries.
-
-    Attributes:
-        ranks: rank of what belongs to each query in its pool, from 1, where it comes after all that score the same.
-        not_finite: queries whose own score was not finite, which put them last.
-    """
+class Retrieval(NamedTuple):
+    """The rank of what belongs to each query in its pool, from 1, where it comes after all that score the same, the
+    number of distractors in each pool, and of queries whose own score was not finite, which put them last."""
 
     ranks: Int64[np.ndarray, " Q"]
     distractors: int
     not_finite: int
-
-    def recall(self, k: int) -> float:
-        """The share of the queries whose own is among the first k; NaN without queries."""
-        return float((self.ranks <= k).mean()) if len(self.ranks) else math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -210,7 +185,7 @@ class RetrievalBenchmark(Benchmark[Retrieved]):
         )
         predictions, labels = self.evaluation.file(f"{PREDICTIONS}.npz"), self.evaluation.file(f"{LABELS}.json")
         write_scored_pairs(predictions, pairs)
-        write_view_captions(labels, self.captions)
+        write_json(labels, [{"scene_id": c.scene, "view": c.view, "caption": c.caption} for c in self.captions])
         return score(predictions, labels, ScoreOptions(method=self.evaluation.method, distractors=self.protocol.count))
 
     def _about(self, scene: Scene) -> tuple[ViewCaption, ...]:
@@ -244,7 +219,7 @@ def score_views(
 
     Args:
         directions: of the texts, unit vectors (`word_directions`).
-        memory: that the features come from; its queries are rendered, and attend to its bank at each pixel.
+        memory: as of `Evaluation.memory_of`.
     """
     assert scene.gaussians is not None
     assert scene.views is not None
@@ -266,7 +241,7 @@ def score_views(
 def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport:
     """Recall at 1, 5 and 10 of texts for views and of views for texts."""
     captions = read_view_captions(labels)
-    pairs = read_scored_pairs(predictions, pooling=options.pooling)
+    pairs = read_scored_pairs(predictions)
     row_of = {name: row for row, name in enumerate(pairs.queries)}
     missing = [each.name for each in captions if each.name not in row_of]
     if missing:
@@ -289,18 +264,20 @@ def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport
     )
     found = retrieve(ordered, [each.caption for each in captions], count=options.distractors)
     sides = dict(zip(("i2t", "t2i"), found, strict=True))
-    overall = {f"{name}_{k}": side.recall(k) for name, side in sides.items() for k in RECALLS}
+
+    def recalls(rows: Sequence[int]) -> dict[str, float]:
+        """The share of queries whose own is among the first k."""
+        return {f"{name}_{k}": float((each.ranks[rows] <= k).mean()) for name, each in sides.items() for k in RECALLS}
+
+    overall = recalls(range(number))
     ranks = [
         {"scene": each.scene, "view": each.view, "i2t_rank": int(there), "t2i_rank": int(back)}
         for each, there, back in zip(captions, sides["i2t"].ranks, sides["t2i"].ranks, strict=True)
     ]
-    by_scene = []
-    for scene in dict.fromkeys(each.scene for each in captions):
-        of_scene = np.array([each.scene == scene for each in captions])
-        recalls = {
-            f"{name}_{k}": float((side.ranks[of_scene] <= k).mean()) for name, side in sides.items() for k in RECALLS
-        }
-        by_scene.append({"scene": scene, "views": int(of_scene.sum()), **recalls})
+    by_scene = [
+        {"scene": scene, "views": len(each), **recalls([captions.index(caption) for caption in each])}
+        for scene, each in grouped(captions, "scene").items()
+    ]
     candidates = {"i2t": pairs.scores.shape[1] - number, "t2i": len(pairs.distractors)}
     same = number - len({each.caption for each in captions})
     notes = [_pool(name, side, candidates[name]) for name, side in sides.items()]
@@ -365,47 +342,14 @@ def retrieve(pairs: ScoredPairs, texts: Sequence[str], *, count: int = 0) -> tup
             )
         ranks = []
         for query, name in enumerate(pairs.queries):
-            pool = (
-                others[query, draw(name, available, count or available)] if available else scores[query, rivals[query]]
-            )
+            pool = scores[query, rivals[query]]
+            if available:
+                pool = others[query, draw(name, available, count or available)]
             ranks.append(rank_of_first(np.concatenate([scores[query, query : query + 1], pool])))
-        sides.append(
-            Retrieval(
-                ranks=np.array(ranks, np.int64),
-                distractors=(count or available) if available else max(number - 1, 0),
-                not_finite=int((~np.isfinite(np.diagonal(scores))).sum()),
-            )
-        )
+        distractors = (count or available) if available else max(number - 1, 0)
+        not_finite = int((~np.isfinite(np.diagonal(scores))).sum())
+        sides.append(Retrieval(np.array(ranks, np.int64), distractors, not_finite))
     return sides[0], sides[1]
-
-
-def view_scores(
-    cells: Float32[np.ndarray, "n _channels"], texts: Float32[np.ndarray, "T D"], pooling: Pooling = "max"
-) -> Float64[np.ndarray, " T"]:
-    """The score of one view with each text: the largest cosine of its cells, as in M3, or their mean.
-
-    Vectors are compared as they are. For centered cosines subtract the mean of each side before.
-
-    Args:
-        cells: rendered features; a view of one vector has one cell.
-        texts: vectors of any length above 0.
-
-    Returns:
-        Scores in [−1, 1]; NaN where a cell is not finite.
-    """
-    if not len(cells) or cells.shape[1] != texts.shape[1] or pooling not in ("max", "mean"):
-        raise InputError(
-            f"retrieval: expected cells of {texts.shape[1]} channels and pooling max or mean, got cells {cells.shape} "
-            f"and {pooling!r}"
-        )
-    directions = _unit(texts)
-    step = max(1, CHUNK_VALUES // max(len(texts), 1))
-    largest, total = np.full(len(texts), -np.inf), np.zeros(len(texts))
-    for start in range(0, len(cells), step):
-        cosines = _unit(cells[start : start + step]) @ directions.T
-        # NaN stays NaN in a maximum and in a sum.
-        largest, total = np.maximum(largest, cosines.max(axis=0)), total + cosines.sum(axis=0)
-    return largest if pooling == "max" else total / len(cells)
 
 
 def rank_of_first(scores: Float64[np.ndarray, " n"]) -> int:
@@ -422,40 +366,17 @@ def draw(name: str, available: int, count: int) -> Int64[np.ndarray, " count"]:
     return rng.choice(available, size=count, replace=False).astype(np.int64)
 
 
-def _unit(vectors: Float32[np.ndarray, "n D"]) -> Float64[np.ndarray, "n D"]:
-    rows = vectors.astype(np.float64)
-    # The largest entry is taken out of the root, so that short vectors have directions as well.
-    rows = rows / np.maximum(np.abs(rows).max(axis=1, initial=0, keepdims=True), np.finfo(np.float64).tiny)
-    return np.asarray(rows / np.sqrt((rows**2).sum(axis=1, keepdims=True) + EPS))
-
-
-def read_scored_pairs(path: Path, *, pooling: Pooling = "max") -> ScoredPairs:
-    """Reads scores, or computes them from features."""
+def read_scored_pairs(path: Path) -> ScoredPairs:
+    """Reads scores of views with texts."""
     if not path.is_file() or path.suffix.lower() in (".json", *PICKLE_SUFFIXES):
-        fault = "no such file" if not path.exists() else "is none"
-        raise InputError(f"{path}: {fault}; expected {EXPECTED}")
-    arrays = read_npz(
-        path,
-        {"queries": ("U", 1)},
-        {
-            "scores": ("f", 2),
-            "distractor_scores": ("f", 2),
-            "views": ("f", 3),
-            "texts": ("f", 2),
-            "text_distractors": ("f", 2),
-            "view_distractors": ("f", 3),
-        },
-    )
+        raise InputError(f"{path}: {'is none' if path.exists() else 'no such file'}; expected {EXPECTED}")
+    arrays = read_npz(path, {"queries": ("U", 1), "scores": ("f", 2)}, {"distractor_scores": ("f", 2)})
     queries = tuple(arrays["queries"].tolist())
-    if ("scores" in arrays) == ("views" in arrays or "texts" in arrays):
-        raise InputError(f"{path}: holds {', '.join(arrays)}; expected {EXPECTED}")
-    if "scores" in arrays:
-        others = arrays.get("distractor_scores", np.zeros((0, len(queries))))
-        with about(path):
-            return ScoredPairs(
-                queries=queries, scores=arrays["scores"].astype(np.float64), distractors=others.astype(np.float64)
-            )
-    return _from_features(path, queries, arrays, pooling)
+    others = arrays.get("distractor_scores", np.zeros((0, len(queries))))
+    with about(path):
+        return ScoredPairs(
+            queries=queries, scores=arrays["scores"].astype(np.float64), distractors=others.astype(np.float64)
+        )
 
 
 def write_scored_pairs(path: Path, pairs: ScoredPairs) -> None:
@@ -466,30 +387,6 @@ def write_scored_pairs(path: Path, pairs: ScoredPairs) -> None:
         arrays["distractor_scores"] = pairs.distractors
     np.savez_compressed(data, **arrays)  # type: ignore[arg-type]
     write_bytes(path, data.getvalue())
-
-
-def _from_features(
-    path: Path, queries: tuple[str, ...], arrays: dict[str, np.ndarray], pooling: Pooling
-) -> ScoredPairs:
-    missing = [name for name in ("views", "texts") if name not in arrays]
-    if missing:
-        raise InputError(f"{path}: {missing[0]} is missing; expected {EXPECTED}")
-    views, texts = (arrays[name].astype(np.float32) for name in ("views", "texts"))
-    if not len(queries) == len(views) == len(texts):
-        raise InputError(
-            f"{path}: {len(queries)} queries, {len(views)} views and {len(texts)} texts; expected as many of each"
-        )
-    more = arrays.get("text_distractors", np.zeros((0, texts.shape[1]))).astype(np.float32)
-    others = arrays.get("view_distractors", np.zeros((0, 1, texts.shape[1]))).astype(np.float32)
-    if more.shape[1] != texts.shape[1]:
-        raise InputError(f"{path}: texts have {texts.shape[1]} channels, and text_distractors {more.shape[1]}")
-    every = np.concatenate([texts, more])
-    with about(path):
-        return ScoredPairs(
-            queries=queries,
-            scores=np.array([view_scores(cells, every, pooling) for cells in views]).reshape(len(views), len(every)),
-            distractors=np.array([view_scores(cells, texts, pooling) for cells in others]).reshape(-1, len(texts)),
-        )
 
 
 def read_view_captions(path: Path) -> tuple[ViewCaption, ...]:
@@ -506,11 +403,6 @@ def read_view_captions(path: Path) -> tuple[ViewCaption, ...]:
     if not captions:
         raise InputError(f"{path}: holds no captions; expected a list of objects with {CAPTION_KEYS}")
     return captions
-
-
-def write_view_captions(path: Path, captions: Sequence[ViewCaption]) -> None:
-    """Writes captions as `read_view_captions` reads them."""
-    write_json(path, [{"scene_id": each.scene, "view": each.view, "caption": each.caption} for each in captions])
 
 
 def read_texts(path: Path) -> tuple[str, ...]:

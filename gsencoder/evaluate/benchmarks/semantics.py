@@ -23,15 +23,14 @@ SceneSplat's benchmark counts (pointcept/utils/misc.py, neighbor_voting). Points
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Int32, Int64
 
 from gsencoder.core.errors import InputError, about, counted
-from gsencoder.core.settings import option
 from gsencoder.data.labels.classes import (
     IDS_PER_CLASS,
     ClassTable,
@@ -70,29 +69,24 @@ RAW_IDS = range(1100, 1358)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SemanticsProtocol(Protocol):
-    """How vertices get the class of Gaussians."""
+    """The classes are options of the command."""
 
     name: Literal["semantics"] = "semantics"
-    voters: int = option(
-        VOTERS,
-        "on meshes: nearest Gaussians with a feature whose most frequent class a vertex has; 1 = the nearest one",
-        ge=1,
-    )
 
     def start(self, evaluation: Evaluation) -> "SemanticsBenchmark":
-        return SemanticsBenchmark(self, evaluation)
+        return SemanticsBenchmark(evaluation)
 
 
 class SemanticsBenchmark(Benchmark[None]):
     """Each scene has its own two files, which are written as it is predicted."""
 
-    def __init__(self, protocol: SemanticsProtocol, evaluation: Evaluation) -> None:
-        self.protocol, self.evaluation, self.classes = protocol, evaluation, predicted_classes(evaluation)
+    def __init__(self, evaluation: Evaluation) -> None:
+        self.evaluation, self.classes = evaluation, predicted_classes(evaluation)
 
     def predict(self, scene: Scene, features: GaussianFeatures) -> None:
         assert scene.gaussians is not None
         points, classes = self.classes.points(scene), self.classes.table
-        predicted = predict_semantics(points, scene.gaussians, features, classes, self.evaluation.words, self.protocol)
+        predicted = predict_semantics(points, scene.gaussians, features, classes, self.evaluation.words)
         for name, values in ((LABELS, class_ids(points, classes)), (PREDICTIONS, predicted)):
             self.evaluation.file(name).mkdir(exist_ok=True)
             write_whole_numbers(self.evaluation.file(name) / f"{scene.name}.txt", values)
@@ -123,17 +117,16 @@ def predict_semantics(
     features: GaussianFeatures,
     classes: ClassTable,
     text: TextEncoder,
-    protocol: SemanticsProtocol = SemanticsProtocol(),
+    voters: int = VOTERS,
 ) -> Int32[np.ndarray, " P"]:
-    """The predicted class id of each point; `id_of_none` where no Gaussian has a feature."""
+    """The predicted class id of each point, that of most of the `voters` nearest Gaussians on meshes; `id_of_none`
+    where no Gaussian has a feature."""
     nearest = nearest_class(features, classes.names, text)
     none = id_of_none(classes)
     labels = np.array([*classes.ids, none], np.int32)[nearest]
     if points.positions is None:
         return labels
-    return labels_of_vertices(
-        points.positions, gaussians.means, labels, k=protocol.voters, none=none, voters=nearest >= 0
-    )
+    return labels_of_vertices(points.positions, gaussians.means, labels, k=voters, none=none, voters=nearest >= 0)
 
 
 def score(predictions: Path, labels: Path, options: ScoreOptions) -> ScoreReport:
@@ -165,9 +158,9 @@ def score_semantics(
             f"{labels}: nothing to score: no vertex of {counted(len(counts), 'scene')} has one of the "
             f"{len(classes.names)} classes; compare its ids with those of classes="
         )
-    overall = _figures(scores)
+    overall = scores.figures
     by_scene = [
-        {"scene": each.scene, **_figures(alone), "vertices": alone.vertices}
+        {"scene": each.scene, **alone.figures, "vertices": alone.vertices}
         for each in counts
         for alone in (semantic_scores([each], classes),)
     ]
@@ -190,25 +183,17 @@ def score_semantics(
         table=table_of("Semantic labels", {method: overall}, notes=notes),
         rows={
             "scenes": by_scene,
-            "classes": [{"class": name, **asdict(values)} for name, values in scores.classes.items()],
+            "classes": [{"class": name, **values} for name, values in scores.classes.items()],
         },
-        line=f"{counted(scores.vertices, 'label')} in {counted(scores.scenes, 'scene')}: mIoU {overall['miou']:.3f}, "
+        line=f"{counted(scores.vertices, 'label')} in {counted(len(counts), 'scene')}: mIoU {overall['miou']:.3f}, "
         f"mAcc {overall['macc']:.3f}, f-mIoU {overall['f_miou']:.3f}; {scores.unlabeled:,} without a prediction",
     )
 
 
-def _figures(scores: "SemanticScores") -> dict[str, float]:
-    return asdict(scores.overall) | {f"f_{name}": value for name, value in asdict(scores.foreground).items()}
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabelCounts:
-    """Vertices of one scene by true and predicted class.
-
-    Attributes:
-        confusion: by row of the true class, and of the predicted one; the last column counts what is predicted as none.
-        ignored: vertices whose true label is no class.
-    """
+    """Vertices of one scene by true and predicted class, the last column for what is predicted as none, and those whose
+    true label is no class."""
 
     scene: str
     confusion: Int64[np.ndarray, "C C_1"]
@@ -216,56 +201,22 @@ class LabelCounts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ClassScores:
-    """Scores of one class.
-
-    Attributes:
-        iou: NaN if it is neither labeled nor predicted.
-        accuracy: NaN if it is not labeled.
-        predictions: vertices predicted as the class, of those that are not ignored.
-    """
-
-    iou: float
-    accuracy: float
-    truths: int
-    predictions: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SemanticAverages:
-    """Means over classes; NaN where no class counts.
-
-    Attributes:
-        miou: mean IoU of the classes that are labeled or predicted.
-        miou_present: of those that are labeled.
-        macc: mean accuracy of the classes that are labeled.
-        accuracy: share of the vertices of these classes that are right.
-    """
-
-    miou: float
-    miou_present: float
-    macc: float
-    accuracy: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SemanticScores:
     """The scores of scenes.
 
     Attributes:
-        scenes: their number.
-        overall: over all classes.
-        foreground: over those that are not `BACKGROUND`.
-        classes: by name.
+        figures: over all classes and, with f_ before the name, over those that are not `BACKGROUND`; NaN where no class
+            counts. miou: mean IoU of the classes that are labeled or predicted, miou_present: of those that are
+            labeled, macc: mean accuracy of these, accuracy: share of their vertices that are right.
+        classes: by name iou (NaN if it is neither labeled nor predicted), accuracy (NaN if it is not labeled), and the
+            vertices that have it: truths, and predictions of those that are not ignored.
         vertices: that count.
         ignored: vertices whose true label is no class.
         unlabeled: vertices that count, and are predicted as no class.
     """
 
-    scenes: int
-    overall: SemanticAverages
-    foreground: SemanticAverages
-    classes: dict[str, ClassScores]
+    figures: dict[str, float]
+    classes: dict[str, dict[str, Any]]
     vertices: int
     ignored: int
     unlabeled: int
@@ -300,27 +251,22 @@ def semantic_scores(counts: Sequence[LabelCounts], classes: ClassTable) -> Seman
     iou = np.divide(right, union, out=np.full(number, math.nan), where=union > 0)
     accuracy = np.divide(right, truths, out=np.full(number, math.nan), where=truths > 0)
 
-    def averages(rows: list[int]) -> SemanticAverages:
+    def averages(rows: list[int], prefix: str) -> dict[str, float]:
         total = int(truths[rows].sum())
-        return SemanticAverages(
-            miou=mean_of(iou[rows]),
-            miou_present=mean_of(iou[rows][truths[rows] > 0]),
-            macc=mean_of(accuracy[rows]),
-            accuracy=int(right[rows].sum()) / total if total else math.nan,
-        )
+        return {
+            f"{prefix}miou": mean_of(iou[rows]),
+            f"{prefix}miou_present": mean_of(iou[rows][truths[rows] > 0]),
+            f"{prefix}macc": mean_of(accuracy[rows]),
+            f"{prefix}accuracy": int(right[rows].sum()) / total if total else math.nan,
+        }
 
+    foreground = [row for row, name in enumerate(classes.names) if name not in BACKGROUND]
+    columns = zip(iou.tolist(), accuracy.tolist(), truths.tolist(), predictions.tolist(), strict=True)
     return SemanticScores(
-        scenes=len(counts),
-        overall=averages(list(range(number))),
-        foreground=averages([row for row, name in enumerate(classes.names) if name not in BACKGROUND]),
+        figures=averages(list(range(number)), "") | averages(foreground, "f_"),
         classes={
-            name: ClassScores(
-                iou=float(iou[row]),
-                accuracy=float(accuracy[row]),
-                truths=int(truths[row]),
-                predictions=int(predictions[row]),
-            )
-            for row, name in enumerate(classes.names)
+            name: dict(zip(("iou", "accuracy", "truths", "predictions"), row, strict=True))
+            for name, row in zip(classes.names, columns, strict=True)
         },
         vertices=int(truths.sum()),
         ignored=sum(scene.ignored for scene in counts),

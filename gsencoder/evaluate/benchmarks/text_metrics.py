@@ -48,8 +48,6 @@ TINY, SMALL = 1e-15, 1e-9
 PUNCTUATION = frozenset(("''", "'", "``", "`", ".", "?", "!", ",", ":", "-", "--", "...", ";"))
 """Tokens that are left out. The package lists brackets, too, but as -LRB-, which its lower-cased tokens never equal;
 they are kept, as it keeps them."""
-PYTHON_TOKENS = "Python tokens"
-"""Name of what `python_tokens` gives, for the heads of columns."""
 
 Ngram = tuple[str, ...]
 
@@ -100,13 +98,10 @@ def python_tokens(text: str) -> str:
         elif match != "o'clock" and (parts := _CONTRACTION.fullmatch(match)):
             tokens += parts.groups()
         else:
-            tokens += _apart(match)
+            # A word with an apostrophe inside that is no contraction, such as rock'n'roll, is cut at the apostrophes.
+            whole = match == "o'clock" or "'" not in match.strip("'")
+            tokens += [match] if whole else re.findall(r"'?[^']+", match)
     return " ".join(token for token in tokens if token not in PUNCTUATION and token != '"')
-
-
-def _apart(word: str) -> list[str]:
-    """A word with an apostrophe inside that is no contraction, such as rock'n'roll, at the apostrophes."""
-    return [word] if word == "o'clock" or "'" not in word.strip("'") else re.findall(r"'?[^']+", word)
 
 
 def bleu(
@@ -119,8 +114,7 @@ def bleu(
         references: one or more such sentences for each sample.
 
     Returns:
-        Scores in [0, 1]: of the corpus, NaN without samples, and one row a sample, of which that of the corpus is no
-        mean.
+        Of the corpus, NaN without samples, and one row a sample, of which that of the corpus is no mean.
     """
     _check(hypotheses, references)
     correct, guessed = np.zeros((2, len(hypotheses), ORDER), np.int64)
@@ -141,7 +135,7 @@ def bleu(
 
 
 def rouge_l(hypotheses: Sequence[str], references: Sequence[Sequence[str]]) -> Float64[np.ndarray, "N"]:
-    """ROUGE-L of each sample, whose mean is the score of the corpus; arguments and errors as of `bleu`.
+    """ROUGE-L of each sample, whose mean is the score of the corpus; arguments as of `bleu`.
 
     A sentence is cut at every single blank here, as the package does, so that an empty one is one empty token, and
     equals another empty one.
@@ -160,7 +154,7 @@ def rouge_l(hypotheses: Sequence[str], references: Sequence[Sequence[str]]) -> F
 
 
 def cider(hypotheses: Sequence[str], references: Sequence[Sequence[str]]) -> Float64[np.ndarray, "N"]:
-    """CIDEr of each sample, in [0, 10], whose mean is the score of the corpus; arguments and errors as of `bleu`."""
+    """CIDEr of each sample, in [0, 10], whose mean is the score of the corpus; arguments as of `bleu`."""
     _check(hypotheses, references)
     counts = [[_ngrams(sentence.split()) for sentence in sentences] for sentences in references]
     documents = Counter(ngram for sample in counts for ngram in set().union(*sample))
@@ -184,11 +178,8 @@ def cider(hypotheses: Sequence[str], references: Sequence[Sequence[str]]) -> Flo
 
 
 def _check(hypotheses: Sequence[str], references: Sequence[Sequence[str]]) -> None:
-    if len(hypotheses) != len(references):
-        raise InputError(f"{len(hypotheses)} hypotheses and references of {len(references)} samples; expected as many")
-    without = next((row for row, sentences in enumerate(references) if not len(sentences)), None)
-    if without is not None:
-        raise InputError(f"sample {without} has no references; expected one or more sentences")
+    if len(hypotheses) != len(references) or not all(map(len, references)):
+        raise InputError(f"{len(hypotheses)} hypotheses: expected references of as many samples, one or more of each")
 
 
 def _ngrams(tokens: Sequence[str]) -> Counter[Ngram]:
@@ -229,8 +220,6 @@ def _tf_idf(
 
 
 PACKAGE = "pycocoevalcap"
-PTB_TOKENS = "PTB tokens"
-"""Name of what `ptb_tokens` gives."""
 TOKENIZER, METEOR = "tokenizer/stanford-corenlp-3.4.1.jar", "meteor/meteor-1.5.jar"
 SECONDS = 1800
 """Longest time that Java may take for all sentences."""
@@ -261,13 +250,11 @@ def find_java_tools() -> JavaTools | str:
 
 
 def ptb_tokens(texts: Sequence[str], tools: JavaTools) -> list[str]:
-    """Tokens of the Penn Treebank, lower case, without punctuation, as pycocoevalcap's PTBTokenizer gives them.
+    """Tokens of the Penn Treebank, lower case, without punctuation, with one blank between them, as
+    pycocoevalcap's PTBTokenizer gives them.
 
     Line breaks inside a text count as blanks. The package replaces \\n alone and reads other breaks as ends of a text,
     after which all later ones belong to the wrong samples.
-
-    Returns:
-        The tokens of each text with one blank between them.
     """
     lines = [" ".join(_BREAKS.sub(" ", text).split()) for text in texts]
     rows = [row for row, line in enumerate(lines) if line]
@@ -288,20 +275,10 @@ def ptb_tokens(texts: Sequence[str], tools: JavaTools) -> list[str]:
     return tokens
 
 
-def meteor(
-    hypotheses: Sequence[str], references: Sequence[Sequence[str]], tools: JavaTools
-) -> tuple[float, Float64[np.ndarray, "N"]]:
-    """METEOR 1.5 for English of a corpus, and of each sample.
-
-    Args:
-        hypotheses: tokens of each sample with blanks between them.
-        references: one or more such sentences for each sample.
-
-    Returns:
-        Scores in [0, 1]: of the corpus, NaN without samples, and of each sample.
-    """
+def meteor(hypotheses: Sequence[str], references: Sequence[Sequence[str]], tools: JavaTools) -> float:
+    """METEOR 1.5 for English of a corpus, NaN without samples; arguments as of `bleu`."""
     if not hypotheses:
-        return float("nan"), np.zeros(0)
+        return math.nan
     lines = [
         "SCORE ||| " + " ||| ".join([*map(_field, sentences), _field(hypothesis).replace("  ", " ")])
         for hypothesis, sentences in zip(hypotheses, references, strict=True)
@@ -313,11 +290,7 @@ def meteor(
     scores = _run(command, "METEOR", [" ||| ".join(["EVAL", *map(str.strip, counts)])]).splitlines()
     if not len(counts) == len(scores) - 1 == len(lines):
         raise InputError(f"METEOR gave {len(counts):,} counts and {len(scores):,} scores for {len(lines):,} samples")
-    try:
-        values = np.array(scores, np.float64)
-    except ValueError as error:
-        raise InputError(f"METEOR gave something else than scores ({' '.join(str(error).split())[:80]})") from error
-    return float(values[-1]), values[:-1]
+    return float(scores[-1])
 
 
 def _field(sentence: str) -> str:
@@ -328,51 +301,44 @@ def _field(sentence: str) -> str:
 def _run(command: Sequence[str], subject: str, lines: Sequence[str] = ()) -> str:
     """What a program writes, given lines of input."""
     data = "".join(f"{line}\n" for line in lines).encode("utf-8", "replace")
+    # Options for Java say what they do in the output.
+    options = ("JAVA_TOOL_OPTIONS", "_JAVA_OPTIONS")
+    environment = {name: value for name, value in os.environ.items() if name not in options}
     try:
         process = subprocess.run(
-            command, input=data, capture_output=True, timeout=SECONDS, env=_environment(), check=False
+            command, input=data, capture_output=True, timeout=SECONDS, env=environment, check=False
         )
-    except subprocess.TimeoutExpired:
-        raise InputError(
-            f"{subject}: Java did not end within {SECONDS:,} seconds; score fewer samples at once"
-        ) from None
-    except OSError as error:
-        raise InputError(f"{subject}: Java cannot be started: {error.strerror or error}") from error
+    except (subprocess.TimeoutExpired, OSError) as error:
+        raise InputError(f"{subject}: Java cannot be run, or not within {SECONDS:,} seconds: {error}") from error
     if process.returncode:
         end = " ".join(process.stderr.decode("utf-8", "replace").split())[-200:]
         raise InputError(f"{subject}: Java ended with code {process.returncode}: {end or 'it said nothing'}")
     return process.stdout.decode("utf-8", "replace")
 
 
-def _environment() -> dict[str, str]:
-    """Without options for Java, which say what they do in the output."""
-    return {name: value for name, value in os.environ.items() if name not in ("JAVA_TOOL_OPTIONS", "_JAVA_OPTIONS")}
-
-
 Tokens = Literal["auto", "python", "given"]
 """How texts become tokens: "auto" = PTB tokens where Java is there, else as "python"; "given" = they are tokens with
 blanks between them already."""
-GIVEN_TOKENS = "tokens as given"
+TOKEN_NAMES = {"auto": "PTB tokens", "python": "Python tokens", "given": "tokens as given"}
+"""For the heads of columns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SentenceScores:
-    """Scores of N samples; those of the corpus are NaN without samples, and fractions: tables show 100 times as much.
+    """Scores of a corpus and of each of its N samples, as fractions; those of the corpus are NaN without samples.
 
     Attributes:
         tokens: name of the tokens that all scores rest on.
         official: whether they are those of the official script. If not, columns name them.
-        bleu: BLEU-1 to 4 of the corpus.
-        meteor: of the corpus; NaN where Java is missing.
-        cider: mean of the samples, in [0, 10].
-        bleu_each: BLEU-1 to 4 of each sample alone.
-        cider_each: of each sample, with the document frequencies of all.
+        bleu: BLEU-1 to 4.
+        meteor: NaN where Java is missing.
+        cider: in [0, 10].
         absent: why a column has no value.
     """
 
     tokens: str
     official: bool
-    bleu: tuple[float, float, float, float]
+    bleu: tuple[float, ...]
     meteor: float
     rouge_l: float
     cider: float
@@ -404,37 +370,32 @@ def score_sentences(
         tools: of `find_java_tools`, a reason for going without, or None = look for them.
     """
     tools = find_java_tools() if tools is None else tools
-    ptb = tokens == "auto" and not isinstance(tools, str)
-    if tokens == "given":
-        candidates, right = list(hypotheses), [list(sentences) for sentences in references]
-    else:
-        candidates, right = _tokenized(hypotheses, references, tools if ptb else None)
-    each_bleu = bleu(candidates, right)
-    each_rouge, each_cider = rouge_l(candidates, right), cider(candidates, right)
-    corpus_meteor = math.nan if isinstance(tools, str) else meteor(candidates, right, tools)[0]
-    b1, b2, b3, b4 = each_bleu[0].tolist()
+    if tokens == "auto" and isinstance(tools, str):
+        tokens = "python"
+    if tokens != "given":
+        # All sentences at once, since Java takes a second to start.
+        texts = [*hypotheses, *(sentence for sentences in references for sentence in sentences)]
+        if isinstance(tools, JavaTools) and tokens == "auto":
+            cut = ptb_tokens(texts, tools)
+        else:
+            cut = list(map(python_tokens, texts))
+        rest = iter(cut)
+        hypotheses = [next(rest) for _ in hypotheses]
+        references = [[next(rest) for _ in sentences] for sentences in references]
+    corpus_bleu, each_bleu = bleu(hypotheses, references)
+    each_rouge, each_cider = rouge_l(hypotheses, references), cider(hypotheses, references)
     return SentenceScores(
-        tokens=GIVEN_TOKENS if tokens == "given" else PTB_TOKENS if ptb else PYTHON_TOKENS,
-        official=ptb or tokens == "given",
-        bleu=(b1, b2, b3, b4),
-        meteor=corpus_meteor,
+        tokens=TOKEN_NAMES[tokens],
+        official=tokens != "python",
+        bleu=tuple(corpus_bleu.tolist()),
+        meteor=math.nan if isinstance(tools, str) else meteor(hypotheses, references, tools),
         rouge_l=mean_of(each_rouge),
         cider=mean_of(each_cider),
-        bleu_each=each_bleu[1],
+        bleu_each=each_bleu,
         rouge_l_each=each_rouge,
         cider_each=each_cider,
         absent={"METEOR": tools} if isinstance(tools, str) else {},
     )
-
-
-def _tokenized(
-    hypotheses: Sequence[str], references: Sequence[Sequence[str]], tools: JavaTools | str | None
-) -> tuple[list[str], list[list[str]]]:
-    """All sentences at once, since Java takes a second to start."""
-    texts = [*hypotheses, *(sentence for sentences in references for sentence in sentences)]
-    cut = ptb_tokens(texts, tools) if isinstance(tools, JavaTools) else [python_tokens(text) for text in texts]
-    rest = iter(cut[len(hypotheses) :])
-    return cut[: len(hypotheses)], [[next(rest) for _ in sentences] for sentences in references]
 
 
 Lemmatize = Callable[[str], str]

@@ -13,10 +13,6 @@ from gsencoder.evaluate.tradeoff.sweep import SettingResult, StageResult
 
 TEMPLATE = Path(__file__).with_name("plot.html")
 DATA = "/*DATA*/"
-OFFSETS = (((6, 4), "left"), ((6, -11), "left"), ((-6, 4), "right"), ((-6, -11), "right"))
-"""Where labels stand relative to their points, and the side at which they begin."""
-Label = tuple[str, tuple[float, float]]
-"""A text, and the point that it belongs to."""
 COST_NAMES = {
     "cpu_seconds": "CPU seconds a scene",
     "seconds": "seconds a scene",
@@ -66,24 +62,20 @@ def picture(stages: Sequence[StageResult]) -> bytes:
     figure = Figure(figsize=(7.5 * columns, 5.4 * rows), layout="constrained")
     canvas = FigureCanvasAgg(figure)
     panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    labels = [_panel(axes, stage) for axes, stage in zip(panels, stages, strict=False)]
+    for axes, stage in zip(panels, stages, strict=False):
+        _panel(axes, stage)
     for axes in panels[len(stages) :]:
         axes.set_visible(False)
-    # Where points and legends are is known once they are drawn.
-    canvas.draw()
-    for axes, texts in zip(panels, labels, strict=False):
-        label_points(axes, texts)
     stream = io.BytesIO()
     canvas.print_png(stream)
     return stream.getvalue()
 
 
-def _panel(axes: Any, result: StageResult) -> list[Label]:
-    """Draws the settings of a stage whose accuracy is a number, and gives the labels of their points."""
+def _panel(axes: Any, result: StageResult) -> None:
+    """Draws the settings of a stage whose accuracy is a number."""
     stage = result.stage
     settings = [each for each in result.results if not math.isnan(each.score(stage.accuracy))]
     colors: dict[str, str] = {}
-    labels: list[Label] = []
     for each in settings:
         group, point = _group(each), (each.score(stage.cost), each.score(stage.accuracy))
         is_base, is_new = not each.knobs, group not in colors
@@ -98,7 +90,8 @@ def _panel(axes: Any, result: StageResult) -> list[Label]:
         if each.row["on_front"]:
             axes.scatter(*point, s=180, facecolors="none", edgecolors="black", linewidths=1.1, zorder=4)
         if not is_base and each.row["phase"] != "joint":
-            labels.append((", ".join(map(str, each.knobs.values())), point))
+            text = ", ".join(map(str, each.knobs.values()))
+            axes.annotate(text, point, xytext=(6, 4), textcoords="offset points", fontsize=7)
     axes.set_xlabel(COST_NAMES[stage.cost])
     axes.set_ylabel(stage.accuracy + (" (more is better)" if HIGHER_IS_BETTER[stage.accuracy] else " (less is better)"))
     axes.set_title(f"{stage.name} (ringed: on the Pareto front)")
@@ -109,26 +102,6 @@ def _panel(axes: Any, result: StageResult) -> list[Label]:
     axes.set_axisbelow(True)
     if settings:
         axes.legend(fontsize=7)
-    return labels
-
-
-def label_points(axes: Any, labels: Sequence[Label]) -> list[Any]:
-    """Writes labels beside points of a panel that was drawn, each at the first of `OFFSETS` where it covers no other
-    label, and returns their annotations; a label for which there is no room is left out."""
-    renderer = axes.figure.canvas.get_renderer()
-    legend = axes.get_legend()
-    occupied = [] if legend is None else [legend.get_window_extent(renderer)]
-    notes = []
-    for text, point in labels:
-        for offset, side in OFFSETS:
-            note = axes.annotate(text, point, xytext=offset, textcoords="offset points", fontsize=7, ha=side)
-            box = note.get_window_extent(renderer)
-            if box.count_overlaps(occupied) == 0:
-                occupied.append(box)
-                notes.append(note)
-                break
-            note.remove()
-    return notes
 
 
 def _group(result: SettingResult) -> str:

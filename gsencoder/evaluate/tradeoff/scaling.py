@@ -107,25 +107,12 @@ class DenseTeacher:
     def __init__(self, teacher: Teacher, views: Views, channels: int) -> None:
         self.space: FeatureSpace = replace(teacher.space, channels=channels, text_encoder="")
         views = upright_views(views, unmirror=True)
-        self._maps = {view: self._dense(teacher.feature_map(views, view)) for view in range(len(views))}
-
-    def _dense(self, coded: FeatureMap) -> FeatureMap:
-        channels = self.space.channels
-        if coded.features is not None:
-            features = coded.features[..., :channels]
-        else:
-            assert coded.table is not None
-            table = coded.table[:, :channels]
-            if coded.codes is not None:
-                features = np.where((coded.codes < 0)[..., None], np.float32(np.nan), table[coded.codes])
-            else:
-                assert coded.shares is not None
-                features = coded.shares @ table
-        return FeatureMap(
-            features=np.ascontiguousarray(features, np.float32),
-            grid_from_image=coded.grid_from_image,
-            space=self.space,
-        )
+        self._maps = []
+        for view in range(len(views)):
+            coded = teacher.feature_map(views, view)
+            rows = np.ascontiguousarray(coded.rows()[:, :channels], np.float32)
+            features = rows.reshape(coded.height, coded.width, channels)
+            self._maps.append(FeatureMap(features=features, grid_from_image=coded.grid_from_image, space=self.space))
 
     def feature_map(self, views: Views, view: int) -> FeatureMap:  # noqa: ARG002
         return self._maps[view]

@@ -1,17 +1,16 @@
 """The stages whose knobs are swept: reconstruction, fusion, encoding, localization, views and packages.
 
-A new knob is a row in the list of its stage. A new stage is a function from `Inputs` to a `Stage`, and a line in
-`STAGES`.
+A new knob is a row in the list of its stage. A new stage is a function that opens a scene, and a line in `make_stage`.
 """
 
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -256,14 +255,6 @@ def open_reconstruction(inputs: Inputs, path: Path) -> Iterator[Opened]:
     yield run, judge
 
 
-def reconstruction_stage(inputs: Inputs) -> Stage:
-    """Reconstruction of scenes with poses."""
-    base = ReconstructionSettings(data=inputs.data)
-    base = replace(base, reconstruct=replace(base.reconstruct, seeds=inputs.seeds))
-    opened = partial(open_reconstruction, inputs)
-    return Stage(name="reconstruction", knobs=RECONSTRUCTION_KNOBS, base=base, open=opened, accuracy="psnr")
-
-
 @contextmanager
 def open_fusion(inputs: Inputs, path: Path) -> Iterator[Opened]:
     """A scene to fuse, whose features are compared with those at the exact settings."""
@@ -285,12 +276,6 @@ def open_fusion(inputs: Inputs, path: Path) -> Iterator[Opened]:
             return scores, stored_bytes(taught.scene, product)
 
         yield run, judge
-
-
-def fusion_stage(inputs: Inputs) -> Stage:
-    """Fusion with the teacher, the seeds and the words of `inputs`."""
-    opened = partial(open_fusion, inputs)
-    return Stage(name="fusion", knobs=FUSION_KNOBS, base=inputs.fusion, open=opened, accuracy="error")
 
 
 Graph = Literal["none", "float32", "float16", "int8_weights", "int8_dynamic"]
@@ -400,12 +385,6 @@ def open_encoder(inputs: Inputs, path: Path) -> Iterator[Opened]:
     yield run, judge
 
 
-def encoder_stage(inputs: Inputs) -> Stage:
-    """The encoders that come with the package, on seeds or splats."""
-    base, opened = EncoderSettings(encode=inputs.encode), partial(open_encoder, inputs)
-    return Stage(name="encoder", knobs=ENCODER_KNOBS, base=base, open=opened, accuracy="names")
-
-
 @contextmanager
 def open_packages(inputs: Inputs, path: Path) -> Iterator[Opened]:
     """A scene whose features are packed into a folder again and again."""
@@ -437,12 +416,6 @@ def open_packages(inputs: Inputs, path: Path) -> Iterator[Opened]:
         yield run, judge
 
 
-def packages_stage(inputs: Inputs) -> Stage:
-    """Packages of features that `inputs` say how to fuse."""
-    base, opened = PackageSettings(), partial(open_packages, inputs)
-    return Stage(name="packages", knobs=PACKAGE_KNOBS, base=base, open=opened, accuracy="error", cost="bytes")
-
-
 LOCALIZATION_KNOBS = (
     Knob(name="relative", key="threshold.relative", values=(0.5, 0.6, 0.8, 0.9)),
     Knob(name="fixed", key="threshold.fixed", values=(0.3, 0.4, 0.6, 0.7)),
@@ -464,12 +437,6 @@ def open_localization(inputs: Inputs, path: Path) -> Iterator[Opened]:
                 "are seen well enough (asked.min_views and asked.min_pixels)"
             )
         yield partial(taught.hits, features), lambda hits, _: (hit_scores(hits), 0)
-
-
-def localization_stage(inputs: Inputs) -> Stage:
-    """Localization in features that `inputs` say how to fuse."""
-    base, opened = inputs.localize, partial(open_localization, inputs)
-    return Stage(name="localization", knobs=LOCALIZATION_KNOBS, base=base, open=opened, accuracy="acc_25")
 
 
 VIEWS_KNOBS = (
@@ -536,18 +503,22 @@ def open_views(inputs: Inputs, path: Path) -> Iterator[Opened]:
         yield run, judge
 
 
-def views_stage(inputs: Inputs) -> Stage:
-    """Views of objects that are localized in features that `inputs` say how to fuse."""
-    opened = partial(open_views, inputs)
-    return Stage(name="views", knobs=VIEWS_KNOBS, base=inputs.choose, open=opened, accuracy="visible")
+def make_stage(name: StageName, inputs: Inputs) -> Stage:
+    """A stage that starts from `inputs`."""
+    photographs = ReconstructionSettings(data=inputs.data)
+    photographs = replace(photographs, reconstruct=replace(photographs.reconstruct, seeds=inputs.seeds))
+    encoder = EncoderSettings(encode=inputs.encode)
+    opened, knobs, base, accuracy = {
+        "reconstruction": (open_reconstruction, RECONSTRUCTION_KNOBS, photographs, "psnr"),
+        "fusion": (open_fusion, FUSION_KNOBS, inputs.fusion, "error"),
+        "encoder": (open_encoder, ENCODER_KNOBS, encoder, "names"),
+        "packages": (open_packages, PACKAGE_KNOBS, PackageSettings(), "error"),
+        "localization": (open_localization, LOCALIZATION_KNOBS, inputs.localize, "acc_25"),
+        "views": (open_views, VIEWS_KNOBS, inputs.choose, "visible"),
+    }[name]
+    cost: Cost = "bytes" if name == "packages" else "cpu_seconds"
+    return Stage(name=name, knobs=knobs, base=base, open=partial(opened, inputs), accuracy=accuracy, cost=cost)
 
 
-STAGES: Mapping[StageName, Callable[[Inputs], Stage]] = {
-    "reconstruction": reconstruction_stage,
-    "fusion": fusion_stage,
-    "encoder": encoder_stage,
-    "packages": packages_stage,
-    "localization": localization_stage,
-    "views": views_stage,
-}
+STAGES: tuple[StageName, ...] = get_args(StageName)
 """The stages that have knobs, in the order of the pipeline."""

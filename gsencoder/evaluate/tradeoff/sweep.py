@@ -91,13 +91,8 @@ class SettingResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rung:
-    """One rung of successive halving.
-
-    Attributes:
-        scenes: of the rung.
-        settings: that were measured on them.
-        survivors: those of the next rung; after the last rung, all in the order in which they are best.
-    """
+    """One rung of successive halving: the number of scenes, the settings that were measured on them, and those of the
+    next rung; after the last rung, all in the order in which they are best."""
 
     scenes: int
     settings: tuple[Knobs, ...]
@@ -106,14 +101,8 @@ class Rung:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageResult:
-    """What a sweep of one stage gave.
-
-    Attributes:
-        results: the base first.
-        records: what they are of, by setting and scene.
-        matter: the knobs whose effect is no noise.
-        rungs: empty where nothing was tried together.
-    """
+    """What a sweep of one stage gave: results, the base first, the records that they are of, the knobs whose effect is
+    no noise, and the rungs, none where nothing was tried together."""
 
     stage: Stage
     results: tuple[SettingResult, ...]
@@ -130,12 +119,8 @@ def sweep_stage(
     halving: HalvingConfig = HalvingConfig(),
     track: Track = untracked,
 ) -> StageResult:
-    """Measures a stage's settings on all scenes, and then those that matter together.
-
-    Args:
-        paths: folders of the scenes.
-        records: what is measured already, and where results go.
-    """
+    """Measures a stage's settings on all scenes, and then those that matter together; `records` has what is measured
+    already, and takes the rest."""
 
     def measured(settings: Sequence[Knobs], scenes: int) -> list[list[Record]]:
         return measure(stage, paths[:scenes], settings, records, rounds=sweep.rounds, track=track)
@@ -184,12 +169,7 @@ def _is_accepted(stage: Stage, knobs: Knobs) -> bool:
 
 
 def check_sweep(stages: Sequence[Stage], sweep: SweepConfig) -> None:
-    """Complains about a sweep before hours of work.
-
-    Raises:
-        InputError: an unknown knob, one that is given twice or left out by `knobs`, no value, or one that its stage
-            refuses.
-    """
+    """Complains about a sweep before hours of work."""
     knob_names = [knob.name for stage in stages for knob in stage.knobs]
     names = [_given(text)[0] for text in sweep.values]
     if (repeated := first_repeated(names)) is not None:

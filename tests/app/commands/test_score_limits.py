@@ -10,7 +10,6 @@ import pytest
 from command_runs import refusal, results_of
 
 from gsencoder.app import main as cli
-from gsencoder.data.labels.classes import load_classes
 
 CLASSES = "id,name\n1,mug\n2,box\n"
 
@@ -37,14 +36,6 @@ def blocks(*ids: int) -> np.ndarray:
     return np.repeat(np.array(ids), 100)
 
 
-def test_walls_and_floors_are_no_instances_in_the_benchmarks() -> None:
-    assert len(load_classes("scannet20", instances=True).names) == 18
-    names = load_classes("scannet200", instances=True)
-    assert len(names.names) == 198
-    assert not {"wall", "floor"} & set(names.names)
-    assert len(load_classes("scannet20").names) == 20
-
-
 def test_a_wall_that_nobody_predicts_costs_nothing(tmp_path: Path) -> None:
     truth = blocks(1001, 2001, 3001)
     words = instance_files(tmp_path, truth, [(truth == 3001, 3, 0.9)])
@@ -60,15 +51,6 @@ def test_masks_of_classes_that_are_not_scored_are_counted(tmp_path: Path) -> Non
     results = results_of(tmp_path / "out")
     assert (results["other_classes"], results["predictions"], results["ap"]) == (1, 1, 0.5)
     assert "Not counted: 1 mask with a class id that is none of the 2" in (tmp_path / "out/table.md").read_text()
-
-
-def test_a_truth_without_objects_of_the_classes_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    truth = blocks(77001, 0)
-    words = instance_files(tmp_path, truth, [(truth == 77001, 1, 0.9)])
-    assert "nothing to score: no object of the 2 classes" in refusal(
-        capsys, *words, f"classes={tmp_path / 'classes.csv'}"
-    )
-    assert not (tmp_path / "out").exists()
 
 
 def test_labels_of_no_class_are_refused_in_truth_and_counted_in_predictions(
@@ -96,15 +78,6 @@ def test_lists_without_an_entry_are_refused(protocol: str, tmp_path: Path, capsy
         capsys, "score", protocol, f"predictions={tmp_path / 'predictions.json'}", f"truth={tmp_path / 'truth.json'}"
     )
     assert "truth.json" in message
-
-
-def test_a_byte_order_mark_is_no_number(tmp_path: Path) -> None:
-    truth = blocks(1001, 0)
-    words = instance_files(tmp_path, truth, [(truth == 1001, 1, 0.9)])
-    for path in (tmp_path / "truth/s.txt", tmp_path / "predictions/masks/0.txt"):
-        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
-    assert cli.main([*words, f"classes={tmp_path / 'classes.csv'}", "quiet=true"]) == 0
-    assert results_of(tmp_path / "out")["ap"] == 1.0
 
 
 def test_a_mask_that_is_a_link_to_itself_and_a_pipe_are_refused(

@@ -1,7 +1,6 @@
 """Predicted answers in ScanQA's and SQA3D's files, and every way in which they can be wrong."""
 
 import json
-import pickle
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -66,18 +65,12 @@ def test_sqa3ds_answers_are_found_by_situation_and_place(tmp_path: Path) -> None
         ([entry(question_id="q9")], "entry 0: question_id q9 is not in the truth"),
         ([entry(scene_id="s9")], "entry 0: is about s9, of which the truth has no questions"),
         ([entry(scene_id="s1")], "entry 0: question q0 is about s0, got s1"),
-        ([entry(question_id=None)], "entry 0: question_id must be"),
         ([{"answer": "x"}], "entry 0: says not which question it answers"),
         ([entry(answer_top10="chair")], "entry 0: answer_top10 must be a list of texts, got 'chair'"),
-        ([entry(answer_top10=[4])], r"entry 0: answer_top10\[0\] must be a text, got 4"),
         ([entry(answer_top10=[])], "entry 0: answer_top10 has 0 answers, expected 1 to 10"),
-        ([entry(answer_top10=["a"] * 11)], "entry 0: answer_top10 has 11 answers"),
-        ([entry(answer_top10=["x" * 10_000_000])], r"entry 0: answer_top10\[0\] has 10,000,000 characters"),
         ([{"question_id": "q0", "answer": 3}], "entry 0: answer must be a text, got 3"),
         ([{"question_id": "q0", "answers": ["x"]}], "got answers, which truth has; were predictions and truth swapped"),
         ({"questions": []}, "got SQA3D's truth; were predictions and truth swapped"),
-        ({"q0": "chair"}, "expected a list of objects with question_id"),
-        ([["q0", "chair"]], "entry 0: expected an object with question_id"),
     ],
 )
 def test_a_wrong_entry_is_named(tmp_path: Path, content: Any, message: str) -> None:
@@ -86,13 +79,6 @@ def test_a_wrong_entry_is_named(tmp_path: Path, content: Any, message: str) -> N
     assert "pred.json" in str(caught.value)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 600
-
-
-def test_scanqas_pickles_are_refused(tmp_path: Path) -> None:
-    for name in ("pred.val.pkl", "pred.val"):
-        (tmp_path / name).write_bytes(pickle.dumps({"s0": {"q0": {"pred_answers_at10": ["a"]}}}))
-        with pytest.raises(InputError, match="is a pickle"):
-            read_answer_predictions(tmp_path / name, SCANQA)
 
 
 def test_situations_at_one_place_are_told_apart_by_where_one_faces(tmp_path: Path) -> None:

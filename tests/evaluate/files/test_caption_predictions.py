@@ -8,7 +8,7 @@ import pytest
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.labels.files import box_corners
-from gsencoder.evaluate.benchmarks.captions import CaptionedBox, CaptionedObject, NamedCaption, read_caption_predictions
+from gsencoder.evaluate.benchmarks.captions import CaptionedObject, read_caption_predictions
 
 OBJECTS = tuple(
     CaptionedObject(scene=scene, object_id=number, object_name="office_chair", captions=("sos a chair eos",))
@@ -28,20 +28,16 @@ def row(**changes: Any) -> dict[str, Any]:
 
 
 def test_captions_of_boxes_are_read_as_the_benchmark_takes_them(tmp_path: Path) -> None:
-    first, second = read_caption_predictions(
-        written(tmp_path, {"s0": [row(), {"caption": "", "box": CORNERS[::-1]}], "s1": []}), OBJECTS
-    )
-    assert first == CaptionedBox(scene="s0", caption="sos a chair eos", aabb=((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)))
-    assert second == CaptionedBox(scene="s0", caption="", aabb=first.aabb)
+    content = {"s0": [row(), {"caption": "", "box": CORNERS[::-1]}], "s1": []}
+    aabb = ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+    expected = {"s0": [("sos a chair eos", aabb), ("", aabb)]}
+    assert read_caption_predictions(written(tmp_path, content), OBJECTS) == (expected, {})
 
 
 def test_captions_of_given_objects_are_read_as_scan2cap_writes_them(tmp_path: Path) -> None:
     path = written(tmp_path, {"s0|3|office_chair": ["sos a chair eos"], "s1|3": ["b"]})
-    assert read_caption_predictions(path, OBJECTS) == (
-        NamedCaption(scene="s0", object_id=3, caption="sos a chair eos"),
-        NamedCaption(scene="s1", object_id=3, caption="b"),
-    )
-    assert read_caption_predictions(written(tmp_path, {}), OBJECTS) == ()
+    assert read_caption_predictions(path, OBJECTS) == ({}, {("s0", 3): "sos a chair eos", ("s1", 3): "b"})
+    assert read_caption_predictions(written(tmp_path, {}), OBJECTS) == ({}, {})
 
 
 @pytest.mark.parametrize(
@@ -49,21 +45,12 @@ def test_captions_of_given_objects_are_read_as_scan2cap_writes_them(tmp_path: Pa
     [
         ({"s9": [row()]}, "'s9': is no scene of the truth"),
         ({"s0": row()}, "pred.json: s0 must be a list of objects with caption and box, got an object"),
-        ({"s0": ["x"]}, r"s0\[0\]: expected an object with caption and box"),
         ({"s0": [row(), row(box=None)]}, r"s0\[1\]: box must be a list of 8 corners"),
-        ({"s0": [row(box=[[0, 0]] * 8)]}, r"s0\[0\]: box\[0\] must be a corner"),
-        ({"s0": [row(box=[["0", 0, 0]] * 8)]}, r"s0\[0\]: box\[0\] must be a number, got '0'"),
-        ({"s0": [row(box=[[float("inf"), 0, 0]] * 8)]}, r"box\[0\] must be a finite number"),
         ({"s0": [row(caption=3)]}, r"s0\[0\]: caption must be a text, got 3"),
-        ({"s0": [row(caption="x" * 10_000_000)]}, r"s0\[0\]: caption has 10,000,000 characters"),
-        ({"s9|3": ["a"]}, "'s9|3': is no scene of the truth"),
-        ({"s0|9": ["a"]}, r"'s0\|9': is no object of the truth"),
-        ({"s0|x": ["a"]}, "object_id must be a whole number"),
+        ({"s9|3": ["a"]}, r"'s9\|3': is no object of the truth"),
         ({"s0|3|lamp": ["a"]}, "the truth calls this object 'office_chair'"),
         ({"s0|3": ["a"], "s0|3|office_chair": ["b"]}, r"is the same object as 's0\|3'"),
         ({"s0|3": []}, "has 0 captions, expected one"),
-        ({"s0|3": ["a", "b"]}, "has 2 captions, expected one"),
-        ({"s0|3": "a"}, "caption must be a list of texts"),
         ([{"ann_id": "1"}], "this is truth: were predictions and truth swapped"),
         ([], "expected an object from scenes"),
     ],

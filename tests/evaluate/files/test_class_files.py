@@ -36,13 +36,6 @@ def test_columns_may_come_in_any_order_and_names_lose_blanks_at_their_ends(tmp_p
     assert (table.names, table.ids, table.groups) == (("wall, white", "floor"), (1, 2), {})
 
 
-def test_the_benchmarks_leave_out_wall_and_floor_where_instances_are_scored() -> None:
-    twenty = load_classes("scannet20")
-    instances = load_classes("scannet20", instances=True)
-    assert set(twenty.names) - set(instances.names) == {"wall", "floor"}
-    assert "ceiling" in load_classes("scannet200", instances=True).names
-
-
 @pytest.mark.parametrize(
     ("text", "problem"),
     [

@@ -8,25 +8,18 @@ import numpy as np
 import pytest
 from labeled_scans import group, write_scannet_labels
 
-from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.errors import InputError
 from gsencoder.data.labels.expressions import read_scanrefer, write_scanrefer
 from gsencoder.evaluate.benchmarks import recognition, referring
 from gsencoder.evaluate.benchmarks.files import ScoreOptions
 from gsencoder.evaluate.benchmarks.recognition import (
-    NamedInstance,
-    RankedNames,
     read_recognition_labels,
     read_recognition_predictions,
-    recognize,
-    write_recognition_labels,
-    write_recognition_predictions,
 )
 from gsencoder.evaluate.benchmarks.referring import (
     PredictedBoxes,
-    compare_boxes,
     read_referring_labels,
     read_referring_predictions,
-    referring_scores,
     write_referring_predictions,
 )
 
@@ -84,8 +77,6 @@ def test_sentences_whose_object_has_no_box_are_counted_and_not_scored(tmp_path: 
         ({"bboxes": [CORNERS, BOX.tolist()]}, 2),
         ({"bbox": CORNERS, "bboxes": [BOX.tolist(), CORNERS]}, 2),
         ({"bbox": None}, 0),
-        ({"bboxes": []}, 0),
-        ({"bbox": None, "bboxes": [CORNERS]}, 1),
         ({"bbox": CORNERS, "bboxes": None}, 1),
     ],
 )
@@ -93,15 +84,6 @@ def test_boxes_are_read_as_corners_or_as_two_of_them(tmp_path: Path, boxes: dict
     (prediction,) = read_referring_predictions(written(tmp_path / "p.json", [KEY | boxes]))
     assert len(prediction.boxes) == count
     assert all(np.array_equal(box, BOX) for box in prediction.boxes)
-
-
-def test_ids_are_the_same_as_numbers_and_as_text(tmp_path: Path) -> None:
-    truth = written(tmp_path / "t.json", [TRUTH])
-    predictions = read_referring_predictions(
-        written(tmp_path / "p.json", [PREDICTED | {"object_id": 3, "ann_id": "00"}])
-    )
-    results = compare_boxes(predictions, read_referring_labels(truth))
-    assert referring_scores(results).top1["multiple"]["not_in_others"].acc50 == 1
 
 
 @pytest.mark.parametrize(
@@ -114,9 +96,7 @@ def test_ids_are_the_same_as_numbers_and_as_text(tmp_path: Path) -> None:
         ({"scene_id": 7}, "entry 0: the scene must be a text, got 7"),
         ({"object_id": "chair"}, "entry 0: object_id must be a whole number from 0, got 'chair'"),
         ({"ann_id": True}, "ann_id must be a whole number"),
-        ({"ann_id": "x" * 10_000_000}, "ann_id must be a whole number .* got 10,000,000 characters"),
         ({"others": 2}, "entry 0: others must be 0 or 1, got 2"),
-        ({"unique_multiple": "unique"}, "unique_multiple must be 0 or 1, got 'unique'"),
     ],
 )
 def test_a_bad_entry_of_sentences_is_named(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -126,14 +106,6 @@ def test_a_bad_entry_of_sentences_is_named(tmp_path: Path, changes: dict[str, An
             read(path)
         assert str(path) in str(error.value)
         assert len(str(error.value)) < len(str(path)) + 250
-
-
-@pytest.mark.parametrize("rows", [{"a": 1}, [3], None])
-def test_what_is_no_list_of_entries_is_refused(tmp_path: Path, rows: Any) -> None:
-    path = written(tmp_path / "boxes.json", rows)
-    for read in (read_referring_labels, read_referring_predictions):
-        with pytest.raises(InputError, match=r"boxes.json: (entry 0: )?expected an? (list|object)"):
-            read(path)
 
 
 def test_a_sentence_that_is_there_twice_or_has_no_box_is_named(tmp_path: Path) -> None:
@@ -151,10 +123,8 @@ def test_a_sentence_that_is_there_twice_or_has_no_box_is_named(tmp_path: Path) -
     ("boxes", "message"),
     [
         ({"bboxes": CORNERS}, r"bboxes\[0\] must be a list of 8 corners"),
-        ({"bboxes": "all"}, "bboxes must be a list of at most 10,000 boxes, got 'all'"),
         ({"bboxes": [None] * 10_001}, "bboxes must be a list of at most 10,000 boxes, got 10,001"),
         ({"bbox": (BOX + 1).tolist(), "bboxes": [CORNERS]}, "bbox is not the first of bboxes"),
-        ({"bbox": CORNERS, "bboxes": []}, "bbox is not the first of bboxes"),
     ],
 )
 def test_bad_lists_of_boxes_are_named(tmp_path: Path, boxes: dict[str, Any], message: str) -> None:
@@ -218,32 +188,15 @@ def test_scanrefers_own_file_has_boxes_from_the_scans_and_kinds_from_the_label_m
     assert {(each.multiple, each.others) for each in read_referring_labels(path, scans=scans)} == {(None, None)}
 
 
-def test_names_that_the_label_map_lacks_are_counted_and_are_others(tmp_path: Path) -> None:
-    path, scans, label_map = scan_refer(tmp_path)
-    label_map.write_text("raw_category\tnyu40id\narmchair\t5\nmonitor\t40\nbed\t4\n")
-    with pytest.warns(SceneWarning, match="1 of 4 names are not in the label map"):
-        truth = read_referring_labels(path, label_map=label_map, scans=scans)
-    assert [each.others for each in truth] == [True, False, True, False]
-    assert [each.multiple for each in truth] == [True, False, True, False]
-
-
 # Recognition
 
 
-def test_names_are_read_back_and_scored(tmp_path: Path) -> None:
-    truth = [NamedInstance(scene="a", object="1", name="chair"), NamedInstance(scene="a", object="2", name="dog")]
-    answers = [RankedNames(scene="a", object="1", names=("bed", "chair")), RankedNames(scene="a", object="2", names=())]
-    write_recognition_labels(tmp_path / "t.json", truth)
-    write_recognition_predictions(tmp_path / "p.json", answers)
-    assert read_recognition_labels(tmp_path / "t.json") == tuple(truth)
-    assert read_recognition_predictions(tmp_path / "p.json") == tuple(answers)
-    results, others = recognize(answers, truth, ("bed", "chair"))
-    assert ([item.rank for item in results], others) == ([2], 1)
-
-
-def test_null_is_no_answer(tmp_path: Path) -> None:
-    (prediction,) = read_recognition_predictions(written(tmp_path / "p.json", [NAMES | {"labels": None}]))
-    assert prediction.names == ()
+def test_names_are_read_and_null_is_no_answer(tmp_path: Path) -> None:
+    truth = written(tmp_path / "t.json", [INSTANCE])
+    assert read_recognition_labels(truth) == {("scene0011_00", "3"): "chair"}
+    predictions = written(tmp_path / "p.json", [NAMES, NAMES | {"object_id": 4, "labels": None}])
+    names = {("scene0011_00", "3"): ("chair", "bed"), ("scene0011_00", "4"): ()}
+    assert read_recognition_predictions(predictions) == names
 
 
 @pytest.mark.parametrize(
@@ -251,20 +204,12 @@ def test_null_is_no_answer(tmp_path: Path) -> None:
     [
         ({"labels": "chair"}, "labels must be a list of names, got 'chair'"),
         ({"labels": ["chair", 5]}, r"labels\[1\] must be a text of one line with 1 to 200 characters, got 5"),
-        ({"labels": ["chair\n"]}, r"labels\[0\] must be a text of one line"),
-        ({"labels": ["x" * 10_000_000]}, r"labels\[0\] must be .* got 10,000,000 characters"),
-        ({"object_id": 0.5}, "object_id must be a whole number"),
         ({"label": "chair"}, "unexpected key 'label'; predictions and truth may be swapped"),
     ],
 )
 def test_a_bad_entry_of_names_is_named(tmp_path: Path, row: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=f"p.json: entry 0: {message}"):
         read_recognition_predictions(written(tmp_path / "p.json", [NAMES | row]))
-
-
-def test_a_prediction_without_names_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="entry 0: labels must be a list of names, got nothing"):
-        read_recognition_predictions(written(tmp_path / "p.json", [{"scene_id": "a", "object_id": 1}]))
 
 
 def test_entries_that_are_there_twice_swapped_or_of_no_class_are_named(tmp_path: Path) -> None:

@@ -1,22 +1,26 @@
-"""Average precision of instances: values worked out by hand."""
+"""Average precision of instances: values worked out by hand, the definition on random scenes, and orders."""
 
+import itertools
 import math
+from collections.abc import Sequence
+from random import Random
 
+import numpy as np
 import pytest
-from instance_scenes import BED, CHAIR, SOFA, aps, masks_of, scored, truth_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from instance_scenes import BED, CHAIR, CLASSES, SOFA, VERTICES, Mask, aps, masks_of, scored, truth_of
 
+from gsencoder.core.errors import InputError
 from gsencoder.data.labels.classes import ClassTable
-from gsencoder.evaluate.benchmarks.instances import OVERLAPS, match_instances
-
-
-def test_the_thresholds_are_nine_from_a_half_and_a_quarter() -> None:
-    expected = [0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.25]
-    assert OVERLAPS.tolist() == pytest.approx(expected, rel=1e-12)
-
-
-def test_a_mask_that_is_the_truth_is_perfect() -> None:
-    # precision (1, 1), recall (1, 0), steps (1 - 0) / 2 and (1 - 0) / 2.
-    assert aps(scored(truth_of((0, 200, 4001)), (0, 200, BED, 0.3))) == (1, 1, 1)
+from gsencoder.evaluate.benchmarks.instances import (
+    OVERLAPS,
+    InstanceScores,
+    average_precision,
+    instance_scores,
+    match_instances,
+    prediction_of_masks,
+)
 
 
 def test_a_ranking_is_integrated_as_by_hand() -> None:
@@ -26,10 +30,10 @@ def test_a_ranking_is_integrated_as_by_hand() -> None:
     # AP of beds = (2/3 + 1/2 + 1 + 1) / 4 = 19/24. There is one chair, which nothing finds: 0.
     truth = truth_of((0, 200, 4001), (200, 400, 4002), (400, 600, 5001))
     scores = scored(truth, (0, 200, BED, 0.9), (400, 600, BED, 0.8), (200, 400, BED, 0.7))
-    assert scores.classes["bed"].ap == pytest.approx(19 / 24)
-    assert scores.classes["bed"].ap25 == pytest.approx(19 / 24)
-    assert scores.classes["chair"].ap == 0
-    assert scores.overall.ap == pytest.approx(19 / 48)
+    assert scores.classes["bed"]["ap"] == pytest.approx(19 / 24)
+    assert scores.classes["bed"]["ap_25"] == pytest.approx(19 / 24)
+    assert scores.classes["chair"]["ap"] == 0
+    assert scores.overall["ap"] == pytest.approx(19 / 48)
 
 
 def test_equal_scores_are_one_step_and_are_reported() -> None:
@@ -37,15 +41,9 @@ def test_equal_scores_are_one_step_and_are_reported() -> None:
     # 1/4: AP = (1/2 + 1) / 4.
     truth = truth_of((0, 200, 4001), (200, 400, 4002), (400, 600, 5001))
     scores = scored(truth, (0, 200, BED, 1.0), (400, 600, BED, 1.0))
-    assert scores.classes["bed"].ap50 == pytest.approx(3 / 8)
+    assert scores.classes["bed"]["ap_50"] == pytest.approx(3 / 8)
     assert scores.equal_scores
-
-
-def test_scores_that_differ_and_a_single_mask_have_a_ranking() -> None:
-    truth = truth_of((0, 200, 4001))
     assert not scored(truth, (0, 200, BED, 1.0)).equal_scores
-    assert not scored(truth, (0, 200, BED, 1.0), (0, 200, BED, 0.9)).equal_scores
-    assert not scored(truth).equal_scores
 
 
 @pytest.mark.parametrize(
@@ -66,12 +64,12 @@ def test_a_second_mask_of_a_truth_is_wrong_and_the_higher_score_is_right() -> No
     # Match at 0.9, false at 0.3: precision (1/2, 1, 1), recall (1, 1, 0), steps 0, 1/2, 1/2.
     truth = truth_of((0, 200, 4001))
     for masks in ([(0, 200, BED, 0.3), (0, 190, BED, 0.9)], [(0, 190, BED, 0.9), (0, 200, BED, 0.3)]):
-        assert scored(truth, *masks).overall.ap50 == 1
+        assert scored(truth, *masks).overall["ap_50"] == 1
     # The second mask of the first bed outranks the match of the second: from the lowest score, precision 2/3, 1/2, 1, 1
     # and recall 1, 1/2, 1/2, 0, which is 19/24 as above.
     truth = truth_of((0, 200, 4001), (200, 400, 4002))
     masks = [(0, 200, BED, 0.9), (0, 190, BED, 0.8), (200, 400, BED, 0.7)]
-    assert scored(truth, *masks).overall.ap50 == pytest.approx(19 / 24)
+    assert scored(truth, *masks).overall["ap_50"] == pytest.approx(19 / 24)
 
 
 def test_a_mask_mostly_on_vertices_without_class_is_ignored_at_lower_thresholds() -> None:
@@ -80,24 +78,24 @@ def test_a_mask_mostly_on_vertices_without_class_is_ignored_at_lower_thresholds(
     # 0, and AP is 1/4.
     truth = truth_of((0, 200, 4001), (400, 480, 5001))
     scores = scored(truth, (0, 200, BED, 0.5), (400, 600, BED, 0.9))
-    assert scores.classes["bed"].ap == pytest.approx((2 + 7 / 4) / 9)
-    assert scores.classes["bed"].ap50 == scores.classes["bed"].ap25 == 1
+    assert scores.classes["bed"]["ap"] == pytest.approx((2 + 7 / 4) / 9)
+    assert scores.classes["bed"]["ap_50"] == scores.classes["bed"]["ap_25"] == 1
 
 
 def test_an_id_of_no_class_is_ignored_as_0_is() -> None:
     for number in (0, 17, 999, 7001, -1, -3000):
         truth = truth_of((0, 200, 4001), (400, 600, number))
-        assert scored(truth, (0, 200, BED, 0.5), (400, 600, BED, 0.9)).overall.ap == 1
+        assert scored(truth, (0, 200, BED, 0.5), (400, 600, BED, 0.9)).overall["ap"] == 1
 
 
 def test_a_truth_of_99_vertices_does_not_count_and_one_of_100_does() -> None:
-    assert math.isnan(scored(truth_of((0, 99, 4001)), (0, 100, BED, 1.0)).overall.ap)
-    assert scored(truth_of((0, 100, 4001)), (0, 100, BED, 1.0)).overall.ap == 1
+    assert math.isnan(scored(truth_of((0, 99, 4001)), (0, 100, BED, 1.0)).overall["ap"])
+    assert scored(truth_of((0, 100, 4001)), (0, 100, BED, 1.0)).overall["ap"] == 1
 
 
 def test_a_mask_of_99_vertices_does_not_count() -> None:
     scores = scored(truth_of((0, 100, 4001)), (0, 99, BED, 1.0))
-    assert scores.overall.ap == 0
+    assert scores.overall["ap"] == 0
     assert scores.predictions.tolist() == [0, 0, 0]
 
 
@@ -108,21 +106,15 @@ def test_small_instances_are_ignored_for_masks_of_their_class_alone(small: int, 
     # mask is false and ranks first: AP 1/4, as above.
     truth = truth_of((0, 200, 4001), (400, 490, small), (490, 800, 6001))
     scores = scored(truth, (0, 200, BED, 0.5), (410, 560, BED, 0.9))
-    assert scores.classes["bed"].ap50 == first
-    assert scores.classes["bed"].ap == pytest.approx((first + 8 / 4) / 9)
-
-
-def test_a_mask_on_a_small_instance_of_its_class_is_neither_right_nor_wrong() -> None:
-    truth = truth_of((0, 200, 4001), (400, 499, 4002), (499, 600, 5001))
-    scores = scored(truth, (0, 200, BED, 0.5), (400, 500, BED, 0.9))
-    assert scores.classes["bed"].ap == 1
+    assert scores.classes["bed"]["ap_50"] == first
+    assert scores.classes["bed"]["ap"] == pytest.approx((first + 8 / 4) / 9)
 
 
 def test_a_mask_at_the_limit_of_the_ignored_share_is_false() -> None:
     # Half of the mask has no class, and the share must be above the threshold of a half.
     truth = truth_of((0, 200, 4001), (400, 500, 5001))
-    assert scored(truth, (0, 200, BED, 0.5), (400, 600, BED, 0.9)).classes["bed"].ap50 == 0.25
-    assert scored(truth, (0, 200, BED, 0.5), (400, 601, BED, 0.9)).classes["bed"].ap50 == 1
+    assert scored(truth, (0, 200, BED, 0.5), (400, 600, BED, 0.9)).classes["bed"]["ap_50"] == 0.25
+    assert scored(truth, (0, 200, BED, 0.5), (400, 601, BED, 0.9)).classes["bed"]["ap_50"] == 1
 
 
 def test_a_mask_over_two_truths_goes_to_the_one_that_comes_first_and_the_order_of_masks_counts() -> None:
@@ -132,26 +124,26 @@ def test_a_mask_over_two_truths_goes_to_the_one_that_comes_first_and_the_order_o
     # Q, P: the first bed takes Q, P is its second mask and false, and the second bed takes P: AP25 = (2/3 + 1) / 2.
     truth = truth_of((0, 100, 4001), (100, 200, 4002))
     p, q = (40, 160, BED, 1.0), (0, 100, BED, 1.0)
-    assert scored(truth, p, q).overall.ap25 == pytest.approx(3 / 8)
-    assert scored(truth, q, p).overall.ap25 == pytest.approx(5 / 6)
+    assert scored(truth, p, q).overall["ap_25"] == pytest.approx(3 / 8)
+    assert scored(truth, q, p).overall["ap_25"] == pytest.approx(5 / 6)
     assert scored(truth, p, q).shared == scored(truth, q, p).shared == 1
-    assert scored(truth, p, q).overall.ap50 == scored(truth, q, p).overall.ap50
+    assert scored(truth, p, q).overall["ap_50"] == scored(truth, q, p).overall["ap_50"]
 
 
 def test_a_class_without_truths_is_left_out_of_means_however_often_it_is_predicted() -> None:
     scores = scored(truth_of((0, 200, 4001)), (0, 200, BED, 0.5), (0, 200, SOFA, 0.9))
-    assert scores.overall.ap == 1
-    assert math.isnan(scores.classes["sofa"].ap)
+    assert scores.overall["ap"] == 1
+    assert math.isnan(scores.classes["sofa"]["ap"])
     assert scores.predictions.tolist() == [1, 0, 1]
 
 
 def test_groups_are_means_of_their_classes_with_truths() -> None:
     truth = truth_of((0, 200, 4001), (200, 400, 5001), (400, 600, 6001))
     scores = scored(truth, (0, 200, BED, 1.0), (200, 400, CHAIR, 1.0))
-    assert scores.groups["head"].ap50 == 1
-    assert scores.groups["common"].ap50 == 0.5
-    assert math.isnan(scores.groups["tail"].ap50)
-    assert scores.overall.ap50 == pytest.approx(2 / 3)
+    assert scores.groups["head"]["ap_50"] == 1
+    assert scores.groups["common"]["ap_50"] == 0.5
+    assert math.isnan(scores.groups["tail"]["ap_50"])
+    assert scores.overall["ap_50"] == pytest.approx(2 / 3)
 
 
 def test_without_classes_any_label_finds_any_truth() -> None:
@@ -162,22 +154,170 @@ def test_without_classes_any_label_finds_any_truth() -> None:
     assert aps(scores) == (1, 1, 1)
     assert list(scores.classes) == ["any"]
     assert scores.groups == {}
-    assert scored(truth, *masks).overall.ap == 0
+    assert scored(truth, *masks).overall["ap"] == 0
 
 
 def test_a_scene_without_masks_scores_0_and_one_without_truths_has_no_score() -> None:
+    assert aps(scored(truth_of((0, 200, 4001)), (0, 200, BED, 0.3))) == (1, 1, 1)
+    # The official script stopped at masks that are all ignored before ScanNet's pull request 26.
+    assert aps(scored(truth_of((0, 200, 4001)), (500, 700, BED, 1.0))) == (0, 0, 0)
     assert aps(scored(truth_of((0, 200, 4001)))) == (0, 0, 0)
     assert all(math.isnan(value) for value in aps(scored(truth_of(), (0, 200, BED, 1.0))))
 
 
-def test_masks_that_are_all_ignored_score_0() -> None:
-    # The official script stopped here with an error before ScanNet's pull request 26.
-    assert aps(scored(truth_of((0, 200, 4001)), (500, 700, BED, 1.0))) == (0, 0, 0)
-
-
-def test_class_0_has_instances_from_id_1000_never_and_its_ids_below_are_ignored() -> None:
-    # With a class of id 0, ids from 1 to 999 are its "groups", which the official script ignores.
+def test_groups_that_are_small_and_of_no_class_are_counted_twice_as_in_scannets_script() -> None:
+    # With a class of id 0, ids from 1 to 999 are groups of it. 60 of 200 vertices of a mask are on a small one: a share
+    # of 0.3 counted once, and 0.6 counted twice, which is above 0.5.
     classes = ClassTable(names=("wall", "bed"), ids=(0, 4))
-    matches = match_instances(truth_of((0, 200, 5), (200, 400, 4001)), masks_of((0, 200, 0, 1.0)), classes)
-    assert matches.instances.tolist() == [0, 1]
-    assert matches.hits.sum() == 0
+    truth = np.concatenate([np.full(60, 7), np.full(140, 4001), np.full(300, 4002)])
+    made = prediction_of_masks("s", [np.arange(500) < 200], [0], [0.9], num_vertices=500)
+    matches = match_instances(truth, made, classes)
+    # False from 0.6 on, the third of nine thresholds: 0.5 and 0.55 ignore it, and so does 0.25.
+    assert matches.thresholds[~matches.hits].tolist() == [2, 3, 4, 5, 6, 7, 8]
+
+
+GROUPED = ClassTable(names=("bed", "chair"), ids=(4, 5), groups={"head": ("chair",), "tail": ("bed",)})
+
+
+def test_two_scenes_are_ranked_together_and_groups_take_their_own_classes() -> None:
+    ids = np.repeat([4001, 5001], [200, 200])
+    rows = np.arange(400)
+    scenes = []
+    for scene, score in (("a", 0.9), ("b", 0.1)):
+        # The bed of each scene is right; the chair's mask of b is on the bed, and wrong.
+        masks = [rows < 200, (rows < 190) if scene == "b" else (rows >= 200)]
+        made = prediction_of_masks(scene, masks, [4, 5], [score, 0.5], num_vertices=400)
+        scenes.append(match_instances(ids, made, GROUPED))
+    scores = instance_scores(scenes, GROUPED)
+    # Chairs: one right and one wrong of one score, of two: precision 1/2, 1, recall 1/2, 0, steps 1/4: 3/8.
+    assert (scores.groups["tail"]["ap_50"], scores.groups["head"]["ap_50"]) == (1, pytest.approx(3 / 8))
+    assert (scores.classes["bed"]["ap_25"], scores.overall["ap"]) == (1, pytest.approx((1 + 3 / 8) / 2))
+    assert (scores.instances.tolist(), scores.predictions.tolist(), scores.equal_scores) == ([2, 2], [2, 2], False)
+
+
+def test_precision_is_taken_at_each_score_from_the_lowest() -> None:
+    # Hits at 0.9, 0.7 and 0.5, wrong at 0.8 and 0.6, of four truths. From the lowest score: precision 3/5, 2/4, 2/3,
+    # 1/2, 1, and 1; recall 3/4, 1/2, 1/2, 1/4, 1/4, 0.
+    scores, hits = np.array([0.5, 0.9, 0.6, 0.8, 0.7]), np.array([True, True, False, False, True])
+    ap = average_precision(scores, hits, 4)
+    assert ap == pytest.approx((3 / 5 + 2 / 4 + 2 / 3 + 1 / 2 + 1 + 1) / 8)
+    assert average_precision(np.zeros(0), np.zeros(0, bool), 3) == 0
+
+
+def test_sizes_that_differ_and_scores_that_are_not_finite_are_refused() -> None:
+    made = prediction_of_masks("a", [], [], [], num_vertices=4)
+    with pytest.raises(InputError, match="a: the masks have 4 vertices, and the truth 3"):
+        match_instances(np.zeros(3, np.int64), made, CLASSES)
+    for score in (math.nan, -math.inf):
+        with pytest.raises(InputError, match="prediction 1 has the score"):
+            prediction_of_masks("a", np.ones((2, 3), bool), [4, 4], [0.5, score], num_vertices=3)
+
+
+def test_a_truth_of_a_smaller_id_chooses_first_whatever_the_scores_are() -> None:
+    pairs = match_instances(
+        truth_of((0, 100, 4001), (100, 200, 4002)), masks_of((40, 160, 4, 0.1), (0, 100, 4, 0.9)), CLASSES
+    )
+    quarter = pairs.thresholds == 9
+    # The first bed takes the mask that is listed first, and the higher score is that of the match; the other is wrong.
+    assert sorted(zip(pairs.outcome_scores[quarter], pairs.hits[quarter], strict=True)) == [(0.1, False), (0.9, True)]
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> tuple[np.ndarray, list[Mask]]:
+    borders = sorted(draw(st.lists(st.integers(0, VERTICES), min_size=2, max_size=9, unique=True)))
+    labels = st.sampled_from([0, 4, 4, 5, 9])
+    parts = [(a, b, draw(labels) * 1000 + k) for k, (a, b) in enumerate(itertools.pairwise(borders), 1)]
+    masks = []
+    for _ in range(draw(st.integers(0, 6))):
+        first, last, number = draw(st.sampled_from(parts))
+        start = max(0, first + draw(st.integers(-60, 60)))
+        end = min(VERTICES, max(start, last + draw(st.integers(-60, 200))))
+        masks.append((start, end, draw(st.sampled_from([number // 1000, 4])), draw(st.sampled_from([0.1, 0.5, 0.9]))))
+    return truth_of(*parts), masks
+
+
+def same(first: InstanceScores, second: InstanceScores) -> None:
+    assert aps(first) == pytest.approx(aps(second), nan_ok=True)
+
+
+def by_definition(truth: np.ndarray, masks: Sequence[Mask], label: int, overlap: float) -> float:
+    """AP of a class of one scene at one threshold from 0.5 on, where no mask lies on two truths, by sets and loops."""
+    ids = sorted({number for number in truth.tolist() if number // 1000 == label})
+    instances = {number: set(np.flatnonzero(truth == number).tolist()) for number in ids}
+    void = {v for v, number in enumerate(truth.tolist()) if number // 1000 not in CLASSES.ids}
+    candidates = [(set(range(a, b)), score) for a, b, own, score in masks if own == label and b - a >= 100]
+    big = {number for number in ids if len(instances[number]) >= 100}
+    if not big:
+        return math.nan
+    ranked: list[tuple[float, bool]] = []
+    owned: dict[int, list[float]] = {}
+    for mask, score in candidates:
+        owner = [n for n in ids if len(mask & instances[n]) / len(mask | instances[n]) > overlap]
+        if owner:
+            owned.setdefault(owner[0], []).append(score)
+        else:
+            ignored = len(mask & void) + sum(len(mask & instances[n]) for n in ids if n not in big)
+            if ignored / len(mask) <= overlap:
+                ranked.append((score, False))
+    for number, matches in owned.items():
+        if number in big:
+            ranked += [(score, rank == 0) for rank, score in enumerate(sorted(matches, reverse=True))]
+    points = [(1.0, 0.0)]
+    for least in sorted({score for score, _ in ranked}, reverse=True):
+        above = [hit for score, hit in ranked if score >= least]
+        points.insert(0, (sum(above) / len(above), sum(above) / len(big)))
+    recalls = [points[0][1], *(recall for _, recall in points), 0.0]
+    return sum(p * (recalls[k] - recalls[k + 2]) / 2 for k, (p, _) in enumerate(points))
+
+
+@settings(max_examples=25)
+@given(scenes())
+def test_every_threshold_from_a_half_follows_the_definition(scene: tuple[np.ndarray, list[Mask]]) -> None:
+    truth, masks = scene
+    scores = scored(truth, *masks)
+    for name, label in (("bed", BED), ("chair", CHAIR)):
+        expected = [by_definition(truth, masks, label, overlap) for overlap in OVERLAPS[:-1]]
+        assert scores.classes[name]["ap"] == pytest.approx(np.mean(expected), nan_ok=True)
+        assert scores.classes[name]["ap_50"] == pytest.approx(expected[0], nan_ok=True)
+
+
+@settings(max_examples=25)
+@given(scenes(), st.randoms())
+def test_the_order_of_masks_means_nothing_where_none_lies_on_two_truths(
+    scene: tuple[np.ndarray, list[Mask]], random: Random
+) -> None:
+    truth, masks = scene
+    shuffled = list(masks)
+    random.shuffle(shuffled)
+    first, second = scored(truth, *masks), scored(truth, *shuffled)
+    assert first.shared == second.shared
+    if first.shared:
+        assert (first.overall["ap"], first.overall["ap_50"]) == pytest.approx(
+            (second.overall["ap"], second.overall["ap_50"]), nan_ok=True
+        )
+    else:
+        same(first, second)
+
+
+@settings(max_examples=25)
+@given(scenes(), st.integers(0, 2**32 - 1))
+def test_the_order_of_vertices_means_nothing(scene: tuple[np.ndarray, list[Mask]], seed: int) -> None:
+    truth, masks = scene
+    order = np.random.default_rng(seed).permutation(VERTICES)
+    made = masks_of(*masks)
+    in_masks = [np.isin(order, made.masks[index]) for index in range(len(masks))]
+    moved = prediction_of_masks("a", in_masks, made.labels.tolist(), made.scores.tolist(), num_vertices=VERTICES)
+    matches = match_instances(truth[order], moved, CLASSES)
+    same(scored(truth, *masks), instance_scores([matches], CLASSES))
+
+
+@settings(max_examples=25)
+@given(st.lists(scenes(), min_size=2, max_size=4))
+def test_the_order_of_scenes_means_nothing_and_a_scene_without_anything_changes_nothing(
+    parts: list[tuple[np.ndarray, list[Mask]]],
+) -> None:
+    matches = [
+        match_instances(truth, masks_of(*masks, scene=str(k)), CLASSES) for k, (truth, masks) in enumerate(parts)
+    ]
+    empty = match_instances(truth_of(), masks_of(scene="empty"), CLASSES)
+    same(instance_scores(matches, CLASSES), instance_scores([empty, *matches[::-1]], CLASSES))

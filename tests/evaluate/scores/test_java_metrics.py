@@ -11,15 +11,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.evaluate.benchmarks import text_metrics as java_metrics
 from gsencoder.evaluate.benchmarks.text_metrics import JavaTools, find_java_tools, meteor, ptb_tokens, python_tokens
 
-ECHO = """
-import sys
-if "-stdio" in sys.argv:
-    for line in sys.stdin:
-        kind, *fields = line.rstrip("\\n").split(" ||| ")
-        print(*(["0.25"] * (len(fields) + 1) if kind == "EVAL" else [str(len(fields))]), sep="\\n", flush=True)
-else:
-    print(open(sys.argv[-1], encoding="utf-8").read().lower())
-"""
+ECHO = 'import sys; print(open(sys.argv[-1], encoding="utf-8").read().lower())'
 
 
 def stand_in(folder: Path, program: str) -> JavaTools:
@@ -45,15 +37,6 @@ def test_texts_keep_their_places_and_their_breaks_become_blanks(tmp_path: Path) 
     assert ptb_tokens(["", " "], JavaTools(java="/nowhere", folder=tmp_path)) == ["", ""]
 
 
-def test_meteor_is_told_references_first_and_asked_for_all_samples_at_the_end(tmp_path: Path) -> None:
-    whole, each = meteor(["a", "b ||| c\nd"], [["a", "b"], ["c"]], stand_in(tmp_path, ECHO))
-    assert whole == 0.25
-    assert each.tolist() == [0.25, 0.25]
-    empty, none = meteor([], [], stand_in(tmp_path, ECHO))
-    assert np.isnan(empty)
-    assert len(none) == 0
-
-
 @pytest.mark.parametrize(
     ("program", "problem"),
     [("import sys; sys.exit('no heap')", "no heap"), ("print('nonsense')", "PTB tokenizer gave 1 lines for 2 texts")],
@@ -66,12 +49,9 @@ def test_what_java_says_when_it_fails_is_told(tmp_path: Path, program: str, prob
 def test_a_meteor_that_ends_early_or_gives_no_numbers_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="Java ended with code 1: no memory"):
         meteor(["a"], [["a"]], stand_in(tmp_path, "import sys; sys.exit('no memory')"))
-    words = "import sys\nfor line in sys.stdin: print(*(['x'] if 'SCORE' in line else ['x', 'x']), sep='\\n')"
-    with pytest.raises(InputError, match="something else than scores"):
-        meteor(["a"], [["a"]], stand_in(tmp_path, words))
     with pytest.raises(InputError, match="METEOR gave 1 counts and 1 scores for 1 samples"):
         meteor(["a"], [["a"]], stand_in(tmp_path, "print('x')"))
-    with pytest.raises(InputError, match="cannot be started"):
+    with pytest.raises(InputError, match="Java cannot be run"):
         meteor(["a"], [["a"]], JavaTools(java="/nowhere/java", folder=tmp_path))
 
 
@@ -103,30 +83,25 @@ for line in sys.stdin:
 """
 
 
-def listener(folder: Path) -> tuple[JavaTools, Path]:
-    """A program in Java's place that writes down what it gets."""
-    java, log = folder / "java", folder / "heard.txt"
-    java.write_text(f"#!{sys.executable}\n" + LISTENER.format(log=str(log)))
-    java.chmod(java.stat().st_mode | stat.S_IXUSR)
-    return JavaTools(java=str(java), folder=folder), log
-
-
 def test_meteor_gets_references_before_the_hypothesis_and_gives_each_score_and_then_that_of_all(tmp_path: Path) -> None:
-    tools, log = listener(tmp_path)
-    whole, each = meteor(["a  b", "c ||| d\ne"], [["r1", "r2"], ["r3"]], tools)
+    log = tmp_path / "heard.txt"
+    tools = stand_in(tmp_path, LISTENER.format(log=str(log)))
+    whole = meteor(["a  b", "c ||| d\ne"], [["r1", "r2"], ["r3"]], tools)
     lines = log.read_text().splitlines()
     assert [line for line in lines if "|||" in line] == [
         "SCORE ||| r1 ||| r2 ||| a b",
         "SCORE ||| r3 ||| c d e",
         "EVAL ||| count a b ||| count c d e",
     ]
-    assert (whole, each.tolist()) == (0.25, [0.0, 0.125])
+    assert whole == 0.25
+    assert np.isnan(meteor([], [], tools))
     options = [*java_metrics.ENCODING, *("-Xmx2G", "-jar", "-", "-", "-stdio", "-l", "-norm")]
     assert [word for word in lines if word.startswith("-")] == 2 * options
 
 
 def test_the_tokenizer_gets_texts_that_are_none_and_tokens_lose_punctuation(tmp_path: Path) -> None:
-    tools, log = listener(tmp_path)
+    log = tmp_path / "heard.txt"
+    tools = stand_in(tmp_path, LISTENER.format(log=str(log)))
     assert ptb_tokens(["", "a , b .", "  ", "c\x85d ''"], tools) == ["", "a b", "", "c d"]
     assert {"-preserveLines", "-lowerCase", "edu.stanford.nlp.process.PTBTokenizer"} <= set(
         log.read_text().splitlines()
@@ -150,7 +125,5 @@ def test_the_treebank_tokenizer_agrees_with_ours_on_plain_texts(real: JavaTools)
 
 @pytest.mark.slow
 def test_meteor_of_equal_sentences_is_near_one_and_of_none_zero(real: JavaTools) -> None:
-    whole, each = meteor(["a brown chair near the door", ""], [["a brown chair near the door"], ["a table"]], real)
-    assert each[0] == pytest.approx(1.0)
-    assert each[1] == 0
-    assert 0 < whole < 1
+    assert meteor(["a brown chair near the door"], [["a brown chair near the door"]], real) == pytest.approx(1.0)
+    assert meteor([""], [["a table"]], real) == 0

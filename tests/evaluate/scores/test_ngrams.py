@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gsencoder.core.errors import InputError
@@ -27,24 +27,18 @@ def test_a_repeated_word_counts_as_often_as_one_reference_has_it() -> None:
 def test_bleu_of_a_corpus_sums_counts_and_lengths() -> None:
     # c = 2 + 4 = 6, r = 3 + 4 = 7; every n-gram is right, so that the penalty exp(1 - 7/6) alone is left.
     corpus, each = bleu(["a b", "a b c d"], [["a b c"], ["a b c d"]])
+    # Of two references at equal distance the shorter one counts: with r = 4, BLEU-1 would be exp(1 - 4/3).
+    assert bleu(["a b c"], [["a b c d", "x y"]])[0][0] == pytest.approx(1.0)
     assert corpus == pytest.approx([math.exp(-1 / 6)] * 4)
     assert each[0, :2] == pytest.approx([math.exp(1 - 3 / 2)] * 2)
     assert each[1] == pytest.approx([1.0] * 4)
 
 
-def test_of_two_references_at_equal_distance_the_shorter_one_counts() -> None:
-    # Three tokens lie between two and four; with r = 4, BLEU-1 would be exp(1 - 4/3).
-    assert bleu(["a b c"], [["a b c d", "x y"]])[0][0] == pytest.approx(1.0)
-
-
 def test_rouge_is_the_f_measure_of_the_longest_common_subsequence() -> None:
     # a c d: P = 3/4, R = 3/5, and (1 + 1.44) · 0.45 / (0.6 + 1.44 · 0.75) = 1.098 / 1.68.
     assert rouge_l(["a b c d"], [["a c d e f"]])[0] == pytest.approx(1.098 / 1.68)
-
-
-def test_rouge_takes_precision_and_recall_from_different_references() -> None:
-    # P = 1 with the long one, R = 1 with the short one.
-    assert rouge_l(["a b"], [["a b c d", "a"]])[0] == pytest.approx(1.0)
+    # Precision and recall come from different references; an empty sentence matches an empty one alone.
+    assert rouge_l(["a b", "", ""], [["a b c d", "a"], [""], ["word"]]).tolist() == pytest.approx([1, 1, 0])
 
 
 def test_cider_is_ten_times_the_mean_cosine_over_four_orders() -> None:
@@ -53,6 +47,9 @@ def test_cider_is_ten_times_the_mean_cosine_over_four_orders() -> None:
     scores = cider(["a b", "c"], [["a b"], ["c d"]])
     assert scores[0] == pytest.approx(5.0)
     assert scores[1] == pytest.approx(10 / 4 / math.sqrt(2) * math.exp(-1 / 72))
+    # Words of every sample, and a lone sample, are worth nothing.
+    assert cider(["a", "a"], [["a"], ["a"]]).tolist() == [0, 0]
+    assert cider(["a b c d e"], [["a b c d e"]]).tolist() == [0]
 
 
 def test_cider_clips_what_a_hypothesis_repeats() -> None:
@@ -60,35 +57,17 @@ def test_cider_clips_what_a_hypothesis_repeats() -> None:
     assert cider(["a a", "b"], [["a"], ["b"]])[0] == pytest.approx(10 / 4 / 2 * math.exp(-1 / 72))
 
 
-def test_words_of_every_sample_and_a_lone_sample_are_worth_nothing_in_cider() -> None:
-    assert cider(["a", "a"], [["a"], ["a"]]).tolist() == [0, 0]
-    assert cider(["a b c d e"], [["a b c d e"]]).tolist() == [0]
-
-
-@pytest.mark.parametrize("sentence", ["", "word"])
-def test_an_empty_sentence_matches_nothing_but_an_empty_one(sentence: str) -> None:
-    corpus, _ = bleu([""], [[sentence]])
-    assert corpus[0] == pytest.approx(0, abs=1e-5)
-    assert rouge_l([""], [[sentence]])[0] == (sentence == "")
-    assert cider(["", "x"], [[sentence], ["x"]])[0] == 0
-
-
-def test_no_samples_have_no_scores() -> None:
+def test_no_samples_have_no_scores_and_samples_need_references() -> None:
+    for references in ([["a"]], [["a"], []]):
+        with pytest.raises(InputError, match="references of as many samples"):
+            bleu(["a", "b"], references)
     corpus, each = bleu([], [])
     assert np.isnan(corpus).all()
     assert each.shape == (0, 4)
     assert len(rouge_l([], [])) == len(cider([], [])) == 0
 
 
-@pytest.mark.parametrize("score", [bleu, rouge_l, cider])
-def test_samples_need_references(score: object) -> None:
-    assert callable(score)
-    with pytest.raises(InputError, match="sample 1 has no references"):
-        score(["a", "b"], [["a"], []])
-    with pytest.raises(InputError, match="as many"):
-        score(["a", "b"], [["a"]])
-
-
+@settings(max_examples=25)
 @given(SAMPLES)
 def test_scores_lie_in_their_ranges_and_perfect_ones_at_their_end(samples: list[tuple[str, list[str]]]) -> None:
     hypotheses, references = [each[0] for each in samples], [each[1] for each in samples]
@@ -100,6 +79,7 @@ def test_scores_lie_in_their_ranges_and_perfect_ones_at_their_end(samples: list[
     assert rouge_l([sentences[0] for sentences in references], references) == pytest.approx(np.ones(len(samples)))
 
 
+@settings(max_examples=25)
 @given(SAMPLES, st.randoms(use_true_random=False))
 def test_the_order_of_samples_and_references_decides_nothing(
     samples: list[tuple[str, list[str]]], random: object
@@ -113,6 +93,7 @@ def test_the_order_of_samples_and_references_decides_nothing(
     assert cider(*others) == pytest.approx(cider(hypotheses, references)[rows])
 
 
+@settings(max_examples=25)
 @given(st.lists(st.sampled_from("abc"), min_size=1, max_size=70), st.lists(st.sampled_from("abc"), min_size=1))
 def test_the_longest_common_subsequence_is_that_of_the_table(first: list[str], second: list[str]) -> None:
     length = longest_by_table(first, second)
@@ -140,25 +121,16 @@ def longest_by_table(first: Sequence[str], second: Sequence[str]) -> int:
         ("a/b and/or TV's U.S. e.g. etc.", "a/b and/or tv 's u.s. e.g. etc."),
         ("\"quoted\" 'single' `back`", "quoted single back"),
         ("wait... what?! ok -- yes - no", "wait what ?! ok yes no"),
-        ("a & b @ home #1 $5 50%", "a & b @ home # 1 $ 5 50 %"),
         ("naïve café – dash — em", "naïve café dash em"),
         ("it’s “good”\ta;b:c,d\nno1", "it 's good a b c d no1"),
         ("3D-aware 3x4 2-3", "3d-aware 3x4 2-3"),
         ("cannot (see) [it] {at} all", "can not -lrb- see -rrb- -lsb- it -rsb- -lcb- at -rcb- all"),
         ("Mr. X's table--big... ‘no’", "mr. x 's table big no"),
         ("", ""),
-        (" .,! ; \n", ""),
     ],
 )
 def test_python_tokens_are_those_of_the_penn_treebank_for_plain_texts(text: str, tokens: str) -> None:
     assert python_tokens(text) == tokens
-
-
-@given(st.text(max_size=60))
-def test_python_tokens_have_one_blank_between_them(text: str) -> None:
-    tokens = python_tokens(text)
-    assert tokens == " ".join(tokens.split())
-    assert "\n" not in tokens
 
 
 def test_a_reference_counts_an_ngram_as_often_as_it_has_it_and_a_document_counts_once_a_sample() -> None:

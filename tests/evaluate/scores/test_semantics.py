@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import accuracy_score, jaccard_score, recall_score
 
@@ -30,63 +30,64 @@ def test_scores_are_those_worked_out_by_hand() -> None:
     # wall: 0 of 1 right, 1 bed called wall: IoU 0 / 2, accuracy 0.
     # sofa: neither there nor predicted; the vertex of id 0 that is called sofa is ignored.
     scores = scored([BED, BED, BED, CHAIR, CHAIR, WALL, 0], [BED, BED, WALL, CHAIR, BED, BED, SOFA])
-    assert {name: row.iou for name, row in scores.classes.items()} == pytest.approx(
+    assert {name: row["iou"] for name, row in scores.classes.items()} == pytest.approx(
         {"wall": 0, "bed": 2 / 5, "chair": 1 / 2, "sofa": math.nan}, nan_ok=True
     )
-    assert scores.overall.miou == pytest.approx((2 / 5 + 1 / 2) / 3)
-    assert scores.overall.macc == pytest.approx((2 / 3 + 1 / 2) / 3)
-    assert scores.overall.accuracy == 3 / 6
+    assert scores.figures["miou"] == pytest.approx((2 / 5 + 1 / 2) / 3)
+    assert scores.figures["macc"] == pytest.approx((2 / 3 + 1 / 2) / 3)
+    assert scores.figures["accuracy"] == 3 / 6
     # Without the wall; its vertex that is called bed still counts as wrong there.
-    assert scores.foreground.miou == pytest.approx((2 / 5 + 1 / 2) / 2)
-    assert scores.foreground.macc == pytest.approx((2 / 3 + 1 / 2) / 2)
-    assert scores.foreground.accuracy == 3 / 5
+    assert scores.figures["f_miou"] == pytest.approx((2 / 5 + 1 / 2) / 2)
+    assert scores.figures["f_macc"] == pytest.approx((2 / 3 + 1 / 2) / 2)
+    assert scores.figures["f_accuracy"] == 3 / 5
     assert (scores.vertices, scores.ignored, scores.unlabeled) == (6, 1, 0)
 
 
 def test_what_is_predicted_as_no_class_is_missed_and_no_class_has_it_wrongly() -> None:
     scores = scored([BED, BED, CHAIR], [BED, 99, -1])
-    assert scores.classes["bed"].iou == scores.classes["bed"].accuracy == 1 / 2
-    assert scores.classes["chair"].iou == 0
+    assert scores.classes["bed"]["iou"] == scores.classes["bed"]["accuracy"] == 1 / 2
+    assert scores.classes["chair"]["iou"] == 0
     assert scores.unlabeled == 2
 
 
 def test_a_class_that_is_predicted_and_not_there_has_the_iou_0_unless_only_those_in_truth_count() -> None:
     scores = scored([BED, BED], [BED, SOFA])
-    assert scores.overall.miou == (1 / 2 + 0) / 2
-    assert scores.overall.miou_present == 1 / 2
-    assert scores.overall.macc == 1 / 2
-    assert math.isnan(scores.classes["sofa"].accuracy)
+    assert scores.figures["miou"] == (1 / 2 + 0) / 2
+    assert scores.figures["miou_present"] == 1 / 2
+    assert scores.figures["macc"] == 1 / 2
+    assert math.isnan(scores.classes["sofa"]["accuracy"])
 
 
 def test_without_vertices_that_count_there_are_no_scores() -> None:
     for truth, predicted in (([], []), ([0, 77], [BED, SOFA])):
         scores = scored(truth, predicted)
-        values = (scores.overall.miou, scores.overall.miou_present, scores.overall.macc, scores.overall.accuracy)
-        assert all(math.isnan(value) for value in values)
+        assert all(math.isnan(value) for value in scores.figures.values())
         assert scores.ignored == len(truth)
 
 
 LABELS = st.lists(st.tuples(st.sampled_from([1, 4, 5, 6, 0]), st.sampled_from([1, 4, 5, 6, 0])), min_size=1)
 
 
+@settings(max_examples=25)
 @given(LABELS)
 def test_scores_are_those_of_scikit_learn(pairs: list[tuple[int, int]]) -> None:
     scores = scored([true for true, _ in pairs], [predicted for _, predicted in pairs])
     with_class = [(true, predicted) for true, predicted in pairs if true]
     if not with_class:
-        assert math.isnan(scores.overall.miou)
+        assert math.isnan(scores.figures["miou"])
         return
     truth, predicted = zip(*with_class, strict=True)
     seen = sorted({label for pair in with_class for label in pair if label})
     there = sorted(set(truth))
     iou = jaccard_score(truth, predicted, labels=seen, average="macro", zero_division=0)
     present = jaccard_score(truth, predicted, labels=there, average="macro", zero_division=0)
-    assert scores.overall.miou == pytest.approx(iou)
-    assert scores.overall.miou_present == pytest.approx(present)
-    assert scores.overall.macc == pytest.approx(recall_score(truth, predicted, labels=there, average="macro"))
-    assert scores.overall.accuracy == pytest.approx(accuracy_score(truth, predicted))
+    assert scores.figures["miou"] == pytest.approx(iou)
+    assert scores.figures["miou_present"] == pytest.approx(present)
+    assert scores.figures["macc"] == pytest.approx(recall_score(truth, predicted, labels=there, average="macro"))
+    assert scores.figures["accuracy"] == pytest.approx(accuracy_score(truth, predicted))
 
 
+@settings(max_examples=25)
 @given(LABELS, st.integers(0, 100))
 def test_scenes_scored_together_are_one_long_scene_in_any_order(pairs: list[tuple[int, int]], cut: int) -> None:
     truth, predicted = ([pair[side] for pair in pairs] for side in (0, 1))
@@ -94,10 +95,25 @@ def test_scenes_scored_together_are_one_long_scene_in_any_order(pairs: list[tupl
     whole = scored(truth, predicted)
     for scenes in (parts, parts[::-1]):
         together = semantic_scores(scenes, CLASSES)
-        assert together.overall.miou == pytest.approx(whole.overall.miou, nan_ok=True)
-        assert together.foreground.macc == pytest.approx(whole.foreground.macc, nan_ok=True)
+        assert together.figures["miou"] == pytest.approx(whole.figures["miou"], nan_ok=True)
+        assert together.figures["f_macc"] == pytest.approx(whole.figures["f_macc"], nan_ok=True)
 
 
 def test_numbers_of_vertices_that_differ_are_refused() -> None:
     with pytest.raises(InputError, match="a: the prediction has 1 labels, and the truth 2"):
         counts([BED, BED], [BED])
+
+
+def test_the_ceiling_is_of_the_background_and_no_class_is_of_none() -> None:
+    classes = ClassTable(names=("ceiling", "bed", "floor", "lamp"), ids=(22, 4, 2, 9))
+    truth, labels = np.array([22, 4, 4, 2, 9]), np.array([22, 4, 22, 2, 77])
+    scores = semantic_scores([count_labels("s", truth, labels, classes)], classes)
+    assert scores.figures["f_miou"] == pytest.approx((1 / 2 + 0) / 2)
+    assert {name: (each["truths"], each["predictions"]) for name, each in scores.classes.items()} == {
+        "ceiling": (1, 2),
+        "bed": (2, 1),
+        "floor": (1, 1),
+        "lamp": (1, 0),
+    }
+    # A class that is there and never predicted counts among those in truth.
+    assert scores.figures["miou_present"] == pytest.approx((1 / 2 + 1 / 2 + 1 + 0) / 4)

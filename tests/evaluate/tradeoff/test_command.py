@@ -9,14 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from PIL import Image
 
 from gsencoder.app import main as cli
 from gsencoder.core.process import Growth
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.evaluate.tradeoff.plots import Label, label_points
 from gsencoder.text.table import make_text_table, save_text_table
 
 pytestmark = pytest.mark.slow
@@ -130,22 +127,3 @@ def test_a_stage_that_asks_for_words_needs_objects_that_have_names(
     words = words_of(scene, "stages=localization", "asked.min_pixels=100000", "quiet=true")
     assert cli.main([*words, f"out={tmp_path / 'out'}"]) == 2
     assert "scene room has no object to localize" in capsys.readouterr().err
-
-
-def drawn(labels: list[Label]) -> tuple[list[str], int]:
-    """The labels that have room on a panel, and how many of them touch."""
-    figure = Figure(figsize=(4, 3))
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    axes.scatter(*zip((0, 0), (1, 1), *(point for _, point in labels), strict=True))
-    canvas.draw()
-    notes = label_points(axes, labels)
-    boxes = [note.get_window_extent() for note in notes]
-    return [note.get_text() for note in notes], sum(box.count_overlaps(boxes) - 1 for box in boxes)
-
-
-def test_labels_never_cover_each_other_and_those_without_room_are_left_out() -> None:
-    for step in (0.0, 0.02):
-        labels = [(f"0.{number}, coverage", (0.4 + step * number, 0.4 + step * number)) for number in range(3)]
-        assert drawn(labels) == ([text for text, _ in labels], 0)
-    assert drawn([("same", (0.5, 0.5))] * 6) == (["same"] * 4, 0)

@@ -27,17 +27,6 @@ def test_the_interval_is_that_of_linear_regression() -> None:
     assert (fit.value, fit.low, fit.high) == pytest.approx((oracle.slope, oracle.slope - half, oracle.slope + half))
 
 
-def test_intervals_hold_the_true_exponent_in_95_of_100_fits() -> None:
-    generator = np.random.default_rng(0)
-    trials, inside = 500, 0
-    sizes = np.tile(np.geomspace(1, 8, 4), 2)
-    for _ in range(trials):
-        fit = fit_exponent(sizes, 5 * sizes**1.2 * np.exp(0.2 * generator.normal(size=len(sizes))))
-        inside += fit.low <= 1.2 <= fit.high
-    # Three standard deviations of a binomial.
-    assert abs(inside / trials - 0.95) < 3 * np.sqrt(0.95 * 0.05 / trials)
-
-
 def test_scenes_of_other_speeds_have_constants_of_their_own() -> None:
     sizes = np.array([1.0, 2.0, 4.0, 10.0, 20.0, 40.0])
     costs = np.array([1.0] * 3 + [100.0] * 3) * sizes

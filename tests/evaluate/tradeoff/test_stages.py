@@ -11,7 +11,7 @@ from gsencoder.data.photographs import Photographs
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.evaluate.tradeoff.stages import Inputs, ReconstructionSettings, reconstruction_stage
+from gsencoder.evaluate.tradeoff.stages import Inputs, ReconstructionSettings, make_stage
 from gsencoder.reconstruct.optimize import OptimizeConfig
 
 pytestmark = pytest.mark.slow
@@ -28,7 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def base() -> ReconstructionSettings:
-    settings = reconstruction_stage(INPUTS).base
+    settings = make_stage("reconstruction", INPUTS).base
     quick = OptimizeConfig(steps=8, sh_degree=1, exposure=False)
     return replace(settings, reconstruct=replace(settings.reconstruct, optimize=quick, holdout=2))
 
@@ -37,7 +37,7 @@ def test_scores_are_those_of_the_reconstruction_itself_in_the_size_that_is_judge
     folder: Path, base: ReconstructionSettings
 ) -> None:
     assert base.data == INPUTS.data
-    with reconstruction_stage(INPUTS).open(folder) as (run, judge):
+    with make_stage("reconstruction", INPUTS).open(folder) as (run, judge):
         product = run(base)
         scores, size = judge(product, base)
         assert scores["psnr"].total == pytest.approx(product.log[-1]["psnr"], abs=1e-3)
@@ -61,7 +61,7 @@ def test_photographs_that_are_fitted_smaller_are_judged_in_the_size_of_all_setti
         sizes.append((int(self.cameras.widths[view]), int(self.cameras.heights[view])))
         return at_scale(self, view, shrink)
 
-    with reconstruction_stage(INPUTS).open(folder) as (run, judge):
+    with make_stage("reconstruction", INPUTS).open(folder) as (run, judge):
         product = run(half)
         monkeypatch.setattr(Photographs, "at_scale", seen)
         scores, _ = judge(product, half)
@@ -72,7 +72,7 @@ def test_photographs_that_are_fitted_smaller_are_judged_in_the_size_of_all_setti
 
 def test_a_scene_of_which_nothing_is_held_out_is_refused(folder: Path, base: ReconstructionSettings) -> None:
     none = replace(base, reconstruct=replace(base.reconstruct, holdout=0))
-    with reconstruction_stage(INPUTS).open(folder) as (run, judge):
+    with make_stage("reconstruction", INPUTS).open(folder) as (run, judge):
         product = run(none)
         with pytest.raises(InputError, match="room: no photograph was held out"):
             judge(product, none)

@@ -1,7 +1,6 @@
 """Sweeps: what is run in which order, what an interrupted one does again, what goes on, and what results say."""
 
 import errno
-import itertools
 import os
 from collections import Counter
 from contextlib import nullcontext
@@ -230,7 +229,7 @@ points = st.integers(1, 12).flatmap(
 
 
 @given(points)
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=40)
 def test_a_rank_is_the_longest_chain_of_points_that_dominate_each_other(given: list[tuple[int, int]]) -> None:
     costs = np.array(given, np.float64)
     ranks = non_dominated_ranks(costs)
@@ -250,12 +249,6 @@ def test_a_rank_is_the_longest_chain_of_points_that_dominate_each_other(given: l
 def test_what_was_not_measured_is_worse_than_anything_that_was() -> None:
     assert non_dominated_ranks(np.array([(1.0, np.nan), (1.0, 5.0)])).tolist() == [1, 0]
     assert non_dominated_ranks(np.array([(0.5, np.nan), (1.0, 5.0)])).tolist() == [0, 0]
-
-
-@pytest.mark.parametrize("columns", [1, 3])
-def test_of_all_corners_of_a_cube_the_origin_alone_is_on_the_front(columns: int) -> None:
-    corners = list(itertools.product((0, 1), repeat=columns))
-    assert non_dominated_ranks(np.array(corners, np.float64)).tolist() == [sum(corner) for corner in corners]
 
 
 def test_the_ends_of_a_front_stand_alone_and_a_crowd_does_not() -> None:
@@ -341,18 +334,6 @@ def test_a_score_counts_things_and_its_error_is_that_of_scenes() -> None:
     assert np.isnan(estimate([Score(0, 0)])[0])
     # A scene without things changes nothing but the number of scenes.
     assert estimate([Score(3, 4), Score(1, 4), Score(0, 0)])[0] == 0.5
-
-
-def test_standard_errors_hold_the_truth_as_often_as_they_say() -> None:
-    generator = np.random.default_rng(0)
-    inside = 0
-    for _ in range(500):
-        chance = generator.beta(8, 2, size=40)
-        things = generator.integers(4, 15, size=40)
-        hits = generator.binomial(things, chance)
-        value, error, _ = estimate([Score(float(h), float(n)) for h, n in zip(hits, things, strict=True)])
-        inside += abs(value - 0.8) <= 1.96 * error
-    assert 0.91 < inside / 500 < 0.98
 
 
 def test_a_difference_of_scores_has_the_error_of_differences_of_scenes() -> None:
