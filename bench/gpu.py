@@ -32,7 +32,7 @@ from machine import machine_of_now, version_of  # noqa: E402
 from radios import small_radio  # noqa: E402
 from splats import front_camera, random_gaussians  # noqa: E402
 
-from gsencoder.core.device import autocast_dtype, choose_device  # noqa: E402
+from gsencoder.core.device import autocast_dtype, choose_device, to_device  # noqa: E402
 from gsencoder.fusion.fuse import fuse  # noqa: E402
 from gsencoder.memory.attention import MemoryAttention, random_projection  # noqa: E402
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder, encoder_inputs  # noqa: E402
@@ -306,7 +306,7 @@ def encoder_cost(setting: Setting) -> Iterator[Row]:
         plan = network.join([cloud])
         tokens = len(cloud.counts)
         yield {"what": "plan", "tokens": tokens, "precision": "", "seconds": time.perf_counter() - start}
-        inputs = (attributes.to(setting.device), opacities.to(setting.device), plan.to(setting.device))
+        inputs = (attributes.to(setting.device), opacities.to(setting.device), to_device(plan, setting.device))
         optimizer = torch.optim.AdamW(network.parameters(), lr=1e-4)
         best: dict[tuple[str, str], Row] = {}
         for _ in range(2 if setting.small else 4):

@@ -14,6 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,15 +24,21 @@ from gsencoder.app.commands.fuse import FuseCommandConfig
 from gsencoder.app.compose import compose
 from gsencoder.data.scenes import load_scene
 from gsencoder.evaluate.sources import RenderedTally
+from gsencoder.memory.attention import make_decoder
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import Blend, blend
 from gsencoder.teachers.build import build_teacher, words_of
+from gsencoder.train.loop import Trainer
 from gsencoder.train.memory import (
     MemoryConfig,
+    MemoryNetwork,
+    MemoryObjective,
     MemoryScene,
+    ViewSamples,
+    first_queries,
+    join_views,
     memory_training,
     prepare_memory,
-    train_decoder,
     train_memory,
     untrained_memory,
 )
@@ -122,8 +129,29 @@ def memory_row(case: Case, config: MemoryConfig, *, optimize: bool = True) -> tu
 
 def decoder_row(case: Case, kind: str, config: MemoryConfig) -> tuple[str, float]:
     start = time.perf_counter()
+    prepared, training = case.scene.prepared, memory_training()
+    first, _ = first_queries(case.scene, config, training.seed)
+    # A linear decoder begins as the least squares from the first queries to the fused features.
+    seen = np.flatnonzero(prepared.weights)
+    targets, chosen = prepared.targets(seen), first[seen].astype(np.float64)
+    weights = np.linalg.lstsq(chosen.T @ chosen, chosen.T @ targets, rcond=None)[0].astype(np.float32)
+    start_decoder = make_decoder(
+        kind,  # type: ignore[arg-type]
+        torch.from_numpy(weights),
+        generator=torch.Generator().manual_seed(training.seed),
+    )
+    network = MemoryNetwork({"": torch.from_numpy(first)}, {"": start_decoder})
     with tempfile.TemporaryDirectory() as work:
-        network = train_decoder(case.scene, kind, config, memory_training(), work=Path(work))  # type: ignore[arg-type]
+        Trainer(
+            network,
+            ViewSamples({"": case.scene}, config, training.seed),
+            partial(MemoryObjective, teachers=[""]),
+            training,
+            collate=join_views,
+            folder=Path(work),
+            settings={},
+            weight_decay=0.0,
+        ).run()
     seconds = time.perf_counter() - start
     queries, decoder = network.queries[0].detach(), network.decoders[0]
 

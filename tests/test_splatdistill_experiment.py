@@ -40,7 +40,7 @@ def test_it_is_the_paper_where_the_paper_says_something() -> None:
     assert config.model.transformer.encoder_channels == (32, 64, 128, 256, 512)
     assert (fusion.lift, fusion.visibility.against, fusion.basis) == ("center", ("rendered",), False)
     assert (config.prepare.center, config.prepare.scale) == (False, False)
-    assert (config.sampling.scope, config.sampling.gaussians) == ("frusta", 0)
+    assert config.sampling.gaussians == 0
     plain = LossConfig(confidence=False, rarity=0.0, divide_by_alpha=False, min_alpha=1e-6, min_kept=1e-6)
     assert config.loss == plain
     assert (plain.cosine, plain.smooth_l1, plain.field_weight, plain.render_weight) == (0.9, 0.1, 1.0, 0.2)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
 
@@ -65,3 +66,15 @@ def enough_memory(subject: str, remedy: str) -> Iterator[None]:
         raise InputError(
             f"{subject}: the GPU has not enough memory; lower {remedy} or give teacher.device=cpu"
         ) from error
+
+
+def to_device(value: Any, device: torch.device) -> Any:
+    """The tensors of a batch, in tuples and mappings however nested, on a device; what is no tensor stays."""
+    if isinstance(value, torch.Tensor):
+        return value.to(device, non_blocking=True)
+    if isinstance(value, dict):
+        return {name: to_device(each, device) for name, each in value.items()}
+    if isinstance(value, tuple):
+        parts = [to_device(each, device) for each in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else tuple(parts)
+    return value

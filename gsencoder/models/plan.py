@@ -6,7 +6,7 @@ Morton order, so that tokens that are close in space are mostly close in memory.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int32, Int64, Integer
@@ -94,29 +94,6 @@ class Plan(NamedTuple):
     counts: Int64[Tensor, " T"]
     levels: tuple[Level, ...]
     stem_neighbors: Integer[Tensor, "T 125"] | None = None
-
-    def to(self, device: str | torch.device) -> "Plan":
-        """The plan with all its tensors on another device."""
-
-        def move(value: Tensor | tuple[Tensor, ...]) -> Any:
-            if isinstance(value, tuple):
-                return tuple(map(move, value))
-            return value.to(device, non_blocking=True)
-
-        levels = tuple(
-            level._replace(
-                neighbors=move(level.neighbors),
-                gather_index=move(level.gather_index),
-                scatter_index=move(level.scatter_index),
-                attn_mask=move(level.attn_mask) if level.attn_mask is not None else None,
-                parents=move(level.parents),
-                children=move(level.children),
-            )
-            for level in self.levels
-        )
-        token_of, members, counts = map(move, (self.token_of, self.members, self.counts))
-        stem = move(self.stem_neighbors) if self.stem_neighbors is not None else None
-        return self._replace(token_of=token_of, members=members, counts=counts, levels=levels, stem_neighbors=stem)
 
 
 class CloudLevel(NamedTuple):

@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Bool, Float, Int64, Integer
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.utils.checkpoint import checkpoint
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.settings import check_limits, option
@@ -25,6 +24,8 @@ from gsencoder.models.neighbors import NeighborConv
 from gsencoder.models.plan import ORDERS, Level, Plan
 from gsencoder.types import SH_C0
 
+MLP_RATIO = 4
+"""Hidden channels of a block's MLP, as a multiple of its channels."""
 MASKED_SCORE = -3e4
 """Added to attention scores of masked slots in an exported graph; finite in half precision."""
 
@@ -106,9 +107,9 @@ class Block(nn.Module):
     The conditional position encoding is a 3³ sparse convolution, a linear layer and a norm.
     """
 
-    def __init__(self, channels: int, heads: int, *, mlp_ratio: float, drop_path: float) -> None:
+    def __init__(self, channels: int, heads: int, *, drop_path: float) -> None:
         super().__init__()
-        hidden = int(channels * mlp_ratio)
+        hidden = MLP_RATIO * channels
         self.position = NeighborConv(channels, channels)
         self.mix = nn.Linear(channels, channels)
         self.norm_position = nn.LayerNorm(channels)
@@ -168,7 +169,7 @@ class Unpool(nn.Module):
         return functional.gelu(self.norm_skip(self.project_skip(skip))) + from_parents.index_select(0, parents)
 
 
-MAX_CHANNELS, MAX_BLOCKS, MAX_MLP_RATIO = 1 << 14, 1000, 64
+MAX_CHANNELS, MAX_BLOCKS = 1 << 14, 1000
 """Limits beyond any network that was ever trained on points; larger sizes are typing errors, or damaged files that
 would fill the memory."""
 
@@ -201,13 +202,9 @@ class TransformerConfig:
         "in training, permute the orders at random: once for all levels, or again at each pooling, as PTv3 "
         "does; outside training they are never permuted",
     )
-    mlp_ratio: float = option(
-        4.0, "hidden channels of a block's MLP, as a multiple of its channels", gt=0, le=MAX_MLP_RATIO
-    )
     drop_path: float = option(
         0.1, "rate of stochastic depth in training, reached at the last encoder block", ge=0, lt=1
     )
-    checkpoint: bool = option(False, "recompute activations of blocks in the backward pass to save memory")
 
     def __post_init__(self) -> None:
         check_limits(self)
@@ -318,23 +315,14 @@ class PointTransformer(nn.Module):
         for number, block in enumerate(blocks, start=first_block):
             order = permutation[number % len(permutation)]
             mask = level.attn_mask[order] if level.attn_mask is not None else None
-            level_inputs = (
-                level.neighbors,
-                level.gather_index[order],
-                level.scatter_index[order],
-                mask,
-                level.patch_width,
-            )
-            if self.config.checkpoint and self.training:
-                x = checkpoint(block, x, *level_inputs, use_reentrant=False)
-            else:
-                x = block(x, *level_inputs)
+            gather, scatter = level.gather_index[order], level.scatter_index[order]
+            x = block(x, level.neighbors, gather, scatter, mask, level.patch_width)
         return x
 
 
 def _make_blocks(config: TransformerConfig, channels: int, rates: list[float]) -> nn.ModuleList:
     heads = channels // config.head_channels
-    return nn.ModuleList(Block(channels, heads, mlp_ratio=config.mlp_ratio, drop_path=rate) for rate in rates)
+    return nn.ModuleList(Block(channels, heads, drop_path=rate) for rate in rates)
 
 
 Attribute = Literal["offset", "color", "opacity", "scale", "rotation"]

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -20,10 +21,10 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset
 
 from gsencoder.core.archive import open_archive, write_archive
-from gsencoder.core.device import autocast_dtype
+from gsencoder.core.device import autocast_dtype, to_device
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files import plain
 from gsencoder.core.logs import Log
@@ -91,16 +92,6 @@ class TrainerConfig:
 
 
 @runtime_checkable
-class TrainingBatch(Protocol):
-    """A batch of samples; `names` are those of the samples, for messages."""
-
-    @property
-    def names(self) -> Sequence[str]: ...
-
-    def to(self, device: torch.device) -> "TrainingBatch": ...
-
-
-@runtime_checkable
 class Objective(Protocol):
     """The loss of a network as weighted terms. In a step each term is Σ total / Σ divisor, summed over all
     micro-batches of all processes.
@@ -128,13 +119,33 @@ class Objective(Protocol):
         ...
 
 
+class ErrorsAsValues(Dataset[Any]):
+    """A dataset that gives the error of a sample as a value: raised in a data worker it would arrive as a long
+    traceback."""
+
+    def __init__(self, dataset: Dataset[Any]) -> None:
+        self.dataset = dataset
+
+    def __getitem__(self, number: int) -> Any:
+        try:
+            return self.dataset[number]
+        except InputError as error:
+            return error
+
+
+def join_unless_error(samples: Sequence[Any], collate: Callable[[Any], Any]) -> Any:
+    """The batch of some samples, or the first error among them."""
+    errors = [each for each in samples if isinstance(each, InputError)]
+    return errors[0] if errors else collate(samples)
+
+
 NO_WEIGHT = 1e-12
 """Divisor of a term that nothing in a step has a weight for."""
 
 
 def sum_divisors(
-    objective: Objective, items: Sequence[TrainingBatch | InputError], device: torch.device
-) -> tuple[list[TrainingBatch], dict[str, float]]:
+    objective: Objective, items: Sequence[Any], device: torch.device
+) -> tuple[list[Any], dict[str, float]]:
     """The micro-batches of a step on this process, and the divisor of each term over all processes.
 
     Raises:
@@ -159,13 +170,13 @@ def sum_divisors(
     return batches, {name: max(total, NO_WEIGHT) for name, total in zip(lambdas, totals, strict=False)}
 
 
-def _names_of(batches: Sequence[TrainingBatch]) -> str:
+def _names_of(batches: Sequence[Any]) -> str:
     return "; ".join(name for batch in batches for name in batch.names)
 
 
 def finite_terms(
     step: int,
-    batches: Sequence[TrainingBatch],
+    batches: Sequence[Any],
     names: Sequence[str],
     micro_terms: Float64[Tensor, "micro terms"],
     norm: float,
@@ -372,25 +383,14 @@ def lost_workers() -> Iterator[None]:
         ) from error
 
 
-class StepSampler(Sampler[list[int]]):
-    """The sample numbers of each micro-batch of this process, in order of steps.
+def micro_batches(first: int, last: int, *, batch: int, accumulate: int, rank: int, world: int) -> list[list[int]]:
+    """The numbers of the samples of each micro-batch of a process, in order of steps.
 
     Step s of a run takes samples s·n to (s + 1)·n − 1, where n = batch · accumulate · world. Each micro-batch of each
     process takes `batch` consecutive ones of them.
     """
-
-    def __init__(self, first: int, last: int, *, batch: int, accumulate: int, rank: int, world: int) -> None:
-        self.steps = range(first, last)
-        self.batch, self.accumulate, self.rank, self.world = batch, accumulate, rank, world
-
-    def __len__(self) -> int:
-        return len(self.steps) * self.accumulate
-
-    def __iter__(self) -> Iterator[list[int]]:
-        for step in self.steps:
-            for micro in range(self.accumulate):
-                start = ((step * self.accumulate + micro) * self.world + self.rank) * self.batch
-                yield list(range(start, start + self.batch))
+    starts = [(number * world + rank) * batch for number in range(first * accumulate, last * accumulate)]
+    return [list(range(start, start + batch)) for start in starts]
 
 
 class ValidationResult(NamedTuple):
@@ -410,7 +410,7 @@ class Trainer:
         objective: Callable[[nn.Module], Objective],
         config: TrainerConfig,
         *,
-        collate: Callable[[Any], TrainingBatch | InputError],
+        collate: Callable[[Any], Any],
         folder: Path,
         settings: Mapping[str, Any],
         process: ProcessRank = ProcessRank(),
@@ -424,9 +424,10 @@ class Trainer:
 
         Args:
             network: trained in place and moved to `device`.
-            dataset: the training samples, by number; an error of a sample is a value.
+            dataset: the training samples, by number.
             objective: gives the loss of the network once it is wrapped for several processes.
-            collate: joins samples to a batch, or returns the error of one of them.
+            collate: joins samples to a batch: tuples and mappings of tensors, with the `names` of the samples for
+                messages.
             folder: existing folder for checkpoint and log.
             settings: what a run must share with the one that it resumes besides `config`, as JSON values.
             weight_decay: of matrices; norms and biases have none.
@@ -520,19 +521,14 @@ class Trainer:
         """The remaining steps, each with the micro-batches of this process, or the errors of their samples."""
         config, process, first = self.config, self.process, self.state.step
         workers = automatic_workers(self.device, process) if config.workers is None else config.workers
-        sampler = StepSampler(
-            first,
-            config.steps,
-            batch=config.batch,
-            accumulate=config.accumulate,
-            rank=process.rank,
-            world=process.world_size,
-        )
+        batch, accumulate, rank, world = config.batch, config.accumulate, process.rank, process.world_size
         # Workers are spawned: a forked child would inherit the state of threads that do not exist in it.
         loader: DataLoader[Any] = DataLoader(
-            self.dataset,
-            batch_sampler=sampler,
-            collate_fn=self._collate,
+            ErrorsAsValues(self.dataset),
+            batch_sampler=micro_batches(
+                first, config.steps, batch=batch, accumulate=accumulate, rank=rank, world=world
+            ),
+            collate_fn=partial(join_unless_error, collate=self._collate),
             num_workers=workers,
             multiprocessing_context="spawn" if workers else None,
             worker_init_fn=start_worker if workers else None,
@@ -541,7 +537,7 @@ class Trainer:
         batches, threads = iter(loader), torch.get_num_threads()
         for step in track(range(first, config.steps), "training"):
             with threads_of_torch(threads if workers else min(SAMPLE_THREADS, threads)):
-                items = [next(batches) for _ in range(config.accumulate)]
+                items = [next(batches) for _ in range(accumulate)]
             yield step, items
 
     def _gradients(self, step: int, items: list[Any]) -> dict[str, float]:
@@ -559,7 +555,7 @@ class Trainer:
             if self._parallel is not None:
                 self._parallel.require_backward_grad_sync = micro + 1 == len(batches)
             with torch.autocast(self.device.type, self._autocast, enabled=self._autocast is not None):
-                terms = self.objective(batch.to(self.device))
+                terms = self.objective(to_device(batch, self.device))
             shares = torch.stack([terms[name] / divisors[name] for name in lambdas])
             loss = (shares * shares.new_tensor(list(lambdas.values()))).sum()
             # DistributedDataParallel averages gradients over processes; the step needs their sum.

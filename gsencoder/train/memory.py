@@ -1,6 +1,6 @@
 """Training of a scene's memory (M3 sec. 3.3): principal queries of Gaussians, rendered through B, attend to banks.
 
-    R̂ = A_gm(B q / alpha),   L = λ_cos · (1 − cos(R̂, R)) + λ_L2 · |R̂ − R|² / C
+    R̂ = A_gm(B q / alpha),   L = (1 − cos(R̂, R)) + |R̂ − R|² / C
 
 over rows of B that are drawn at random in each view, and Gaussians, which are rows with one entry, with a weight of
 their own; in standard units about the mean of the space. With the geometry frozen this is a regression on sparse rows,
@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -36,7 +36,7 @@ from gsencoder.data.splats.files import fingerprint
 from gsencoder.fusion.basis import to_coordinates
 from gsencoder.fusion.checkpoint import CachedTeacher, upright
 from gsencoder.fusion.fuse import fuse
-from gsencoder.memory.attention import Decoder, MemoryAttention, make_decoder, random_projection
+from gsencoder.memory.attention import MemoryAttention, random_projection
 from gsencoder.memory.bank import BankConfig, MapStream, RawSample, build_bank, draw_sample, principal_queries
 from gsencoder.models.output_space import OutputSpace, output_space_parts, read_output_space
 from gsencoder.teachers.base import Teacher
@@ -50,7 +50,6 @@ from gsencoder.types.features import Scoring
 
 BANK_FILE, SCENE_FILE, MAPS_FOLDER = "bank.safetensors", "scene.safetensors", "maps"
 SAMPLE_FILE, SETTINGS_FILE = "sample.safetensors", "made_with.json"
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,42 +120,32 @@ def prepare_memory(
             f"memory: the predicted features are of ({predicted.space.describe()}), and the teacher's of "
             f"({teacher.space.describe()})"
         )
-    settings = _preparation_settings(scene, teacher, bank, prepare, predicted)
+    assert scene.views is not None
+    _begin(folder, _preparation_settings(scene, teacher, bank, prepare, predicted))
     stream = _map_stream(scene, teacher, folder)
     if (folder / BANK_FILE).is_file():
-        prepared = open_memory_scene(folder, settings)
+        prepared = open_memory_scene(folder)
         _sample_raw(folder, stream, prepared.outputs.space, sample)
         return prepared
-    _begin(folder, settings)
     maps = folder / MAPS_FOLDER
     work = None if teacher.cheap else maps
     features = predicted or fuse(scene, teacher, prepare.fusion, work=work, device=device, track=track).features
     outputs = OutputSpace(space=features.space, mean=features.mean, scale=_spread(features), basis=features.basis)
-    source = _source(teacher, folder)
     maps.mkdir(exist_ok=True)
     components = build_bank(stream, features.space, features.mean, bank)
-    assert scene.views is not None
-    rows = view_rows(scene, source, outputs, prepare, np.arange(len(scene.views)), device)
+    rows = view_rows(scene, _source(teacher, folder), outputs, prepare, np.arange(len(scene.views)), device)
     _sample_raw(folder, stream, features.space, sample)
     write_prepared(folder / SCENE_FILE, scene, features, outputs, rows)
     arrays, header = output_space_parts(outputs)
     of_bank, figures = bank_parts(components)
     arrays |= {"bank": components.components, **of_bank}
-    write_archive(folder / BANK_FILE, arrays, {**header, **figures, "made_with": settings})
-    return open_memory_scene(folder, settings)
+    write_archive(folder / BANK_FILE, arrays, {**header, **figures})
+    return open_memory_scene(folder)
 
 
-def open_memory_scene(folder: Path, settings: Mapping[str, Any] | None = None) -> MemoryScene:
-    """Opens a prepared scene.
-
-    Args:
-        folder: of `prepare_memory`.
-        settings: what the preparation depends on; None = anything.
-    """
+def open_memory_scene(folder: Path) -> MemoryScene:
+    """Opens what `prepare_memory` has prepared in a folder."""
     with _advice(folder), open_archive(folder / BANK_FILE) as file:
-        stored = file.value("made_with", dict)
-        if settings is not None and stored != settings:
-            raise InputError(f"was prepared with {first_difference(stored, dict(settings))}")
         outputs = read_output_space(file)
         bank = read_bank(file, file.array("bank", "float32", ("M", outputs.space.channels)), outputs.space)
     return MemoryScene(prepared=PreparedScene(folder / SCENE_FILE), outputs=outputs, bank=bank)
@@ -167,8 +156,7 @@ def _advice(folder: Path) -> AbstractContextManager[None]:
 
 
 def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Writes what a preparation depends on before its first map and its sample, which do not say so themselves, or
-    compares it with what an interrupted one wrote."""
+    """Writes what a preparation depends on before its first file, or compares it with what an earlier one wrote."""
     path = folder / SETTINGS_FILE
     with _advice(folder):
         if not path.is_file():
@@ -180,7 +168,7 @@ def _begin(folder: Path, settings: Mapping[str, Any]) -> None:
         except (OSError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: cannot be read ({type(error).__name__})") from error
         if stored != settings:
-            raise InputError(f"{folder}: was begun with {first_difference(stored, settings)}")
+            raise InputError(f"{folder}: was prepared with {first_difference(stored, dict(settings))}")
 
 
 def open_raw_sample(folder: Path) -> RawSample:
@@ -190,16 +178,11 @@ def open_raw_sample(folder: Path) -> RawSample:
 
 
 def _sample_raw(folder: Path, stream: MapStream, space: FeatureSpace, count: int) -> None:
-    """Stores a sample of raw features, unless there is one of this number already."""
+    """Stores a sample of raw features, unless there is one."""
     path = folder / SAMPLE_FILE
-    if not count:
-        return
-    if path.is_file():
-        with open_archive(path) as file:
-            if file.value("limit", int) == count:
-                return
-    sample = draw_sample(stream, space, count)
-    write_archive(path, {"features": sample.features}, {"total": sample.total, "limit": count})
+    if count and not path.is_file():
+        sample = draw_sample(stream, space, count)
+        write_archive(path, {"features": sample.features}, {"total": sample.total})
 
 
 def _source(teacher: Teacher, folder: Path) -> Teacher:
@@ -248,6 +231,10 @@ def _spread(features: GaussianFeatures) -> float:
     return float(np.sqrt(total / len(seen))) or 1.0
 
 
+ROWS = 2000
+"""Rows of B that are drawn in each view of a step."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MemoryConfig:
     """Queries, attention and loss of a memory."""
@@ -264,21 +251,16 @@ class MemoryConfig:
         "code does; dot = by products, as its equation",
     )
     temperature: float = option(0.05, "temperature of the attention's softmax", gt=0)
-    points: int = option(2000, "rows of B that are drawn in each view of a step", ge=1)
     gaussian_weight: float = option(
         0.3,
-        "weight of Gaussians that are compared with their fused features, half as many as points; without "
+        "weight of Gaussians that are compared with their fused features, half as many as rows of B; without "
         "them rendered features come nearer to the teacher's, and those of the Gaussians go their own way; 0 = off",
         ge=0,
     )
     min_alpha: float = option(0.5, "smallest opacity of a row", gt=0, le=1)
-    cosine: float = option(1.0, "weight of 1 − cosine", ge=0)
-    l2: float = option(1.0, "weight of the squared distance in standard units", ge=0)
 
     def __post_init__(self) -> None:
         check_limits(self)
-        if not self.cosine + self.l2 > 0:
-            raise InputError("cosine, l2: expected one above 0; there would be no loss")
 
 
 class MemoryBatch(NamedTuple):
@@ -286,11 +268,6 @@ class MemoryBatch(NamedTuple):
 
     names: tuple[str, ...]
     rows: tuple[RenderRows, ...]
-
-    def to(self, device: torch.device) -> "MemoryBatch":
-        """The batch with its tensors on a device."""
-        rows = tuple(RenderRows(*(part.to(device, non_blocking=True) for part in each)) for each in self.rows)
-        return MemoryBatch(names=self.names, rows=rows)
 
 
 class ViewSamples(Dataset[MemoryBatch]):
@@ -301,24 +278,20 @@ class ViewSamples(Dataset[MemoryBatch]):
         self._config, self._seed = config, seed
         self._views = next(iter(self._scenes.values())).view_names
 
-    def __getitem__(self, number: int) -> MemoryBatch | InputError:  # type: ignore[override]
-        """Sample `number`, or its error as a value."""
+    def __getitem__(self, number: int) -> MemoryBatch:
         epoch, position = divmod(number, len(self._views))
         view = int(np.random.default_rng([self._seed, 0, epoch]).permutation(len(self._views))[position])
-        try:
-            rows = tuple(self._rows(scene, view, number) for scene in self._scenes.values())
-        except InputError as error:
-            return error
+        rows = tuple(self._rows(scene, view, number) for scene in self._scenes.values())
         return MemoryBatch(names=(self._views[view],), rows=rows)
 
     def _rows(self, scene: PreparedScene, view: int, number: int) -> RenderRows:
         config, rng = self._config, np.random.default_rng([self._seed, 1, number])
         seen = scene.weights > 0
-        rows = sample_rows(scene.view(view), seen, config.min_alpha, config.points, rng)
+        rows = sample_rows(scene.view(view), seen, config.min_alpha, ROWS, rng)
         if not config.gaussian_weight:
             return rows
         of_seen = np.flatnonzero(seen)
-        chosen = np.sort(rng.choice(of_seen, min(len(of_seen), -(-config.points // 2)), replace=False))
+        chosen = np.sort(rng.choice(of_seen, min(len(of_seen), ROWS // 2), replace=False))
         # A Gaussian is a row of B with one entry.
         gaussians = RenderRows(
             crow=torch.arange(len(chosen) + 1),
@@ -330,16 +303,11 @@ class ViewSamples(Dataset[MemoryBatch]):
         return join_rows([rows, gaussians], [0, 0])
 
 
-def join_views(samples: Sequence[MemoryBatch | InputError]) -> MemoryBatch | InputError:
-    """Joins samples to a batch; if one of them is an error, returns the first error instead."""
-    batches = []
-    for sample in samples:
-        if isinstance(sample, InputError):
-            return sample
-        batches.append(sample)
-    shifts = [0] * len(batches)
-    rows = tuple(join_rows(of_teacher, shifts) for of_teacher in zip(*(each.rows for each in batches), strict=True))
-    return MemoryBatch(names=tuple(name for each in batches for name in each.names), rows=rows)
+def join_views(samples: Sequence[MemoryBatch]) -> MemoryBatch:
+    """Joins samples to a batch."""
+    shifts = [0] * len(samples)
+    rows = tuple(join_rows(of_teacher, shifts) for of_teacher in zip(*(each.rows for each in samples), strict=True))
+    return MemoryBatch(names=tuple(name for each in samples for name in each.names), rows=rows)
 
 
 class MemoryNetwork(nn.Module):
@@ -361,40 +329,31 @@ class MemoryNetwork(nn.Module):
 
 
 class MemoryObjective:
-    """The loss of a memory: for each teacher and row w · (λ_cos · (1 − cos) + λ_L2 · |R̂ − R|² / C)."""
+    """The loss of a memory: for each teacher and row w · ((1 − cos) + |R̂ − R|² / C)."""
 
     advice = "memory.min_alpha"
 
-    def __init__(self, network: nn.Module, config: MemoryConfig, teachers: Sequence[str]) -> None:
-        self.network, self._teachers = network, tuple(teachers)
-        self._weights = {name: value for name, value in (("cosine", config.cosine), ("l2", config.l2)) if value}
-
-    def _by_term(self, teacher: str, values: Mapping[str, T]) -> dict[str, T]:
-        """Values of the terms whose weight is not 0, by the names of the terms in the log."""
-        return {term if len(self._teachers) == 1 else f"{teacher}/{term}": values[term] for term in self._weights}
-
-    @property
-    def lambdas(self) -> dict[str, float]:
-        """The weights of the terms that are not 0, by name."""
-        return {name: weight for each in self._teachers for name, weight in self._by_term(each, self._weights).items()}
+    def __init__(self, network: nn.Module, teachers: Sequence[str]) -> None:
+        self.network = network
+        # The terms of each teacher; in the log they have its name where there are several.
+        several = len(teachers) > 1
+        self._terms = [tuple(f"{name}/{term}" if several else term for term in ("cosine", "l2")) for name in teachers]
+        self.lambdas = {term: 1.0 for terms in self._terms for term in terms}
 
     def divisors(self, batch: MemoryBatch) -> dict[str, float]:
         """The sum of the weights of the rows, for each term."""
-        divisors: dict[str, float] = {}
-        for name, rows in zip(self._teachers, batch.rows, strict=True):
-            divisors |= self._by_term(name, dict.fromkeys(self._weights, float(rows.row_weights.double().sum())))
-        return divisors
+        weights = [float(rows.row_weights.double().sum()) for rows in batch.rows]
+        return {term: weight for terms, weight in zip(self._terms, weights, strict=True) for term in terms}
 
     def __call__(self, batch: MemoryBatch) -> dict[str, Tensor]:
         """Totals of the terms whose weight is not 0."""
         totals: dict[str, Tensor] = {}
-        for name, predicted, rows in zip(self._teachers, self.network(batch.rows), batch.rows, strict=True):
+        for (cosine, l2), predicted, rows in zip(self._terms, self.network(batch.rows), batch.rows, strict=True):
             predicted, target = predicted.float(), rows.targets
             products = (predicted * target).sum(dim=1)
             lengths = torch.sqrt(((predicted * predicted).sum(dim=1) + EPS) * ((target * target).sum(dim=1) + EPS))
-            directions = ((1 - products / lengths) * rows.row_weights).sum()
-            distances = ((predicted - target).square().mean(dim=1) * rows.row_weights).sum()
-            totals |= self._by_term(name, {"cosine": directions, "l2": distances})
+            totals[cosine] = ((1 - products / lengths) * rows.row_weights).sum()
+            totals[l2] = ((predicted - target).square().mean(dim=1) * rows.row_weights).sum()
         return totals
 
 
@@ -443,66 +402,31 @@ def train_memory(
         work: existing folder for the checkpoint and the log.
     """
     training = memory_training() if training is None else training
-    network, state = _train(scenes, config, training, None, work, process, device, track)
-    memories = {}
-    for number, (name, scene) in enumerate(scenes.items()):
-        attention = network.decoders[number]
-        assert isinstance(attention, MemoryAttention)
-        queries, projection = (each.detach().cpu().numpy() for each in (network.queries[number], attention.projection))
-        memories[name] = _memory_of(scene, config, queries, projection)
-    return memories, state
-
-
-def train_decoder(
-    scene: MemoryScene,
-    kind: Decoder,
-    config: MemoryConfig,
-    training: TrainerConfig,
-    *,
-    work: Path,
-    track: Track = untracked,
-) -> MemoryNetwork:
-    """The same training with a decoder in place of the attention, to compare with; its outputs are in standard units.
-
-    Args:
-        scene: prepared for one teacher.
-        kind: of the decoder.
-        config: queries and loss; what is said of attention is not used.
-        work: existing folder for the checkpoint and the log.
-    """
-    network, _ = _train({"": scene}, config, training, kind, work, ProcessRank(), torch.device("cpu"), track)
-    return network
-
-
-def _train(
-    scenes: Mapping[str, MemoryScene],
-    config: MemoryConfig,
-    training: TrainerConfig,
-    kind: Decoder | None,
-    work: Path,
-    process: ProcessRank,
-    device: torch.device,
-    track: Track,
-) -> tuple[MemoryNetwork, TrainingState]:
     _check_same_scene(scenes)
     check_rows(scenes, config.min_alpha)
-    queries, decoders = {}, {}
+    first, decoders = dict[str, Tensor](), dict[str, nn.Module]()
     for name, scene in scenes.items():
-        first, projection = first_queries(scene, config, training.seed)
-        queries[name] = torch.from_numpy(first)
-        decoders[name] = _decoder_of(scene, config, kind, first, projection, training.seed)
+        queries, projection = first_queries(scene, config, training.seed)
+        first[name] = torch.from_numpy(queries)
+        decoders[name] = MemoryAttention(
+            scene.bank,
+            torch.from_numpy(projection),
+            mean=scene.outputs.mean,
+            scoring=config.scoring,
+            temperature=config.temperature,
+            values=torch.from_numpy(scene.values),
+        )
     settings = {
         "memory": plain(config),
-        "decoder": kind or "attention",
         "teachers": list(scenes),
         "spaces": {name: scene.bank.space.describe() for name, scene in scenes.items()},
-        "components": {name: len(scene.bank) for name, scene in scenes.items()},
         "digests": {name: fingerprint_of(scene.bank) for name, scene in scenes.items()},
     }
+    network = MemoryNetwork(first, decoders)
     trainer = Trainer(
-        MemoryNetwork(queries, decoders),
+        network,
         ViewSamples(scenes, config, training.seed),
-        partial(MemoryObjective, config=config, teachers=list(scenes)),
+        partial(MemoryObjective, teachers=list(scenes)),
         training,
         collate=join_views,
         folder=work,
@@ -512,8 +436,12 @@ def _train(
         weight_decay=0.0,
     )
     state = trainer.run(track)
-    assert isinstance(trainer.network, MemoryNetwork)
-    return trainer.network, state
+    memories = {}
+    for (name, scene), optimized, attention in zip(scenes.items(), network.queries, network.decoders, strict=True):
+        assert isinstance(attention, MemoryAttention)
+        queries, projection = (each.detach().cpu().numpy() for each in (optimized, attention.projection))
+        memories[name] = _memory_of(scene, config, queries, projection)
+    return memories, state
 
 
 def fingerprint_of(bank: MemoryBank) -> str:
@@ -534,31 +462,6 @@ def check_rows(scenes: Mapping[str, MemoryScene], min_alpha: float) -> None:
                 f"memory.min_alpha: no cell of {len(views)} views of teacher {name} is covered to {min_alpha:g} by "
                 "Gaussians with features; give a smaller one"
             )
-
-
-def _decoder_of(
-    scene: MemoryScene,
-    config: MemoryConfig,
-    kind: Decoder | None,
-    queries: Float32[np.ndarray, "N s"],
-    projection: Float32[np.ndarray, "s D"],
-    seed: int,
-) -> nn.Module:
-    """What turns queries into features in standard units, before the training."""
-    if kind is None:
-        return MemoryAttention(
-            scene.bank,
-            torch.from_numpy(projection),
-            mean=scene.outputs.mean,
-            scoring=config.scoring,
-            temperature=config.temperature,
-            values=torch.from_numpy(scene.values),
-        )
-    # A linear decoder begins as the least squares from the first queries to the fused features.
-    seen = np.flatnonzero(scene.prepared.weights)
-    targets, chosen = scene.prepared.targets(seen), queries[seen].astype(np.float64)
-    weights = np.linalg.lstsq(chosen.T @ chosen, chosen.T @ targets, rcond=None)[0].astype(np.float32)
-    return make_decoder(kind, torch.from_numpy(weights), generator=torch.Generator().manual_seed(seed))
 
 
 def _memory_of(

@@ -8,9 +8,7 @@ A Gaussian of a class with n Gaussians in the dataset is weighted by n^−power.
 import hashlib
 import json
 import shutil
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, advised, listed, readable
-from gsencoder.core.files import atomic_file, locked, read_foreign, read_foreign_text
+from gsencoder.core.files import locked, read_foreign
 from gsencoder.core.process import ProcessRank, Track
 from gsencoder.core.settings import check_limits, first_difference, option
 from gsencoder.fusion.basis import to_coordinates
@@ -261,15 +259,13 @@ def cluster_targets(sample: Float32[np.ndarray, "n channels"], *, seed: int = 0)
     return np.asarray(kmeans.cluster_centers_, dtype=np.float32)
 
 
-SPACE_FILE, DATASET_SETTINGS_FILE, CLASS_BALANCE_FILE = "space.safetensors", "settings.json", "rarity.safetensors"
-MAPS_PREFIX = ".maps."
-"""Prefix of the folders that cache teacher maps of scenes in preparation."""
+SPACE_FILE, CLASS_BALANCE_FILE = "space.safetensors", "rarity.safetensors"
 CLUSTERED_TARGETS = 200_000
 """Approximate number of targets, over all scenes, from which classes of a dense teacher are clustered."""
 
 
 class PreparedDataset:
-    """A folder of prepared scenes that share an output space.
+    """A folder of prepared scenes that share an output space, whose file holds what the preparation depends on.
 
     The file of each scene is written atomically, so that an interrupted preparation can be continued, and several
     processes can share the work.
@@ -277,32 +273,25 @@ class PreparedDataset:
 
     def __init__(self, folder: Path, settings: dict[str, Any] | None = None) -> None:
         """Args:
-        folder: the folder; created if it does not exist and settings are given.
+        folder: the folder, which is created with the space.
         settings: everything that the preparation depends on, compared with the settings stored in the folder. None =
             open an existing dataset with any settings.
         """
-        self.folder, path = folder, folder / DATASET_SETTINGS_FILE
+        self.folder, path = folder, folder / SPACE_FILE
+        self.settings: dict[str, Any] = json.loads(json.dumps(settings, default=str)) if settings is not None else {}
         with advised("give another folder as prepared="):
-            try:
-                if settings is not None:
-                    folder.mkdir(parents=True, exist_ok=True)
-                stored: Any = json.loads(read_foreign_text(path)) if path.is_file() else None
-            except (OSError, ValueError, RecursionError) as error:
-                raise InputError(f"{path}: cannot be used: {error}") from error
-            if path.is_file() and not isinstance(stored, dict):
-                raise InputError(f"{path}: expected settings, got {str(stored)[:40]}")
-            if stored is None and settings is None:
-                raise InputError(f"{folder}: expected prepared scenes, found no {DATASET_SETTINGS_FILE}")
-            if stored is None and any(not entry.name.startswith(".") for entry in folder.iterdir()):
-                raise InputError(f"{folder}: holds something else than prepared scenes (no {DATASET_SETTINGS_FILE})")
-            self.settings: dict[str, Any] = (
-                stored if settings is None else json.loads(json.dumps(settings, default=str))
-            )
-            if stored is not None and stored != self.settings:
+            if not path.is_file():
+                if settings is None:
+                    raise InputError(f"{folder}: expected prepared scenes, found no {SPACE_FILE}")
+                with readable(folder):
+                    if folder.exists() and any(not entry.name.startswith(".") for entry in folder.iterdir()):
+                        raise InputError(f"{folder}: holds something else than prepared scenes (no {SPACE_FILE})")
+                return
+            with open_archive(path) as file:
+                stored = file.value("made_with", dict)
+            if settings is not None and stored != self.settings:
                 raise InputError(f"{folder}: was prepared with {first_difference(stored, self.settings)}")
-        if stored is None:
-            with atomic_file(path) as stream:
-                stream.write(json.dumps(self.settings, indent=1).encode())
+            self.settings = stored
 
     def fingerprint(self) -> str:
         """A hash of the output space, by which a resumed training checks that its targets are the same."""
@@ -345,10 +334,6 @@ class PreparedDataset:
         """The path of a scene's file, which exists once the scene is prepared."""
         return self.folder / "scenes" / f"{name}.safetensors"
 
-    def holds_scenes(self) -> bool:
-        """Whether any scene is prepared."""
-        return any((self.folder / "scenes").glob("*"))
-
     def has_scene(self, source: Path) -> bool:
         """Whether the scene at this path is prepared, from this path or from another one with the same files."""
         path = self.scene_path(source.name)
@@ -386,11 +371,19 @@ class PreparedDataset:
             device: where B is made and multiplied.
         """
         outputs, _ = self.load_space()
-        path = self.scene_path(scene.name)
+        path, maps = self.scene_path(scene.name), self.folder / f".maps.{scene.name}"
         path.parent.mkdir(exist_ok=True)
-        with self._maps() as maps:
-            cached = CachedTeacher(teacher, maps)
-            prepare_scene(path, scene, cached, outputs, config, source=source, device=device)
+        maps.mkdir(exist_ok=True)
+        with locked(maps, wait=True):
+            if path.is_file():  # Another run has prepared the scene meanwhile.
+                return
+            try:
+                maps.mkdir(exist_ok=True)
+                for stale in maps.iterdir():
+                    stale.unlink()
+                prepare_scene(path, scene, CachedTeacher(teacher, maps), outputs, config, source=source, device=device)
+            finally:
+                shutil.rmtree(maps, ignore_errors=True)
 
     def check_kinds(self, teacher: Teacher) -> None:
         """Checks that a scene to train on has no names that the dataset's classes lack, such as those of labels that
@@ -405,24 +398,6 @@ class PreparedDataset:
                 f"{self.folder}: the classes of this dataset lack {listed(new, 3)}, since the scene has changed; give "
                 "another folder as prepared="
             )
-
-    @contextmanager
-    def _maps(self) -> Iterator[Path]:
-        """A folder for the teacher's maps of one scene while the block lasts. It is locked, so that others can tell it
-        from that of a killed run."""
-        with ExitStack() as held:
-            with locked(self.folder, wait=True):
-                maps = held.enter_context(tempfile.TemporaryDirectory(dir=self.folder, prefix=MAPS_PREFIX))
-                held.enter_context(locked(maps))
-            yield Path(maps)
-
-    def remove_stale_maps(self) -> None:
-        """Removes caches of teacher maps that killed runs left; where folders cannot be locked, none."""
-        with locked(self.folder, wait=True):
-            for path in self.folder.glob(f"{MAPS_PREFIX}*"):
-                with suppress(OSError), locked(path) as is_stale:
-                    if is_stale:
-                        shutil.rmtree(path, ignore_errors=True)
 
     def count_classes(self, names: Sequence[str], track: Track, process: ProcessRank = ProcessRank()) -> None:
         """Counts the target classes of the training scenes and stores the counts, unless those of these scenes are

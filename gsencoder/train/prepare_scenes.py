@@ -3,8 +3,8 @@
 import hashlib
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatch
 from functools import partial
@@ -32,10 +32,9 @@ from gsencoder.teachers.build import TeacherConfig, build_teacher, options_of_me
 from gsencoder.teachers.heads import Head
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, closed_table
-from gsencoder.train.adapter_heads import measure_dataset_heads, missing_heads, teacher_of_heads
 from gsencoder.train.distributed import check_agreement, fail_together
-from gsencoder.train.prepare import DATASET_SETTINGS_FILE, PrepareConfig, PreparedDataset
-from gsencoder.train.space import fit_space
+from gsencoder.train.prepare import SPACE_FILE, PrepareConfig, PreparedDataset
+from gsencoder.train.space import fit_space, measure_dataset_heads, missing_heads, teacher_of_heads
 from gsencoder.types import Scene
 
 TRAINED = "trained on"
@@ -183,65 +182,54 @@ def prepare_scenes(
         SceneWarning: scenes that lack one of several teachers.
     """
     teachers = config.teachers_by_name
+    several, every = len(teachers) > 1, [*training, *held_out]
     folders = teacher_folders(folder, list(teachers))
     settings = {
         name: _preparation_settings(training, words.get(name), teacher, config, voxel)
         for name, teacher in teachers.items()
     }
-    reader = SceneReader(config, words, voxel)
-    several = len(teachers) > 1
-    unmeasured: dict[str, list[Head]] = {}
-    with _without_remains([*folders.values(), folder]):
-        with fail_together():
-            if process.is_first:
-                with_heads = teacher_of_heads(teachers, heads)
-                for name, path in folders.items():
-                    dataset = PreparedDataset(path, settings[name])
-                    dataset.remove_stale_maps()
-                    # Read first, since a head that is not there is an error before the teacher has made a map.
-                    with _about_teacher(config, name):
-                        unmeasured[name] = missing_heads(dataset, heads, teachers[name]) if name == with_heads else []
+    reader, unmeasured = SceneReader(config, words, voxel), list[Head]()
+    with_heads = teacher_of_heads(teachers, heads)
+    with fail_together():
         datasets = {name: PreparedDataset(path, settings[name]) for name, path in folders.items()}
-        for name, dataset in datasets.items():
-            open_scene, views = partial(reader.with_views, name), config.prepare.basis_views
-            with _about_teacher(config, name):
-                fit_space(dataset, training, open_scene, config.prepare, optional=several, process=process, track=track)
-                with fail_together():
-                    if process.is_first:
-                        measure_dataset_heads(dataset, unmeasured[name], training, open_scene, views, optional=several)
-        # Before hours of preparation, since the encoder could not have such columns.
-        check_distinct({name: dataset.load_space()[0].space for name, dataset in datasets.items()})
-        missing = {
-            path: [name for name, dataset in datasets.items() if not dataset.has_scene(path)]
-            for path in [*training, *held_out]
-        }
-        with fail_together():
-            pass  # No process may start to prepare before all have listed the missing scenes.
-        with fail_together():
-            share = [path for path, names in missing.items() if names][process.rank :: process.world_size]
-            weights = reader.weights_of_teachers(share[0]) if share and process.world_size > 1 else {}
-        for name in teachers:
-            check_agreement(
-                f"the weights of teacher {name}" if several else "the teacher's weights", weights.get(name, "")
-            )
-        with fail_together():
-            assigned: Iterable[Path] = track(share, "preparing scenes")
-            for path in assigned:
-                trained = path in training
-                try:
-                    _prepare_scene(
-                        path, missing[path], datasets, reader, config, device, trained=trained, optional=several
-                    )
-                except InputError as error:
-                    # The error is raised when all processes have ended their shares, which may take hours.
-                    if process.world_size > 1:
-                        warnings.warn(f"process {process.rank} stops: {error}", SceneWarning, stacklevel=2)
-                    raise
-        with fail_together():
-            if process.is_first:
-                _check_teachers(datasets, training, held_out)
-        for dataset in datasets.values():
-            dataset.count_classes([path.name for path in training], track, process)
+        if process.is_first:
+            # Read first, since a head that is not there is an error before the teacher has made a map.
+            with _about_teacher(config, with_heads):
+                unmeasured = missing_heads(datasets[with_heads], heads, teachers[with_heads])
+    for name, dataset in datasets.items():
+        open_scene = partial(reader.with_views, name)
+        with _about_teacher(config, name):
+            fit_space(dataset, training, open_scene, config.prepare, optional=several, process=process, track=track)
+            with fail_together():
+                if unmeasured and name == with_heads:
+                    views = config.prepare.basis_views
+                    measure_dataset_heads(dataset, unmeasured, training, open_scene, views, optional=several)
+    # Before hours of preparation, since the encoder could not have such columns.
+    check_distinct({name: dataset.load_space()[0].space for name, dataset in datasets.items()})
+    missing = {path: [name for name, dataset in datasets.items() if not dataset.has_scene(path)] for path in every}
+    with fail_together():
+        pass  # No process may start to prepare before all have listed the missing scenes.
+    with fail_together():
+        share = [path for path, names in missing.items() if names][process.rank :: process.world_size]
+        weights = reader.weights_of_teachers(share[0]) if share and process.world_size > 1 else {}
+    for name in teachers:
+        check_agreement(f"the weights of teacher {name}" if several else "the teacher's weights", weights.get(name, ""))
+    with fail_together():
+        for path in track(share, "preparing scenes"):
+            try:
+                _prepare_scene(
+                    path, missing[path], datasets, reader, config, device, trained=path in training, optional=several
+                )
+            except InputError as error:
+                # The error is raised when all processes have ended their shares, which may take hours.
+                if process.world_size > 1:
+                    warnings.warn(f"process {process.rank} stops: {error}", SceneWarning, stacklevel=2)
+                raise
+    with fail_together():
+        if process.is_first:
+            _check_teachers(datasets, training, held_out)
+    for dataset in datasets.values():
+        dataset.count_classes([path.name for path in training], track, process)
     return datasets
 
 
@@ -255,37 +243,20 @@ def _about_teacher(config: SourceConfig, name: str) -> Iterator[None]:
 def teacher_folders(folder: Path, names: Sequence[str]) -> dict[str, Path]:
     """The folder of the prepared scenes of each teacher: the given one, or one in it for each of several teachers."""
     if len(names) == 1:
-        prepared = sorted(path.parent.name for path in folder.glob(f"*/{DATASET_SETTINGS_FILE}"))
-        if prepared and not (folder / DATASET_SETTINGS_FILE).is_file():
+        prepared = sorted(path.parent.name for path in folder.glob(f"*/{SPACE_FILE}"))
+        if prepared and not (folder / SPACE_FILE).is_file():
             teacher = names[0] if names[0] in prepared else prepared[0]
             raise InputError(
                 f"{folder}: was prepared for several teachers ({listed(prepared, 3)}), and this run has one; give "
                 f"another prepared=, or the folder of one of them ({folder / teacher})"
             )
         return {names[0]: folder}
-    if (folder / DATASET_SETTINGS_FILE).is_file():
+    if (folder / SPACE_FILE).is_file():
         raise InputError(
             f"{folder}: was prepared for one teacher, and this run has several; give another prepared=, or move it to "
             f"the teacher's folder in one (FOLDER/{names[0]})"
         )
     return {name: folder / name for name in names}
-
-
-@contextmanager
-def _without_remains(folders: Sequence[Path]) -> Iterator[None]:
-    """Removes, when a preparation fails, what it made of folders in which nothing was prepared."""
-    there = {path for each in folders for path in (each, each / DATASET_SETTINGS_FILE) if path.exists()}
-    try:
-        yield
-    except BaseException:
-        for each in folders:
-            with suppress(OSError):
-                settings_file = each / DATASET_SETTINGS_FILE
-                if settings_file not in there and list(each.iterdir()) == [settings_file]:
-                    settings_file.unlink()
-                if each not in there:
-                    each.rmdir()
-        raise
 
 
 def _preparation_settings(

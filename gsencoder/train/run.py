@@ -23,7 +23,6 @@ from gsencoder.models.output_space import OutputSpaces
 from gsencoder.teachers.build import words_by_teacher
 from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import Words, closed_table
-from gsencoder.train.adapter_heads import dataset_heads, render_heads, required_heads, teacher_of_heads
 from gsencoder.train.distributed import check_agreement, cpu_share, digest_of, fail_together, join_processes
 from gsencoder.train.loop import (
     TRAINING_CHECKPOINT_FILE,
@@ -47,6 +46,7 @@ from gsencoder.train.samples import (
     TrainingScene,
     join_samples,
 )
+from gsencoder.train.space import dataset_heads, render_heads, required_heads, teacher_of_heads
 
 
 class Distillation:

@@ -9,7 +9,7 @@ import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -20,7 +20,6 @@ from torch.utils.data import Dataset
 
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.settings import check_limits, option
-from gsencoder.geometry import sh_basis
 from gsencoder.models.encoder import EncoderConfig, encoder_inputs
 from gsencoder.models.plan import CloudPlan, Plan, join_plans
 from gsencoder.train.losses import TERMS, LossConfig, RenderRows, TeacherTargets
@@ -29,6 +28,8 @@ from gsencoder.train.prepared_file import PreparedScene, ViewRows
 from gsencoder.types import SH_C0, Cameras, Gaussians
 from gsencoder.types.checks import perpendicular
 
+NEAR = 0.01
+"""Smallest depth of a Gaussian that a view shows, world units."""
 _CANDIDATES_PER_GAUSSIAN = 4
 """Gaussians nearest to the center that are tested against the frusta first, as a multiple of the size of a crop."""
 
@@ -37,9 +38,6 @@ _CANDIDATES_PER_GAUSSIAN = 4
 class SamplingConfig:
     """Selection of the Gaussians and views of a sample (SplatDistill sec. 3.3, "view-dependent selection")."""
 
-    scope: Literal["frusta", "scene"] = option(
-        "frusta", "candidates: Gaussians in the frusta of the target views, or all of the scene"
-    )
     views: int = option(4, "number of target views of a sample, in which the render loss is computed", ge=1)
     gaussians: int = option(
         30_000, "largest number of Gaussians of a sample, nearest to its center first; 0 = all", ge=0
@@ -55,25 +53,14 @@ class SamplingConfig:
         check_limits(self)
 
 
-def in_frusta(means: Float32[np.ndarray, "N 3"], cameras: Cameras, *, near: float = 0.01) -> Bool[np.ndarray, " N"]:
-    """True for Gaussians whose center lies in the image of at least one camera and beyond its near plane.
-
-    Args:
-        means: in the cameras' world.
-        cameras: all of them count.
-        near: smallest depth, world units.
-    """
+def in_frusta(means: Float32[np.ndarray, "N 3"], cameras: Cameras) -> Bool[np.ndarray, " N"]:
+    """True for Gaussians whose center lies in the image of at least one camera and beyond its near plane."""
     inside = np.zeros(len(means), bool)
     for view in range(len(cameras)):
         # The rows that are found already need not be looked at again.
         rows = np.flatnonzero(~inside)
-        inside[rows] = cameras.in_image(*cameras.project(means[rows], view), view, near=near)
+        inside[rows] = cameras.in_image(*cameras.project(means[rows], view), view, near=NEAR)
     return inside
-
-
-def seen_by(point: Float32[np.ndarray, "3"], cameras: Cameras, *, near: float = 0.01) -> Bool[np.ndarray, " V"]:
-    """True for cameras in whose image a point lies, beyond the near plane."""
-    return cameras.in_image(*cameras.project(point[None]), near=near)[:, 0]
 
 
 def nearest_rows(
@@ -111,20 +98,16 @@ def choose_crop(
     show nothing of the sample.
 
     Args:
-        means: centers of all Gaussians of the scene.
         center_weights: for each Gaussian, its weight in drawing the center of a crop; 0 for those without a target.
-        config: settings of sampling.
         size: largest number of Gaussians (`crop_size`); 0 = no limit.
-        rng: source of all random numbers.
 
     Returns:
         Distinct views, fewer than `config.views` if no more are suitable, and rows in ascending order.
     """
-    full_scene = config.scope == "scene"
     if not 0 < size < len(means):
         drawn = rng.permutation(len(cameras))
         views = drawn[: config.views]
-        rows = np.arange(len(means)) if full_scene else np.flatnonzero(in_frusta(means, cameras.select(views)))
+        rows = np.flatnonzero(in_frusta(means, cameras.select(views)))
         for view in drawn[config.views :]:
             if len(rows):
                 break
@@ -133,17 +116,16 @@ def choose_crop(
             rows = np.flatnonzero(in_frusta(means, cameras.select(views)))
     else:
         center = means[_draw_center(center_weights, config, rng)]
-        seeing = np.flatnonzero(seen_by(center, cameras))
+        seeing = np.flatnonzero(cameras.in_image(*cameras.project(center[None]), near=NEAR)[:, 0])
         views = rng.permutation(seeing if len(seeing) else len(cameras))[: config.views]
-        rows = nearest_rows(means, center, len(means) if full_scene else _CANDIDATES_PER_GAUSSIAN * size)
-        if not full_scene:
-            selected = cameras.select(views)
-            rows = rows[in_frusta(means[rows], selected)]
-            if len(rows) < size:
-                rows = np.flatnonzero(in_frusta(means, selected))
-            if not len(rows):  # No view sees the center, and those drawn see no Gaussian at all: use all views.
-                views = rng.permutation(len(cameras))
-                rows = np.flatnonzero(in_frusta(means, cameras))
+        rows = nearest_rows(means, center, _CANDIDATES_PER_GAUSSIAN * size)
+        selected = cameras.select(views)
+        rows = rows[in_frusta(means[rows], selected)]
+        if len(rows) < size:
+            rows = np.flatnonzero(in_frusta(means, selected))
+        if not len(rows):  # No view sees the center, and those drawn see no Gaussian at all: use all views.
+            views = rng.permutation(len(cameras))
+            rows = np.flatnonzero(in_frusta(means, cameras))
         rows = rows[nearest_rows(means[rows], center, size)]
     if not len(rows):
         raise InputError("sample: no Gaussian lies in the frustum of any view; check poses and units")
@@ -196,10 +178,6 @@ class Augmentation:
     noise: float = 0.02
 
 
-_DIRECTIONS = 64
-"""Directions over which harmonics are turned: more than enough for the 16 coefficients of degree 3."""
-
-
 def augment(
     gaussians: Gaussians,
     rng: np.random.Generator,
@@ -208,14 +186,12 @@ def augment(
     voxel: float,
     up: Float64[np.ndarray, "3"] | None = None,
 ) -> Gaussians:
-    """Applies random changes to a splat; row i of the result is Gaussian i.
+    """Applies random changes to a splat with colors of degree 0; row i of the result is Gaussian i.
 
     Args:
-        gaussians: the splat, world units.
-        rng: source of all random numbers.
-        config: strengths of the changes; `drop` is applied by `samples.make_sample`, since it removes rows.
+        config: strengths of the changes; `drop` is applied by `make_sample`, since it removes rows.
         voxel: unit of `jitter`, world units.
-        up: axis of `turn`, a unit vector; None = the z axis of the world.
+        up: axis of `turn`; None = the z axis of the world.
     """
     axis = np.array([0.0, 0.0, 1.0]) if up is None else up / np.linalg.norm(up)
     rotation = Rotation.from_rotvec(axis * math.radians(rng.uniform(-config.turn, config.turn)))
@@ -226,23 +202,17 @@ def augment(
         to_from = to_from @ (np.eye(3) - 2 * np.outer(horizontal, horizontal))
     turned = turn(gaussians, to_from, float(rng.uniform(1 - config.scale, 1 + config.scale)))
     shift = rng.uniform(0, voxel, 3) + rng.normal(0, config.jitter * voxel, turned.means.shape)
-    return replace(
-        turned,
-        means=(turned.means + shift).astype(np.float32),
-        sh=_relight(turned.sh, rng, config),
-    )
+    # Colors are ½ + SH_C0·dc.
+    gain = rng.uniform(1 - config.light, 1 + config.light) * rng.uniform(1 - config.tint, 1 + config.tint, 3)
+    black_shift = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
+    noise = rng.normal(0, config.noise, (len(turned.sh), 3))
+    relit = turned.sh * gain + ((black_shift + noise) / SH_C0)[:, None]
+    return replace(turned, means=(turned.means + shift).astype(np.float32), sh=relit.astype(np.float32))
 
 
-def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float = 1.0) -> Gaussians:
-    """The splat after x → scale · to_from · x: means, quats, scales and harmonics together.
-
-    Args:
-        gaussians: world units.
-        to_from: a rotation, or a rotation with a mirror: any orthonormal matrix.
-        scale: > 0.
-    """
-    if np.abs(to_from @ to_from.T - np.eye(3)).max() > 1e-6 or not 0 < scale < math.inf:
-        raise InputError("turn: expected an orthonormal matrix and a positive scale")
+def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float) -> Gaussians:
+    """The splat, with colors of degree 0, after x → scale · to_from · x, where `to_from` is a rotation, or one with a
+    mirror."""
     mirrored = np.linalg.det(to_from) < 0
     # A Gaussian looks the same mirrored through its center, so −M turns its axes as M does, and is a rotation.
     rotation = Rotation.from_matrix(-to_from if mirrored else to_from)
@@ -255,35 +225,8 @@ def turn(gaussians: Gaussians, to_from: Float64[np.ndarray, "3 3"], scale: float
         quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
         scales=(gaussians.scales * np.float32(scale)).astype(np.float32),
         opacities=gaussians.opacities,
-        sh=_turn_sh(gaussians.sh, to_from),
+        sh=gaussians.sh,
     )
-
-
-def _turn_sh(sh: Float32[np.ndarray, "N K 3"], to_from: np.ndarray) -> Float32[np.ndarray, "N K 3"]:
-    """Coefficients of the turned function, f'(d) = f(to_fromᵀ d), from its values in many directions: exact, since a
-    turned harmonic is a sum of harmonics of its degree."""
-    degree = math.isqrt(sh.shape[1]) - 1
-    if degree == 0:
-        return sh
-    i = np.arange(_DIRECTIONS) + 0.5
-    z, azimuth = 1 - 2 * i / _DIRECTIONS, i * math.pi * (1 + 5**0.5)
-    radius = np.sqrt(1 - z * z)
-    directions = np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), z), axis=1)
-    basis = sh_basis(torch.from_numpy(directions), degree).numpy()
-    unturned_basis = sh_basis(torch.from_numpy(directions @ to_from), degree).numpy()
-    matrix = np.linalg.lstsq(basis, unturned_basis, rcond=None)[0]
-    return np.einsum("kj,njc->nkc", matrix, sh).astype(np.float32)
-
-
-def _relight(
-    sh: Float32[np.ndarray, "N K 3"], rng: np.random.Generator, config: Augmentation
-) -> Float32[np.ndarray, "N K 3"]:
-    """Changes brightness and tint and adds noise; colors are ½ + SH_C0·dc, and all degrees are scaled equally."""
-    gain = rng.uniform(1 - config.light, 1 + config.light) * rng.uniform(1 - config.tint, 1 + config.tint, 3)
-    relit = sh * gain
-    black_shift = 0.5 * gain - 0.5 + rng.uniform(-config.tint, config.tint)
-    relit[:, 0] += (black_shift + rng.normal(0, config.noise, (len(sh), 3))) / SH_C0
-    return relit.astype(np.float32)
 
 
 MIN_REMAINING_WEIGHT = 0.5
@@ -435,43 +378,9 @@ class Batch(NamedTuple):
     plan: Plan
     teachers: tuple[TeacherTargets, ...]
 
-    def to(self, device: torch.device) -> "Batch":
-        """The batch with all its tensors on a device."""
-        if self.attributes.device == device:
-            return self
 
-        def move(value: Tensor) -> Tensor:
-            return value.to(device, non_blocking=True)
-
-        return Batch(
-            names=self.names,
-            attributes=move(self.attributes),
-            opacities=move(self.opacities),
-            plan=self.plan.to(device),
-            teachers=tuple(
-                TeacherTargets(
-                    targets=move(each.targets),
-                    codes=move(each.codes),
-                    loss_weights=move(each.loss_weights),
-                    rows=RenderRows(*map(move, each.rows)),
-                )
-                for each in self.teachers
-            ),
-        )
-
-
-def join_samples(results: Sequence[Sample | InputError], patch: int) -> Batch | InputError:
-    """Joins samples to a batch; if one of them is an error, returns the first error instead.
-
-    Args:
-        results: one or more samples or errors.
-        patch: largest number of tokens in a patch of the encoder.
-    """
-    samples = []
-    for result in results:
-        if isinstance(result, InputError):
-            return result
-        samples.append(result)
+def join_samples(samples: Sequence[Sample], patch: int) -> Batch:
+    """Joins samples to a batch; `patch` is the largest number of tokens in a patch of the encoder."""
     sizes = [len(sample.attributes) for sample in samples]
     starts = [sum(sizes[:i]) for i in range(len(sizes))]
     return Batch(
@@ -600,15 +509,7 @@ class SampleDataset(Dataset[Sample]):
         self.scenes, self.recipe = list(scenes), recipe
         self._codes: OrderedDict[int, Codes] = OrderedDict()
 
-    def __getitem__(self, number: int) -> Sample | InputError:  # type: ignore[override]
-        """Sample `number`, or its error as a value: raised in a data worker it would arrive as a long traceback."""
-        try:
-            return self.make(number)
-        except InputError as error:
-            return error
-
-    def make(self, number: int) -> Sample:
-        """Makes sample `number`."""
+    def __getitem__(self, number: int) -> Sample:
         epoch, position = divmod(number, len(self.scenes))
         order = np.random.default_rng([self.recipe.seed, 0, epoch]).permutation(len(self.scenes))
         rng = np.random.default_rng([self.recipe.seed, 1, number])

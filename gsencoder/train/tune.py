@@ -94,15 +94,6 @@ class TuningBatch(NamedTuple):
     labels: Tensor
     tokens: Tensor | None
 
-    def to(self, device: torch.device) -> "TuningBatch":
-        """The batch with its tensors on a device."""
-        return TuningBatch(
-            names=self.names,
-            inputs={name: value.to(device, non_blocking=True) for name, value in self.inputs.items()},
-            labels=self.labels.to(device, non_blocking=True),
-            tokens=None if self.tokens is None else self.tokens.to(device, non_blocking=True),
-        )
-
 
 def chat(text: str, pictures: Sequence[Any], answer: str | None = None) -> list[dict[str, Any]]:
     """The messages of a prompt, pictures before words as `ask` sends them, and those of an answer."""
@@ -151,16 +142,12 @@ class PairSamples(Dataset[TuningSample]):
         self._longest, self._seed = longest, seed
         self._frame = answer_frame(processor)
 
-    def __getitem__(self, number: int) -> TuningSample | InputError:  # type: ignore[override]
-        """Sample `number`, or its error as a value."""
+    def __getitem__(self, number: int) -> TuningSample:
         epoch, position = divmod(number, len(self.pairs))
         chosen = int(np.random.default_rng([self._seed, 0, epoch]).permutation(len(self.pairs))[position])
         pair = self.pairs[chosen]
         answer = pair.answers[int(np.random.default_rng([self._seed, 1, number]).integers(len(pair.answers)))]
-        try:
-            return self.sample(pair, answer)
-        except InputError as error:
-            return error
+        return self.sample(pair, answer)
 
     def sample(self, pair: TuningPair, answer: str) -> TuningSample:
         """A pair as tensors."""
@@ -197,25 +184,15 @@ class PairSamples(Dataset[TuningSample]):
         return TuningSample(name=pair.name, inputs=inputs, labels=labels, tokens=tokens)
 
 
-def join_pairs(samples: Sequence[TuningSample | InputError], *, padding: int) -> TuningBatch | InputError:
-    """Joins samples to a batch; if one of them is an error, returns the first error instead.
-
-    Args:
-        samples: one or more.
-        padding: id of the token that fills up shorter samples; they are masked and without a loss.
-    """
-    good = []
-    for sample in samples:
-        if isinstance(sample, InputError):
-            return sample
-        good.append(sample)
+def join_pairs(samples: Sequence[TuningSample], *, padding: int) -> TuningBatch:
+    """Joins samples to a batch; shorter ones are filled up with the token `padding`, masked and without a loss."""
     fills: Mapping[str, int] = {"input_ids": padding}
-    inputs = {name: _stacked([each.inputs[name] for each in good], fills.get(name, 0)) for name in good[0].inputs}
-    tokens = [each.tokens for each in good if each.tokens is not None]
+    inputs = {name: _stacked([each.inputs[name] for each in samples], fills.get(name, 0)) for name in samples[0].inputs}
+    tokens = [each.tokens for each in samples if each.tokens is not None]
     return TuningBatch(
-        names=tuple(each.name for each in good),
+        names=tuple(each.name for each in samples),
         inputs=inputs,
-        labels=_stacked([each.labels[None] for each in good], IGNORED),
+        labels=_stacked([each.labels[None] for each in samples], IGNORED),
         tokens=torch.cat(tokens) if tokens else None,
     )
 

@@ -24,7 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from gsencoder.core.errors import InputError, listed
+from gsencoder.core.errors import InputError
 from gsencoder.core.files import is_full_disk
 from gsencoder.core.pretrained import (
     digest_files,
@@ -42,17 +42,12 @@ SERVED_FOLDER = "served"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdapterConfig:
-    """Low-rank adapters (LoRA, Hu et al. 2021): a layer's W x becomes W x + (alpha / rank) · B A x."""
+    """Low-rank adapters (LoRA, Hu et al. 2021) of all linear layers of the language model: W x becomes W x + (alpha /
+    rank) · B A x."""
 
     rank: int = option(16, "rank of A and B", ge=1, le=4096)
     alpha: float = option(32.0, "scale of the adapters, divided by the rank", gt=0)
     dropout: float = option(0.05, "share of an adapter's inputs that is dropped in training", ge=0, lt=1)
-    targets: tuple[str, ...] = option(
-        (),
-        "ends of the names of the linear layers that get adapters, such as q_proj,v_proj; layers of the "
-        "vision tower get none; empty = all of the language model",
-        names=True,
-    )
 
     def __post_init__(self) -> None:
         check_limits(self)
@@ -135,53 +130,18 @@ def load_adapted(
     # Its path is written into the adapters.
     model = load_pretrained(AutoModelForImageTextToText, folder.resolve(), WHAT)
     model.to(getattr(torch, base))
+    tower, head = model.get_encoder("image"), model.get_output_embeddings()
+    in_tower = set(tower.modules()) if tower is not model else set()
+    layers = {each for each in model.get_decoder().modules() if isinstance(each, nn.Linear)} - in_tower - {head}
     torch.manual_seed(seed)
     lora = peft.LoraConfig(
         r=config.rank,
         lora_alpha=config.alpha,
         lora_dropout=config.dropout,
-        target_modules=_layers(model, config.targets),
+        target_modules=[name for name, module in model.named_modules() if module in layers],
     )
     with quiet_peft():
         return peft.get_peft_model(model, lora)
-
-
-def check_targets(config: Any, targets: tuple[str, ...]) -> None:
-    """Checks that a model has the layers that get adapters, by its configuration, without its weights.
-
-    Args:
-        config: of the model.
-        targets: of `AdapterConfig`.
-    """
-    if not targets:
-        return
-    from transformers import AutoModelForImageTextToText
-
-    with torch.device("meta"), quiet_transformers():
-        model = AutoModelForImageTextToText.from_config(config)
-    _layers(model, targets)
-
-
-def _layers(model: Any, targets: tuple[str, ...]) -> list[str]:
-    """Full names of the linear layers that get adapters."""
-    decoder, tower, head = model.get_decoder(), model.get_encoder("image"), model.get_output_embeddings()
-    in_tower = set(tower.modules()) if tower is not model else set()
-    in_decoder = set(decoder.modules())
-    linear = {
-        name: module
-        for name, module in model.named_modules()
-        if isinstance(module, nn.Linear) and module is not head and module not in in_tower
-    }
-    if not targets:
-        return [name for name, module in linear.items() if module in in_decoder]
-    for target in targets:
-        if not any(name == target or name.endswith(f".{target}") for name in linear):
-            ends = sorted({name.rpartition(".")[2] for name in linear})
-            raise InputError(
-                f"lora.targets: no linear layer outside the vision tower is called {target[:60]}; there are "
-                f"{listed(ends, 12)}"
-            )
-    return [name for name in linear if any(name == target or name.endswith(f".{target}") for target in targets)]
 
 
 def save_adapters(folder: Path, adapted: Any, processor: Any) -> None:

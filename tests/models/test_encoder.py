@@ -146,18 +146,6 @@ def test_gradients_are_those_of_finite_differences() -> None:
     assert (loss_at(1e-6) - loss_at(-1e-6)) / 2e-6 == pytest.approx(slope, rel=1e-5)
 
 
-def test_keeping_no_activations_gives_the_same_gradients() -> None:
-    attributes, opacities, cloud = encoder_inputs(splat(100), CONFIG, 0.1)
-    gradients = []
-    for checkpointing in (False, True):
-        network = encoder(replace(CONFIG, transformer=replace(TINY, checkpoint=checkpointing, drop_path=0.3))).train()
-        torch.manual_seed(5)
-        network(attributes, opacities, network.join([cloud])).square().mean().backward()
-        gradients.append([value.grad for value in network.parameters()])
-    for plain, again in zip(*gradients, strict=True):
-        torch.testing.assert_close(plain, again)
-
-
 def test_training_draws_orders_and_paths_at_random_and_evaluation_never() -> None:
     attributes, opacities, cloud = encoder_inputs(splat(200), CONFIG, 0.1)
     network = encoder()

@@ -19,17 +19,17 @@ from gsencoder.teachers.base import MissingInput
 from gsencoder.teachers.heads import Head
 from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.radio import RadioConfig
-from gsencoder.train.adapter_heads import (
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.space import (
     FeatureDecoder,
     dataset_heads,
     measure_dataset_heads,
     missing_heads,
     render_heads,
     required_heads,
+    sampled_maps,
     teacher_of_heads,
 )
-from gsencoder.train.prepare import PreparedDataset
-from gsencoder.train.space import sampled_maps, views_of_scenes
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Views
 
 SPACE = FeatureSpace(name="s", channels=6)
@@ -94,14 +94,6 @@ def test_heads_belong_to_the_one_teacher_that_has_some() -> None:
         teacher_of_heads({"a": radio, "b": radio}, ["sam"])
 
 
-@pytest.mark.parametrize(
-    ("scenes", "views", "expected"), [(3, 6, [2, 2, 2]), (2, 5, [2, 3]), (4, 2, [1, 1, 1, 0]), (1, 256, [256])]
-)
-def test_maps_are_spread_over_scenes_and_the_first_has_one(scenes: int, views: int, expected: list[int]) -> None:
-    counts = views_of_scenes(scenes, views)
-    assert counts == expected
-
-
 def test_scenes_that_lack_the_teacher_leave_their_maps_to_the_others() -> None:
     scenes = [Path(str(number)) for number in range(40)]
 
@@ -112,6 +104,9 @@ def test_scenes_that_lack_the_teacher_leave_their_maps_to_the_others() -> None:
 
     listed = [path.name for path, _, _ in sampled_maps(scenes, open_scene, 8, optional=True)]
     assert sorted(listed) == sorted(["3", "13", "23", "33"] * 2)
+    # Maps are spread evenly; scenes may have none, and the first has one.
+    listed = [path.name for path, _, _ in sampled_maps(scenes[3::10], open_scene, 2)]
+    assert listed == ["3", "13", "23"]
     # Four scenes have three views each.
     assert len(list(sampled_maps(scenes, open_scene, 30, optional=True))) == 12
     with pytest.raises(MissingInput):
@@ -161,7 +156,7 @@ def of_teacher(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Any]:
     def read(teacher: Any, names: Any) -> list[Head]:
         return [heads[name] for name in names]
 
-    monkeypatch.setattr("gsencoder.train.adapter_heads.load_teacher_heads", read)
+    monkeypatch.setattr("gsencoder.train.space.load_teacher_heads", read)
     return read
 
 

@@ -1,14 +1,30 @@
-"""Processes of one launcher: their devices, and what they do together."""
+"""Processes of one launcher: their devices, what they do together, and what they share."""
 
+import json
+import shutil
 from pathlib import Path
 
 import pytest
 import torch
 from forked_ranks import RankServer
+from training_scenes import DenseSideTeacher, prepared, small_encoder
 
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import ProcessRank, rank_from_environment
-from gsencoder.train.distributed import check_agreement, fail_together, gpu_index, join_processes
+from gsencoder.core.process import ProcessRank, rank_from_environment, untracked
+from gsencoder.core.threads import available_cores, threads_of_torch
+from gsencoder.evaluate.validation import validate_names
+from gsencoder.models.output_space import OutputSpaces
+from gsencoder.train.distributed import (
+    check_agreement,
+    cpu_share,
+    fail_together,
+    gpu_index,
+    join_processes,
+    value_of_first,
+    values_of_all,
+)
+from gsencoder.train.prepare import CLASS_BALANCE_FILE, PreparedDataset
+from gsencoder.train.samples import TrainingScene
 
 SLURM_TASK = {"SLURM_STEP_ID": "0", "SLURM_NTASKS": "8", "SLURM_LOCALID": "1", "SLURM_STEP_NODELIST": "gpu[03-04]"}
 
@@ -106,3 +122,82 @@ def test_processes_with_different_weights_all_stop_and_name_both_digests(tmp_pat
 
 def test_one_process_agrees_with_itself() -> None:
     check_agreement("the teacher's weights", "8a1f")
+
+
+SCRIPT = """
+import json
+from pathlib import Path
+
+from test_distributed import counted, scores_of
+
+from gsencoder.train.distributed import join_processes
+from gsencoder.train.prepare import PreparedDataset
+
+if __name__ == "__main__":
+    with join_processes("cpu") as (process, _):
+        dataset = PreparedDataset(Path({folder!r}))
+        counts = counted(dataset, {names!r}, process)
+        result = {{"counts": counts, **scores_of(dataset, {names!r})}}
+    Path({folder!r} + f".{{process.rank}}").write_text(json.dumps(result))
+"""
+
+
+def counted(dataset: PreparedDataset, names: list[str], process: ProcessRank = ProcessRank()) -> list[list[float]]:
+    dataset.count_classes(names, untracked, process)
+    balance = dataset.load_class_balance()
+    return [balance.counts.tolist(), *balance.codebook.tolist()]
+
+
+def scores_of(dataset: PreparedDataset, names: list[str]) -> dict[str, object]:
+    """The scores of an encoder, and which pictures there are."""
+    scenes = [TrainingScene([scene]) for scene in dataset.scenes(names)]
+    outputs = OutputSpaces(by_teacher={"sides": dataset.load_space()[0]})
+    codebooks = {"sides": dataset.load_class_balance().codebook}
+    result = validate_names(scenes, small_encoder(outputs.widths), outputs, codebooks)
+    return {"scores": dict(result.scores), "pictures": sorted(result.pictures)}
+
+
+@pytest.mark.alone
+def test_two_processes_count_and_validate_each_scene_once_and_as_one_does(tmp_path: Path, ranks: RankServer) -> None:
+    dataset, names = prepared(tmp_path / "one", count=5, teacher=DenseSideTeacher())
+    one = {"counts": counted(dataset, names), **scores_of(dataset, names)}
+    copy = shutil.copytree(tmp_path / "one", tmp_path / "two")
+    (copy / CLASS_BALANCE_FILE).unlink()
+    script = tmp_path / "run.py"
+    script.write_text(SCRIPT.format(folder=str(copy), names=names))
+    ranks.started(script).end_well()
+    first, second = (json.loads(Path(f"{copy}.{rank}").read_text()) for rank in (0, 1))
+    assert first["counts"] == second["counts"] == one["counts"]
+    assert first["scores"] == pytest.approx(one["scores"], rel=1e-9)
+    assert second["scores"] == first["scores"]
+    # All pictures are drawn by the process that logs them.
+    assert (first["pictures"], second["pictures"]) == (one["pictures"], [])
+
+
+def test_a_process_that_was_started_alone_has_its_own_values() -> None:
+    assert (value_of_first("a"), values_of_all("a")) == ("a", ["a"])
+
+
+def test_processes_of_a_machine_divide_its_cores_unless_threads_are_given() -> None:
+    cores = available_cores()
+    assert cpu_share(ProcessRank(world_size=2 * cores, local_world_size=2 * cores)) == 1
+    assert cpu_share(ProcessRank(world_size=8, local_world_size=1)) == cores
+    assert cpu_share(ProcessRank(world_size=8, local_world_size=8), threads=5) == 5
+    with threads_of_torch(3):
+        assert cpu_share(ProcessRank()) == torch.get_num_threads() == 3
+
+
+@pytest.mark.parametrize(
+    ("environment", "local"),
+    [
+        ({"RANK": "9", "WORLD_SIZE": "16", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "8"}, 8),
+        ({"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"}, 1),
+        ({"SLURM_STEP_TASKS_PER_NODE": "4(x2),1", "SLURM_TASKS_PER_NODE": "9"}, 4),
+        ({"SLURM_TASKS_PER_NODE": "3"}, 3),
+        ({}, 1),
+    ],
+)
+def test_launchers_state_the_processes_of_a_machine(environment: dict[str, str], local: int) -> None:
+    task = {"SLURM_STEP_ID": "0", "SLURM_PROCID": "5", "SLURM_NTASKS": "9", "SLURM_STEP_NODELIST": "a"}
+    variables = environment if "RANK" in environment else {**task, **environment}
+    assert rank_from_environment(variables)[0].local_world_size == local

@@ -1,4 +1,4 @@
-"""Samples and batches: where they come from, what they keep to, and that nothing else decides them."""
+"""Samples and batches: which Gaussians they hold, what is changed at random, and that nothing else decides them."""
 
 import shutil
 from dataclasses import replace
@@ -11,27 +11,38 @@ import torch
 from archives import rewrite
 from hypothesis import given
 from hypothesis import strategies as st
+from joint_training import Datasets, batch_of, joint
 from safetensors.numpy import load_file
-from training_scenes import SMALL, DenseSideTeacher, prepared, samples, small_encoder
+from splats import front_camera
+from training_scenes import LOSSES, SMALL, DenseSideTeacher, prepared, samples, small_encoder
 
 from gsencoder.core.errors import InputError
+from gsencoder.geometry import covariances
 from gsencoder.render import BlendConfig, blend
-from gsencoder.train.loop import StepSampler
-from gsencoder.train.losses import LossConfig
+from gsencoder.train import samples as module
+from gsencoder.train.loop import ErrorsAsValues, join_unless_error, micro_batches
+from gsencoder.train.losses import AdapterHead, LossConfig, render_loss
 from gsencoder.train.prepare import PreparedDataset
 from gsencoder.train.prepared_file import PreparedScene, ViewRows
+from gsencoder.train.run import Distillation
 from gsencoder.train.samples import (
     Augmentation,
     SampleDataset,
     SamplingConfig,
     TrainingScene,
+    augment,
     choose_crop,
+    crop_size,
+    drop_random,
+    in_frusta,
     join_samples,
     make_sample,
+    nearest_rows,
     restrict_rows,
     target_codes,
+    turn,
 )
-from gsencoder.types import Cameras
+from gsencoder.types import SH_C0, Cameras, Gaussians
 
 
 def same(first: object, second: object) -> bool:
@@ -63,26 +74,20 @@ def test_processes_share_a_step_and_a_resumed_run_goes_on_in_the_middle(
     batch: int, accumulate: int, world: int, first: int, steps: int
 ) -> None:
     def numbers(rank: int, begin: int) -> list[list[int]]:
-        return list(StepSampler(begin, first + steps, batch=batch, accumulate=accumulate, rank=rank, world=world))
+        return micro_batches(begin, first + steps, batch=batch, accumulate=accumulate, rank=rank, world=world)
 
-    sampler = StepSampler(first, first + steps, batch=batch, accumulate=accumulate, rank=0, world=world)
-    assert len(sampler) == len(list(sampler)) == steps * accumulate
+    assert len(numbers(0, first)) == steps * accumulate
     sample_numbers = sorted(number for rank in range(world) for micro in numbers(rank, first) for number in micro)
     size = batch * accumulate * world
     assert sample_numbers == list(range(first * size, (first + steps) * size))
     assert numbers(0, 0)[-steps * accumulate :] == numbers(0, first)
-
-
-def test_one_process_with_more_micro_batches_takes_the_samples_of_several(
-    dataset: tuple[PreparedDataset, list[str]],
-) -> None:
-    alone = list(StepSampler(0, 2, batch=1, accumulate=2, rank=0, world=1))
-    pair = [list(StepSampler(0, 2, batch=1, accumulate=1, rank=rank, world=2)) for rank in range(2)]
-    assert alone == [micro for step in zip(*pair, strict=True) for micro in step]
+    # One process with more micro-batches takes the samples of several.
+    alone = micro_batches(first, first + steps, batch=batch, accumulate=accumulate * world, rank=0, world=1)
+    assert sorted(alone) == sorted(micro for rank in range(world) for micro in numbers(rank, first))
 
 
 def test_without_changes_a_sample_holds_the_scene_as_it_is(dataset: tuple[PreparedDataset, list[str]]) -> None:
-    whole = SamplingConfig(scope="scene", gaussians=0, views=2)
+    whole = SamplingConfig(gaussians=0, views=2)
     data = samples(*dataset, augmentation=None, sampling=whole)
     sample, source = data[0], None
     for scene in data.scenes:
@@ -100,7 +105,7 @@ def test_without_changes_a_sample_holds_the_scene_as_it_is(dataset: tuple[Prepar
 def test_the_rows_of_a_sample_are_those_of_the_view_in_the_dataset(dataset: tuple[PreparedDataset, list[str]]) -> None:
     """With all Gaussians and nothing changed, B is that of `render.blend`, and its render of the targets is near the
     teacher's own cells."""
-    whole = SamplingConfig(scope="scene", gaussians=0, views=1)
+    whole = SamplingConfig(gaussians=0, views=1)
     data = samples(*dataset, augmentation=None, sampling=whole, losses=LossConfig(rarity=0.0))
     sample = data[0]
     scene = next(each.first for each in data.scenes if sample.name.startswith(each.name))
@@ -123,15 +128,15 @@ def test_of_many_scenes_the_latest_used_are_kept_open(
     monkeypatch.setattr("gsencoder.train.samples.MAX_OPEN_FILES", most)
     data, used = samples(*dataset), list[str]()
     for number in range(9):
-        used.append(data.make(number).name.split(" ")[0])
+        used.append(data[number].name.split(" ")[0])
         opened = {scene.name for scene in data.scenes for part in scene.parts if "_arrays" in vars(part)}
         assert opened == set(list(dict.fromkeys(reversed(used)))[:most])
 
 
 def test_samples_of_a_step_are_of_one_size_and_steps_of_many(dataset: tuple[PreparedDataset, list[str]]) -> None:
-    crops = SamplingConfig(scope="scene", views=1, gaussians=300, smallest=20)
+    crops = SamplingConfig(views=1, gaussians=300, smallest=20)
     data = samples(*dataset, augmentation=None, sampling=crops, step_samples=3)
-    sizes = [len(data.make(number).attributes) for number in range(12)]
+    sizes = [len(data[number].attributes) for number in range(12)]
     assert [sizes[start : start + 3] for start in range(0, 12, 3)] == [[size] * 3 for size in sizes[::3]]
     assert len(set(sizes)) == 4
 
@@ -165,7 +170,7 @@ def test_gaussians_without_a_target_have_no_kind_and_no_part_in_the_loss(
     arrays = load_file(path)
     rewrite(path, {**arrays, "weights": np.where(np.arange(len(arrays["means"])) % 5 == 0, 0, arrays["weights"])})
     scene = PreparedScene(path)
-    recipe = samples(*dataset, augmentation=None, sampling=SamplingConfig(scope="scene", gaussians=0)).recipe
+    recipe = samples(*dataset, augmentation=None, sampling=SamplingConfig(gaussians=0)).recipe
     balance, power = recipe.teachers[0].class_balance, recipe.losses.rarity
     squares = np.square(scene.targets(np.arange(len(scene)))[:, None] - balance.codebook).sum(axis=2)
     expected = np.where(scene.weights > 0, squares.argmin(axis=1), -1)
@@ -186,11 +191,11 @@ def test_where_all_weights_are_1_samples_are_the_same_without_looking_up_classes
 ) -> None:
     data = samples(*dataset, sampling=sampling, losses=LossConfig(rarity=0.0, contrast_weight=0.0))
     assert not data.recipe.uses_classes(data.recipe.teachers[0])
-    without = [data.make(number) for number in range(4)]
+    without = [data[number] for number in range(4)]
     data._codes.clear()
     monkeypatch.setattr(type(data.recipe), "uses_classes", lambda *_: True)
     for number, sample in enumerate(without):
-        looked_up = data.make(number)
+        looked_up = data[number]
         for one, other in zip(sample.teachers, looked_up.teachers, strict=True):
             assert same(one._replace(codes=other.codes), other)
         assert same(sample._replace(teachers=()), looked_up._replace(teachers=()))
@@ -324,8 +329,257 @@ def test_views_that_see_nothing_are_named(dataset: tuple[PreparedDataset, list[s
     part._header[0].cam_from_world[:, 2, 3] -= 1000  # Both cameras now stand behind the wall and look away.
     data = SampleDataset([scene], replace(data.recipe, augmentation=Augmentation()))
     with pytest.raises(InputError, match=r"scene wall_0: sample: no Gaussian"):
-        data.make(0)
+        data[0]
     # From a worker it comes back as a value, and through the batch, so that it can be raised in its own words.
-    assert isinstance(data[0], InputError)
-    assert isinstance(join_samples([data[0]], SMALL.transformer.patch), InputError)
+    error = ErrorsAsValues(data)[0]
+    assert isinstance(error, InputError)
+    assert join_unless_error([None, error, InputError("later")], join_samples) is error
     part._header[0].cam_from_world[:, 2, 3] += 1000
+
+
+RNG = np.random.default_rng
+
+
+def test_the_frustum_of_a_camera_is_what_its_pixels_look_at() -> None:
+    camera = front_camera()
+    points = np.random.default_rng(0).uniform(-4, 4, (2000, 3)).astype(np.float32)
+    pose, K = camera.cam_from_world[0].astype(np.float64), camera.Ks[0]
+    x, y, z = (points.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+    expected = (z > 0.01) & (u >= 0) & (u < camera.widths[0]) & (v >= 0) & (v < camera.heights[0])
+    inside = in_frusta(points, camera)
+    assert (inside == expected).mean() > 0.999  # Rounding may move a point on the border.
+    assert 0 < inside.sum() < len(points)
+
+
+def test_almost_nothing_that_a_view_shows_lies_outside_its_frustum() -> None:
+    """Small Gaussians whose center lies beside the picture reach into it at its edge alone."""
+    camera = front_camera()
+    rng = np.random.default_rng(2)
+    cloud = Gaussians(
+        means=rng.uniform(-3, 3, (3000, 3)).astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (3000, 1)),
+        scales=np.full((3000, 3), 0.02, np.float32),
+        opacities=np.full(3000, 0.9, np.float32),
+        sh=np.zeros((3000, 1, 3), np.float32),
+    )
+    b = blend(cloud, camera)
+    inside = in_frusta(cloud.means, camera)
+    weight_inside = b.weight[inside[b.col.numpy()]].sum()
+    assert weight_inside > 0.9 * b.weight.sum()
+
+
+@given(st.integers(1, 50), st.integers(1, 60))
+def test_a_crop_holds_the_nearest(count: int, wanted: int) -> None:
+    means = RNG(count).normal(size=(count, 3)).astype(np.float32)
+    rows = nearest_rows(means, means[0], wanted)
+    assert len(rows) == min(count, wanted)
+    assert (np.diff(rows) > 0).all()
+    distances = np.linalg.norm(means - means[0], axis=1)
+    outside = np.setdiff1d(np.arange(count), rows)
+    if len(outside):
+        assert distances[rows].max() <= distances[outside].min() + 1e-6
+
+
+def cameras(count: int) -> Cameras:
+    """Cameras in a row that look along +z."""
+    one = front_camera()
+    poses = np.repeat(one.cam_from_world, count, axis=0)
+    poses[:, 0, 3] = -10.0 * np.arange(count)
+    return Cameras(
+        cam_from_world=poses,
+        Ks=np.repeat(one.Ks, count, axis=0),
+        widths=np.repeat(one.widths, count),
+        heights=np.repeat(one.heights, count),
+    )
+
+
+def cloud(count: int = 1000, places: int = 1) -> np.ndarray:
+    """Points before the first cameras of a row."""
+    points = RNG(0).uniform(-1, 1, (count, 3)) + np.array([0, 0, 3])
+    points[:, 0] += 10 * (np.arange(count) % places)
+    return points.astype(np.float32)
+
+
+def test_without_a_limit_a_sample_is_all_that_its_views_see() -> None:
+    points, row = cloud(1000, 4), cameras(4)
+    config = SamplingConfig(views=2, gaussians=0)
+    views, rows = choose_crop(points, row, np.ones(1000, np.float32), config, 0, RNG(0))
+    assert len(set(views)) == 2
+    assert np.array_equal(rows, np.flatnonzero(in_frusta(points, row.select(views))))
+
+
+def test_the_views_of_a_crop_look_at_its_center() -> None:
+    points, row = cloud(1000, 4), cameras(4)
+    for seed in range(8):
+        config = SamplingConfig(views=2)
+        views, rows = choose_crop(points, row, np.ones(1000, np.float32), config, 50, RNG(seed))
+        assert len(views) == 1  # No other camera of the row sees the same place.
+        assert len(rows) == 50
+        assert in_frusta(points[rows], row.select(views)).all()
+        assert (np.diff(rows) > 0).all()
+
+
+def test_a_crop_holds_the_gaussians_nearest_to_its_center_that_the_views_see() -> None:
+    points, camera = cloud(), front_camera()
+    chances = np.zeros(1000, np.float32)
+    visible = np.flatnonzero(in_frusta(points, camera))
+    chances[visible[7]] = 1
+    config = SamplingConfig(views=1, rare_centers=1.0)
+    _, rows = choose_crop(points, camera, chances, config, 20, RNG(0))
+    distances = np.linalg.norm(points[visible] - points[visible[7]], axis=1)
+    assert set(rows) == set(visible[np.argsort(distances)[:20]])
+
+
+def test_a_rare_target_is_often_the_center_of_a_crop() -> None:
+    points, camera = cloud(), front_camera()
+    chances = np.full(1000, 1e-3, np.float32)
+    visible = np.flatnonzero(in_frusta(points, camera))
+    chances[visible[0]] = 1e3
+    config = SamplingConfig(views=1, rare_centers=1.0)
+    for seed in range(5):
+        assert visible[0] in choose_crop(points, camera, chances, config, 5, RNG(seed))[1]
+
+
+def test_where_no_gaussian_has_a_target_any_may_be_the_center() -> None:
+    config = SamplingConfig(views=1)
+    assert len(choose_crop(cloud(), cameras(1), np.zeros(1000, np.float32), config, 5, RNG(0))[1])
+
+
+def test_a_camera_that_looks_into_the_void_gives_way_to_one_that_sees_something() -> None:
+    points, row = cloud(50), cameras(3)  # All before the first camera.
+    for size in (0, 5):
+        for seed in range(6):
+            views, rows = choose_crop(points, row, np.ones(50, np.float32), SamplingConfig(views=1), size, RNG(seed))
+            assert len(rows)
+            assert 0 in views
+
+
+def test_a_scene_behind_its_cameras_is_an_error() -> None:
+    behind = cloud(10) - np.array([0, 0, 9], np.float32)
+    for size in (0, 5):
+        with pytest.raises(InputError, match="no Gaussian lies in the frustum of any view"):
+            choose_crop(behind, cameras(2), np.ones(10, np.float32), SamplingConfig(), size, RNG(0))
+
+
+@given(st.integers(1, 40), st.floats(0, 0.9), st.integers(0, 50))
+def test_thinning_out_leaves_something(count: int, most: float, seed: int) -> None:
+    rows = np.arange(count) * 2
+    remaining = drop_random(rows, most, RNG(seed))
+    assert len(remaining) >= 1
+    assert np.isin(remaining, rows).all()
+
+
+def test_crops_are_of_sizes_in_equal_ratios() -> None:
+    config = SamplingConfig(gaussians=400, smallest=25)
+    sizes = [crop_size(config, RNG(seed)) for seed in range(99)]
+    assert min(sizes) >= 25
+    assert max(sizes) <= 400
+    assert 70 < np.median(sizes) < 140  # 100 is as far from 25 as from 400.
+    assert crop_size(SamplingConfig(gaussians=400, smallest=0), RNG(0)) == 400
+    assert crop_size(SamplingConfig(gaussians=0), RNG(0)) == 0
+
+
+NOTHING = Augmentation(turn=0.0, tilt=0.0, mirror=0.0, scale=0.0, jitter=0.0, drop=0.0, light=0.0, tint=0.0, noise=0.0)
+
+
+def splat(count: int = 30) -> Gaussians:
+    rng = np.random.default_rng(0)
+    quats = rng.normal(size=(count, 4))
+    return Gaussians(
+        means=rng.normal(size=(count, 3)).astype(np.float32),
+        quats=(quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32),
+        scales=rng.uniform(0.01, 0.3, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0, 1, count).astype(np.float32),
+        sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
+    )
+
+
+def orthonormal(seed: int, mirrored: bool) -> np.ndarray:
+    q, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    q *= np.sign(np.linalg.det(q))
+    return q @ np.diag([1, 1, -1]) if mirrored else q
+
+
+@given(st.integers(0, 1000), st.booleans(), st.floats(0.2, 5))
+def test_a_splat_turns_as_a_whole(seed: int, mirrored: bool, scale: float) -> None:
+    one, matrix = splat(), orthonormal(seed, mirrored)
+    turned = turn(one, matrix, scale)
+    before = covariances(torch.from_numpy(one.quats), torch.from_numpy(one.scales)).double().numpy()
+    after = covariances(torch.from_numpy(turned.quats), torch.from_numpy(turned.scales)).double().numpy()
+    np.testing.assert_allclose(after, scale**2 * matrix @ before @ matrix.T, rtol=1e-3, atol=1e-4 * scale**2)
+    np.testing.assert_allclose(turned.means, scale * one.means @ matrix.T, rtol=1e-4, atol=1e-4)
+
+
+def test_with_every_amount_at_zero_nothing_changes_but_the_place_on_the_grid() -> None:
+    one = splat()
+    same = augment(one, np.random.default_rng(0), NOTHING, voxel=0.02)
+    np.testing.assert_allclose(same.sh, one.sh, atol=1e-6)
+    np.testing.assert_allclose(same.scales, one.scales)
+    shift = same.means - one.means
+    assert (np.abs(shift - shift[0]) < 1e-6).all()
+    assert (shift >= -1e-6).all()
+    assert (shift <= 0.02 + 1e-6).all()
+
+
+def test_up_stays_up_but_for_the_tilt() -> None:
+    up = np.array([0.0, 0.6, 0.8])
+    one = replace(splat(), means=np.stack([(i * up).astype(np.float32) for i in range(30)]))
+    turned = augment(one, np.random.default_rng(3), replace(NOTHING, turn=180.0, mirror=1.0), voxel=0.0, up=up)
+    np.testing.assert_allclose(turned.means, one.means, atol=1e-4)
+
+
+def test_the_same_random_numbers_give_the_same_splat() -> None:
+    one, config = splat(), Augmentation()
+    first, second = (augment(one, np.random.default_rng(5), config, voxel=0.1) for _ in range(2))
+    for name in ("means", "quats", "scales", "sh"):
+        assert np.array_equal(getattr(first, name), getattr(second, name))
+
+
+def test_light_changes_brightness_and_black_stays_near_black() -> None:
+    black = replace(splat(), sh=np.full((30, 1, 3), -0.5 / SH_C0, np.float32))
+    lit = augment(black, np.random.default_rng(0), replace(NOTHING, light=0.9), voxel=0.1)
+    np.testing.assert_allclose(lit.sh * SH_C0 + 0.5, 0, atol=1e-6)
+
+
+def test_heads_of_a_teacher_are_in_its_render_loss_and_in_no_other_term(datasets: Datasets) -> None:
+    data = joint(datasets)
+    batch = batch_of(data, range(3))
+    predicted = torch.randn(len(batch.attributes), 8)
+    torch.manual_seed(5)
+    heads = [(AdapterHead(torch.nn.Linear(4, 3), torch.zeros(3), 1.0), torch.nn.Identity())]
+    plain = Distillation(small_encoder(8), LOSSES, data.recipe.teachers).terms(predicted, batch)
+    for number, name in enumerate(datasets):
+        terms = Distillation(small_encoder(8), LOSSES, data.recipe.teachers, heads={name: heads}).terms(
+            predicted, batch
+        )
+        rows, own = batch.teachers[number].rows, predicted.split([4, 4], dim=1)[number]
+        expected = render_loss(own, rows.blend(len(own)), rows.targets, rows.row_weights, LOSSES, heads)
+        torch.testing.assert_close(terms[f"{name}/render"], expected)
+        assert not torch.isclose(terms[f"{name}/render"], plain[f"{name}/render"])
+        for term in set(plain) - {f"{name}/render"}:
+            torch.testing.assert_close(terms[term], plain[term])
+
+
+def test_centers_are_drawn_by_the_classes_of_the_first_teacher_that_a_scene_has(
+    datasets: Datasets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = joint(datasets)
+    given: list[np.ndarray] = []
+
+    def choose(means: np.ndarray, cameras: object, weights: np.ndarray, *others: object) -> object:
+        given.append(weights)
+        return chosen(means, cameras, weights, *others)  # type: ignore[arg-type]
+
+    chosen = module.choose_crop
+    monkeypatch.setattr(module, "choose_crop", choose)
+    for parts, number in (((0, 1), 0), ((None, 1), 1), ((0, None), 0)):
+        scene = data.scenes[0]
+        having = TrainingScene([None if part is None else scene.parts[part] for part in parts])
+        SampleDataset([having], data.recipe)[0]
+        own, balance = scene.parts[number], data.recipe.teachers[number].class_balance
+        expected = np.zeros(len(own))
+        seen = np.flatnonzero(own.weights)
+        expected[seen] = balance.target_weights(own.targets(seen), 1.0)
+        np.testing.assert_allclose(given.pop(), expected, rtol=1e-5)

@@ -1,19 +1,35 @@
 """An encoder with several teachers: what each of them contributes is what it contributes alone."""
 
+import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from joint_training import Datasets, batch_of, joint
-from training_scenes import LOSSES, SHORT, samples, small_encoder
+from joint_training import Datasets, HeightTeacher, batch_of, joint
+from training_scenes import LOSSES, PREPARE, SHORT, SideTeacher, prepared, samples, scene, small_encoder
 
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.logs import LOG_FILE, read_log
+from gsencoder.core.process import untracked
 from gsencoder.core.settings import first_difference
+from gsencoder.models.output_space import OutputSpaces
+from gsencoder.teachers.base import MissingInput
 from gsencoder.teachers.labels import PaletteConfig
-from gsencoder.train.run import Distillation, TrainConfig, encoder_trainer, resume_settings
-from gsencoder.train.samples import SampleDataset
+from gsencoder.train.loop import (
+    TRAINING_CHECKPOINT_FILE,
+    TrainingState,
+    check_same_teachers,
+    load_checkpoint,
+    save_checkpoint,
+)
+from gsencoder.train.prepare import PreparedDataset
+from gsencoder.train.prepare_scenes import _check_teachers, teacher_folders
+from gsencoder.train.run import Distillation, TrainConfig, encoder_trainer, resume_settings, train
+from gsencoder.train.samples import SampleDataset, TrainingScene
+from gsencoder.train.space import dataset_space
 
 
 def test_terms_and_gradients_of_each_teacher_are_those_of_a_training_with_it_alone(datasets: Datasets) -> None:
@@ -25,7 +41,7 @@ def test_terms_and_gradients_of_each_teacher_are_those_of_a_training_with_it_alo
     terms, divisors = both.terms(predicted, batch), both.divisors(batch)
     sum(terms[name] for name in terms).backward()
     assert predicted.grad is not None
-    for number, (name, (dataset, names)) in enumerate(datasets.items()):
+    for number, name in enumerate(datasets):
         alone = Distillation(small_encoder(), LOSSES, data.recipe.teachers[number : number + 1])
         own = batch._replace(teachers=batch.teachers[number : number + 1])
         part = predicted.detach().split(widths, dim=1)[number].clone().requires_grad_()
@@ -38,14 +54,15 @@ def test_terms_and_gradients_of_each_teacher_are_those_of_a_training_with_it_alo
         assert divisors[f"{name}/render"] == pytest.approx(own.teachers[0].rows.row_weights.sum().item(), rel=1e-6)
         assert divisors[f"{name}/field"] == pytest.approx(own.teachers[0].loss_weights.sum().item(), rel=1e-6)
         torch.testing.assert_close(predicted.grad.split(widths, dim=1)[number], part.grad)
-        del dataset, names
+    half = Distillation(small_encoder(8), LOSSES, joint(datasets, {"heights": 0.25}).recipe.teachers).lambdas
+    assert half == {name: weight * (0.25 if "heights" in name else 1) for name, weight in both.lambdas.items()}
 
 
 def test_samples_have_the_targets_of_each_teacher_for_the_same_gaussians(datasets: Datasets) -> None:
     data = joint(datasets)
     for number, (name, (dataset, names)) in enumerate(datasets.items()):
         # A teacher alone draws other centers, by its own classes, unless all Gaussians are in each sample.
-        everything = {"sampling": replace(data.recipe.sampling, scope="scene", gaussians=0)}
+        everything = {"sampling": replace(data.recipe.sampling, gaussians=0)}
         together = SampleDataset(data.scenes[:2], replace(data.recipe, **everything))
         alone = samples(dataset, names[:2], **everything)
         assert together[0].name == alone[0].name
@@ -94,46 +111,6 @@ def test_the_log_averages_a_teachers_losses_over_the_steps_that_have_it(datasets
             assert float(row[name]) == pytest.approx(np.mean(values), rel=1e-5)
 
 
-def test_a_resumed_run_has_the_same_bits(datasets: Datasets, tmp_path: Path) -> None:
-    def run(folder: Path, steps: range | None = None) -> torch.Tensor:
-        encoder = small_encoder(8)
-        trainer = encoder_trainer(encoder, joint(datasets), LOSSES, SHORT, folder=folder, settings={"run": 1})
-        if steps is None:
-            trainer.run()
-        else:
-            with pytest.raises(KeyboardInterrupt):
-                trainer.run(_stop_at(4))
-        return encoder.head_norm.weight.detach().clone()
-
-    straight = run(_made(tmp_path / "straight"))
-    run(_made(tmp_path / "killed"), range(4))
-    assert torch.equal(run(tmp_path / "killed"), straight)
-
-
-def test_training_lowers_the_losses_of_both_teachers(datasets: Datasets, tmp_path: Path) -> None:
-    data, encoder = joint(datasets), small_encoder(8)
-    batch = batch_of(data, range(6))
-
-    def field_losses() -> dict[str, float]:
-        distillation = Distillation(encoder.eval(), LOSSES, data.recipe.teachers)
-        with torch.no_grad():
-            terms, divisors = distillation(batch), distillation.divisors(batch)
-        return {name: terms[name].item() / divisors[name] for name in ("sides/field", "heights/field")}
-
-    before = field_losses()
-    encoder_trainer(encoder, data, LOSSES, replace(SHORT, steps=25), folder=tmp_path, settings={}).run()
-    after = field_losses()
-    for name, loss in before.items():
-        assert after[name] < 0.8 * loss, name
-
-
-def test_the_weight_of_a_teacher_multiplies_that_of_each_of_its_terms(datasets: Datasets) -> None:
-    lambdas = Distillation(small_encoder(8), LOSSES, joint(datasets, {"heights": 0.25}).recipe.teachers).lambdas
-    for term, weight in (("field", 1.0), ("render", LOSSES.render_weight), ("contrast", LOSSES.contrast_weight)):
-        assert lambdas[f"sides/{term}"] == weight
-        assert lambdas[f"heights/{term}"] == 0.25 * weight
-
-
 def test_a_teacher_without_contrast_has_no_such_term(datasets: Datasets) -> None:
     data = joint(datasets)
     sides, heights = data.recipe.teachers
@@ -167,16 +144,130 @@ def test_a_run_goes_on_only_with_its_teachers_in_their_order(datasets: Datasets)
     assert first != resume_settings(config, opened, ["wall_0", "wall_1"], "")
 
 
-def _stop_at(step: int) -> object:
-    def track(steps: range, label: str) -> object:
-        for number in steps:
-            if number == step:
-                raise KeyboardInterrupt
-            yield number
-
-    return track
-
-
 def _made(folder: Path) -> Path:
     folder.mkdir(exist_ok=True)
     return folder
+
+
+def test_other_teachers_than_those_of_a_checkpoint_are_refused_before_and_after_preparation(tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    check_same_teachers(path, ["a", "b", "c"])
+    encoder = small_encoder()
+    optimizer = torch.optim.AdamW(encoder.parameters())
+    stored = {"teachers": ["a", "b"], "spaces": {"a": "1", "b": "2"}}
+    save_checkpoint(path, encoder, optimizer, TrainingState(step=1), stored)
+    check_same_teachers(path, ["a", "b"])
+    for asked in (["a", "b", "c"], ["b", "a"], ["a"]):
+        message = re.escape(f"was made with teachers=['a', 'b'], and this run asks teachers={asked};")
+        with pytest.raises(InputError, match=f"{message}.*; give resume=false"):
+            check_same_teachers(path, asked)
+        with pytest.raises(InputError, match=message):
+            load_checkpoint(path, encoder, optimizer, {"teachers": asked, "spaces": {}})
+
+
+def test_a_run_with_another_list_of_teachers_is_refused_before_anything_is_prepared(tmp_path: Path) -> None:
+    encoder = small_encoder()
+    optimizer = torch.optim.AdamW(encoder.parameters())
+    made_with = {"teachers": ["a", "b"]}
+    save_checkpoint(tmp_path / TRAINING_CHECKPOINT_FILE, encoder, optimizer, TrainingState(step=1), made_with)
+    config = TrainConfig(teachers={name: PaletteConfig() for name in "abc"})
+    with pytest.raises(InputError, match="and this run asks teachers="):
+        train([tmp_path / "nowhere"], config, work=tmp_path, device="cpu")
+    assert not (tmp_path / "prepared").exists()
+
+
+def test_names_that_a_scene_to_train_on_has_gained_need_other_prepared_scenes(datasets: Datasets) -> None:
+    class Named(SideTeacher):
+        kinds = ("mug", "teapot")
+
+    class Dense(HeightTeacher):
+        kinds = ("mug", "teapot")
+
+    dataset = PreparedDataset(datasets["sides"][0].folder)
+    dataset.load_kinds = lambda: ("mug",)  # type: ignore[method-assign]
+    with pytest.raises(InputError, match="the classes of this dataset lack teapot, since the scene has changed"):
+        dataset.check_kinds(Named())
+    dataset.check_kinds(Dense())
+    dataset.load_kinds = lambda: ("teapot", "mug")  # type: ignore[method-assign]
+    dataset.check_kinds(Named())
+
+
+def test_classes_are_counted_again_when_a_scene_gains_the_teacher(tmp_path: Path) -> None:
+    dataset, names = prepared(tmp_path, count=2)
+    before = dataset.load_class_balance().counts.sum()
+    dataset.count_classes(names, untracked)
+    assert dataset.load_class_balance().counts.sum() == before
+    dataset.prepare(scene(2), SideTeacher(), PREPARE, source=Path("wall_2"))
+    dataset.count_classes([*names, "wall_2"], untracked)
+    assert dataset.load_class_balance().counts.sum() > 1.3 * before
+
+
+def test_files_of_other_gaussians_are_refused(datasets: Datasets, tmp_path: Path) -> None:
+    other, _ = prepared(tmp_path / "other", count=1, teacher=HeightTeacher())
+    moved = scene(0)
+    assert moved.gaussians is not None
+    other.scene_path("wall_0").unlink()
+    shifted = replace(moved, gaussians=replace(moved.gaussians, means=moved.gaussians.means + np.float32(1e-3)))
+    other.prepare(shifted, HeightTeacher(), PREPARE, source=Path("wall_0"))
+    first = datasets["sides"][0].find_scene("wall_0")
+    with pytest.raises(InputError, match="has other Gaussians or views than"):
+        TrainingScene([first, other.find_scene("wall_0")]).check_consistent()
+    with pytest.raises(InputError, match="a scene has no teacher"):
+        TrainingScene([None, None])
+
+
+def test_scenes_without_a_teacher_and_teachers_without_a_scene_are_reported(datasets: Datasets) -> None:
+    opened = {name: dataset for name, (dataset, _) in datasets.items()}
+    walls = [Path(f"wall_{number}") for number in range(3)]
+    with pytest.warns(SceneWarning, match=r"teacher heights: 1 of 3 scenes lack what it needs \(wall_2\)"):
+        _check_teachers(opened, walls, [])
+    with pytest.raises(InputError, match="1 scenes have none of them, such as 'wall_3'"):
+        _check_teachers(opened, [*walls, Path("wall_3")], [])
+    with pytest.raises(InputError, match="teacher heights: no scene to train on has it"):
+        _check_teachers(opened, walls[2:], walls[:2])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        _check_teachers(opened, walls[:1], walls[1:2])
+
+
+def test_the_space_is_that_of_the_scenes_that_have_the_teacher() -> None:
+    def open_scene(path: Path) -> tuple[object, object]:
+        if path.name == "bare":
+            raise MissingInput("the scene has no labels")
+        return scene(0), HeightTeacher()
+
+    outputs, _, _ = dataset_space([Path("bare"), Path("a")], open_scene, PREPARE, optional=True)  # type: ignore[arg-type]
+    expected, _, _ = dataset_space([Path("a")], open_scene, PREPARE)  # type: ignore[arg-type]
+    np.testing.assert_allclose(outputs.mean, expected.mean, atol=1e-6)
+    with pytest.raises(MissingInput, match="no scene to train on has what it needs; the first one: .* no labels"):
+        dataset_space([Path("bare")], open_scene, PREPARE, optional=True)  # type: ignore[arg-type]
+    with pytest.raises(MissingInput, match="no labels"):
+        dataset_space([Path("bare"), Path("a")], open_scene, PREPARE)  # type: ignore[arg-type]
+
+
+def test_scenes_prepared_for_one_teacher_are_not_taken_for_those_of_several(datasets: Datasets) -> None:
+    folder = datasets["sides"][0].folder
+    assert teacher_folders(folder, ["sides"]) == {"sides": folder}
+    with pytest.raises(InputError, match="was prepared for one teacher, and this run has several"):
+        teacher_folders(folder, ["sides", "heights"])
+
+
+def test_scenes_prepared_for_several_teachers_are_not_taken_for_those_of_one(datasets: Datasets) -> None:
+    folder = datasets["sides"][0].folder.parent
+    assert set(teacher_folders(folder, ["sides", "heights"])) == {"sides", "heights"}
+    for name, own in (("sides", "sides"), ("colors", "heights")):
+        message = rf"was prepared for several teachers \(heights, sides\), and this run has one; .*/{own}\)"
+        with pytest.raises(InputError, match=message):
+            teacher_folders(folder, [name])
+
+
+def test_two_teachers_of_one_feature_space_are_refused(datasets: Datasets) -> None:
+    outputs, _ = datasets["sides"][0].load_space()
+    with pytest.raises(InputError, match=r"teachers: a and b have the same features \(sides · 4 channels\)"):
+        OutputSpaces(by_teacher={"a": outputs, "b": outputs})
+    # The same model at two sizes has two spaces of one name, which are named by their teachers.
+    other = replace(outputs, space=replace(outputs.space, preprocessing="half size"))
+    both = OutputSpaces(by_teacher={"a": outputs, "b": other})
+    assert both.resolve("b") == "b"
+    with pytest.raises(InputError, match="gives features of a, b; got 'sides'"):
+        both.resolve("sides")

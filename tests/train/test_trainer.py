@@ -1,18 +1,23 @@
 """The loop: it learns, micro batches add up, and it stops before a value that is not finite does harm."""
 
+import os
 import shutil
+import signal
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from trainer_runs import Prepared, losses, steps_in, trainer
+from archives import header_of
+from safetensors.numpy import load_file
+from trainer_runs import Prepared, assert_same_weights, losses, rows, steps_in, trainer
 from training_scenes import LOSSES, SHORT, samples, small_encoder
 
+from gsencoder.core.archive import write_archive
 from gsencoder.core.errors import InputError
 from gsencoder.core.logs import LOG_FILE, read_log
-from gsencoder.core.process import ProcessRank
+from gsencoder.core.process import ProcessRank, Stopped
 from gsencoder.train import loop as data_workers
 from gsencoder.train.loop import (
     TRAINING_CHECKPOINT_FILE,
@@ -20,6 +25,7 @@ from gsencoder.train.loop import (
     ValidationResult,
     _parameter_groups,
     automatic_workers,
+    silence_connection_errors,
 )
 from gsencoder.train.losses import LossConfig
 from gsencoder.train.prepared_file import PreparedScene
@@ -29,30 +35,18 @@ pytestmark = pytest.mark.slow
 
 
 def test_training_brings_the_loss_down(dataset: Prepared, tmp_path: Path) -> None:
-    trainer(dataset, tmp_path, replace(SHORT, steps=40)).run()
+    trainer(dataset, tmp_path, replace(SHORT, steps=20)).run()
     curve = losses(tmp_path)
-    assert len(curve) == 40
-    assert np.mean(curve[-5:]) < 0.6 * np.mean(curve[:5])
+    assert len(curve) == 20
+    assert np.mean(curve[-5:]) < 0.8 * np.mean(curve[:5])
 
 
-@pytest.mark.skipif(torch.cuda.is_initialized(), reason="a GPU is in use")
-def test_a_run_on_a_cpu_leaves_nothing_to_do_for_a_gpu(dataset: Prepared, tmp_path: Path) -> None:
-    before = len(torch.cuda._queued_calls)
-    trainer(dataset, tmp_path).run()
-    assert len(torch.cuda._queued_calls) == before
-
-
-def test_a_rerun_gives_the_same_losses(dataset: Prepared, tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        torch.manual_seed(len(name))
-        trainer(dataset, tmp_path / name).run()
-    assert losses(tmp_path / "a") == losses(tmp_path / "b")
-
-
-def test_a_sample_that_cannot_be_made_stops_the_run_in_its_own_words(dataset: Prepared, tmp_path: Path) -> None:
+def test_a_sample_that_cannot_be_made_stops_the_run_in_its_own_words(
+    dataset: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     one = trainer(dataset, tmp_path)
     refused = InputError("scene wall_1: its file is gone")
-    one.dataset.make = lambda number: (_ for _ in ()).throw(refused)  # type: ignore[method-assign]
+    monkeypatch.setattr("gsencoder.train.samples.make_sample", lambda *_: (_ for _ in ()).throw(refused))
     with pytest.raises(InputError, match="wall_1: its file is gone"):
         one.run()
 
@@ -118,13 +112,6 @@ def test_a_target_that_is_not_finite_stops_the_run_before_the_step_and_names_the
     assert not (tmp_path / TRAINING_CHECKPOINT_FILE).exists()
 
 
-def test_a_gradient_that_is_not_finite_stops_the_run_too(dataset: Prepared, tmp_path: Path) -> None:
-    one = trainer(dataset, tmp_path)
-    one.network.head_norm.weight.register_hook(lambda gradient: gradient * float("inf"))
-    with pytest.raises(InputError, match="the gradient of wall_"):
-        one.run()
-
-
 def test_what_was_done_before_a_step_that_is_not_finite_is_kept(dataset: Prepared, tmp_path: Path) -> None:
     one = trainer(dataset, tmp_path, replace(SHORT, checkpoint_every=1e9))
     calls: list[int] = []
@@ -134,7 +121,7 @@ def test_what_was_done_before_a_step_that_is_not_finite_is_kept(dataset: Prepare
         return gradient * (float("nan") if len(calls) == 4 else 1.0)
 
     one.network.head_norm.weight.register_hook(spoil)
-    with pytest.raises(InputError, match="not finite at step 3; parameters were not changed"):
+    with pytest.raises(InputError, match="the gradient of wall_.* not finite at step 3; parameters were not changed"):
         one.run()
     assert steps_in(tmp_path) == 3
     trainer(dataset, tmp_path).run()
@@ -189,3 +176,127 @@ def test_beside_a_gpu_samples_are_made_by_the_cores_that_are_left_as_far_as_shar
     process = ProcessRank(rank=0, world_size=processes, local_rank=0, local_world_size=processes)
     assert automatic_workers(torch.device("cuda"), process) == expected
     assert automatic_workers(torch.device("cpu"), process) == 0
+
+
+def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(dataset: Prepared, tmp_path: Path) -> None:
+    trainer(dataset, tmp_path / "whole").run()
+
+    def stop_at_five(steps: range, label: str):
+        for step in steps:
+            if step == 5:
+                raise KeyboardInterrupt
+            yield step
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(dataset, tmp_path / "cut").run(stop_at_five)
+    assert len(losses(tmp_path / "cut")) == 5
+    again = trainer(dataset, tmp_path / "cut")
+    assert again.state.step == 5
+    again.run()
+    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+    assert_same_weights(tmp_path / "cut", tmp_path / "whole")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.usefixtures("interrupts")
+def test_a_signal_within_a_step_ends_the_run_after_it(dataset: Prepared, tmp_path: Path) -> None:
+    trainer(dataset, tmp_path / "whole").run()
+    cut = trainer(dataset, tmp_path / "cut")
+    step = cut.optimizer.step
+
+    def half() -> None:
+        if cut.state.step == 4:
+            os.kill(os.getpid(), signal.SIGINT)
+        step()
+
+    cut.optimizer.step = half  # type: ignore[method-assign,assignment]
+    with pytest.raises(KeyboardInterrupt):
+        cut.run()
+    assert steps_in(tmp_path / "cut") == 5
+    trainer(dataset, tmp_path / "cut").run()
+    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+    assert_same_weights(tmp_path / "cut", tmp_path / "whole")
+
+
+@pytest.mark.parametrize(("cause", "saved"), [(Stopped(15), True), (KeyboardInterrupt(), True), (None, False)])
+def test_a_stop_that_compiled_code_wraps_is_a_stop(
+    dataset: Prepared, tmp_path: Path, cause: BaseException | None, saved: bool
+) -> None:
+    def stop_at_three(steps: range, label: str):
+        for step in steps:
+            if step == 3:
+                raise SystemError("returned a result with an exception set") from cause
+            yield step
+
+    with pytest.raises(SystemError):
+        trainer(dataset, tmp_path, replace(SHORT, checkpoint_every=1e9)).run(stop_at_three)
+    assert (tmp_path / TRAINING_CHECKPOINT_FILE).is_file() == saved
+
+
+def test_a_worker_whose_training_process_is_gone_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    for error in (ConnectionResetError(), BrokenPipeError(), EOFError()):
+        silence_connection_errors(type(error), error, None)
+    assert capsys.readouterr().err == ""
+    silence_connection_errors(ValueError, ValueError("wrong"), None)
+    assert "ValueError: wrong" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("at", [4, 8])
+def test_an_interrupted_validation_is_done_again(dataset: Prepared, tmp_path: Path, at: int) -> None:
+    config = replace(SHORT, validate_every=4, log_every=4, checkpoint_every=1e9)
+    scores: list[float] = []
+
+    def validate(encoder: torch.nn.Module) -> ValidationResult:
+        scores.append(float(sum(value.double().sum() for value in encoder.state_dict().values())))
+        if len(scores) == at // 4:
+            raise KeyboardInterrupt
+        return ValidationResult({"score": scores[-1]})
+
+    with pytest.raises(KeyboardInterrupt):
+        trainer(dataset, tmp_path / "cut", config, validate=validate).run()
+    assert steps_in(tmp_path / "cut") == at
+    trainer(dataset, tmp_path / "cut", config, validate=validate).run()
+    scores += [0.0] * 10
+    trainer(dataset, tmp_path / "whole", config, validate=validate).run()
+    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+    assert len([row for row in rows(tmp_path / "cut") if "validation/score" in row]) == 2
+
+
+def test_rows_of_steps_that_are_done_again_are_taken_out_of_the_log(dataset: Prepared, tmp_path: Path) -> None:
+    first = trainer(dataset, tmp_path, replace(SHORT, checkpoint_every=1e9, steps=8))
+
+    def stop_at_five(steps: range, label: str):
+        for step in steps:
+            if step == 5:
+                raise KeyboardInterrupt
+            if step == 3:
+                first.save()
+            yield step
+
+    with pytest.raises(KeyboardInterrupt):
+        first.run(stop_at_five)
+    assert len(losses(tmp_path)) == 5  # Two rows more than the checkpoint has steps.
+    trainer(dataset, tmp_path).run()
+    assert [int(row["step"]) for row in read_log(tmp_path / LOG_FILE)] == list(range(1, 9))
+
+
+def test_a_checkpoint_of_other_settings_is_refused_and_named(dataset: Prepared, tmp_path: Path) -> None:
+    trainer(dataset, tmp_path).run()
+    with pytest.raises(InputError, match=r"was made with run=1, and this run asks run=2"):
+        encoder_trainer(small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 2})
+    for key, message in (("samples_per_step", "a step had 1 samples, and this run has 4"), ("spaces", "changed")):
+        with pytest.raises(InputError, match=message):
+            encoder_trainer(
+                small_encoder(), samples(*dataset), LOSSES, SHORT, folder=tmp_path, settings={"run": 1, key: 4}
+            )
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("step", -5), ("step", 1000), ("unlogged", [{"loss": "x"}]), ("closed", False)]
+)
+def test_a_state_that_no_run_was_in_is_refused(dataset: Prepared, tmp_path: Path, key: str, value: object) -> None:
+    trainer(dataset, tmp_path).run()
+    path = tmp_path / TRAINING_CHECKPOINT_FILE
+    write_archive(path, load_file(path), {**header_of(path), key: value})
+    with pytest.raises(InputError, match="give resume=false"):
+        trainer(dataset, tmp_path)

@@ -133,7 +133,6 @@ def test_folders_that_a_training_did_not_make_are_left_alone(
     "setting",
     [
         "train.seed=99999999999999999999",
-        "model.transformer.mlp_ratio=1e12",
         "model.transformer.encoder_channels=32,32,32,32,32000000000",
         "model.transformer.encoder_depths=1,1,1,1,300000",
         "loss.rarity=1000",

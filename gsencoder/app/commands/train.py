@@ -25,12 +25,12 @@ from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.models.output_space import WEIGHTS_FILE, OutputSpace
 from gsencoder.models.weights import save_weights
 from gsencoder.teachers.build import words_by_teacher
-from gsencoder.train.adapter_heads import dataset_heads, required_heads, teacher_of_heads
 from gsencoder.train.distributed import cpu_share, fail_together
 from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE, check_same_teachers
 from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
 from gsencoder.train.prepared_file import PreparedScene
 from gsencoder.train.run import TrainConfig, Training, fit
+from gsencoder.train.space import dataset_heads, required_heads, teacher_of_heads
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,7 +32,7 @@ from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.localize import select_features
 from gsencoder.train.distributed import fail_together
 from gsencoder.train.tune import TuneConfig, TuningPair, open_processor, save_tuned, tune
-from gsencoder.train.vlm import SERVED_FOLDER, TowerLayout, check_peft, check_targets, link_served
+from gsencoder.train.vlm import SERVED_FOLDER, TowerLayout, check_peft, link_served
 from gsencoder.types import GaussianFeatures
 
 
@@ -278,8 +278,7 @@ def run(config: TuneCommandConfig, run: Run) -> None:
     prepared = prepared_folder(config.prepared, out)
     questions = read_dataset(Path(config.paths[0]), config.split, config.scenes)
     model, features = find_file(config.model, "model", folder=True), Path(config.features)
-    model_config, _, layout = open_processor(model, with_tokens=bool(config.tokens))
-    check_targets(model_config, config.lora.targets)
+    _, _, layout = open_processor(model, with_tokens=bool(config.tokens))
     recipe = PromptRecipe(
         config=config, vlm=VlmConfig(image_side=config.image_side), tokens=config.tokens, layout=layout
     )
