@@ -1,5 +1,5 @@
 """The error of every numeric routine at every extreme: remakes tests/stability/errors.csv, docs/numerics.png, and the
-table in docs/numerics.md.
+measured errors in docs/numerics.md, whose table says what each routine promises.
 
     python bench/numerics.py [--check]
 
@@ -18,10 +18,9 @@ sys.path.insert(0, str(ROOT / "tests"))
 from json_option import add_json_option, write_figures  # noqa: E402
 from stability import routines  # noqa: E402
 from stability.extremes import EXTREMES  # noqa: E402
-from stability.registry import ROUTINES, TABLE, committed, error_of, most, write_table  # noqa: E402
+from stability.registry import DOCUMENT, ROUTINES, TABLE, committed, error_of, most, write_table  # noqa: E402
 
 assert routines
-BEGIN, END = "<!-- made by bench/numerics.py -->\n", "<!-- end -->\n"
 Errors = dict[tuple[str, str], float]
 
 
@@ -39,24 +38,14 @@ def measured() -> Errors:
 
 
 def document(errors: Errors) -> None:
-    path = ROOT / "docs" / "numerics.md"
-    lines = [
-        "| routine | domain | promise | error that is meant | against | worst measured | at |\n",
-        "|---|---|---|---|---|---|---|\n",
-    ]
+    text = DOCUMENT.read_text()
     for routine in ROUTINES.values():
         cells = {extreme.name: errors.get((routine.name, extreme.name)) for extreme in EXTREMES}
         at, worst = max(((name, error) for name, error in cells.items() if error is not None), key=lambda pair: pair[1])
-        lines.append(
-            f"| {routine.name} | {routine.domain} | {routine.promise:.1g} | {routine.measure} | {routine.oracle} | "
-            f"{worst:.1e} | {at if worst else ''} |\n"
-        )
-    extremes = ["| extreme | what |\n", "|---|---|\n", *(f"| {each.name} | {each.what} |\n" for each in EXTREMES)]
-    text = path.read_text()
-    before, rest = text.split(BEGIN, 1)
-    path.write_text(
-        before + BEGIN + "\n" + "".join(lines) + "\n" + "".join(extremes) + "\n" + END + rest.split(END, 1)[1]
-    )
+        (before,) = (line for line in text.splitlines() if line.startswith(f"| {routine.name} | "))
+        kept = before.strip("| ").split(" | ")[:5]
+        text = text.replace(before, f"| {' | '.join(kept)} | {worst:.1e} | {at if worst else ''} |")
+    DOCUMENT.write_text(text)
 
 
 def picture(errors: Errors) -> None:

@@ -62,10 +62,7 @@ class GaussianEncoder(nn.Module):
     """Merges Gaussians into tokens, runs the point transformer, and gives each Gaussian the feature of its token."""
 
     def __init__(self, config: EncoderConfig, channels: int | Sequence[int]) -> None:
-        """Args:
-        config: inputs, token grid and network.
-        channels: columns of the output, of each teacher: rank R of a basis, or all D channels of the space.
-        """
+        """The columns of the output, of each teacher, are the rank R of a basis, or all D channels of the space."""
         super().__init__()
         widths = [channels] if isinstance(channels, int) else list(channels)
         self.config, self.channels = config, sum(widths)
@@ -83,13 +80,8 @@ class GaussianEncoder(nn.Module):
     def forward(
         self, attributes: Float[Tensor, "N A"], opacities: Float[Tensor, " N"], plan: Plan
     ) -> Float[Tensor, "N channels"]:
-        """Predicts features in standard units (see `OutputSpace`), in float32 or wider even under autocast.
-
-        Args:
-            attributes: input channels from `embed`, with the inputs of the configuration.
-            opacities: weights of the Gaussians within their tokens.
-            plan: the plan of these Gaussians, in this order.
-        """
+        """Predicts features in standard units (see `OutputSpace`), in float32 or wider even under autocast. `opacities`
+        are weights of the Gaussians within their tokens."""
         tokens = merge(attributes, opacities.clamp(min=MIN_MERGE_WEIGHT), plan)
         if not torch.compiler.is_exporting():
             # Levels may end in unused tokens.
@@ -157,15 +149,11 @@ def encoder_inputs(
     *,
     scene_curves: SceneCurves | None = None,
 ) -> tuple[Float[Tensor, "N A"], Float[Tensor, " N"], CloudPlan]:
-    """Computes the inputs of an encoder for one cloud: attributes, opacities and plan.
+    """The inputs of an encoder for one cloud: attributes, opacities and plan.
 
     Args:
-        gaussians: the cloud.
-        config: configuration of the encoder.
         voxel: edge length of the token grid's cells in units of the cloud (`config.voxel` is in metres).
-        device: the device of the tensors.
-        scene_curves: patch boundaries of the full scene if the cloud is a part of one (`curves.cut_scene_curves`);
-            None = the cloud is the full scene.
+        scene_curves: patch boundaries of the full scene if the cloud is a part of one; None = it is the full scene.
     """
 
     def tensor(array: np.ndarray) -> Tensor:

@@ -37,12 +37,7 @@ INVALID_CODE = 2**63 - 1
 
 
 def check_extent(extent: float, voxel: float) -> None:
-    """Checks that points do not spread over more cells than codes can number.
-
-    Args:
-        extent: number of cells along the longest axis.
-        voxel: edge length of a cell, world units.
-    """
+    """Checks that points do not spread over more cells on an axis than codes can number."""
     if not extent < MAX_EXTENT:
         raise InputError(
             f"grid: the points spread over {extent:.3g} cells of {voxel:.3g} units on an axis; the limit is 2²⁰; "
@@ -56,13 +51,8 @@ def coordinate_bits(cells: Int64[Any, "N 3"]) -> int:
 
 
 def curve_from_morton(morton: Int64[Any, " N"], order: Order, bits: int) -> Int64[Any, " N"]:
-    """Codes along a curve of cells that are given by their Morton codes; the "-trans" orders swap x and y first.
-
-    Args:
-        morton: codes of coordinates from 0 to 2^bits − 1.
-        order: the curve.
-        bits: levels of the curve.
-    """
+    """Codes along a curve of cells that are given by Morton codes of coordinates from 0 to 2^bits − 1; the "-trans"
+    orders swap x and y first."""
     morton = swap_xy(morton, order)
     return hilbert_from_morton(morton, bits) if order.startswith("hilbert") else morton
 
@@ -95,7 +85,7 @@ def hilbert_from_morton(morton: Int64[Any, " N"], bits: int) -> Int64[Any, " N"]
 
     The curve within a cell has one of 24 orientations (Hamilton 2006, "Compact Hilbert indices"). A table gives, for an
     orientation and the octants of the next two levels, their digits on the curve and the orientation inside. `bits`
-    limits the work and does not change the result: cells counted from one corner always get the same codes.
+    limits the work and does not change the result.
     """
     table = hilbert_table()
     if hasattr(morton, "new_tensor"):
@@ -160,12 +150,8 @@ def _trailing_ones(number: int) -> int:
 
 
 class SceneCurves(NamedTuple):
-    """The patch boundaries of a full scene, for the plans of its parts.
-
-    Attributes:
-        corner: lowest corner of the scene, which is the origin of its grid coordinates; world units.
-        starts: for each level, the first code of each of P patches along each of O orders.
-    """
+    """The patch boundaries of a full scene, for the plans of its parts: its lowest corner, the origin of its grid
+    coordinates, in world units, and for each level the first code of each of P patches along each of O orders."""
 
     corner: Float32[np.ndarray, "3"]
     starts: tuple[Int64[np.ndarray, "O _P"], ...]
@@ -174,18 +160,9 @@ class SceneCurves(NamedTuple):
 def cut_scene_curves(
     means: Float32[np.ndarray, "N 3"], voxel: float, *, levels: int, orders: Sequence[Order], patch: int
 ) -> SceneCurves | None:
-    """Cuts the curves of a scene into patches.
-
-    Args:
-        means: centers, world units; at least one.
-        voxel: edge length of the finest grid's cells, world units; it doubles from level to level.
-        orders: the curves that attention follows.
-        patch: largest number of tokens in a patch. T tokens make ⌈T / patch⌉ patches, and the k-th begins at token
-            ⌊k·T / patches⌋.
-
-    Returns:
-        The boundaries; None if the scene has too many cells for one set of codes, so that each part needs its own.
-    """
+    """Cuts the curves of a scene into patches of at most `patch` tokens: T of them make ⌈T / patch⌉ patches, and the
+    k-th begins at token ⌊k·T / patches⌋. None if the scene has too many cells for one set of codes, so that each part
+    needs its own."""
     scaled = np.floor(means.astype(np.float64) / voxel)
     low, high = scaled.min(axis=0), scaled.max(axis=0)
     # Two cells fewer than would fit, since the origin of a part may be rounded to a cell next to the lowest one.

@@ -108,8 +108,7 @@ def convolve_reference(
     return padded[neighbors.long()].flatten(1) @ weight.flatten(0, 1)
 
 
-# Operators of their own, because a compiler that traced the loop over blocks of rows would compile it anew for every
-# number of cells, and because `gsencoder.infer.onnx.export` translates them to standard ONNX operators.
+# Operators of their own, which `gsencoder.infer.onnx.export` translates to standard ONNX operators.
 @torch.library.custom_op("gsencoder::convolve", mutates_args=())
 def convolve(x: Tensor, neighbors: Tensor, weight: Tensor) -> Tensor:
     """`convolve_reference`, computed in blocks of rows, on a CPU without the cells that no row of a block needs."""

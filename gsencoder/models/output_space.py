@@ -87,7 +87,6 @@ class OutputSpace:
         return replace(self, centered=True, scaled=True).standardize(self.restore(outputs))
 
     def features(self, restored: Float32[np.ndarray, "N channels"]) -> GaussianFeatures:
-        """Wraps restored outputs of all Gaussians as features, all with weight 1."""
         return GaussianFeatures(
             features=restored,
             weights=np.ones(len(restored), np.float32),
@@ -98,13 +97,12 @@ class OutputSpace:
 
 
 def output_space_parts(outputs: OutputSpace) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and header values that represent an output space in a file."""
+    """The arrays and header values of an output space in a file."""
     arrays, header = space_parts(outputs.space, outputs.mean, outputs.basis)
     return arrays, {**header, "scale": outputs.scale, "centered": outputs.centered, "scaled": outputs.scaled}
 
 
 def read_output_space(file: Archive) -> OutputSpace:
-    """Reads an output space from a file."""
     space, mean, basis = read_space(file)
     switches = {name: bool(file.value(name, bool)) for name in ("centered", "scaled")}
     return OutputSpace(space=space, mean=mean, scale=file.value("scale", float, int), basis=basis, **switches)
@@ -112,12 +110,7 @@ def read_output_space(file: Archive) -> OutputSpace:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OutputSpaces:
-    """The output spaces of an encoder, one for each of its teachers. The columns of the encoder's outputs are those of
-    the first space, then those of the second, and so on.
-
-    Attributes:
-        by_teacher: the spaces by the names of the teachers, in the order of their columns.
-    """
+    """The output spaces of an encoder by teacher, in the order of their columns."""
 
     by_teacher: Mapping[str, OutputSpace]
 
@@ -128,17 +121,14 @@ class OutputSpaces:
 
     @property
     def channels(self) -> int:
-        """Columns of the outputs, of all spaces together."""
         return sum(outputs.channels for outputs in self.by_teacher.values())
 
     @property
     def widths(self) -> list[int]:
-        """Columns of the outputs of each space."""
         return [outputs.channels for outputs in self.by_teacher.values()]
 
     @property
     def columns(self) -> dict[str, slice]:
-        """The columns of each space, by the name of its teacher."""
         ends = np.cumsum([outputs.channels for outputs in self.by_teacher.values()]).tolist()
         return {name: slice(end - self.by_teacher[name].channels, end) for name, end in zip(self, ends, strict=True)}
 
@@ -153,12 +143,10 @@ class OutputSpaces:
 
     @property
     def unit(self) -> Float32[np.ndarray, " channels"]:
-        """The unit of each column; see `OutputSpace.unit`."""
         return np.concatenate([np.full(each.channels, each.unit, np.float32) for each in self.by_teacher.values()])
 
     @property
     def offset(self) -> Float32[np.ndarray, " channels"]:
-        """The offset of each column; see `OutputSpace.offset`."""
         return np.concatenate([outputs.offset for outputs in self.by_teacher.values()])
 
     def restore(self, outputs: Float32[np.ndarray, "n channels"]) -> Float32[np.ndarray, "n channels"]:
@@ -168,7 +156,7 @@ class OutputSpaces:
         return restored
 
     def select(self, name: str | None = None) -> OutputSpace:
-        """One of the spaces; `name` and errors are those of `resolve`."""
+        """One of the spaces; see `teacher_of_space`."""
         return self[self.resolve(name)]
 
     def resolve(self, name: str | None = None) -> str:
@@ -177,13 +165,8 @@ class OutputSpaces:
 
 
 def teacher_of_space(spaces: Mapping[str, FeatureSpace], name: str | None = None, *, option: str = "space") -> str:
-    """The teacher that a name stands for: the teacher itself, or the name of its feature space.
-
-    Args:
-        spaces: the feature spaces of an encoder, by the names of their teachers.
-        name: of a teacher or a feature space; None = the only one.
-        option: where the name comes from, for the message.
-    """
+    """The teacher that a name stands for: the teacher itself, or the name of its feature space; None = the only one.
+    `option` is where the name comes from, for the message."""
     names = [each.name for each in spaces.values()]
     teachers = {each.name: teacher for teacher, each in spaces.items() if names.count(each.name) == 1}
     teachers |= {teacher: teacher for teacher in spaces}
@@ -196,13 +179,8 @@ def teacher_of_space(spaces: Mapping[str, FeatureSpace], name: str | None = None
 
 
 def name_of_space(spaces: Mapping[str, FeatureSpace], space: FeatureSpace, encoder: str) -> str:
-    """The teacher of an encoder whose features are of a space.
-
-    Args:
-        spaces: of the encoder, by teacher.
-        space: that is wanted.
-        encoder: in messages: the setting that names it.
-    """
+    """The teacher of an encoder whose features are of a space; `encoder` is the setting that names it, for the
+    message."""
     for name, each in spaces.items():
         if each == space:
             return name
@@ -224,11 +202,8 @@ def check_distinct(spaces: Mapping[str, FeatureSpace]) -> None:
 
 
 def output_spaces_parts(outputs: OutputSpaces) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and header values that represent the output spaces of an encoder in a file.
-
-    Those of a single space are what `output_space_parts` gives, and the teacher's name; arrays of several spaces have
-    the number of the space before their names.
-    """
+    """The arrays and header values of an encoder's output spaces in a file. Arrays of several spaces have the number of
+    the space before their names."""
     if len(outputs) == 1:
         (name,) = outputs
         arrays, header = output_space_parts(outputs[name])
@@ -267,13 +242,9 @@ SHIPPED = "shipped:"
 
 
 def find_weights(source: str, option: str = "weights") -> Path:
-    """Finds the file of weights: in a folder that `train` wrote, at a path, or by the name of an encoder that comes
-    with the package. Relative paths are also looked up in GSENCODER_MODELS.
-
-    Args:
-        source: the path or name; `shipped:NAME` is never a path, and "" is DEFAULT_WEIGHTS.
-        option: that gives it, for errors.
-    """
+    """Finds the file of weights: in a folder that `train` wrote, at a path, also one in GSENCODER_MODELS, or by the
+    name of an encoder that comes with the package. `shipped:NAME` is never a path, "" is DEFAULT_WEIGHTS, and `option`
+    is what gives it, for errors."""
     names = sorted(path.parent.name for path in SHIPPED_WEIGHTS.glob(f"*/{WEIGHTS_FILE}"))
     name = (source or SHIPPED + DEFAULT_WEIGHTS).removeprefix(SHIPPED)
     try:

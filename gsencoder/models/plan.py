@@ -26,16 +26,11 @@ from gsencoder.models.neighbors import KernelSize, neighbor_table
 
 
 def grid_coords(points: Tensor, voxel: float, corner: Tensor | None = None) -> Int64[Tensor, "N 3"]:
-    """Non-negative grid coordinates of points [N, 3].
+    """Non-negative grid coordinates of points.
 
     Cell borders lie at multiples of `voxel` in world coordinates. The origin of the coordinates is the largest multiple
-    of ALIGN cells at or below the lowest point on each axis, so that a part of a scene is divided into cells and pooled
-    exactly as the full scene is. With the corner of the full scene its cells also have the same coordinates.
-
-    Args:
-        points: world units.
-        voxel: edge length of a cell, world units.
-        corner: lowest corner of the full scene, [3], world units; None = the lowest of the points.
+    of ALIGN cells at or below the lowest point on each axis, or the lowest `corner` of the full scene, so that a part
+    of a scene is divided into cells and pooled exactly as the full scene is.
     """
     if not len(points):
         return torch.zeros(0, 3, dtype=torch.int64, device=points.device)
@@ -85,8 +80,7 @@ class Plan(NamedTuple):
         members: the Gaussians sorted by token.
         counts: number of Gaussians of each token.
         levels: finest first.
-        stem_neighbors: the 125 cells around each token of the finest level, for a stem of 5³ cells; T where a cell is
-            not occupied. None for a stem of 3³, which uses `neighbors` of that level.
+        stem_neighbors: the cells around each token for a stem of 5³ cells, as `neighbors` of a level; None for 3³.
     """
 
     token_of: Int64[Tensor, " N"]
@@ -132,15 +126,13 @@ def plan_cloud(
     scene_curves: SceneCurves | None = None,
     stem: KernelSize = 3,
 ) -> CloudPlan:
-    """Computes the plan of one cloud.
+    """The plan of one cloud.
 
     Args:
-        means: centers in world units.
         voxel: edge length of the finest grid's cells, world units; it doubles from level to level.
         orders: the curves that attention follows, in turn.
-        scene_curves: patch boundaries of the full scene, made with the same voxel, levels, orders and patch as here and
-            in `join_plans`. The cloud is then cut where the scene is, so that its tokens share a patch exactly where
-            they do in the scene. None = the cloud is the full scene.
+        scene_curves: patch boundaries of the full scene, made with the same voxel, levels, orders and patch. The cloud
+            is then cut where the scene is, so that its tokens share a patch exactly where they do in the scene.
         stem: edge of the neighborhood of the encoder's first convolution, cells.
     """
     cells = grid_coords(means, voxel, torch.from_numpy(scene_curves.corner) if scene_curves is not None else None)
@@ -181,16 +173,12 @@ def _no_pooling(morton: Int64[Tensor, " T"]) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def join_plans(clouds: Sequence[CloudPlan], patch: int, *, round_up: bool = True) -> Plan:
-    """Joins the plans of clouds to that of a batch, and cuts each cloud into patches of nearly equal size.
-
-    Tokens of the clouds follow one another without padding in between.
+    """Joins the plans of clouds to that of a batch, whose tokens follow one another, and cuts each cloud into patches
+    of nearly equal size: ⌈n / patch⌉ of n tokens; a part of a scene has its share of each of the scene's patches.
 
     Args:
-        clouds: plans with equal numbers of levels and orders.
-        patch: largest number of tokens in a patch. A cloud of n tokens has ⌈n / patch⌉ patches that differ by one token
-            at most; a part of a scene has its share of each of the scene's patches.
         round_up: append unused tokens to every level, so that few different sizes occur: libraries that compile a
-            matrix product for each size (oneDNN in bfloat16, torch.compile) then do so rarely.
+            matrix product for each size (oneDNN in bfloat16) then do so rarely.
     """
     tokens = [len(cloud.counts) for cloud in clouds]
     gaussians = [len(cloud.members) for cloud in clouds]
@@ -282,11 +270,8 @@ def _patch_lengths(levels: Sequence[CloudLevel], patch: int) -> list[Int64[Tenso
 def _pack_patches(
     lengths: Sequence[Int64[Tensor, " _patches"]], round_size: Callable[[int], int]
 ) -> tuple[Int64[Tensor, "o slots"], Int64[Tensor, "o T"], Bool[Tensor, "o patches width"]]:
-    """Packs runs of tokens along the curves into patches of one width.
-
-    Returns:
-        The position on the curve in each slot, the slot of each position, and which slots attention may look at.
-    """
+    """Packs runs of tokens along the curves into patches of one width: the position on the curve in each slot, the slot
+    of each position, and which slots attention may look at."""
     count = round_size(max(len(order_lengths) for order_lengths in lengths))
     length = torch.stack([_pad_to(order_lengths, count) for order_lengths in lengths])
     width = int(length.max()) if count else 0

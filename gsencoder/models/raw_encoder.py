@@ -27,13 +27,7 @@ from gsencoder.models.transformer import TransformerConfig, embed
 
 
 class TokenLevel(NamedTuple):
-    """The tokens of one level, in Morton order.
-
-    Attributes:
-        cells: grid coordinates.
-        morton: Morton codes.
-        curve_codes: codes along each order.
-    """
+    """The tokens of one level, in Morton order: grid coordinates, Morton codes, and codes along each order."""
 
     cells: Int64[Tensor, "T 3"]
     morton: Int64[Tensor, " T"]
@@ -68,11 +62,6 @@ class RawEncoder(nn.Module):
         """Predicts features of a cloud of one or more Gaussians: coordinates in the basis, or vectors, of each space.
 
         Args:
-            means: centers, world units.
-            quats: wxyz; normalized here.
-            scales: standard deviations > 0, world units.
-            opacities: in [0, 1].
-            sh_dc: degree-0 spherical-harmonic coefficients.
             voxel: edge length of the finest grid's cells, world units. An input, since the exporter would round a
                 constant to float32, which moves Gaussians near a border to another cell.
             corner: lowest corner of the full scene if the cloud is a part of one (`SceneCurves.corner`), else +inf.
@@ -158,7 +147,6 @@ def _runs(codes: Int64[Tensor, " N"]) -> tuple[Int64[Tensor, " T"], Int64[Tensor
 
 
 def _run_lengths(first: Int64[Tensor, " T"], total: int) -> Int64[Tensor, " T"]:
-    """The numbers of rows of runs, given their first rows."""
     return torch.cat((first[1:], first[:1] + total)) - first
 
 
@@ -201,15 +189,9 @@ def _walk_columns(
     steps: int,
     count: int,
 ) -> Int32[Tensor, "cells T"]:
-    """The positions of successive cells of columns among sorted keys; `count` for cells that are not occupied.
-
-    Args:
-        padded: the sorted keys, with padding at the end.
-        position: where each column's first cell would be.
-        target_keys: the key of each column's first cell.
-        steps: number of cells of a column.
-        count: number of keys.
-    """
+    """The positions of successive cells of columns among `count` sorted keys, which are padded at their end; `count`
+    for cells that are not occupied. `position` is where each column's first cell would be, and `target_keys` its
+    key."""
     matches = []
     for _ in range(steps):
         hit = _take(padded, position) == target_keys
@@ -231,13 +213,8 @@ class PatchIndex(NamedTuple):
 
 
 def _cut_patches(codes: Int64[Tensor, " T"], starts: Int64[Tensor, " P"], patch: int) -> PatchIndex:
-    """Cuts tokens into patches, each padded to `patch` slots.
-
-    Args:
-        codes: codes of the tokens along the order.
-        starts: first codes of the patches of the full scene; negative if the cloud is the full scene.
-        patch: largest number of tokens in a patch.
-    """
+    """Cuts tokens, given by their codes along an order, into patches, each padded to `patch` slots; `starts` are the
+    first codes of the patches of the full scene, negative if the cloud is the full scene."""
     count = codes.shape[0]
     codes, rows = torch.sort(codes, stable=True)
     rank = torch.arange(count, device=codes.device)

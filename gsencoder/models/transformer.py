@@ -278,14 +278,9 @@ class PointTransformer(nn.Module):
             self.up.append(_make_blocks(config, up[level], [config.drop_path * level / config.levels] * depth))
 
     def forward(self, x: Float[Tensor, "T C"], plan: Plan) -> Float[Tensor, "T D"]:
-        """Runs all blocks; they follow the orders in turn, in training permuted as `shuffle_orders` says.
-
-        The permutations are drawn from torch's generator on the CPU, which the training loop seeds by the step.
-
-        Args:
-            x: embedded tokens, C = encoder_channels[0].
-            plan: made with the levels, patch and orders of the configuration.
-        """
+        """Runs all blocks on embedded tokens; they follow the orders in turn, in training permuted as `shuffle_orders`
+        says. The permutations are drawn from torch's generator on the CPU, which the training loop seeds by the
+        step."""
         permutations = self._permutations()
         skips: list[Tensor] = []
         first_block = 0
@@ -349,21 +344,12 @@ def embed(
     voxel: float | Float[Tensor, ""],
     attributes: tuple[Attribute, ...],
 ) -> Float[Tensor, "N C"]:
-    """Computes the input channels, all of order one.
+    """The input channels, all of order one, concatenated in the order of `attributes`.
 
     offset: position of the center in its voxel, −1 to 1. color: degree-0 color, −1 for black to 1 for white, clamped to
     ±2. opacity: −1 to 1. scale: ¼ of log(scale / voxel), largest first. rotation: ¼ of the six distinct entries of
     R diag(log s − mean log s) Rᵀ, the off-diagonal ones times √2, so that distances between inputs are Frobenius
-    distances between matrices.
-
-    Args:
-        means: world units.
-        quats: wxyz; normalized here.
-        scales: standard deviations > 0, world units.
-        opacities: in [0, 1].
-        sh_dc: degree-0 spherical-harmonic coefficients.
-        voxel: edge length of the token grid's cells, world units; a tensor in an exported graph, where it is an input.
-        attributes: the attributes to embed; their channels are concatenated in this order.
+    distances between matrices. The voxel, in world units, is a tensor in an exported graph, where it is an input.
     """
     channels: list[Tensor] = []
     log_scales = torch.log(scales.double() / voxel).clamp(-MAX_ABS_LOG_SCALE, MAX_ABS_LOG_SCALE).to(means.dtype)

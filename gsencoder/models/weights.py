@@ -22,15 +22,8 @@ def save_weights(
     *,
     dtype: Literal["float32", "float16"] = "float32",
 ) -> None:
-    """Writes parameters, configuration and output spaces; an existing file is replaced only by a complete new one.
-
-    Args:
-        encoder: the encoder to save.
-        outputs: its output spaces.
-        made_by: settings and results of the training, as JSON values.
-        dtype: type of the stored parameters. float16 halves the file and keeps 3 decimal digits of the parameters,
-            which are small numbers.
-    """
+    """Writes parameters as `dtype`, configuration and output spaces, with settings and results of the training as JSON
+    values."""
     arrays, header = output_spaces_parts(outputs)
     for name, value in encoder.state_dict().items():
         with np.errstate(over="ignore"):
@@ -44,16 +37,8 @@ def save_weights(
 
 
 def load_weights(source: str | Path, option: str = "weights") -> tuple[GaussianEncoder, OutputSpaces, dict[str, Any]]:
-    """Loads an encoder.
-
-    Args:
-        source: a file, a folder that `train` wrote, or the name of an encoder that comes with the package; see
-            `find_weights`.
-        option: that gives it, for errors.
-
-    Returns:
-        The encoder in evaluation mode, its output spaces, and settings and results of its training.
-    """
+    """Loads an encoder in evaluation mode, its output spaces, and settings and results of its training; see
+    `find_weights` for the arguments."""
     with open_archive(find_weights(str(source), option)) as file:
         config = _read_config(file.value("encoder", dict))
         outputs = read_output_spaces(file)

@@ -50,12 +50,8 @@ class Presence:
     """
 
     def __init__(self, process: ProcessRank, init_method: str, *, wait: timedelta) -> None:
-        """Waits until all processes have come.
-
-        Args:
-            init_method: as `rank_from_environment` gives it.
-            wait: longest wait of an operation of `store`.
-        """
+        """Waits until all processes have come. `init_method` is as `rank_from_environment` gives it; `wait` is the
+        longest wait of an operation of `store`."""
         self._process, self._stopped = process, threading.Event()
         self._others = [rank for rank in range(process.world_size) if rank != process.rank]
         host, port = store_address(os.environ, init_method)
@@ -232,10 +228,7 @@ _presence: Presence | None = None
 
 
 def gpu_index(process: ProcessRank, init_method: str) -> int:
-    """The index of this process's GPU among those that it sees.
-
-    It is 0 where SLURM binds one GPU to each task, so that a task sees only that one.
-    """
+    """The index of this process's GPU among those that it sees: 0 where SLURM binds one GPU to each task."""
     is_bound = init_method.startswith("tcp://") and torch.cuda.device_count() == 1
     return 0 if is_bound else process.local_rank
 
@@ -244,14 +237,10 @@ def gpu_index(process: ProcessRank, init_method: str) -> int:
 def join_processes(
     device: Device = "auto", *, settings: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[ProcessRank, torch.device]]:
-    """Joins the process group for the block.
+    """Joins the process group for the block, and gives the rank and the device of this process.
 
     Args:
-        device: "auto" (one GPU per process if torch sees any, else the CPU), "cpu" or "cuda".
         settings: the settings of the run, in which all processes must agree; None = they are not compared.
-
-    Yields:
-        The rank and the device of this process.
     """
     process, init_method = rank_from_environment(os.environ)
     chosen = choose_device(device, gpu_index(process, init_method))
@@ -297,16 +286,10 @@ def join_processes(
 
 
 @contextmanager
-def lost_processes(process: ProcessRank, minutes: float | None = None) -> Iterator[None]:
-    """Turns the error of a collective operation whose other side has died, or does not answer, into one that says so.
-
-    Args:
-        minutes: longest wait for the others within the block; None = that of the group. NCCL has its own watch, which
-            ends the process.
-    """
-    shorter = process.world_size > 1 and minutes is not None
-    if minutes is not None and shorter:
-        _set_wait(timedelta(minutes=minutes))
+def lost_processes(process: ProcessRank, minutes: float = 60 * WAIT_HOURS) -> Iterator[None]:
+    """Turns the error of a collective operation whose other side has died, or does not answer within some minutes, into
+    one that says so. NCCL has its own watch, which ends the process."""
+    _set_wait(minutes)
     try:
         yield
     except InputError:
@@ -316,7 +299,7 @@ def lost_processes(process: ProcessRank, minutes: float | None = None) -> Iterat
         if process.world_size == 1 or not any(words in message.lower() for words in LOST):
             raise
         hung = "timed out" in message.lower() or "timeout" in message.lower()
-        waited = f"did not answer for {minutes:g} minutes" if hung and minutes is not None else "did not answer"
+        waited = f"did not answer for {minutes:g} minutes" if minutes < 60 * WAIT_HOURS else "did not answer"
         lost = _presence.find_lost(waits=not hung) if _presence is not None else []
         raise InputError(
             f"training: process {process.rank} of {process.world_size}: {named(lost) if lost else 'another process'} "
@@ -324,16 +307,15 @@ def lost_processes(process: ProcessRank, minutes: float | None = None) -> Iterat
             "to continue"
         ) from error
     finally:
-        if shorter:
-            _set_wait(timedelta(hours=WAIT_HOURS))
+        _set_wait(60 * WAIT_HOURS)
 
 
-def _set_wait(longest: timedelta) -> None:
+def _set_wait(minutes: float) -> None:
     """Sets the longest wait of the operations of the group that begin from now on."""
     # torch has no public function for a group that exists.
     change = getattr(distributed.distributed_c10d, "_set_pg_timeout", None)
-    if change is not None:
-        change(longest)
+    if change is not None and _in_group():
+        change(timedelta(minutes=minutes))
 
 
 def digest_of(value: Any) -> str:
@@ -408,13 +390,8 @@ def _is_nccl() -> bool:
 
 
 def check_agreement(subject: str, value: str, advice: str = "give all processes the same files") -> None:
-    """Checks that all processes have the same value of something, such as the digest of a teacher's weights.
-
-    Args:
-        subject: what it is the value of, for the error.
-        value: of this process; empty = it has none, and any fits.
-        advice: what to do where they differ.
-    """
+    """Checks that all processes have the same value of something, such as the digest of a teacher's weights; an empty
+    value fits any."""
     digests = [(rank, each) for rank, each in enumerate(values_of_all(value)) if each]
     for rank, each in digests:
         if each != digests[0][1]:
@@ -426,10 +403,8 @@ def check_agreement(subject: str, value: str, advice: str = "give all processes 
 
 @contextmanager
 def fail_together() -> Iterator[None]:
-    """Synchronizes processes at the end of a block that they run independently, or that one of them runs for all.
-
-    If one process fails in the block, all fail, so that none waits forever.
-    """
+    """Synchronizes processes at the end of a block that they run independently, or that one of them runs for all: if
+    one fails in it, all fail, so that none waits forever."""
     failure: Exception | None = None
     try:
         yield

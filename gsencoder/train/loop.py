@@ -146,11 +146,8 @@ NO_WEIGHT = 1e-12
 def sum_divisors(
     objective: Objective, items: Sequence[Any], device: torch.device
 ) -> tuple[list[Any], dict[str, float]]:
-    """The micro-batches of a step on this process, and the divisor of each term over all processes.
-
-    Raises:
-        InputError: a sample could not be made, here or on another process, or no term has a weight.
-    """
+    """The micro-batches of a step on this process, and the divisor of each term over all processes. Fails in all of
+    them if a sample could not be made, or if no term has a weight."""
     batches = [item for item in items if not isinstance(item, InputError)]
     lambdas = objective.lambdas
     batch_divisors = [objective.divisors(batch) for batch in batches]
@@ -184,11 +181,7 @@ def finite_terms(
     processes: int,
 ) -> dict[str, float]:
     """The loss terms of a step over all processes, by name, given what each micro-batch of this one adds to them and
-    the norm of the gradient over all processes.
-
-    Raises:
-        InputError: a loss of any process, or the gradient, is not finite.
-    """
+    the norm of the gradient over all. Fails in all of them if one of these is not finite."""
     bad_loss = bad_gradient = ""
     for batch, row in zip(batches, micro_terms.tolist(), strict=True):
         for name, value in zip(names, row, strict=True):
@@ -215,14 +208,9 @@ TRAINING_CHECKPOINT_FILE = "checkpoint.safetensors"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingState:
-    """The state of a training run that is not in tensors.
-
-    Attributes:
-        step: number of completed steps.
-        seconds: their duration.
-        unlogged: losses of the steps since the last row of the log, to be averaged in the next row.
-        closed: whether logging and validation after the last step are completed.
-    """
+    """The state of a training run that is not in tensors: completed steps, their duration, the losses since the last
+    row of the log, to be averaged in the next row, and whether logging and validation after the last step are
+    completed."""
 
     step: int = 0
     seconds: float = 0.0
@@ -256,12 +244,7 @@ def trained_state(model: nn.Module) -> dict[str, Tensor]:
 def load_checkpoint(
     path: Path, model: nn.Module, optimizer: torch.optim.Optimizer, settings: dict[str, Any]
 ) -> TrainingState:
-    """Restores model and optimizer from a checkpoint.
-
-    Raises:
-        InputError: the file is damaged, or is of another network or of a run with other settings; the first setting
-            that differs is named.
-    """
+    """Restores model and optimizer from a checkpoint; of a run with other settings the first that differs is named."""
     with advised(_advice(path)), open_archive(path) as file:
         stored_settings = file.value("settings", dict)
         if stored_settings != settings:
@@ -333,11 +316,9 @@ SAMPLE_THREADS = 4
 
 
 def automatic_workers(device: torch.device, process: ProcessRank) -> int:
-    """How many processes make samples for a training process.
-
-    Without a GPU none, since the network has all cores. With a GPU one for each core of this process's share of the
-    machine but one, at most `MAX_WORKERS`, and as many as /dev/shm has room for, which is small in containers.
-    """
+    """How many processes make samples for a training process: without a GPU none, since the network has all cores; else
+    one for each core of this process's share of the machine but one, at most `MAX_WORKERS`, as far as /dev/shm has
+    room."""
     if device.type == "cpu":
         return 0
     cores = available_cores() // process.local_world_size - 1
@@ -426,18 +407,12 @@ class Trainer:
             network: trained in place and moved to `device`.
             dataset: the training samples, by number.
             objective: gives the loss of the network once it is wrapped for several processes.
-            collate: joins samples to a batch: tuples and mappings of tensors, with the `names` of the samples for
-                messages.
+            collate: joins samples to a batch: tuples and mappings of tensors, with the `names` of the samples.
             folder: existing folder for checkpoint and log.
             settings: what a run must share with the one that it resumes besides `config`, as JSON values.
             weight_decay: of matrices; norms and biases have none.
             final_rate: learning rate at the end, as a share of the highest.
-            tensorboard: whether to write TensorBoard events.
-            validate: validates the network, which is given in evaluation mode; called in all processes, which may
-                share the work, and the result of the first one is logged.
-
-        Raises:
-            InputError: the folder holds a run with other settings.
+            validate: is called in all processes with the network in evaluation mode; the result of the first is logged.
         """
         self.config, self.dataset, self.process, self.device = config, dataset, process, device
         self.folder, self.validate, self._final_rate = folder, validate, final_rate
@@ -472,12 +447,8 @@ class Trainer:
         self._autocast = autocast_dtype(config.precision, device, training=True)
 
     def run(self, track: Track = untracked) -> TrainingState:
-        """Runs the remaining steps; returns steps and seconds of the training.
-
-        Raises:
-            InputError: a sample cannot be made, or a loss or gradient is not finite; the error names the samples and
-                the loss term, and parameters are not changed. Or a data worker was ended.
-        """
+        """Runs the remaining steps. An error of a sample, or of a loss or gradient that is not finite, names the
+        samples and the term; parameters are not changed."""
         with lost_workers(), self._saving_when_stopped():
             start, saved = time.monotonic() - self.state.seconds, time.monotonic()
             if not self.state.closed:

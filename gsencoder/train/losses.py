@@ -74,13 +74,8 @@ class LossConfig:
 
 
 class RenderRows(NamedTuple):
-    """Rows of B for the render loss, over the Gaussians of a sample or a batch.
-
-    Attributes:
-        crow, col, weight: compressed rows, as in `gsencoder.render.Blend`.
-        targets: the teacher's vectors in the cells, standard units.
-        row_weights: weight of each row in the loss.
-    """
+    """Rows of B for the render loss, over the Gaussians of a sample or a batch, in compressed form as in
+    `gsencoder.render.Blend`, with the teacher's vectors in the cells, in standard units, and the weight of each row."""
 
     crow: Int64[Tensor, " P_plus_1"]
     col: Int32[Tensor, " nnz"]
@@ -96,15 +91,9 @@ class RenderRows(NamedTuple):
 
 
 class TeacherTargets(NamedTuple):
-    """What one teacher says of the Gaussians and views of a sample or a batch.
-
-    Attributes:
-        targets: targets of the Gaussians, standard units; in float16, since samples that are made
-            ahead fill shared memory.
-        codes: class of each Gaussian's target, a row of the teacher's codebook; −1 without a target.
-        loss_weights: weight of each Gaussian in the loss; 0 without a target.
-        rows: rows of the render loss.
-    """
+    """What one teacher says of the Gaussians and views of a sample or a batch. Targets are in standard units, in
+    float16, since samples that are made ahead fill shared memory; the code of a Gaussian is the class of its target, a
+    row of the teacher's codebook, and its weight in the loss is 0 without a target."""
 
     targets: Float16[Tensor, "N C"]
     codes: Int64[Tensor, " N"]
@@ -121,11 +110,8 @@ class AdapterHead(nn.Module):
     mean: Tensor
 
     def __init__(self, body: nn.Module, mean: Float[Tensor, " E"], scale: float) -> None:
-        """Args:
-        body: network from features [n, D] to vectors [n, E].
-        mean: mean of the outputs of `body` for the teacher's features.
-        scale: root mean square distance of these outputs from their mean.
-        """
+        """The `body` leads from features [n, D] to vectors [n, E]; for the teacher's features these have the mean
+        `mean`, and `scale` is the root mean square distance from it."""
         super().__init__()
         if not 0 < scale < float("inf"):
             raise InputError(f"heads: expected a positive scale, got {scale}")
@@ -178,17 +164,10 @@ def contrast_loss(
     config: LossConfig,
 ) -> Float[Tensor, ""]:
     """L_contrast before division: Σ_i w_i · cross-entropy of the class of target i, with the class probabilities
-    softmax_k(−|predicted − c_k|² / (2·C·temperature)).
+    softmax_k(−|predicted − c_k|² / (2·C·temperature)) for the vectors c_k of the codebook.
 
     If two classes look alike, L_3D is smallest at a mean of both, which may be nearest to a third class. This term
     moves the prediction towards the likelier of the two, so that it is also the nearest vector of the codebook.
-
-    Args:
-        predicted: standard units.
-        codes: for each Gaussian, the class of its target, which is a row of the codebook.
-        weights: 0 for Gaussians without a target, whose codes are ignored.
-        codebook: vectors c_k of the target classes, standard units.
-        config: gives the temperature.
     """
     rows = torch.nonzero(weights).squeeze(1)
     half = 0.5 * (codebook * codebook).sum(dim=1)
@@ -208,16 +187,8 @@ def render_loss(
     """L_render (Eq. 4) before division: Σ_p w_p · match((B f)_p / alpha_p, t_p) over cells of the teacher's grid.
 
     alpha_p is the weight of the crop's Gaussians in cell p, so the rendered features are weighted means. Without
-    `config.divide_by_alpha` it is 1, and they are the composited features.
-
-    Args:
-        predicted: predicted features f of the Gaussians of the sample, standard units.
-        blend: B over these Gaussians, with one row for each cell.
-        target: the teacher's vectors t in the cells, standard units.
-        weights: of the cells.
-        config: of the matching loss.
-        heads: the loss is summed over the outputs of these. Both sides are decoded from the dataset's basis, so what
-            it drops of the teacher's vectors is missing in both. Without heads the features themselves are compared.
+    `config.divide_by_alpha` it is 1, and they are the composited features. With heads the loss is summed over their
+    outputs; both sides are decoded from the dataset's basis, so what it drops is missing in both.
     """
     rendered = blend.render(predicted.float())
     if config.divide_by_alpha:
@@ -232,15 +203,7 @@ def render_loss(
 
 
 class LossInputs(NamedTuple):
-    """What a term is computed from: the columns of one teacher.
-
-    Attributes:
-        predicted: the encoder's outputs, standard units.
-        targets: what the teacher says.
-        codebook: the vectors of the teacher's target classes, standard units.
-        heads: its adapter heads.
-        config: parameters of the terms.
-    """
+    """What a term is computed from: the columns of one teacher, in standard units."""
 
     predicted: Float[Tensor, "N C"]
     targets: TeacherTargets
@@ -250,13 +213,8 @@ class LossInputs(NamedTuple):
 
 
 class Term(NamedTuple):
-    """A term of the loss.
-
-    Attributes:
-        total: Σ_i w_i · loss_i.
-        weights: the weights w of these sums, which are known before anything is computed.
-        classes: whether it compares classes of targets, which dense teachers lack.
-    """
+    """A term of the loss: Σ_i w_i · loss_i, its weights w, which are known before anything is computed, and whether it
+    compares classes of targets, which dense teachers lack."""
 
     total: Callable[[LossInputs], Float[Tensor, ""]]
     weights: Callable[[TeacherTargets], Float[Tensor, " n"]]

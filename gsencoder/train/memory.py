@@ -54,13 +54,8 @@ SAMPLE_FILE, SETTINGS_FILE = "sample.safetensors", "made_with.json"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MemoryScene:
-    """A scene that is prepared for one teacher.
-
-    Attributes:
-        prepared: its Gaussians, fused features, and rows of B.
-        outputs: the units of these features.
-        bank: the components.
-    """
+    """A scene that is prepared for one teacher: its Gaussians, fused features and rows of B, their units, and the
+    components."""
 
     prepared: PreparedScene
     outputs: OutputSpace
@@ -101,13 +96,9 @@ def prepare_memory(
 
     Args:
         scene: with Gaussians and views.
-        teacher: whose features are remembered.
         folder: created if it does not exist.
-        bank: how the bank is made.
-        prepare: settings of the fusion and of the rows.
         predicted: features of the teacher's space that an encoder predicts for the scene; None = they are fused.
         sample: number of raw features that are stored beside the bank for `open_raw_sample`, or all if there are fewer.
-        device: where B is made and multiplied.
     """
     if not (prepare.center and prepare.scale):
         raise InputError("prepare.center, prepare.scale: expected true: the losses of a memory are in their units")
@@ -392,15 +383,8 @@ def train_memory(
     device: torch.device = torch.device("cpu"),
     track: Track = untracked,
 ) -> tuple[dict[str, QueryMemory], TrainingState]:
-    """Optimizes the queries of a scene for one teacher or several at once. Interrupted, it is resumed by the next call
-    with the same `work`.
-
-    Args:
-        scenes: the scene as it was prepared for each teacher.
-        config: queries, attention and loss.
-        training: settings of the loop; None = those of `memory_training`.
-        work: existing folder for the checkpoint and the log.
-    """
+    """Optimizes the queries of a scene, as it was prepared for one teacher or several, for all at once. Interrupted, it
+    is resumed by the next call with the same `work`, an existing folder."""
     training = memory_training() if training is None else training
     _check_same_scene(scenes)
     check_rows(scenes, config.min_alpha)

@@ -87,16 +87,8 @@ def prepare_scene(
     source: Path | None = None,
     device: torch.device = torch.device("cpu"),
 ) -> None:
-    """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of `config.render_views`.
-
-    Args:
-        scene: the scene, with Gaussians and views.
-        teacher: a teacher of the space of `outputs`.
-        outputs: output space of the dataset.
-        config: settings of the preparation.
-        source: the path that the scene was read from.
-        device: where B is made and multiplied.
-    """
+    """Computes and writes a scene's Gaussians, fused targets, and rows of the render loss of `config.render_views`;
+    `source` is the path that the scene was read from, and B is made and multiplied on `device`."""
     assert scene.gaussians is not None
     assert scene.views is not None
     fusion = replace(config.fusion, basis=outputs.basis is not None)
@@ -126,7 +118,7 @@ def view_rows(
     device: torch.device = torch.device("cpu"),
 ) -> list[ViewRows]:
     """The matrices B of some views on the teacher's grid, pooled to cells of `config.render_cell` pixels, with the
-    teacher's vectors; the other arguments are those of `prepare_scene`."""
+    teacher's vectors."""
     assert scene.gaussians is not None
     assert scene.views is not None
     blending = replace(config.fusion.blend, min_weight=config.render_min_weight)
@@ -146,13 +138,9 @@ def view_rows(
 def _pool_map(
     feature_map: FeatureMap, outputs: OutputSpace, cell: int
 ) -> tuple[Float32[np.ndarray, "P channels"], Bool[np.ndarray, " P"], FeatureMap]:
-    """Pools a feature map to cells of about `cell` pixels or more, in standard units.
-
-    Cells that the pooled grid would have only a part of, at the right and lower border, are left out.
-
-    Returns:
-        The mean vectors of the cells, which of them have a vector, and an empty map with the grid of the cells.
-    """
+    """Pools a feature map to cells of about `cell` pixels or more: their mean vectors in standard units, which of them
+    have a vector, and an empty map with their grid. Cells that the pooled grid would have only a part of, at the right
+    and lower border, are left out."""
     affine = feature_map.grid_from_image
     side = 1 / float(np.sqrt(affine[0, 0] * affine[1, 1]))
     factor = max(1, round(cell / side))
@@ -210,11 +198,8 @@ class ClassBalance:
     counts: Float64[np.ndarray, " C"]
 
     def class_weights(self, power: float) -> Float32[np.ndarray, " C"]:
-        """The weight n^−power of each class, scaled so that its mean over the targets of the dataset is 1.
-
-        Classes without Gaussians get the weight of the most frequent class: only mixtures of other classes, as in cells
-        across an edge, are nearest to them.
-        """
+        """The weight n^−power of each class, scaled so that its mean over the targets of the dataset is 1. Classes
+        without Gaussians, to which cells across an edge may be nearest, get that of the most frequent class."""
         counts = np.where(self.counts > 0, self.counts, max(float(self.counts.max()), 1.0))
         weights = counts**-power
         weights *= self.counts.sum() / max(float((weights * self.counts).sum()), 1e-30)
@@ -299,9 +284,7 @@ class PreparedDataset:
             return hashlib.sha256(read_foreign(self.folder / SPACE_FILE)).hexdigest()[:16]
 
     def digest_of_scenes(self, names: Sequence[str]) -> str:
-        """A hash of the headers of prepared scenes, which hold the checksums of all arrays, by which processes compare
-        what they train on.
-        """
+        """A hash of the headers of prepared scenes, which hold the checksums of all arrays."""
         digest = hashlib.sha256()
         for name in names:
             path = self.scene_path(name)
@@ -361,15 +344,7 @@ class PreparedDataset:
         source: Path = Path(),
         device: torch.device = torch.device("cpu"),
     ) -> None:
-        """Prepares one scene, and writes its file atomically.
-
-        Args:
-            scene: the scene, with Gaussians and views.
-            teacher: a teacher of the dataset's space.
-            config: settings of the preparation.
-            source: the path that the scene was read from.
-            device: where B is made and multiplied.
-        """
+        """Prepares one scene, which was read from `source`, and writes its file atomically."""
         outputs, _ = self.load_space()
         path, maps = self.scene_path(scene.name), self.folder / f".maps.{scene.name}"
         path.parent.mkdir(exist_ok=True)
@@ -387,8 +362,7 @@ class PreparedDataset:
 
     def check_kinds(self, teacher: Teacher) -> None:
         """Checks that a scene to train on has no names that the dataset's classes lack, such as those of labels that
-        were added since. Dense teachers have no classes before their targets are clustered.
-        """
+        were added since."""
         if teacher.table is None:
             return
         kinds = self.load_kinds()
@@ -400,12 +374,8 @@ class PreparedDataset:
             )
 
     def count_classes(self, names: Sequence[str], track: Track, process: ProcessRank = ProcessRank()) -> None:
-        """Counts the target classes of the training scenes and stores the counts, unless those of these scenes are
-        stored already; scenes that are not prepared are left out.
-
-        All processes of a training call this: the first one clusters the classes of a dense teacher from a sample of
-        the targets and writes the file, and each counts the targets of its share of the scenes.
-        """
+        """Counts the target classes of the training scenes that are prepared, and stores the counts, unless those of
+        these scenes are stored already. All processes of a training call this; each counts its share of the scenes."""
         codebook = None
         with fail_together():
             if process.is_first:

@@ -100,11 +100,8 @@ class SceneReader:
         self._shared: dict[str, Teacher] = {}
 
     def teacher(self, name: str, scene: Scene) -> Teacher:
-        """The teacher of a scene: its own, or one that is built once for all scenes.
-
-        Raises:
-            MissingInput: the scene lacks what the teacher needs.
-        """
+        """The teacher of a scene: its own, or one that is built once for all scenes; a `MissingInput` where the scene
+        lacks what it needs."""
         config = self.config.teachers_by_name[name]
         teacher = None if config.per_scene else self._shared.get(name)
         if teacher is None:
@@ -160,26 +157,19 @@ def prepare_scenes(
     device: torch.device = torch.device("cpu"),
     track: Track = untracked,
 ) -> dict[str, PreparedDataset]:
-    """Prepares the scenes that are not in `folder` yet; the processes of a training share the work.
-
-    A scene that lacks what one of several teachers needs, such as labels, is prepared for the others.
+    """Prepares the scenes that are not in `folder` yet; the processes of a training share the work. A scene that lacks
+    what one of several teachers needs, such as labels, is prepared for the others, with a warning.
 
     Args:
         training: scenes whose targets define the output spaces and the class balances.
-        held_out: scenes for validation.
         words: the words of teachers that have any, by teacher.
-        config: settings of reading, seeding, the teachers and preparation.
-        folder: folder of the prepared dataset, or of one for each of several teachers; created if it does not exist.
+        folder: of the prepared dataset, or of one for each of several teachers.
         voxel: edge length of the encoder's grid cells in metres, from which the unit of a splat is estimated if it is
             unknown.
         heads: names of the teacher's adapter heads that are measured over the dataset.
-        device: of this process, where B is made and multiplied.
 
     Returns:
         The prepared dataset of each teacher, by its name.
-
-    Warns:
-        SceneWarning: scenes that lack one of several teachers.
     """
     teachers = config.teachers_by_name
     several, every = len(teachers) > 1, [*training, *held_out]
@@ -286,10 +276,8 @@ def _prepare_scene(
     trained: bool,
     optional: bool,
 ) -> None:
-    """Prepares a scene, which is trained on or held out, for some teachers.
-
-    With `optional` those are left out for which it lacks something.
-    """
+    """Prepares a scene, which is trained on or held out, for some teachers; with `optional` those are left out for
+    which it lacks something."""
     with about(path):
         scene, teachers = reader.load(path), dict[str, Teacher]()
         for name in names:
@@ -349,8 +337,7 @@ def split_scenes(
 
     Args:
         patterns: names of scenes to hold out, with * and ? as in file names.
-        split: file of the names of the scenes to train on, one a line, such as scannetv2_train.txt; those that are
-            neither in it nor held out are left out. None = all that are not held out.
+        split: file of the names of the scenes to train on; None = all that are not held out.
         holdout_split: file of the names of the scenes to hold out, in place of patterns.
     """
     names = [path.name for path in paths]

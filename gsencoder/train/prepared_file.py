@@ -17,7 +17,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float16, Float32, Float64, Int8, Int32, Int64
+from jaxtyping import Bool, Float, Float16, Float32, Float64, Int32, Int64
 
 from gsencoder.core.archive import Archive, MappedArrays, open_archive, write_archive
 from gsencoder.core.arrays import round_columns
@@ -80,9 +80,7 @@ def write_prepared(
     """Writes a prepared scene.
 
     Args:
-        scene: the scene, with Gaussians and cameras.
         features: fused features, in the basis of `outputs`.
-        outputs: output space of the dataset.
         views: matrix and teacher's vectors for each camera.
         source: the path that the scene was read from, by which the file is recognized; None if nobody looks for it.
         precision: of the targets, and of the teacher's vectors in the rows.
@@ -152,10 +150,8 @@ def array_types(precision: Precision) -> Mapping[str, tuple[str, int]]:
 
 
 def check_arrays(arrays: MappedArrays, views: int) -> None:
-    """Checks the shapes of all arrays, and the values of those that are read for all Gaussians.
-
-    Entries of B and targets are checked when they are read; checking them here would read the entire file.
-    """
+    """Checks the shapes of all arrays, and the values of those that are read for all Gaussians. Entries of B and
+    targets are checked when they are read."""
     shapes = {name: arrays.shape(name) for name in ARRAYS}
     sizes = {name: shape[0] for name, shape in shapes.items()}
     columns = {name: shape[1:] for name, shape in shapes.items()}
@@ -177,20 +173,14 @@ def check_arrays(arrays: MappedArrays, views: int) -> None:
 
 
 def digest_of_files(source: Path) -> str:
-    """A hash of the names and sizes of the files of a scene, by which it is recognized where it was moved to.
-
-    Contents are not read: thousands of scenes are looked at before a training begins.
-    """
+    """A hash of the names and sizes of the files of a scene, by which it is recognized where it was moved to. Contents
+    are not read: thousands of scenes are looked at before a training begins."""
     if source.is_dir():
         files = (Path(folder) / name for folder, _, names in os.walk(source) for name in names)
         rows = sorted(f"{path.relative_to(source).as_posix()} {path.stat().st_size}" for path in files)
     else:
         rows = [str(source.stat().st_size)] if source.exists() else []
     return hashlib.sha256("\n".join(rows).encode()).hexdigest()[:16] if rows else ""
-
-
-BLOCK_ROWS = 512
-"""Rows of eight bits that are converted at a time."""
 
 
 class PreparedScene:
@@ -315,7 +305,10 @@ class PreparedScene:
         """The same in float16, as samples hold them."""
         with self._error_context():
             stored = self._arrays.rows("targets", rows)
-        return _as_float16(stored, self._scales["targets"]) if self._scales else stored
+        if not self._scales:
+            return stored
+        # In torch, which converts to float16 several times faster than numpy.
+        return (torch.from_numpy(stored).float() * torch.from_numpy(self._scales["targets"])).half().numpy()
 
     def _scaled(self, name: str, stored: np.ndarray) -> Float[np.ndarray, "n channels"]:
         """Rows of an array in standard units: float16 as they are stored, or float32 of integers."""
@@ -339,15 +332,3 @@ class PreparedScene:
             if not in_range.all() or not (view_rows.weight >= 0).all() or not np.isfinite(view_rows.targets).all():
                 raise InputError(f"view {self.view_names[view]!r}: its columns, weights or targets are out of range")
         return view_rows
-
-
-def _as_float16(
-    integers: Int8[np.ndarray, "n channels"], scales: Float32[np.ndarray, " channels"]
-) -> Float16[np.ndarray, "n channels"]:
-    """Integers times the scales of their columns. In torch, which converts to float16 several times faster than numpy,
-    and in blocks that stay in the cache."""
-    result, values, factors = np.empty(integers.shape, np.float16), torch.from_numpy(integers), torch.from_numpy(scales)
-    rows = torch.from_numpy(result)
-    for start in range(0, len(integers), BLOCK_ROWS):
-        rows[start : start + BLOCK_ROWS] = values[start : start + BLOCK_ROWS].float().mul_(factors)
-    return result

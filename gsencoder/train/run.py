@@ -68,13 +68,8 @@ class Distillation:
         heads: Mapping[str, Heads] = {},
         device: torch.device = torch.device("cpu"),
     ) -> None:
-        """Args:
-        network: a `GaussianEncoder`, possibly wrapped for several processes.
-        config: weights and parameters of the terms.
-        teachers: in the order of the encoder's output columns.
-        heads: adapter heads of teachers, by name.
-        device: of the losses.
-        """
+        """The `network` is a `GaussianEncoder`, possibly wrapped for several processes; teachers are in the order of
+        its output columns, and adapter heads by teacher."""
         self.network, self.config = network, config
         self._widths = [teacher.channels for teacher in teachers]
         self._codebooks = [torch.from_numpy(each.class_balance.codebook).to(device) for each in teachers]
@@ -191,15 +186,8 @@ class TrainConfig(SourceConfig):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Training:
-    """The result of a training run.
-
-    Attributes:
-        encoder: the trained network.
-        outputs: its output spaces.
-        tables: text tables of the teachers that have one, by name.
-        state: steps and seconds of the training.
-        scores: scores of the last validation; empty without held-out scenes.
-    """
+    """The result of a training run; text tables are those of the teachers that have one, and scores those of the last
+    validation."""
 
     encoder: GaussianEncoder
     outputs: OutputSpaces
@@ -220,22 +208,14 @@ def train(
     track: Track = untracked,
 ) -> Training:
     """Distills a teacher into an encoder. Under torchrun or SLURM every process calls this, and all return the result.
-
-    An interrupted call is resumed by the next one with the same `work`, from its checkpoint and its prepared scenes.
+    An interrupted call is resumed by the next one with the same `work`.
 
     Args:
         scenes: folders or splat files to train on.
-        config: settings of the run.
         work: folder for the checkpoint and the log; created if it does not exist.
         held_out: scenes on which `validate` scores the encoder.
         prepared: folder of prepared scenes, which runs with the same sources can share; None = a folder in `work`.
-        device: on which scenes are prepared and the encoder is trained.
         validate: scores the encoder during training, for example `gsencoder.evaluate.validation.validate_names`.
-        track: wraps loops to show progress.
-
-    Raises:
-        InputError: a scene cannot be used; `work` or `prepared` holds a run with other settings; or a loss or gradient
-            is not finite.
     """
     folder = Path(work)
     training, validation = [Path(path) for path in scenes], [Path(path) for path in held_out]
@@ -335,15 +315,8 @@ def fit(
 
 
 def teacher_recipes(datasets: Mapping[str, PreparedDataset], losses: LossConfig) -> tuple[TeacherRecipe, ...]:
-    """The teachers of a training with the weights and classes of their targets.
-
-    Raises:
-        InputError: no loss is computed on any teacher.
-
-    Warns:
-        SceneWarning: none is on some, whose features the encoder offers all the same, or no teacher has classes for
-            L_contrast.
-    """
+    """The teachers of a training with the weights and classes of their targets; refused where no loss is computed on
+    any teacher, with a warning where none is on some, or where none has classes for L_contrast."""
     weights = losses.teacher_weights or (1.0,) * len(datasets)
     teachers = tuple(
         TeacherRecipe(

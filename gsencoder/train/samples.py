@@ -91,18 +91,12 @@ def choose_crop(
     size: int,
     rng: np.random.Generator,
 ) -> tuple[tuple[int, ...], Int64[np.ndarray, " n"]]:
-    """Chooses target views and the Gaussians of a sample.
+    """Chooses target views and the Gaussians of a sample: distinct views, fewer than `config.views` if no more are
+    suitable, and rows in ascending order.
 
     Without a limit of size the views are drawn first and all Gaussians in their frusta are taken, as in the paper. With
-    a limit the center of the crop is drawn first, and the views are drawn from those that see it: other views would
-    show nothing of the sample.
-
-    Args:
-        center_weights: for each Gaussian, its weight in drawing the center of a crop; 0 for those without a target.
-        size: largest number of Gaussians (`crop_size`); 0 = no limit.
-
-    Returns:
-        Distinct views, fewer than `config.views` if no more are suitable, and rows in ascending order.
+    a limit the center of the crop is drawn first, by `center_weights`, which are 0 for Gaussians without a target, and
+    the views are drawn from those that see it: other views would show nothing of the sample.
     """
     if not 0 < size < len(means):
         drawn = rng.permutation(len(cameras))
@@ -240,17 +234,12 @@ def restrict_rows(
     remaining: Int64[np.ndarray, " n"],
     config: LossConfig,
 ) -> ViewRows:
-    """Restricts the rows of B of a view to the Gaussians of a sample, and selects the rows to compare.
+    """Restricts the rows of B of a view to the `selected` Gaussians of a crop, and selects the rows to compare.
 
     A row is selected if the teacher has a vector there, the full scene covers it with an alpha of `min_alpha` or more,
-    and at least the share `min_kept` of its weight is on selected Gaussians. Gaussians that were then dropped at random
-    are left out of the row, of whose weight at least MIN_REMAINING_WEIGHT must remain.
-
-    Args:
-        view: rows over all Gaussians of the scene.
-        selected: the Gaussians of the crop.
-        remaining: those of them that the sample has after dropping some at random; they become columns 0, 1, ….
-        config: the thresholds.
+    and at least the share `min_kept` of its weight is on selected Gaussians. Those of them that were then dropped at
+    random are left out of the row, of whose weight at least MIN_REMAINING_WEIGHT must remain; the `remaining` ones
+    become columns 0, 1, ….
     """
     column_of = np.full(gaussians, -1, np.int32)
     column_of[selected] = -2
@@ -287,15 +276,7 @@ def sample_rows(
     rng: np.random.Generator | None = None,
 ) -> RenderRows:
     """Rows of a view over the Gaussians that were seen, all with the weight 1: those with a vector and an alpha of
-    `min_alpha` or more.
-
-    Args:
-        view: rows over all Gaussians.
-        seen: the Gaussians that take part.
-        min_alpha: smallest sum of the weights of a row.
-        count: number of rows that are drawn at random; 0 = all of them.
-        rng: source of random numbers.
-    """
+    `min_alpha` or more, or `count` of them, drawn at random."""
     weight = np.where(seen[view.col], view.weight, np.float32(0))
     chosen = np.flatnonzero(view.valid & (_row_sums(weight, view.crow) >= min_alpha))
     if rng is not None and 0 < count < len(chosen):
@@ -313,7 +294,7 @@ def sample_rows(
 
 
 def make_render_rows(view: ViewRows, class_balance: ClassBalance, power: float) -> RenderRows:
-    """Converts rows of one view to tensors; the weight of each in the loss is n^−power of its target's class."""
+    """Rows of one view as tensors; the weight of each in the loss is n^−power of its target's class."""
     return RenderRows(
         crow=torch.from_numpy(view.crow),
         col=torch.from_numpy(view.col),
@@ -354,7 +335,7 @@ def no_targets(gaussians: int, channels: int) -> TeacherTargets:
 
 
 class Sample(NamedTuple):
-    """One sample, as a data worker returns it; attributes as in `Batch`."""
+    """One sample, as a data worker returns it."""
 
     name: str
     attributes: Float[Tensor, "N A"]
@@ -364,13 +345,8 @@ class Sample(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """A batch of samples, concatenated along Gaussians, tokens and rows.
-
-    Attributes:
-        names: scene and views of each sample, for messages.
-        attributes, opacities, plan: inputs of the encoder.
-        teachers: targets of each teacher, in the order of the recipe; without weights in scenes that lack the teacher.
-    """
+    """A batch of samples, concatenated along Gaussians, tokens and rows; `names` are scene and views of each sample,
+    for messages. In scenes that lack a teacher its targets have no weight."""
 
     names: tuple[str, ...]
     attributes: Float[Tensor, "N A"]
@@ -401,13 +377,8 @@ def join_samples(samples: Sequence[Sample], patch: int) -> Batch:
 
 
 class TrainingScene:
-    """The prepared files of one scene.
-
-    Attributes:
-        parts: the prepared scene of each teacher, in the order of the teachers; None for those that the scene lacks.
-        first: the first of them, from which Gaussians and cameras are read; these are the same in all.
-        name: of the scene.
-    """
+    """The prepared files of one scene, in the order of the teachers; None for those that the scene lacks. Gaussians and
+    cameras are read from the first."""
 
     def __init__(self, parts: Sequence[PreparedScene | None]) -> None:
         present = [part for part in parts if part is not None]
@@ -443,15 +414,8 @@ was used least recently are closed first."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TeacherRecipe:
-    """A teacher of a training.
-
-    Attributes:
-        name: for messages and logs.
-        class_balance: classes of its targets in the dataset and their frequencies; the columns of the codebook are the
-            teacher's columns of the encoder's outputs.
-        weight: of its losses.
-        classes: whether its targets have classes that a term of the loss may compare.
-    """
+    """A teacher of a training: the weight of its losses, and whether its targets have classes that a term of the loss
+    may compare. The columns of the codebook are the teacher's columns of the encoder's outputs."""
 
     name: str
     class_balance: ClassBalance
@@ -466,19 +430,9 @@ class TeacherRecipe:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleRecipe:
-    """Settings of making samples from scenes.
-
-    Attributes:
-        encoder: attributes and grid of the encoder.
-        sampling: selection of views and Gaussians.
-        augmentation: random changes; None = none.
-        losses: thresholds of the rows of the render loss, and the power of class weights.
-        teachers: the teachers, in the order of the encoder's output columns. Centers of crops are drawn by the classes
-            of the first one that a scene has.
-        seed: seed of all random numbers.
-        step_samples: samples of one step over all processes; their crops have one size, so that no process waits for
-            another.
-    """
+    """Settings of making samples from scenes. The teachers are in the order of the encoder's output columns; centers of
+    crops are drawn by the classes of the first one that a scene has. The `step_samples` samples of one step over all
+    processes have crops of one size, so that no process waits for another."""
 
     encoder: EncoderConfig
     sampling: SamplingConfig
@@ -521,10 +475,8 @@ class SampleDataset(Dataset[Sample]):
             return make_sample(scene, self._target_codes(scene_index), self.recipe, size, rng)
 
     def _target_codes(self, scene_index: int) -> Codes:
-        """Target classes of a scene's Gaussians for each teacher, cached together with the open scene.
-
-        The number of open scenes is limited, since each holds a file descriptor.
-        """
+        """Target classes of a scene's Gaussians for each teacher, cached together with the open scene; their number is
+        limited, since each holds a file descriptor."""
         if scene_index not in self._codes:
             self._codes[scene_index] = target_codes(self.scenes[scene_index], self.recipe)
         self._codes.move_to_end(scene_index)
@@ -562,14 +514,8 @@ def make_sample(
     size: int,
     rng: np.random.Generator,
 ) -> Sample:
-    """Makes a sample: selects views and Gaussians of a scene, augments them and computes the encoder's inputs.
-
-    Args:
-        codes: target classes of its Gaussians for each teacher (`target_codes`).
-        recipe: settings of the sample.
-        size: largest number of Gaussians; 0 = all that the views see.
-        rng: source of all random numbers.
-    """
+    """Makes a sample: selects views and Gaussians of a scene, augments them and computes the encoder's inputs. Its
+    `size` is the largest number of Gaussians; 0 = all that the views see."""
     source = scene.first
     # With the power 1 every class is equally often the center of a crop.
     first, first_codes = next((number, each) for number, each in enumerate(codes) if each is not None)

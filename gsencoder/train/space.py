@@ -254,16 +254,8 @@ def measure_dataset_heads(
     *,
     optional: bool = False,
 ) -> None:
-    """Measures heads over the maps that the dataset's output space was computed from, and adds them to its folder.
-
-    Args:
-        dataset: with its output space.
-        heads: those of `missing_heads`.
-        scenes: all scenes to train on.
-        open_scene: reads a scene without making Gaussians, and builds its teacher.
-        views: number of maps.
-        optional: leave out scenes that lack what the teacher needs.
-    """
+    """Measures the heads of `missing_heads` over the maps that the dataset's output space was computed from, and adds
+    them to its folder."""
     if not heads:
         return
     path, outputs = dataset.folder / HEADS_FILE, dataset.load_space()[0]

@@ -50,13 +50,7 @@ IGNORED = -100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TuningPair:
-    """A question as it is asked, and right answers.
-
-    Attributes:
-        name: of the question, for messages.
-        prompt: in a store.
-        answers: one or more; an epoch takes one of them.
-    """
+    """A question of a store of prompts, and one or more right answers, of which an epoch takes one."""
 
     name: str
     prompt: StoredPrompt
@@ -64,14 +58,8 @@ class TuningPair:
 
 
 class TuningSample(NamedTuple):
-    """A pair as tensors.
-
-    Attributes:
-        name: of the question.
-        inputs: of the model, with one row each; what has the shape of `input_ids` reaches to the answer's end.
-        labels: the answer's tokens; `IGNORED` in the prompt.
-        tokens: rendered features of its pictures; None where the model looks at the pictures.
-    """
+    """A pair as tensors: the model's inputs with one row each, where what has the shape of `input_ids` reaches to the
+    answer's end; labels, which are `IGNORED` in the prompt; and rendered features of its pictures, or None."""
 
     name: str
     inputs: dict[str, Tensor]
@@ -80,14 +68,8 @@ class TuningSample(NamedTuple):
 
 
 class TuningBatch(NamedTuple):
-    """Samples, padded on the right.
-
-    Attributes:
-        names: of the questions.
-        inputs: of the model.
-        labels: int64[B, T], `IGNORED` in prompts and padding.
-        tokens: [pictures, P, D] of all samples in their order; None without.
-    """
+    """Samples of the questions `names`, padded on the right; labels [B, T] are `IGNORED` in prompts and padding, and
+    tokens [pictures, P, D] are those of all samples in their order."""
 
     names: tuple[str, ...]
     inputs: dict[str, Tensor]
@@ -131,13 +113,6 @@ class PairSamples(Dataset[TuningSample]):
     def __init__(
         self, pairs: Sequence[TuningPair], store: PromptStore, processor: Any, *, longest: int | None, seed: int
     ) -> None:
-        """Args:
-        pairs: one or more.
-        store: of their prompts.
-        processor: of the model.
-        longest: tokens that the model takes; None = unknown.
-        seed: of orders and answers.
-        """
         self.pairs, self._store, self._processor = tuple(pairs), store, processor
         self._longest, self._seed = longest, seed
         self._frame = answer_frame(processor)
@@ -212,23 +187,14 @@ TERM = "answer"
 
 
 class TunedVlm(nn.Module):
-    """A vision-language model under adapters, with rendered features in the place of its tower's output or without.
-
-    Attributes:
-        adapted: the `peft.PeftModel`.
-        projection: from the channels of the features to those of the tower; None where they are the same, or where no
-            features are given.
-    """
+    """A vision-language model under adapters, the `peft.PeftModel` `adapted`, with rendered features in the place of
+    its tower's output or without. A projection leads from their channels to those of the tower where these differ."""
 
     def __init__(
         self, adapted: Any, layout: TowerLayout | None = None, channels: int | None = None, *, seed: int = 0
     ) -> None:
-        """Args:
-        adapted: a `peft.PeftModel`.
-        layout: of the tower's output; None where the model looks at pictures.
-        channels: of the features that are projected; None = they are given as they are.
-        seed: of the projection.
-        """
+        """The `layout` is that of the tower's output, None where the model looks at pictures; `channels` those of
+        features that are projected."""
         super().__init__()
         self.adapted = adapted
         self.projection: nn.Linear | None = None
@@ -245,13 +211,8 @@ class TunedVlm(nn.Module):
         tokens: Float[Tensor, "n P D"] | None = None,
         keep: Int64[Tensor, " K"] | None = None,
     ) -> Float[Tensor, "B K vocabulary"]:
-        """Logits.
-
-        Args:
-            inputs: of the model, as its processor gives them.
-            tokens: rendered features of the pictures, in their order.
-            keep: positions whose logits are wanted, in each row; None = all.
-        """
+        """Logits of the positions `keep`, or of all. `inputs` are as the model's processor gives them, and `tokens` are
+        rendered features of the pictures, in their order."""
         options = {} if keep is None or not self._keeps else {"logits_to_keep": keep}
         if self._hook is not None and tokens is not None:
             self._hook.tokens = tokens if self.projection is None else self.projection(tokens)
@@ -313,14 +274,8 @@ class TuneConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Tuned:
-    """The result of a tuning.
-
-    Attributes:
-        network: on the device that it was trained on.
-        processor: of the model.
-        layout: of the tower's output that features replace; None where the model looks at pictures.
-        state: steps and seconds.
-    """
+    """The result of a tuning; the layout is that of the tower's output that features replace, None where the model
+    looks at pictures."""
 
     network: TunedVlm
     processor: Any
@@ -352,17 +307,8 @@ def tune(
     tensorboard: bool = False,
     track: Track = untracked,
 ) -> Tuned:
-    """Trains adapters of a model on questions and answers. Interrupted, it is resumed by the next call with the same
-    `work`.
-
-    Args:
-        pairs: questions in a store with their answers.
-        store: of the prompts.
-        model: folder of a vision-language model of transformers.
-        config: adapters and loop.
-        work: existing folder for the checkpoint and the log.
-        tensorboard: whether to write TensorBoard events.
-    """
+    """Trains adapters of a model of transformers on questions and answers. Interrupted, it is resumed by the next call
+    with the same `work`, an existing folder."""
     check_pairs(pairs)
     first = pairs[0].prompt.tokens
     model_config, processor, layout = open_processor(model, with_tokens=bool(first))
@@ -444,13 +390,8 @@ def save_tuned(folder: Path, tuned: Tuned) -> None:
 
 
 def open_tuned(folder: Path, model: Path, *, with_tokens: bool = False) -> Tuned:
-    """The model with adapters that `save_tuned` wrote, for programs; servers read them through peft themselves.
-
-    Args:
-        folder: of the adapters.
-        model: that they belong to.
-        with_tokens: whether rendered features replace the tower's output, as in the training.
-    """
+    """The model with adapters that `save_tuned` wrote, for programs; servers read them through peft themselves. With
+    `with_tokens` rendered features replace the tower's output, as in the training."""
     check_peft()
     import peft
     from transformers import AutoModelForImageTextToText

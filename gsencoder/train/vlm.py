@@ -113,16 +113,8 @@ def model_digest(folder: Path) -> str:
 def load_adapted(
     folder: Path, config: AdapterConfig, *, base: Literal["float32", "bfloat16"] = "float32", seed: int = 0
 ) -> Any:
-    """The model of a folder with new adapters, whose parameters alone are trained. As B = 0, it answers as the model.
-
-    Args:
-        folder: of the model.
-        config: of the adapters.
-        base: the type in which the weights of the model are kept.
-
-    Returns:
-        A `peft.PeftModel`.
-    """
+    """The model of a folder, in the type `base`, with new adapters, whose parameters alone are trained: a
+    `peft.PeftModel`. As B = 0, it answers as the model."""
     check_peft()
     import peft
     from transformers import AutoModelForImageTextToText
@@ -145,17 +137,8 @@ def load_adapted(
 
 
 def save_adapters(folder: Path, adapted: Any, processor: Any) -> None:
-    """Writes adapters as peft does, and the processor, without which servers load no model.
-
-    Args:
-        folder: an existing one.
-        adapted: of `load_adapted`.
-        processor: of the same model.
-
-    Raises:
-        InputError: they cannot be written.
-        OSError: the disk is full, which the output folder says.
-    """
+    """Writes adapters as peft does, and the processor, without which servers load no model. A full disk stays an
+    OSError, which the output folder reports."""
     try:
         for each in adapted.peft_config.values():
             # A set of peft, whose order changes from run to run.
@@ -179,15 +162,9 @@ def save_adapters(folder: Path, adapted: Any, processor: Any) -> None:
 
 
 def link_served(folder: Path, model: Path) -> None:
-    """Makes the folder `served`: links to the model's files and to the adapters, which transformers and its server take
-    for one model with an adapter in it.
-
-    `transformers serve` reads a configuration where the adapters are, and peft's folder has none.
-
-    Args:
-        folder: of the adapters.
-        model: that they belong to.
-    """
+    """Makes the folder `served`: links to the files of the model and to the adapters in `folder`, which transformers
+    and its server take for one model with an adapter in it. `transformers serve` reads a configuration where the
+    adapters are, and peft's folder has none."""
     served = folder / SERVED_FOLDER
     adapters = [each for each in sorted(folder.iterdir()) if each.is_file() and each.name.startswith("adapter_")]
     served.mkdir()
@@ -213,16 +190,9 @@ STRETCHED, CROPPED = ("idefics3", "smolvlm"), ("llava",)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TowerLayout:
-    """The output of a vision tower that features take the place of.
-
-    Attributes:
-        model: kind of the model.
-        grid: rows and columns of patches.
-        channels: of the tower.
-        fit: how pictures become square; see `gsencoder.infer.views.pictures.tower_grid`.
-        layer: of the hidden states; None = the last, after the final norm.
-        skipped: tokens before those of patches.
-    """
+    """The output of a vision tower that features take the place of: rows and columns of patches, how pictures become
+    square (see `gsencoder.infer.views.pictures.tower_grid`), the layer of the hidden states (None = the last, after the
+    final norm), and the tokens before those of patches."""
 
     model: str
     grid: tuple[int, int]
@@ -271,17 +241,10 @@ def tower_layout(config: Any, processor: Any) -> TowerLayout:
 
 
 class TokenHook:
-    """Puts tokens in the place of a tower's output while they are set.
-
-    Attributes:
-        tokens: of the pictures of the next call, in their order; None = the tower's output stays.
-    """
+    """Puts `tokens` of the pictures of the next call in the place of a tower's output; where they are None, it
+    stays."""
 
     def __init__(self, tower: nn.Module, layout: TowerLayout) -> None:
-        """Args:
-        tower: the vision tower of the model.
-        layout: of its output.
-        """
         self.tokens: Float[Tensor, "n P D"] | None = None
         self._layout = layout
         tower.register_forward_hook(self._replace)

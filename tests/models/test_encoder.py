@@ -9,7 +9,7 @@ from small_encoders import CONFIG, TINY, encoder, run, splat
 
 from gsencoder.geometry import rotmats_from_quats
 from gsencoder.models.encoder import encoder_inputs
-from gsencoder.models.transformer import ATTRIBUTE_CHANNELS, embed, input_channels
+from gsencoder.models.transformer import ATTRIBUTE_CHANNELS, embed
 
 
 def test_a_batch_gives_what_its_clouds_give_alone() -> None:
@@ -53,13 +53,6 @@ def test_each_level_has_a_permutation_of_its_own_only_if_orders_are_shuffled_at_
     assert counts["pooling"] > 50
 
 
-def test_a_rerun_gives_the_same_bits() -> None:
-    network, one = encoder(), splat(400)
-    first = run(network, one)
-    torch.manual_seed(99)
-    assert torch.equal(run(network, one), first)
-
-
 def test_moving_the_scene_by_whole_blocks_of_cells_changes_nothing() -> None:
     """Pooling pairs cells from multiples of ALIGN, so that is the step within which places matter."""
     network, one = encoder(), splat(300)
@@ -96,23 +89,6 @@ def test_one_ellipsoid_has_one_embedding_however_it_is_written() -> None:
     for other, sizes in ((-quats, scales), (renamed, scales[:, [1, 2, 0]])):
         again = embed(means, other, sizes, opacities, sh, voxel=0.1, attributes=names)
         torch.testing.assert_close(again, plain, rtol=1e-5, atol=1e-5)
-
-
-def test_embeddings_stay_small_at_the_ends_of_what_a_splat_may_hold() -> None:
-    scales = torch.tensor([[1e-30, 1e30, 1.0], [1e-9, 1e-9, 1e4], [1e38, 1e38, 1e38]])
-    quats = torch.tensor([[1.0, 0, 0, 0], [0, 0, 0, 0], [1e-20, 1e20, 0, 0]])
-    means = torch.tensor([[1e6, -1e6, 0], [0, 0, 0], [3e5, 1, 1]])
-    channels = embed(
-        means,
-        quats,
-        scales,
-        torch.tensor([0.0, 1.0, 0.5]),
-        torch.tensor([[1e30, -1e30, 0]] * 3),
-        voxel=0.02,
-        attributes=tuple(ATTRIBUTE_CHANNELS),
-    )
-    assert channels.shape == (3, input_channels(tuple(ATTRIBUTE_CHANNELS)))
-    assert channels.abs().max() <= 9
 
 
 @pytest.mark.slow

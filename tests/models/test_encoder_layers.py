@@ -1,6 +1,5 @@
 """Layers of the encoder beside its transformer: their precision, the stem, merging, projectors; refused shapes."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +8,7 @@ import torch
 from small_encoders import CONFIG, TINY, encoder, run, splat
 
 from gsencoder.core.errors import InputError
-from gsencoder.models.encoder import GaussianEncoder, encoder_inputs, merge
-from gsencoder.models.plan import join_plans, plan_cloud
+from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.transformer import TransformerConfig
 
 
@@ -52,32 +50,6 @@ def test_the_layers_after_the_transformer_have_gradients_of_float32_under_autoca
 
 
 # torch's own compiler instantiates an autograd function, and warns that one should not.
-@pytest.mark.filterwarnings("ignore:.*should not be instantiated:DeprecationWarning")
-@pytest.mark.slow
-def test_compiled_it_gives_the_same_and_is_not_compiled_for_every_number_of_cells(no_jaxtyping: None) -> None:
-    graphs = []
-
-    def count(graph: torch.fx.GraphModule, example: list[torch.Tensor]) -> Callable[..., object]:
-        graphs.append(graph)
-        return graph.forward
-
-    two_levels = {"encoder_depths": (1, 1), "encoder_channels": (16, 32)}
-    two_levels |= {"decoder_depths": (1,), "decoder_channels": (16,)}
-    network = encoder(replace(CONFIG, transformer=replace(TINY, **two_levels)))
-    compiled = torch.compile(network, backend=count, dynamic=True)
-    graphs_after = []
-    for size in (64, 100, 150):
-        attributes, opacities, cloud = encoder_inputs(splat(size), network.config, 0.1)
-        plan = network.join([cloud])
-        with torch.no_grad():
-            torch.testing.assert_close(
-                compiled(attributes, opacities, plan), network(attributes, opacities, plan), rtol=1e-5, atol=1e-5
-            )
-        graphs_after.append(len(graphs))
-    # The first size is compiled for itself, because two of its dimensions are equal by chance.
-    assert graphs_after[1] == graphs_after[2]
-
-
 WIDE_STEM = replace(CONFIG, stem=5)
 
 
@@ -96,32 +68,9 @@ def test_a_wide_stem_sees_two_cells_away() -> None:
         assert differs.tolist() == [max(abs(center - centers[4])) <= 0.1 * reach + 0.01 for center in centers]
 
 
-def test_a_wide_stem_keeps_the_laws_of_batches_and_of_order() -> None:
-    network, splats = encoder(WIDE_STEM), [splat(300, 1), splat(41, 2), splat(1, 3)]
-    alone = torch.cat([run(network, one) for one in splats])
-    for round_up in (False, True):
-        torch.testing.assert_close(run(network, *splats, round_up=round_up), alone, rtol=1e-5, atol=1e-5)
-    order = np.random.default_rng(1).permutation(300)
-    torch.testing.assert_close(run(network, splats[0].select(order)), alone[:300][order], rtol=1e-5, atol=1e-5)
-
-
-def test_merging_gives_the_weighted_mean_of_a_cells_gaussians() -> None:
-    means = torch.tensor([[0.01, 0.01, 0.01], [0.05, 0.05, 0.05], [0.95, 0.95, 0.95]])
-    plan = join_plans([plan_cloud(means, 0.1, levels=1)], 8)
-    merged = merge(torch.tensor([[1.0], [4.0], [9.0]]), torch.tensor([1.0, 2.0, 0.5]), plan)
-    torch.testing.assert_close(merged, torch.tensor([[3.0], [9.0]]))
-
-
 def test_a_cell_of_invisible_gaussians_has_features_too() -> None:
     one = replace(splat(20, extent=0.05), opacities=np.zeros(20, np.float32))
     assert torch.isfinite(run(encoder(), one)).all()
-
-
-def test_thousands_of_coincident_gaussians_are_one_token() -> None:
-    one = splat(3000)
-    features = run(encoder(), replace(one, means=np.full_like(one.means, 0.5)))
-    assert torch.isfinite(features).all()
-    assert (features == features[0]).all()
 
 
 @pytest.mark.parametrize(
@@ -143,12 +92,6 @@ def test_thousands_of_coincident_gaussians_are_one_token() -> None:
 def test_a_shape_that_cannot_be_is_refused(change: dict, message: str, no_jaxtyping: None) -> None:
     with pytest.raises(InputError, match=message):
         replace(TINY, **change)
-
-
-@pytest.mark.parametrize("change", [{"voxel": 0.0}, {"stem": 4}, {"inputs": ()}, {"inputs": ("color", "color")}])
-def test_an_encoder_of_nothing_is_refused(change: dict, no_jaxtyping: None) -> None:
-    with pytest.raises(InputError):
-        replace(CONFIG, **change)
 
 
 def test_each_teacher_has_a_projector_of_its_own() -> None:

@@ -12,13 +12,9 @@ from hypothesis import strategies as st
 from gsencoder.core.errors import InputError
 from gsencoder.models.grid import (
     ALIGN,
-    INVALID_CODE,
     MAX_EXTENT,
     Order,
-    check_extent,
-    coordinate_bits,
     curve_from_morton,
-    hilbert_from_morton,
     morton_codes,
 )
 from gsencoder.models.plan import grid_coords
@@ -72,25 +68,9 @@ def test_transposed_orders_are_the_orders_of_swapped_cells() -> None:
     assert torch.equal(curve_codes(cells, "hilbert-trans", 20), curve_codes(swapped, "hilbert", 20))
 
 
-def test_orders_that_are_not_transposed_take_x_first() -> None:
-    cells = torch.randint(0, 2**20, (500, 3))
-    morton = morton_codes(cells)
-    assert torch.equal(curve_codes(cells, "z", 20), morton)
-    assert torch.equal(curve_codes(cells, "hilbert", 20), hilbert_from_morton(morton, 20))
-
-
 @given(st.lists(st.tuples(*[st.integers(0, 2**21 - 1)] * 3), min_size=1, max_size=20))
 def test_morton_codes_interleave_bits(cells: list[tuple[int, int, int]]) -> None:
     assert morton_codes(torch.tensor(cells)).tolist() == [interleaved(*cell) for cell in cells]
-
-
-def test_codes_are_distinct_at_the_far_end_of_twenty_bits() -> None:
-    far = 2**20 + ALIGN - 1
-    cells = torch.tensor(list(itertools.product((0, 1, far - 1, far), repeat=3)))
-    for order in ORDERS:
-        codes = curve_codes(cells, order, coordinate_bits(cells))
-        assert len(codes.unique()) == 64
-        assert (codes >= 0).all()
 
 
 @pytest.mark.parametrize("bits", range(2, 22))
@@ -131,37 +111,9 @@ def test_positions_that_are_not_finite_are_counted_and_refused(bad: float) -> No
         grid_coords(torch.tensor([[0.0, 0, 0], [0, bad, 0]]), 1.0)
 
 
-def test_no_points_have_no_cells() -> None:
-    assert grid_coords(torch.zeros(0, 3), 0.1).shape == (0, 3)
-    assert coordinate_bits(torch.zeros(0, 3, dtype=torch.int64)) == 1
-
-
 @pytest.mark.parametrize("order", ORDERS)
 def test_arrays_and_tensors_have_the_same_codes(order: str) -> None:
     cells = np.random.default_rng(0).integers(0, MAX_EXTENT, (500, 3))
     codes = curve_codes(cells, order, 20)
     assert isinstance(codes, np.ndarray)
     np.testing.assert_array_equal(curve_codes(torch.from_numpy(cells), order, 20).numpy(), codes)
-
-
-def test_bits_are_those_of_the_largest_coordinate() -> None:
-    for largest, bits in ((0, 1), (1, 1), (2, 2), (3, 2), (4, 3), (2**20, 21)):
-        assert coordinate_bits(torch.tensor([[0, largest, 0], [0, 0, 0]])) == bits
-
-
-def test_an_extent_below_the_limit_is_let_through_and_no_other() -> None:
-    check_extent(MAX_EXTENT - 0.5, 0.1)
-    for extent in (float(MAX_EXTENT), float("inf"), float("nan")):
-        with pytest.raises(InputError, match="cells of 0.1 units"):
-            check_extent(extent, 0.1)
-
-
-@pytest.mark.parametrize("order", ORDERS)
-def test_no_cell_has_the_code_that_none_has(order: str) -> None:
-    """Coordinates have 21 bits with the room for alignment, and three of them fill an int64 to its last bit."""
-    far = MAX_EXTENT + ALIGN - 1
-    cells = torch.tensor(list(itertools.product((0, far), repeat=3)))
-    codes = curve_codes(cells, order, coordinate_bits(cells))
-    assert (codes >= 0).all()
-    assert (codes < INVALID_CODE).all()
-    assert np.iinfo(np.int64).max == INVALID_CODE

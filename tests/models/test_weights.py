@@ -63,15 +63,6 @@ def test_parameters_that_are_not_finite_are_not_written(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_missing_file_is_said_to_be_missing(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="weights: no file at"):
-        load_weights(tmp_path / "e.safetensors")
-    with pytest.raises(InputError, match="basis: no file at"):
-        load_weights(tmp_path / "e.safetensors", "basis")
-    with pytest.raises(InputError, match=r"holds no encoder\.safetensors"):
-        load_weights(tmp_path)
-
-
 def with_header(path: Path, change: dict) -> None:
     rewrite(path, header={**header_of(path), **change})
 

@@ -20,27 +20,13 @@ def view_of(cameras: Cameras, dtype: torch.dtype = torch.float32) -> tuple[torch
     return pose, K, int(cameras.widths[0]), int(cameras.heights[0])
 
 
-@routine(
-    "rotations of quaternions",
-    "vectors",
-    domain="quaternions of any length from 1e-14 to 1e18",
-    promise=1e-6,
-    measure="entry of the matrix",
-    oracle="longdouble, from the homogeneous form",
-)
+@routine("rotations of quaternions", "vectors")
 def rotation_error(case: Case) -> float:
     quats = case.vectors[:, :4].copy()
     return worst(geometry.rotmats_from_quats(torch.from_numpy(quats)), oracles.rotations(quats), 1)
 
 
-@routine(
-    "covariances",
-    "splat",
-    domain="unit quaternions; scales from 1e-18 to 1e18 units",
-    promise=1e-6,
-    measure="entry, relative to the largest of its matrix",
-    oracle="longdouble",
-)
+@routine("covariances", "splat")
 def covariance_error(case: Case) -> float:
     g = case.gaussians
     want = oracles.covariances(g.quats, g.scales)
@@ -48,16 +34,7 @@ def covariance_error(case: Case) -> float:
     return worst(got, want, np.abs(want).max(axis=(1, 2), keepdims=True))
 
 
-@routine(
-    "projection of Gaussians (geometry.project, float32)",
-    "splat",
-    "camera",
-    domain="any origin that float32 resolves the scene at; scales up to 1e18 pixels; any field of view below 180°",
-    promise=1e-5,
-    measure="centers in pixels, relative to 1 + their distance from the first pixel; depths, extents and conics "
-    "relative to the largest of their row; 1 where a Gaussian is in view on one side only",
-    oracle="longdouble EWA",
-)
+@routine("projection of Gaussians (geometry.project, float32)", "splat", "camera")
 def projection_error(case: Case) -> float:
     want = oracles.project(case.gaussians, case.cameras)
     got = geometry.project(*tensors(case.gaussians), *view_of(case.cameras))
@@ -81,16 +58,7 @@ def projection_error(case: Case) -> float:
     )
 
 
-@routine(
-    "projection of points (Cameras.project, float32)",
-    "splat",
-    "camera",
-    domain="any origin that float32 resolves the scene at; depths other than 0",
-    promise=1e-6,
-    measure="pixels relative to their distance from the first pixel and to focal length / depth × that from the "
-    "camera; depths relative to the distance from the camera",
-    oracle="longdouble pinhole",
-)
+@routine("projection of points (Cameras.project, float32)", "splat", "camera")
 def points_error(case: Case) -> float:
     want = oracles.project(case.gaussians, case.cameras)
     front = want.depths > NEAR
@@ -106,15 +74,7 @@ def points_error(case: Case) -> float:
     )
 
 
-@routine(
-    "unprojection (Cameras.unproject, float32)",
-    "splat",
-    "camera",
-    domain="any origin that float32 resolves the scene at",
-    promise=1e-6,
-    measure="points relative to the distance from the origin, or from the camera where that is larger",
-    oracle="longdouble projection there, this back",
-)
+@routine("unprojection (Cameras.unproject, float32)", "splat", "camera")
 def unprojection_error(case: Case) -> float:
     want = oracles.project(case.gaussians, case.cameras)
     front = want.depths > NEAR
@@ -127,15 +87,7 @@ def unprojection_error(case: Case) -> float:
     return worst(case.cameras.unproject(pixels, depths, 0), points, scale)
 
 
-@routine(
-    "colors from spherical harmonics",
-    "splat",
-    "camera",
-    domain="degree 0 to 3; camera centers at least 1e-9 units and at most 1e18 away",
-    promise=1e-5,
-    measure="color",
-    oracle="longdouble harmonics in cartesian form",
-)
+@routine("colors from spherical harmonics", "splat", "camera")
 def colors_error(case: Case) -> float:
     g, center = case.gaussians, case.cameras.centers[0].astype(np.float32)
     basis = oracles.harmonics(g.means.astype(oracles.Wide) - center)
@@ -143,15 +95,7 @@ def colors_error(case: Case) -> float:
     return worst(geometry.colors_from_sh(*map(torch.from_numpy, (g.sh, g.means, center))), want, 1)
 
 
-@routine(
-    "boxes around Gaussians",
-    "splat",
-    domain="any origin; one Gaussian or more; scales from 1e-18 to 1e18",
-    promise=1e-9,
-    measure="corners relative to the box and its distance from the origin; how far a point lies outside the "
-    "oriented box, relative to its size",
-    oracle="longdouble bounds of ellipsoids",
-)
+@routine("boxes around Gaussians", "splat")
 def boxes_error(case: Case) -> float:
     g, rows = case.gaussians, np.arange(len(case.gaussians))
     got = box_around(g, rows, extent="sigma")

@@ -19,7 +19,6 @@ from gsencoder.models.transformer import ATTRIBUTE_CHANNELS, PatchAttention, Poo
 from gsencoder.types import SH_C0
 
 Wide = oracles.Wide
-ORIGINS = "any origin that float32 resolves the scene at; fewer than 2²⁰ cells on an axis"
 CONFIG = EncoderConfig(
     transformer=TransformerConfig(
         encoder_depths=(1, 1),
@@ -40,14 +39,7 @@ def few(case: Case) -> Case:
     return case if n <= FEW else replace(case, gaussians=case.gaussians.select(np.arange(0, n, -(-n // FEW))))
 
 
-@routine(
-    "encoder: grid cells",
-    "splat",
-    domain=ORIGINS,
-    promise=1e-9,
-    measure="how far a point lies outside its cell, in cells",
-    oracle="exact fractions",
-)
+@routine("encoder: grid cells", "splat")
 def cells_error(case: Case) -> float:
     means, voxel = few(case).gaussians.means, case.voxel
     cells = grid_coords(torch.from_numpy(means), voxel).numpy()
@@ -61,15 +53,7 @@ def cells_error(case: Case) -> float:
     return float(outside)
 
 
-@routine(
-    "encoder: codes along curves",
-    "splat",
-    domain="coordinates below 2²¹",
-    promise=0.0,
-    measure="share of the cells whose Morton code is not the interleaved bits; 1 where Hilbert codes are not one a "
-    "cell, or do not share all but the last digit with those of the same coarser cell",
-    oracle="integers, a bit at a time",
-)
+@routine("encoder: codes along curves", "splat")
 def codes_error(case: Case) -> float:
     cells = grid_coords(torch.from_numpy(few(case).gaussians.means), case.voxel).numpy()
     cells = np.unique(cells, axis=0)
@@ -83,14 +67,7 @@ def codes_error(case: Case) -> float:
     return float(wrong.mean()) if whole else 1.0
 
 
-@routine(
-    "encoder: input channels",
-    "splat",
-    domain=f"{ORIGINS}; scales within e^±12 cells, and as these beyond; opacities from 0 to 1",
-    promise=5e-6,
-    measure="channel; offsets modulo 2, since a point on a border lies in either cell",
-    oracle="longdouble, from the definitions",
-)
+@routine("encoder: input channels", "splat")
 def embed_error(case: Case) -> float:
     g, voxel = case.gaussians, Wide(case.voxel)
     arrays = (g.means, g.quats, g.scales, g.opacities, g.sh[:, 0])
@@ -112,15 +89,7 @@ def embed_error(case: Case) -> float:
     return worst(got, np.concatenate(want, axis=1), 1)
 
 
-@routine(
-    "encoder: merging into cells",
-    "splat",
-    "vectors",
-    domain="any number of Gaussians in a cell; opacities from 0 to 1; values of 1e-8 to 1e6",
-    promise=1e-5,
-    measure="mean of a cell, relative to the largest value in it",
-    oracle="longdouble weighted means",
-)
+@routine("encoder: merging into cells", "splat", "vectors")
 def merge_error(case: Case) -> float:
     means = torch.from_numpy(case.gaussians.means)
     plan = join_plans([plan_cloud(means, case.voxel, levels=1)], 24)
@@ -136,15 +105,7 @@ def merge_error(case: Case) -> float:
     return worst(got, sums / total[:, None], largest)
 
 
-@routine(
-    "encoder: pooling to a coarser grid",
-    "splat",
-    "vectors",
-    domain="tokens of 1e-8 to 1e6",
-    promise=1e-4,
-    measure="output of the layer, relative to the largest",
-    oracle="the same layer in float64, over children looked up by their cells",
-)
+@routine("encoder: pooling to a coarser grid", "splat", "vectors")
 def pool_error(case: Case) -> float:
     torch.manual_seed(0)
     layer = Pool(CHANNELS, 16)
@@ -165,15 +126,7 @@ def pool_error(case: Case) -> float:
     return worst(got, want.numpy())
 
 
-@routine(
-    "encoder: convolution over neighbors",
-    "splat",
-    "vectors",
-    domain="tokens of 1e-8 to 1e6",
-    promise=1e-5,
-    measure="output of the layer, relative to the largest",
-    oracle="longdouble sums over cells looked up by name",
-)
+@routine("encoder: convolution over neighbors", "splat", "vectors")
 def convolution_error(case: Case) -> float:
     torch.manual_seed(0)
     layer = NeighborConv(CHANNELS, 8)
@@ -217,26 +170,12 @@ def attention_case(case: Case, *, exported: bool) -> float:
     return worst(got, want, float(np.abs(want).max()) * (1 + case.logits))
 
 
-@routine(
-    "encoder: attention",
-    "logits",
-    domain="scores from −1e4 to 1e4",
-    promise=1e-6,
-    measure="output, relative to the largest and to 1 + the largest score",
-    oracle="longdouble softmax over the slots that are no padding",
-)
+@routine("encoder: attention", "logits")
 def patch_attention_error(case: Case) -> float:
     return attention_case(case, exported=False)
 
 
-@routine(
-    "encoder: attention as exported to ONNX",
-    "logits",
-    domain="scores from −1e4 to 1e4: padding is masked by −3e4",
-    promise=1e-6,
-    measure="output, relative to the largest and to 1 + the largest score",
-    oracle="longdouble softmax over the slots that are no padding",
-)
+@routine("encoder: attention as exported to ONNX", "logits")
 def exported_attention_error(case: Case) -> float:
     return attention_case(case, exported=True)
 
@@ -279,29 +218,28 @@ def encoder_error(case: Case, made: GaussianEncoder, autocast: bool = False) -> 
     return float((got - want).square().mean().sqrt() / want.square().mean().sqrt())
 
 
-ENCODER = f"{ORIGINS}; any scales, needles and opacities"
 RELATIVE = "root mean square error of the outputs of a small random encoder, relative to these"
 ORACLE = "the same network in float64, on the same inputs"
 
 
-@routine("encoder in float32", "splat", domain=ENCODER, promise=1e-4, measure=RELATIVE, oracle=ORACLE)
+@routine("encoder in float32", "splat")
 def float32_error(case: Case) -> float:
     return encoder_error(case, network_of(torch.float32))
 
 
-@routine("encoder in bfloat16 (autocast)", "splat", domain=ENCODER, promise=5e-2, measure=RELATIVE, oracle=ORACLE)
+@routine("encoder in bfloat16 (autocast)", "splat")
 def bfloat16_error(case: Case) -> float:
     return encoder_error(case, network_of(torch.float32), autocast=True)
 
 
-@routine("encoder with weights of float16", "splat", domain=ENCODER, promise=5e-3, measure=RELATIVE, oracle=ORACLE)
+@routine("encoder with weights of float16", "splat")
 def float16_error(case: Case) -> float:
     made = network_of(torch.float32)
     made.load_state_dict({name: value.half().float() for name, value in made.state_dict().items()})
     return encoder_error(case, made)
 
 
-@routine("encoder with weights of int8", "splat", domain=ENCODER, promise=5e-2, measure=RELATIVE, oracle=ORACLE)
+@routine("encoder with weights of int8", "splat")
 def int8_weights_error(case: Case) -> float:
     made = network_of(torch.float32)
     with torch.no_grad():

@@ -48,62 +48,23 @@ def blend_of(case: Case, backend: str = "cpu") -> Blend:
     return _blend_of(id(case), backend)
 
 
-SCENES = (
-    "any origin that float32 resolves the scene at; scales up to 1e18 pixels; needles of any aspect; any number of "
-    "layers; any field of view below 180°"
-)
-
-
-@routine(
-    "Blend (numba)",
-    "splat",
-    "camera",
-    domain=SCENES,
-    promise=1e-6,
-    measure="weight",
-    oracle="longdouble compositing",
-)
+@routine("Blend (numba)", "splat", "camera")
 def blend_error(case: Case) -> float:
     return worst(dense(blend_of(case)), weights_of(case), 1)
 
 
-@routine(
-    "Blend (torch, float32)",
-    "splat",
-    "camera",
-    domain=SCENES,
-    promise=1e-4,
-    measure="weight, at pixels where no alpha or transmittance is within 1e-4 of a threshold",
-    oracle="longdouble compositing",
-)
+@routine("Blend (torch, float32)", "splat", "camera")
 def reference_error(case: Case) -> float:
     clear = clear_of(case)
     return worst(dense(blend_of(case, "reference"))[clear], weights_of(case)[clear], 1)
 
 
-@routine(
-    "transmittance: 1 − exp Σ log1p(−α)",
-    "splat",
-    "camera",
-    domain=SCENES,
-    promise=1e-5,
-    measure="opacity of a ray, of the numba kernel",
-    oracle="longdouble product",
-)
+@routine("transmittance: 1 − exp Σ log1p(−α)", "splat", "camera")
 def alpha_error(case: Case) -> float:
     return worst(blend_of(case).alpha, weights_of(case).sum(axis=1), 1)
 
 
-@routine(
-    "rendered values: B @ values",
-    "splat",
-    "camera",
-    "vectors",
-    domain="values whose sums float32 holds",
-    promise=1e-5,
-    measure="relative to Σ w·|value| of a row and channel",
-    oracle="longdouble product",
-)
+@routine("rendered values: B @ values", "splat", "camera", "vectors")
 def render_error(case: Case) -> float:
     values = case.vectors if len(case.vectors) == len(case.gaussians) else np.ones((len(case.gaussians), 3), np.float32)
     want = weights_of(case) @ values.astype(oracles.Wide)
@@ -111,15 +72,7 @@ def render_error(case: Case) -> float:
     return worst(blend_of(case).render(torch.from_numpy(values)), want, np.maximum(scale, 1e-6 * np.abs(values).max()))
 
 
-@routine(
-    "expected and median depth",
-    "splat",
-    "camera",
-    domain=SCENES,
-    promise=1e-4,
-    measure="relative to the depth; the median may be that of a neighbor in depth where half is reached within 1e-5",
-    oracle="longdouble sums",
-)
+@routine("expected and median depth", "splat", "camera")
 def depth_error(case: Case) -> float:
     weights, b = weights_of(case), blend_of(case)
     depths = oracles.project(case.gaussians, case.cameras).depths
@@ -152,15 +105,7 @@ def raster(case: Case, dtype: torch.dtype, backend: str) -> tuple[list[torch.Ten
     return inputs, torch.cat((out.rgb, out.alpha[..., None], out.depth[..., None]), dim=2)
 
 
-@routine(
-    "rasterizer, forward (numba, float32)",
-    "splat",
-    "camera",
-    domain=SCENES,
-    promise=1e-4,
-    measure="colors and alpha, and depth relative to the largest, at pixels where no threshold is within 1e-4",
-    oracle="longdouble compositing",
-)
+@routine("rasterizer, forward (numba, float32)", "splat", "camera")
 def raster_error(case: Case) -> float:
     inputs, out = raster(case, torch.float32, "cpu")
     weights = weights_of(case)
@@ -173,17 +118,7 @@ def raster_error(case: Case) -> float:
     return worst(out.detach().flatten(0, 1).numpy()[clear], want[clear], scale)
 
 
-@routine(
-    "rasterizer, backward (numba, float32)",
-    "splat",
-    "camera",
-    domain=SCENES.replace("1e18 pixels", "1e8 pixels (gradients of larger ones are beyond float32)"),
-    promise=1e-3,
-    measure="gradient by means, quaternions, scales, opacities and colors of a smooth loss, relative to the largest; "
-    "that by quaternions relative to scales × the gradient by these where that is larger, as spheres have none",
-    oracle="float64 autograd through the torch twin",
-    limits={"scale": (-8.0, 7.0)},
-)
+@routine("rasterizer, backward (numba, float32)", "splat", "camera", limits={"scale": (-8.0, 7.0)})
 def gradient_error(case: Case) -> float:
     gradients = []
     for dtype, backend in ((torch.float32, "cpu"), (torch.float64, "reference")):
@@ -202,16 +137,7 @@ def gradient_error(case: Case) -> float:
     return max(errors, default=0.0)
 
 
-@routine(
-    "lift: Σ Bᵀ @ maps / Σ Bᵀ @ 1",
-    "splat",
-    "camera",
-    "vectors",
-    domain="vectors of length 1e-30 to 1e30; summed weights above the smallest normal float32",
-    promise=1e-4,
-    measure="relative to the longest vector of the map",
-    oracle="longdouble sums over three views of the same camera",
-)
+@routine("lift: Σ Bᵀ @ maps / Σ Bᵀ @ 1", "splat", "camera", "vectors")
 def lift_error(case: Case) -> float:
     weights, b = weights_of(case), blend_of(case)
     rng = np.random.default_rng(0)

@@ -33,14 +33,7 @@ def scores_of(case: Case) -> np.ndarray:
     return np.concatenate([case.vectors[:, 0], case.vectors[:, 1] + 3 * np.abs(case.vectors).max()])
 
 
-@routine(
-    "Otsu's threshold",
-    "vectors",
-    domain="finite float32 scores of any magnitude and spread",
-    promise=0.02,
-    measure="variance between the classes that a better split would have, relative to the best one's",
-    oracle="all splits of the scores above their median, in longdouble",
-)
+@routine("Otsu's threshold", "vectors")
 def otsu_error(case: Case) -> float:
     scores = scores_of(case)
     upper = np.sort(scores[scores >= np.median(scores)]).astype(Wide)
@@ -55,14 +48,7 @@ def otsu_error(case: Case) -> float:
     return float(1 - between(int((upper < otsu(scores)).sum())) / best)
 
 
-@routine(
-    "adaptive threshold",
-    "vectors",
-    domain="finite float32 scores",
-    promise=1e-6,
-    measure="relative to the largest score",
-    oracle="longdouble median and deviation",
-)
+@routine("adaptive threshold", "vectors")
 def threshold_error(case: Case) -> float:
     scores = scores_of(case)
     config = ThresholdConfig()
@@ -91,14 +77,7 @@ def cluster_errors(points: np.ndarray, labels: np.ndarray, eps: float, count: in
     return float(wrong.mean())
 
 
-@routine(
-    "DBSCAN",
-    "splat",
-    domain="any origin that float32 resolves the scene at; distances from 1e-6 to 1e9 times the radius",
-    promise=0.0,
-    measure="share of the points that are against the rule for every radius within the rounding of their coordinates",
-    oracle="all pairs, in longdouble",
-)
+@routine("DBSCAN", "splat")
 def dbscan_error(case: Case) -> float:
     points = few(case).gaussians.means
     errors = []
@@ -108,14 +87,7 @@ def dbscan_error(case: Case) -> float:
     return max(errors)
 
 
-@routine(
-    "DBSCAN on a grid",
-    "splat",
-    domain="as DBSCAN; more neighbors than fit into memory",
-    promise=0.0,
-    measure="share of the points that are against the rule for every radius within 0.9 of the one asked for",
-    oracle="all pairs, in longdouble",
-)
+@routine("DBSCAN on a grid", "splat")
 def grid_dbscan_error(case: Case) -> float:
     points, eps = few(case).gaussians.means, 3 * case.voxel
     with pytest.MonkeyPatch.context() as patch:
@@ -123,14 +95,7 @@ def grid_dbscan_error(case: Case) -> float:
         return cluster_errors(points, cluster(points, eps, 4), eps, 4, slack=0.9)
 
 
-@routine(
-    "scores of clusters",
-    "vectors",
-    domain="finite scores; positive weights",
-    promise=1e-9,
-    measure="score, relative to the largest relevancy",
-    oracle="longdouble means",
-)
+@routine("scores of clusters", "vectors")
 def cluster_scores_error(case: Case) -> float:
     scores = case.vectors[:, 0]
     weights = (10 ** np.random.default_rng(0).uniform(-6, 6, len(scores))).astype(np.float32)
@@ -145,14 +110,7 @@ def cluster_scores_error(case: Case) -> float:
     return max(errors)
 
 
-@routine(
-    "presence probability",
-    "vectors",
-    domain="features of length 1e-8 to 1e6 about their mean; a cluster of one Gaussian or more",
-    promise=1e-4,
-    measure="probability",
-    oracle="longdouble evidence and logistic function",
-)
+@routine("presence probability", "vectors")
 def presence_error(case: Case) -> float:
     features, zero = features_of(case), np.zeros(CHANNELS, np.float32)
     cosines = relevancy(features, WORDS[:1], zero)[0]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from stability.extremes import EXTREMES, Case, Extreme
 
+DOCUMENT = Path(__file__).parents[2] / "docs" / "numerics.md"
 TABLE = Path(__file__).with_name("errors.csv")
 """Measured errors of all cells; `python bench/numerics.py` remakes it."""
 FACTOR = 8
@@ -24,12 +25,9 @@ class Routine:
     """A numeric routine.
 
     Attributes:
-        name: in the table.
+        name: in the table of docs/numerics.md, which says what it takes, and how its error is meant.
         reads: the parts of a case that it reads.
-        domain: what it promises to take, in words and numbers.
         promise: largest error that it promises there.
-        measure: of the error.
-        oracle: what it is compared with.
         error: of a case.
         exempt: extremes outside the domain, or that say nothing about the routine, with the reason.
         limits: of fields of `random_cases.Recipe`, where the domain is narrower than what searches draw from.
@@ -37,10 +35,7 @@ class Routine:
 
     name: str
     reads: frozenset[str]
-    domain: str
     promise: float
-    measure: str
-    oracle: str
     error: Callable[[Case], float]
     exempt: dict[str, str]
     limits: dict[str, tuple[float, float]]
@@ -62,13 +57,18 @@ def _words(parts: frozenset[str]) -> str:
 ROUTINES: dict[str, Routine] = {}
 
 
+def table_rows() -> dict[str, list[str]]:
+    """The cells of the table of docs/numerics.md by routine: domain, promise, and how its error is meant."""
+    rows = [line.strip("| ").split(" | ") for line in DOCUMENT.read_text().splitlines() if line.startswith("| ")]
+    return {row[0]: row[1:] for row in rows if len(row) > 3}
+
+
+PROMISES = {name: float(cells[1]) for name, cells in table_rows().items() if name != "routine"}
+
+
 def routine(
     name: str,
     *reads: str,
-    domain: str,
-    promise: float,
-    measure: str,
-    oracle: str,
     exempt: dict[str, str] | None = None,
     limits: dict[str, tuple[float, float]] | None = None,
 ) -> Callable[[Callable[[Case], float]], Callable[[Case], float]]:
@@ -76,8 +76,7 @@ def routine(
 
     def enter(error: Callable[[Case], float]) -> Callable[[Case], float]:
         assert name not in ROUTINES, name
-        made = Routine(name, frozenset(reads), domain, promise, measure, oracle, error, exempt or {}, limits or {})
-        ROUTINES[name] = made
+        ROUTINES[name] = Routine(name, frozenset(reads), PROMISES[name], error, exempt or {}, limits or {})
         return error
 
     return enter

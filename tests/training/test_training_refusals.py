@@ -18,12 +18,9 @@ pytestmark = pytest.mark.slow
     [
         (["holdout=kitchen_*"], "holdout: no scene is called 'kitchen_*'"),
         (["holdout=room_*"], "matches every scene"),
-        (["train.steps=0"], "train.steps: expected 1 or more"),
-        (["loss.min_kept=2.0"], "loss.min_kept"),
         (["model.transformer.encoder_depths=[1,1]"], "encoder_channels: expected one entry per level"),
         (["teacher=radio"], "teacher.model= is missing"),
         (["device=cuda"], "no GPU"),
-        (["experiment=kitchen"], "experiment: expected one of"),
     ],
 )
 def test_a_training_that_cannot_be_is_refused_in_one_line(
@@ -36,19 +33,11 @@ def test_a_training_that_cannot_be_is_refused_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_two_scenes_of_one_name_are_refused(rooms: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(rooms / "room_0", tmp_path / "room_0")
-    table = f"teacher.words={rooms / 'words.safetensors'}"
-    line = refusal(capsys, "train", str(rooms / "room_0"), str(tmp_path / "room_0"), table, f"out={tmp_path / 'out'}")
-    assert "two scenes are called 'room_0'" in line
-
-
 @pytest.mark.usefixtures("no_gpu")
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (["weights=nowhere"], "weights: no file at nowhere"),
-        (["encode.chunk=-1"], "encode.chunk"),
         (["encode.device=cuda"], "sees no GPU"),
     ],
 )
@@ -132,10 +121,7 @@ def test_folders_that_a_training_did_not_make_are_left_alone(
 @pytest.mark.parametrize(
     "setting",
     [
-        "train.seed=99999999999999999999",
-        "model.transformer.encoder_channels=32,32,32,32,32000000000",
         "model.transformer.encoder_depths=1,1,1,1,300000",
-        "loss.rarity=1000",
         "loss.cosine=0 loss.smooth_l1=0 loss.contrast_weight=0",
     ],
 )
