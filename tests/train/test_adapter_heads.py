@@ -72,12 +72,6 @@ def test_heads_of_the_loss_give_standard_units_of_their_space_and_have_no_gradie
     assert render_heads(HeadSet(space=SPACE), outputs()) == []
 
 
-def test_heads_of_another_backbone_are_refused() -> None:
-    other = FeatureSpace(name="s", channels=6, weights="1234")
-    with pytest.raises(InputError, match=r"heads take features of \(s · 6 channels · 1234\), and these are of \(s · 6"):
-        render_heads(HeadSet(space=other, heads=(measured("clip.summary", 4),)), outputs())
-
-
 def test_a_training_asks_for_the_heads_of_its_loss_and_for_those_that_are_stored_besides() -> None:
     teacher = RadioConfig(heads=("siglip", "clip"))
     assert required_heads(("sam", "siglip"), {"radio": teacher}) == ("sam", "siglip", "clip")

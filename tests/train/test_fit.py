@@ -78,17 +78,6 @@ def begin(
     return arguments["dataset"], arguments["validated"], arguments["heads"]
 
 
-def test_each_teacher_has_its_own_weight_and_classes(
-    datasets: Datasets, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for weights, expected in (((), [1.0, 1.0]), ((2.0, 0.25), [2.0, 0.25])):
-        data, *_ = begin(datasets, ["wall_0"], tmp_path, monkeypatch, teacher_weights=weights)
-        assert [teacher.weight for teacher in data.recipe.teachers] == expected
-        for teacher, (name, dataset) in zip(data.recipe.teachers, datasets.items(), strict=True):
-            assert teacher.name == name
-            np.testing.assert_array_equal(teacher.class_balance.codebook, dataset.load_class_balance().codebook)
-
-
 @pytest.mark.parametrize(
     ("losses", "untrained"),
     [

@@ -81,9 +81,7 @@ def test_fused_features_are_a_memory_before_any_training(prepared: MemoryScene) 
     assert np.median(cosines) > 0.9
 
 
-@pytest.mark.parametrize(
-    ("scoring", "init"), [("centered", "fused"), ("centered", "random"), ("cosine", "random"), ("dot", "random")]
-)
+@pytest.mark.parametrize(("scoring", "init"), [("centered", "fused"), ("cosine", "random"), ("dot", "random")])
 def test_training_brings_rendered_features_to_the_teachers(
     prepared: MemoryScene, tmp_path: Path, scoring: str, init: str
 ) -> None:
@@ -142,6 +140,8 @@ def test_an_epoch_goes_through_all_views_and_rows_are_drawn_without_repeats(prep
         assert sorted(names[2 * epoch : 2 * epoch + 2]) == ["far", "near"]
     one, again = samples[3], samples[3]
     torch.testing.assert_close(one.rows[0].targets, again.rows[0].targets)
+    for other in (samples[5], samples[1], ViewSamples({"a": prepared}, MemoryConfig(), seed=1)[3]):
+        assert not np.array_equal(other.rows[0].targets[:50], one.rows[0].targets)
     rows = {row.tobytes() for row in one.rows[0].targets.numpy()}
     assert len(rows) == 50
 
@@ -268,22 +268,6 @@ def sample(scene: MemoryScene, number: int, *, seed: int = 0, config: MemoryConf
     return ViewSamples({"a": scene}, config or MemoryConfig(), seed)[number]
 
 
-def targets(batch: MemoryBatch) -> np.ndarray:
-    return batch.rows[0].targets.numpy()
-
-
-@pytest.mark.usefixtures("few_rows")
-def test_a_view_gives_other_rows_and_other_gaussians_in_each_epoch_and_for_each_seed(prepared: MemoryScene) -> None:
-    of_near = [number for number in range(8) if sample(prepared, number).names == ("near",)]
-    assert len(of_near) == 4
-    one, other = (targets(sample(prepared, number)) for number in of_near[:2])
-    for rows in (slice(0, 50), slice(50, 75)):
-        assert not np.array_equal(one[rows], other[rows])
-    for number in range(4):
-        if sample(prepared, number, seed=1).names == sample(prepared, number).names:
-            assert not np.array_equal(targets(sample(prepared, number, seed=1)), targets(sample(prepared, number)))
-
-
 @pytest.mark.parametrize("least", [0.1, 0.5, 0.95])
 def test_rows_are_at_least_as_opaque_as_is_asked_for(prepared: MemoryScene, least: float) -> None:
     config = MemoryConfig(gaussian_weight=0.0, min_alpha=least)
@@ -315,32 +299,6 @@ def test_both_terms_of_the_loss_count_each_row_by_its_weight(prepared: MemorySce
     assert terms["l2"].item() == pytest.approx((squares * weights).sum().item(), rel=1e-5)
 
 
-def test_random_first_queries_depend_on_the_seed_and_have_scores_of_their_scoring(prepared: MemoryScene) -> None:
-    for scoring, length in (("centered", np.sqrt(12)), ("cosine", np.sqrt(12)), ("dot", 1.0)):
-        config = MemoryConfig(channels=200, init="random", scoring=scoring)  # type: ignore[arg-type]
-        queries, projection = first_queries(prepared, config, seed=3)
-        again, other = (first_queries(prepared, config, seed=seed) for seed in (3, 4))
-        np.testing.assert_array_equal(again[0], queries)
-        np.testing.assert_array_equal(again[1], projection)
-        assert not np.array_equal(other[0], queries)
-        assert not np.array_equal(other[1], projection)
-        assert queries.std() == pytest.approx(1, abs=0.02)
-        assert np.square(projection).sum(axis=1).mean() == pytest.approx(length**2, rel=0.1)
-
-
-@pytest.mark.usefixtures("few_rows")
-def test_the_seed_of_the_training_chooses_its_samples(prepared: MemoryScene, tmp_path: Path) -> None:
-    """Its first queries are those of the fused features, whatever the seed is."""
-    queries = []
-    for number, seed in enumerate((0, 0, 1)):
-        training = replace(STEPS, seed=seed)
-        config = MemoryConfig(channels=4)
-        memories, _ = train_memory({"a": prepared}, config, training, work=made(tmp_path / str(number)))
-        queries.append(memories["a"].queries)
-    np.testing.assert_array_equal(queries[0], queries[1])
-    assert not np.array_equal(queries[0], queries[2])
-
-
 def fewer_components(bank: MemoryBank) -> MemoryBank:
     return replace(
         bank,
@@ -356,25 +314,6 @@ def test_a_run_is_not_resumed_with_another_bank(prepared: MemoryScene, tmp_path:
     other = replace(prepared, bank=fewer_components(prepared.bank))
     with pytest.raises(InputError, match=r"digests\.a="):
         train_memory({"a": other}, config, STEPS, work=tmp_path)
-
-
-def test_a_folder_that_was_prepared_for_other_views_or_another_teacher_is_refused(tmp_path: Path) -> None:
-    scene = wall(0)
-    assert scene.views is not None
-    prepare_memory(scene, BlendedTeacher(scene), tmp_path, BankConfig(), PREPARE)
-    renamed = replace(scene, views=replace(scene.views, names=("near", "farther")))
-    with pytest.raises(InputError, match="was prepared with views"):
-        prepare_memory(renamed, BlendedTeacher(scene), tmp_path, BankConfig(), PREPARE)
-    with pytest.raises(InputError, match=r"was prepared with teacher\.name=.*hidden.*other"):
-        prepare_memory(scene, BlendedTeacher(scene, "other"), tmp_path, BankConfig(), PREPARE)
-    with pytest.raises(InputError, match=r"was prepared with prepare\.render_cell=2, and this run asks"):
-        prepare_memory(scene, BlendedTeacher(scene), tmp_path, BankConfig(), replace(PREPARE, render_cell=4))
-
-
-def test_components_in_the_units_of_the_outputs_are_restored_to_themselves(prepared: MemoryScene) -> None:
-    np.testing.assert_allclose(prepared.outputs.restore(prepared.values), prepared.bank.components, atol=1e-4)
-    # About one a channel, as the targets that they are averaged for.
-    assert 0.3 < np.square(prepared.values).mean() < 3
 
 
 def predicted_features(name: str = "hidden", seed: int = 0) -> GaussianFeatures:
@@ -427,14 +366,6 @@ def test_gaussians_without_a_feature_have_no_query_before_and_after_the_training
         assert memory.queries[predicted.seen].all(axis=1).all()
 
 
-def test_a_folder_that_was_prepared_with_other_predictions_is_refused(tmp_path: Path) -> None:
-    prepared_from(tmp_path / "made", predicted_features())
-    prepared_from(tmp_path / "made", predicted_features())
-    for other in (None, predicted_features(seed=1)):
-        with pytest.raises(InputError, match="predicted="):
-            prepared_from(tmp_path / "made", other)
-
-
 def test_a_preparation_that_was_cut_off_is_not_continued_with_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -480,8 +411,7 @@ def in_a_basis(predicted: GaussianFeatures) -> GaussianFeatures:
     return replace(predicted, features=coordinates * predicted.seen[:, None], basis=basis)
 
 
-@pytest.mark.parametrize("basis", [True, False])
-@pytest.mark.parametrize("least", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize(("basis", "least"), [(True, 0.2), (False, 0.8)])
 def test_the_fit_is_how_far_rendered_features_are_from_the_teachers_maps_in_all_views(
     tmp_path: Path, basis: bool, least: float
 ) -> None:

@@ -22,8 +22,7 @@ from gsencoder.core.files import plain
 from gsencoder.core.process import ProcessRank, untracked
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.teachers.base import MissingInput
-from gsencoder.teachers.build import words_by_teacher
-from gsencoder.teachers.labels import LabelsConfig, PaletteConfig
+from gsencoder.teachers.labels import PaletteConfig
 from gsencoder.teachers.onnx import OnnxConfig
 from gsencoder.train import prepare_scenes as prepare_module
 from gsencoder.train.memory import prepare_memory
@@ -127,14 +126,6 @@ def test_a_scene_that_was_moved_is_recognized_by_its_files(tmp_path: Path) -> No
         dataset.has_scene(moved)
 
 
-def test_what_is_there_is_opened_without_settings_and_nothing_is_made(tmp_path: Path) -> None:
-    dataset, _ = prepared(tmp_path / "prepared", count=1)
-    assert PreparedDataset(tmp_path / "prepared").settings == dataset.settings
-    with pytest.raises(InputError, match=f"expected prepared scenes, found no {SPACE_FILE}"):
-        PreparedDataset(tmp_path / "nothing")
-    assert not (tmp_path / "nothing").exists()
-
-
 def test_a_folder_of_another_dataset_is_refused_and_the_setting_named(tmp_path: Path) -> None:
     prepared(tmp_path, count=1)
     with pytest.raises(InputError, match=r"prepared with made="):
@@ -204,17 +195,6 @@ def test_scenes_of_two_spaces_are_refused() -> None:
         dataset_space([Path("a"), Path("b")], lambda path: (scene(0), next(teachers)), PREPARE)
     with pytest.raises(InputError, match="no scenes"):
         dataset_space([], lambda path: (scene(0), SideTeacher()), PREPARE)
-
-
-def test_the_space_of_a_dense_teacher_has_the_moments_of_its_maps() -> None:
-    config = PrepareConfig(fusion=FuseConfig(narrow=0), basis_views=4)
-    outputs, codebook, _ = dataset_space([Path("a"), Path("b")], lambda _: (scene(0), DenseSideTeacher()), config)
-    assert codebook is None
-    np.testing.assert_allclose(outputs.mean, (TABLE[1] + TABLE[2]) / 2, atol=1e-5)
-    assert outputs.scale == pytest.approx(np.sqrt(0.5), rel=1e-4)
-    assert outputs.basis is not None
-    assert outputs.basis.rank == 1  # Two vectors lie on one line.
-    assert outputs.space == SPACE
 
 
 def test_a_teacher_that_says_the_same_everywhere_is_refused() -> None:
@@ -400,19 +380,6 @@ def test_all_else_is_the_same_and_targets_take_half_the_bytes(both: tuple[Prepar
             np.testing.assert_array_equal(narrow[name], values)
 
 
-def test_a_sample_of_such_targets_is_one_of_float16_otherwise(tmp_path: Path) -> None:
-    dataset, names = prepared(tmp_path, count=1, teacher=UnevenTeacher())
-    wide = samples(dataset, names)[5]
-    path = dataset.scene_path(names[0])
-    prepare_scene(path, scene(0), UnevenTeacher(), dataset.load_space()[0], replace(PREPARE, targets="int8"))
-    narrow = samples(dataset, names)[5]
-    assert narrow.attributes.equal(wide.attributes)
-    (one,), (other,) = narrow.teachers, wide.teachers
-    assert one.targets.dtype == other.targets.dtype
-    largest = PreparedScene(path).targets(np.arange(400)).max()
-    assert 0 < (one.targets - other.targets).abs().max() <= 2 * HALF_STEP * largest
-
-
 def test_a_scene_of_the_other_type_in_a_folder_is_refused(
     both: tuple[PreparedScene, PreparedScene], tmp_path: Path
 ) -> None:
@@ -425,19 +392,6 @@ def test_a_scene_of_the_other_type_in_a_folder_is_refused(
         path.write_bytes(other.path.read_bytes())
         with pytest.raises(InputError, match=f"{path}: expected targets of {fits.precision}, .*got {other.precision}"):
             dataset.has_scene(Path("wall_0"))
-
-
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
-def test_scales_that_no_preparation_writes_are_an_error_with_the_file_and_what_to_do(
-    both: tuple[PreparedScene, PreparedScene], tmp_path: Path, value: float
-) -> None:
-    path = tmp_path / "wall_0.safetensors"
-    path.write_bytes(both[1].path.read_bytes())
-    arrays: dict[str, Any] = load_file(path)
-    arrays["row_target_scales"][1] = value
-    rewrite(path, arrays)
-    with pytest.raises(InputError, match=rf"{path}: .*scales.*; remove the file to prepare the scene again$"):
-        PreparedScene(path).view(0)
 
 
 def test_a_memory_reads_its_features_from_its_targets_and_refuses_eight_bits(tmp_path: Path) -> None:
@@ -593,17 +547,6 @@ def test_errors_name_the_options_of_one_of_several_teachers_as_they_are_typed(
         prepare_scenes(WALLS[:1], [], {}, SourceConfig(teachers={name: OnnxConfig()}), tmp_path / "one", voxel=0.1)
     with pytest.raises(InputError, match="^teacher.model: no file"):
         prepare_scenes(WALLS[:1], [], {}, SourceConfig(teacher=OnnxConfig()), tmp_path / "single", voxel=0.1)
-
-
-def test_errors_of_words_name_the_options_of_one_of_several_teachers_as_they_are_typed() -> None:
-    config = LabelsConfig(words="none.safetensors")
-    for teachers, members, option in (
-        ({"labels": config, "palette": PaletteConfig()}, False, "teachers.labels.words"),
-        ({"things": config}, True, "teachers.things.words"),
-        ({"labels": config}, False, "teacher.words"),
-    ):
-        with pytest.raises(InputError, match=f"^{option}: no file"):
-            words_by_teacher(teachers, members=members)
 
 
 def test_names_of_teachers_that_differ_only_in_case_are_refused() -> None:

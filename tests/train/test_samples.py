@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from joint_training import Datasets, batch_of, joint
 from safetensors.numpy import load_file
 from splats import front_camera
-from training_scenes import LOSSES, SMALL, DenseSideTeacher, prepared, samples, small_encoder
+from training_scenes import LOSSES, SMALL, samples, small_encoder
 
 from gsencoder.core.errors import InputError
 from gsencoder.geometry import covariances
@@ -60,13 +60,8 @@ def test_a_sample_depends_on_the_seed_and_its_number_alone(dataset: tuple[Prepar
     assert same(one[3], other[3])
     assert not same(one[3], one[4])
     assert not same(one[3], samples(*dataset, seed=4)[3])
-
-
-def test_every_pass_shows_every_scene_once(dataset: tuple[PreparedDataset, list[str]]) -> None:
-    data = samples(*dataset)
-    for epoch in range(3):
-        seen = {data[3 * epoch + step].name.split(" ")[0] for step in range(3)}
-        assert seen == set(dataset[1])
+    for epoch in range(2):
+        assert {one[3 * epoch + step].name.split(" ")[0] for step in range(3)} == set(dataset[1])
 
 
 @given(st.integers(1, 3), st.integers(1, 3), st.integers(1, 4), st.integers(0, 3), st.integers(1, 3))
@@ -263,6 +258,7 @@ ALL = np.arange(4)
 @pytest.mark.parametrize(
     ("row", "selected", "kept", "stays"),
     [
+        (None, ALL, ALL, False),  # without a vector of the teacher
         ([0.4, 0.4, 0.0, 0.0], ALL, ALL, True),
         ([0.2, 0.2, 0.0, 0.0], ALL, ALL, False),  # too faint
         ([0.0, 0.0, 0.0, 0.0], ALL, ALL, False),  # empty
@@ -273,19 +269,12 @@ ALL = np.arange(4)
     ],
 )
 def test_rows_stay_where_they_mean_something(
-    row: list[float], selected: np.ndarray, kept: np.ndarray, stays: bool
+    row: list[float] | None, selected: np.ndarray, kept: np.ndarray, stays: bool
 ) -> None:
-    restricted = restrict_rows(rows_of([row, [1.0, 0, 0, 0]]), 4, selected, kept, LossConfig())
+    view = rows_of([row or [1.0, 0, 0, 0], [1.0, 0, 0, 0]], [row is not None, True])
+    restricted = restrict_rows(view, 4, selected, kept, LossConfig())
     assert restricted.targets.ravel().tolist() == ([0.0, 1.0] if stays else [1.0])
     assert restricted.col.max() < len(kept)
-
-
-def test_cells_without_a_teachers_vector_are_left_out() -> None:
-    restricted = restrict_rows(
-        rows_of([[1.0, 0], [0, 1.0]], [False, True]), 2, np.arange(2), np.arange(2), LossConfig()
-    )
-    assert restricted.targets.ravel().tolist() == [1.0]
-    assert restricted.col.tolist() == [1]
 
 
 def test_samples_side_by_side_are_the_samples_alone(dataset: tuple[PreparedDataset, list[str]]) -> None:
@@ -306,14 +295,6 @@ def test_samples_side_by_side_are_the_samples_alone(dataset: tuple[PreparedDatas
         alone = [join_samples([part], SMALL.transformer.patch) for part in parts]
         apart = torch.cat([encoder(one.attributes, one.opacities, one.plan) for one in alone])
     torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-5)
-
-
-def test_a_dense_teacher_has_clusters_in_the_place_of_names(tmp_path: Path) -> None:
-    dataset, names = prepared(tmp_path, teacher=DenseSideTeacher())
-    balance = dataset.load_class_balance()
-    assert dataset.load_space()[1] is None
-    assert balance.counts.sum() == sum(int((scene.weights > 0).sum()) for scene in dataset.scenes(names))
-    assert np.isfinite(samples(dataset, names)[0].teachers[0].targets.numpy()).all()
 
 
 def test_no_scenes_are_refused(dataset: tuple[PreparedDataset, list[str]]) -> None:
@@ -351,23 +332,6 @@ def test_the_frustum_of_a_camera_is_what_its_pixels_look_at() -> None:
     inside = in_frusta(points, camera)
     assert (inside == expected).mean() > 0.999  # Rounding may move a point on the border.
     assert 0 < inside.sum() < len(points)
-
-
-def test_almost_nothing_that_a_view_shows_lies_outside_its_frustum() -> None:
-    """Small Gaussians whose center lies beside the picture reach into it at its edge alone."""
-    camera = front_camera()
-    rng = np.random.default_rng(2)
-    cloud = Gaussians(
-        means=rng.uniform(-3, 3, (3000, 3)).astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (3000, 1)),
-        scales=np.full((3000, 3), 0.02, np.float32),
-        opacities=np.full(3000, 0.9, np.float32),
-        sh=np.zeros((3000, 1, 3), np.float32),
-    )
-    b = blend(cloud, camera)
-    inside = in_frusta(cloud.means, camera)
-    weight_inside = b.weight[inside[b.col.numpy()]].sum()
-    assert weight_inside > 0.9 * b.weight.sum()
 
 
 @given(st.integers(1, 50), st.integers(1, 60))
@@ -440,11 +404,6 @@ def test_a_rare_target_is_often_the_center_of_a_crop() -> None:
     config = SamplingConfig(views=1, rare_centers=1.0)
     for seed in range(5):
         assert visible[0] in choose_crop(points, camera, chances, config, 5, RNG(seed))[1]
-
-
-def test_where_no_gaussian_has_a_target_any_may_be_the_center() -> None:
-    config = SamplingConfig(views=1)
-    assert len(choose_crop(cloud(), cameras(1), np.zeros(1000, np.float32), config, 5, RNG(0))[1])
 
 
 def test_a_camera_that_looks_into_the_void_gives_way_to_one_that_sees_something() -> None:
@@ -528,13 +487,6 @@ def test_up_stays_up_but_for_the_tilt() -> None:
     one = replace(splat(), means=np.stack([(i * up).astype(np.float32) for i in range(30)]))
     turned = augment(one, np.random.default_rng(3), replace(NOTHING, turn=180.0, mirror=1.0), voxel=0.0, up=up)
     np.testing.assert_allclose(turned.means, one.means, atol=1e-4)
-
-
-def test_the_same_random_numbers_give_the_same_splat() -> None:
-    one, config = splat(), Augmentation()
-    first, second = (augment(one, np.random.default_rng(5), config, voxel=0.1) for _ in range(2))
-    for name in ("means", "quats", "scales", "sh"):
-        assert np.array_equal(getattr(first, name), getattr(second, name))
 
 
 def test_light_changes_brightness_and_black_stays_near_black() -> None:
