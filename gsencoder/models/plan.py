@@ -91,14 +91,8 @@ class Plan(NamedTuple):
 
 
 class CloudLevel(NamedTuple):
-    """One level of one cloud, not yet cut into patches.
-
-    Attributes:
-        neighbors, parents, children: as in `Level`.
-        sorted_tokens: for each order, the tokens along its curve.
-        scene_patches: for each order, the patches of the full scene that these tokens are in; None if the cloud is the
-            full scene.
-    """
+    """One level of one cloud, not yet cut into patches, as in `Level`; for each order the tokens along its curve, and
+    the patches of the full scene that these are in, None if the cloud is the full scene."""
 
     neighbors: Int32[Tensor, "T 27"]
     sorted_tokens: Int64[Tensor, "O T"]

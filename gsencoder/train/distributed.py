@@ -43,11 +43,8 @@ LEFT = "left"
 
 
 class Presence:
-    """The meeting of this process with the others, and what it knows of them.
-
-    Attributes:
-        store: for `torch.distributed.init_process_group`.
-    """
+    """The meeting of this process with the others, and what it knows of them; `store` is for
+    `torch.distributed.init_process_group`."""
 
     def __init__(self, process: ProcessRank, init_method: str, *, wait: timedelta) -> None:
         """Waits until all processes have come. `init_method` is as `rank_from_environment` gives it; `wait` is the

@@ -93,14 +93,9 @@ class TrainerConfig:
 
 @runtime_checkable
 class Objective(Protocol):
-    """The loss of a network as weighted terms. In a step each term is Σ total / Σ divisor, summed over all
-    micro-batches of all processes.
-
-    Attributes:
-        network: the network to call, possibly wrapped for several processes.
-        lambdas: the weights of the terms that are not 0, by name.
-        advice: for the error where no term has a divisor above 0: what the user should check.
-    """
+    """The loss of a network, possibly wrapped for several processes, as weighted terms. In a step each term is Σ total
+    / Σ divisor, summed over all micro-batches of all processes. `lambdas` are the weights of the terms that are not 0,
+    and `advice` is what the user should check where no term has a divisor above 0."""
 
     network: nn.Module
 

@@ -468,8 +468,7 @@ def _memory_of(
 
 
 def _check_same_scene(scenes: Mapping[str, MemoryScene]) -> None:
-    """Raises:
-    InputError: the scenes are of different Gaussians or views."""
+    """Refuses scenes of different Gaussians or views."""
     first_name, first = next(iter(scenes.items()))
     for name, scene in scenes.items():
         if len(scene.prepared) != len(first.prepared) or scene.prepared.view_names != first.prepared.view_names:

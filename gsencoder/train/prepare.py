@@ -187,12 +187,7 @@ MAX_CLUSTERS = 128
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ClassBalance:
-    """A codebook of target classes and their frequencies.
-
-    Attributes:
-        codebook: one vector per class, in standard units.
-        counts: number of Gaussians of each class in the dataset.
-    """
+    """A codebook of target classes, in standard units, and their numbers of Gaussians in the dataset."""
 
     codebook: Float32[np.ndarray, "C channels"]
     counts: Float64[np.ndarray, " C"]
@@ -257,11 +252,8 @@ class PreparedDataset:
     """
 
     def __init__(self, folder: Path, settings: dict[str, Any] | None = None) -> None:
-        """Args:
-        folder: the folder, which is created with the space.
-        settings: everything that the preparation depends on, compared with the settings stored in the folder. None =
-            open an existing dataset with any settings.
-        """
+        """Opens the folder, which is created with the space; `settings` are everything that the preparation depends on,
+        compared with those stored in it, and None = open an existing dataset with any settings."""
         self.folder, path = folder, folder / SPACE_FILE
         self.settings: dict[str, Any] = json.loads(json.dumps(settings, default=str)) if settings is not None else {}
         with advised("give another folder as prepared="):

@@ -28,7 +28,7 @@ from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.folder import TEACHER_NAME
 from gsencoder.models.output_space import check_distinct
 from gsencoder.teachers.base import MissingInput, Teacher
-from gsencoder.teachers.build import TeacherConfig, build_teacher, options_of_member
+from gsencoder.teachers.build import TeacherConfig, build_teacher, options_of_member, words_by_teacher
 from gsencoder.teachers.heads import Head
 from gsencoder.teachers.labels import LabelsConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig, Words, closed_table
@@ -86,6 +86,10 @@ class SourceConfig:
     def teachers_by_name(self) -> dict[str, TeacherConfig]:
         """The teachers of the training, one or several."""
         return dict(self.teachers) or {self.teacher.name: self.teacher}
+
+    def load_words(self) -> dict[str, Words]:
+        """The words of the teachers that have any, by teacher."""
+        return words_by_teacher(self.teachers_by_name, self.text, members=bool(self.teachers))
 
     def typed_options(self, name: str) -> AbstractContextManager[None]:
         """Names options of a teacher in errors by the keys that are typed: teachers.NAME.OPTION with `teachers`."""

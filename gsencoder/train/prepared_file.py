@@ -51,13 +51,8 @@ ARRAYS = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewRows:
-    """The blending matrix B of one view, with a row for each cell of the teacher's grid, and the teacher's vectors.
-
-    Attributes:
-        crow, col, weight: B in compressed rows, as in `gsencoder.render.Blend`.
-        targets: the teacher's vectors in the cells, standard units.
-        valid: cells in which the teacher has a vector.
-    """
+    """The blending matrix B of one view, in compressed rows as in `gsencoder.render.Blend`, with a row for each cell of
+    the teacher's grid; the teacher's vectors in the cells, in standard units, and the cells in which it has one."""
 
     crow: Int64[np.ndarray, " P_plus_1"]
     col: Int32[np.ndarray, " nnz"]

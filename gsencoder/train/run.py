@@ -20,7 +20,6 @@ from gsencoder.core.threads import threads_of_torch
 from gsencoder.fusion.measured_heads import heads_digest
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpaces
-from gsencoder.teachers.build import words_by_teacher
 from gsencoder.text.table import TextTable
 from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.train.distributed import check_agreement, cpu_share, digest_of, fail_together, join_processes
@@ -219,43 +218,40 @@ def train(
     """
     folder = Path(work)
     training, validation = [Path(path) for path in scenes], [Path(path) for path in held_out]
-    words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
+    words = config.load_words()
     with join_processes(device) as (process, chosen_device):
         folder.mkdir(parents=True, exist_ok=True)
         with fail_together():
             if process.is_first:
                 check_same_teachers(folder / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
-        with threads_of_torch(cpu_share(process, config.prepare_threads)):
-            datasets = prepare_scenes(
-                training,
-                validation,
-                words,
-                config,
-                Path(prepared) if prepared is not None else folder / "prepared",
-                voxel=config.model.voxel,
-                heads=required_heads(config.heads, config.teachers_by_name),
-                process=process,
-                device=chosen_device,
-                track=track,
-            )
-        return fit(
-            datasets,
-            [path.name for path in training],
-            [path.name for path in validation],
-            words,
-            config,
-            work=folder,
-            process=process,
-            device=chosen_device,
-            validate=validate,
-            track=track,
-        )
+        place: dict[str, Any] = {"process": process, "device": chosen_device, "track": track}
+        prepared_in = Path(prepared) if prepared is not None else folder / "prepared"
+        datasets = prepare(training, validation, words, config, prepared_in, **place)
+        return fit(datasets, training, validation, words, config, work=folder, validate=validate, **place)
+
+
+def prepare(
+    scenes: Sequence[Path],
+    held_out: Sequence[Path],
+    words: Mapping[str, Words],
+    config: TrainConfig,
+    folder: Path,
+    *,
+    process: ProcessRank,
+    device: torch.device,
+    track: Track = untracked,
+) -> dict[str, PreparedDataset]:
+    """Prepares the scenes of a training in a folder, with this process's share of the cores."""
+    heads = required_heads(config.heads, config.teachers_by_name)
+    place: dict[str, Any] = {"process": process, "device": device, "track": track}
+    with threads_of_torch(cpu_share(process, config.prepare_threads)):
+        return prepare_scenes(scenes, held_out, words, config, folder, voxel=config.model.voxel, heads=heads, **place)
 
 
 def fit(
     datasets: Mapping[str, PreparedDataset],
-    training: Sequence[str],
-    held_out: Sequence[str],
+    scenes: Sequence[Path],
+    held_out: Sequence[Path],
     words: Mapping[str, Words],
     config: TrainConfig,
     *,
@@ -265,9 +261,9 @@ def fit(
     validate: SceneValidator | None = None,
     track: Track = untracked,
 ) -> Training:
-    """Trains an encoder on prepared scenes, given by name; the other arguments are those of `train`."""
+    """Trains an encoder on prepared scenes; the arguments are those of `train`."""
     # Samples are numbered by scene, so that the order in which scenes are given must not matter to a resumed run.
-    training = sorted(training)
+    training = sorted(path.name for path in scenes)
     outputs = OutputSpaces(by_teacher={name: dataset.load_space()[0] for name, dataset in datasets.items()})
     with_heads = teacher_of_heads(config.teachers_by_name, config.heads)
     heads = dataset_heads(datasets[with_heads], config.heads)
@@ -285,10 +281,10 @@ def fit(
     )
     score_encoder: Callable[[GaussianEncoder], ValidationResult] = lambda encoder: ValidationResult({})  # noqa: ARG005, E731
     if validate is not None and held_out:
-        held_out_parts = [_parts(datasets, name) for name in held_out]
-        scenes = [TrainingScene(parts) for parts in held_out_parts if any(part is not None for part in parts)]
+        held_out_parts = [_parts(datasets, path.name) for path in held_out]
+        others = [TrainingScene(parts) for parts in held_out_parts if any(part is not None for part in parts)]
         codebooks = {teacher.name: teacher.class_balance.codebook for teacher in recipe.teachers}
-        score_encoder = lambda encoder: validate(scenes, encoder, outputs, codebooks)  # noqa: E731
+        score_encoder = lambda encoder: validate(others, encoder, outputs, codebooks)  # noqa: E731
     if process.world_size > 1:
         digests = [dataset.digest_of_scenes(training) for dataset in datasets.values()]
         check_agreement("the prepared scenes", digest_of(digests))

@@ -180,13 +180,9 @@ def augment(
     voxel: float,
     up: Float64[np.ndarray, "3"] | None = None,
 ) -> Gaussians:
-    """Applies random changes to a splat with colors of degree 0; row i of the result is Gaussian i.
-
-    Args:
-        config: strengths of the changes; `drop` is applied by `make_sample`, since it removes rows.
-        voxel: unit of `jitter`, world units.
-        up: axis of `turn`; None = the z axis of the world.
-    """
+    """Applies random changes to a splat with colors of degree 0; row i of the result is Gaussian i. `drop` is applied
+    by `make_sample`, since it removes rows; the voxel, in world units, is the unit of `jitter`, and `up` the axis of
+    `turn`, None = that of z."""
     axis = np.array([0.0, 0.0, 1.0]) if up is None else up / np.linalg.norm(up)
     rotation = Rotation.from_rotvec(axis * math.radians(rng.uniform(-config.turn, config.turn)))
     horizontal = Rotation.from_rotvec(axis * rng.uniform(0, 2 * math.pi)).apply(perpendicular(axis))

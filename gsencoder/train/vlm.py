@@ -54,8 +54,7 @@ class AdapterConfig:
 
 
 def check_peft() -> None:
-    """Raises:
-    InputError: peft is missing."""
+    """Refuses to go on without peft."""
     try:
         import peft  # noqa: F401
     except ImportError as error:

@@ -72,7 +72,7 @@ def begin(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with pytest.raises(Begun):
-            fit(datasets, training, ["wall_1"], {}, config, validate=validate, **around)  # type: ignore[arg-type]
+            fit(datasets, [Path(name) for name in training], [Path("wall_1")], {}, config, validate=validate, **around)  # type: ignore[arg-type]
     if warned is not None:
         warned += [str(each.message) for each in caught]
     return arguments["dataset"], arguments["validated"], arguments["heads"]

@@ -15,7 +15,6 @@ from gsencoder.app.summary import basis_figures, describe_basis
 from gsencoder.core.logs import EVENTS_FOLDER, LOG_FILE
 from gsencoder.core.process import Device, retain_freed_memory
 from gsencoder.core.settings import option
-from gsencoder.core.threads import threads_of_torch
 from gsencoder.data.scenes import find_scenes
 from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.errors import total_fit
@@ -24,12 +23,11 @@ from gsencoder.fusion.measured_heads import HeadSet, save_heads
 from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.models.output_space import WEIGHTS_FILE, OutputSpace
 from gsencoder.models.weights import save_weights
-from gsencoder.teachers.build import words_by_teacher
-from gsencoder.train.distributed import cpu_share, fail_together
+from gsencoder.train.distributed import fail_together
 from gsencoder.train.loop import TRAINING_CHECKPOINT_FILE, check_same_teachers
-from gsencoder.train.prepare_scenes import prepare_scenes, split_scenes
+from gsencoder.train.prepare_scenes import split_scenes
 from gsencoder.train.prepared_file import PreparedScene
-from gsencoder.train.run import TrainConfig, Training, fit
+from gsencoder.train.run import TrainConfig, Training, fit, prepare
 from gsencoder.train.space import dataset_heads, required_heads, teacher_of_heads
 
 
@@ -69,7 +67,7 @@ def run(config: TrainCommandConfig, run: Run) -> None:
     out = run.out("train")
     prepared = prepared_folder(config.prepared, out)
     training, held_out = split_scenes(find_scenes(config.paths), config.holdout, config.split, config.holdout_split)
-    words = words_by_teacher(config.teachers_by_name, config.text, members=bool(config.teachers))
+    words = config.load_words()
     with run.processes(config.device, out, state="training") as group:
         process, device, folder = group.process, group.device, None
         with fail_together():
@@ -77,20 +75,11 @@ def run(config: TrainCommandConfig, run: Run) -> None:
                 folder = group.folder()
                 if folder is not None and config.resume:
                     check_same_teachers(group.work.path / TRAINING_CHECKPOINT_FILE, list(config.teachers_by_name))
-        with run.step("prepare"), threads_of_torch(cpu_share(process, config.prepare_threads)):
-            heads_asked = required_heads(config.heads, config.teachers_by_name)
-            datasets = prepare_scenes(
-                training,
-                held_out,
-                words,
-                config,
-                prepared,
-                voxel=config.model.voxel,
-                heads=heads_asked,
-                process=process,
-                device=device,
-                track=run.track,
+        with run.step("prepare"):
+            datasets = prepare(
+                training, held_out, words, config, prepared, process=process, device=device, track=run.track
             )
+            heads_asked = required_heads(config.heads, config.teachers_by_name)
             heads = dataset_heads(datasets[teacher_of_heads(config.teachers_by_name, heads_asked)], heads_asked)
         if config.prepare_only:
             run.print(f"{prepared}: {len(training)} scenes to train on, {len(held_out)} for validation")
@@ -102,8 +91,8 @@ def run(config: TrainCommandConfig, run: Run) -> None:
         with run.step("train"):
             result = fit(
                 datasets,
-                names(training),
-                names(held_out),
+                training,
+                held_out,
                 words,
                 config,
                 work=group.work.path,
@@ -115,7 +104,7 @@ def run(config: TrainCommandConfig, run: Run) -> None:
         if folder is None:
             return
         figures = {
-            name: encoder_basis_figures(result.outputs[name], dataset.scenes(names(held_out)))
+            name: encoder_basis_figures(result.outputs[name], dataset.scenes([path.name for path in held_out]))
             for name, dataset in datasets.items()
         }
         write_results(folder, group.work.path, result, figures, heads, config, run)
@@ -125,11 +114,6 @@ def run(config: TrainCommandConfig, run: Run) -> None:
         of = f" for {name}" if len(figures) > 1 else ""
         run.print(f"{out}: basis{of}: {describe_basis(of_teacher, 'held-out scenes')}")
     run.print(*(f"{out}: {line}" for line in heads.describe()))
-
-
-def names(paths: Sequence[Path]) -> list[str]:
-    """The names of scenes in a prepared dataset."""
-    return [path.name for path in paths]
 
 
 def encoder_basis_figures(outputs: OutputSpace, held_out: Sequence[PreparedScene]) -> dict[str, int | float]:
