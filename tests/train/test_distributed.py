@@ -169,8 +169,6 @@ def test_processes_of_a_machine_divide_its_cores_unless_threads_are_given() -> N
         ({"RANK": "9", "WORLD_SIZE": "16", "LOCAL_RANK": "1", "LOCAL_WORLD_SIZE": "8"}, 8),
         ({"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "1"}, 1),
         ({"SLURM_STEP_TASKS_PER_NODE": "4(x2),1", "SLURM_TASKS_PER_NODE": "9"}, 4),
-        ({"SLURM_TASKS_PER_NODE": "3"}, 3),
-        ({}, 1),
     ],
 )
 def test_launchers_state_the_processes_of_a_machine(environment: dict[str, str], local: int) -> None:

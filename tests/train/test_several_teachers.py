@@ -111,17 +111,6 @@ def test_the_log_averages_a_teachers_losses_over_the_steps_that_have_it(datasets
             assert float(row[name]) == pytest.approx(np.mean(values), rel=1e-5)
 
 
-def test_a_teacher_without_contrast_has_no_such_term(datasets: Datasets) -> None:
-    data = joint(datasets)
-    sides, heights = data.recipe.teachers
-    distillation = Distillation(small_encoder(8), LOSSES, (sides, replace(heights, classes=False)))
-    batch = batch_of(data, range(2))
-    terms = distillation.terms(torch.randn(len(batch.attributes), 8), batch)
-    assert set(terms) == set(distillation.lambdas)
-    assert "sides/contrast" in terms
-    assert "heights/contrast" not in terms
-
-
 def test_a_teacher_of_weight_zero_changes_nothing_but_its_own_columns(datasets: Datasets, tmp_path: Path) -> None:
     weightless = joint(datasets, {"heights": 0.0})
     names = Distillation(small_encoder(8), LOSSES, weightless.recipe.teachers).lambdas

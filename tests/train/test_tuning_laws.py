@@ -22,9 +22,8 @@ from gsencoder.train.tune import (
     check_pairs,
     join_pairs,
     open_processor,
-    pairs_digest,
 )
-from gsencoder.train.vlm import SPLIT, TokenHook, TowerLayout, tower_layout
+from gsencoder.train.vlm import SPLIT, TowerLayout, tower_layout
 
 
 def made(
@@ -96,21 +95,6 @@ PROMPT = StoredPrompt(text="t", pictures=("a.png",), tokens="x", space="s")
 PAIR = TuningPair(name="q", prompt=PROMPT, answers=("yes", "y"))
 
 
-def test_the_fingerprint_of_pairs_changes_with_everything_that_is_learned() -> None:
-    others = [
-        replace(PAIR, prompt=replace(PROMPT, text="u")),
-        replace(PAIR, prompt=replace(PROMPT, pictures=("b.png",))),
-        replace(PAIR, prompt=replace(PROMPT, tokens="y")),
-        replace(PAIR, answers=("y", "yes")),
-    ]
-    digests = [pairs_digest([pair]) for pair in (PAIR, *others)]
-    digests += [pairs_digest([PAIR, others[0]]), pairs_digest([others[0], PAIR])]
-    assert len(set(digests)) == 7
-    assert {len(each) for each in digests} == {16}
-    # A name is for people.
-    assert pairs_digest([replace(PAIR, name="other")]) == digests[0]
-
-
 def test_pairs_need_answers_and_one_space() -> None:
     check_pairs([PAIR, PAIR])
     other = replace(PAIR, name="r", prompt=replace(PROMPT, space="other"))
@@ -177,41 +161,3 @@ def test_pictures_are_split_as_the_processor_does_unless_features_replace_the_to
     assert getattr(processor.image_processor, SPLIT) is True
     assert open_processor(Path("model"), with_tokens=True)[2] == tower_layout(config, processor)
     assert getattr(processor.image_processor, SPLIT) is False
-
-
-class Tower(nn.Module):
-    """Two pictures of a summary token and three patches, and two layers."""
-
-    def forward(self) -> Any:
-        layers = tuple(torch.full((2, 4, 5), float(number)) for number in range(3))
-        return SimpleNamespace(last_hidden_state=layers[-1], hidden_states=layers)
-
-
-def test_tokens_take_the_place_of_patches_of_one_layer_while_they_are_set() -> None:
-    tower = Tower()
-    hook = TokenHook(tower, TowerLayout(model="llava", grid=(1, 3), channels=5, fit="crop", layer=-2, skipped=1))
-    hook.tokens = torch.arange(30.0, dtype=torch.float64).reshape(2, 3, 5)
-    output = tower()
-    assert torch.equal(output.hidden_states[1][:, 1:], hook.tokens.float())
-    # The summary and the other layers stay.
-    assert output.hidden_states[1][:, 0].tolist() == [[1.0] * 5] * 2
-    assert (output.hidden_states[0].unique().tolist(), output.hidden_states[2].unique().tolist()) == ([0.0], [2.0])
-    assert output.last_hidden_state.unique().tolist() == [2.0]
-    assert output.hidden_states[1].dtype == torch.float32
-    hook.tokens = None
-    assert tower().hidden_states[1].unique().tolist() == [1.0]
-
-
-def test_tokens_take_the_place_of_the_last_state_where_no_layer_is_named() -> None:
-    tower = Tower()
-    hook = TokenHook(tower, TowerLayout(model="idefics3", grid=(2, 2), channels=5, fit="stretch"))
-    hook.tokens = torch.arange(40.0).reshape(2, 4, 5)
-    output = tower()
-    assert torch.equal(output.last_hidden_state, hook.tokens)
-    assert output.hidden_states[2].unique().tolist() == [2.0]
-    for wrong in ((2, 3, 5), (1, 4, 5), (2, 4, 6)):
-        hook.tokens = torch.zeros(wrong)
-        with pytest.raises(
-            InputError, match=f"2 pictures of 4 patches with 5 channels, .* {list(wrong)}".replace("[", r"\[")
-        ):
-            tower()
