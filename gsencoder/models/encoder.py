@@ -71,7 +71,7 @@ class GaussianEncoder(nn.Module):
         self.stem_norm = nn.LayerNorm(width)
         self.transformer = PointTransformer(config.transformer)
         self.head_norm = nn.LayerNorm(out)
-        self.head = _head(out, widths, config.projector)
+        self.head = Projectors(out, widths, config.projector) if config.projector else nn.Linear(out, sum(widths))
 
     def join(self, clouds: list[CloudPlan]) -> Plan:
         """Joins plans of clouds to that of a batch; see `plan.join_plans`."""
@@ -119,10 +119,6 @@ class Projectors(nn.Module):
 
     def forward(self, x: Float[Tensor, "T C"]) -> Float[Tensor, "T channels"]:
         return torch.cat([projector(x) for projector in self.of_teacher], dim=1)
-
-
-def _head(channels: int, widths: Sequence[int], hidden: int) -> nn.Module:
-    return Projectors(channels, widths, hidden) if hidden else nn.Linear(channels, sum(widths))
 
 
 def merge(attributes: Float[Tensor, "N A"], weights: Float[Tensor, " N"], plan: Plan) -> Float[Tensor, "T A"]:

@@ -28,16 +28,10 @@ from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class OutputSpace:
-    """The space of an encoder's outputs.
-
-    Attributes:
-        space: the feature space of restored and decoded features.
-        mean: mean of the space, which is subtracted.
-        scale: root mean square distance of features from the mean.
-        basis: the basis in which outputs are coordinates; None if they are all D channels.
-        centered: whether outputs are relative to the mean; coordinates of a basis always are.
-        scaled: whether outputs are in units of the scale, instead of those of the space.
-    """
+    """The space of an encoder's outputs: the feature space of restored and decoded features, its mean, the root mean
+    square distance of features from it, and the basis in which outputs are coordinates, None if they are all D
+    channels. They are relative to the mean if `centered`, as coordinates of a basis always are, and in units of the
+    scale if `scaled`."""
 
     space: FeatureSpace
     mean: Float32[np.ndarray, " D"]

@@ -141,7 +141,7 @@ def plan_cloud(
     stem_neighbors = neighbor_table(cells, stem) if stem != 3 else None
     cloud_levels = []
     for level in range(levels):
-        parents, children, first = _pool_tokens(morton) if level + 1 < levels else _no_pooling(morton)
+        parents, children, first = _pool_tokens(morton if level + 1 < levels else morton[:0])
         codes, sorted_tokens = torch.sort(curve_codes, dim=1)
         scene_patches = None
         if scene_curves is not None:
@@ -159,11 +159,6 @@ def _pool_tokens(morton: Int64[Tensor, " T"]) -> tuple[Int64[Tensor, " T"], Int6
     step = torch.arange(8, device=morton.device)
     children = first[:, None] + torch.where(step < counts[:, None], step, 0)
     return parents, children, first
-
-
-def _no_pooling(morton: Int64[Tensor, " T"]) -> tuple[Tensor, Tensor, Tensor]:
-    empty = morton.new_zeros(0)
-    return empty, empty.view(0, 8), empty
 
 
 def join_plans(clouds: Sequence[CloudPlan], patch: int, *, round_up: bool = True) -> Plan:

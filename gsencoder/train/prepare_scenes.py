@@ -337,13 +337,8 @@ def _words_digest(words: Words | None) -> str:
 def split_scenes(
     paths: Sequence[Path], patterns: Sequence[str], split: Path | None = None, holdout_split: Path | None = None
 ) -> tuple[list[Path], list[Path]]:
-    """Splits scenes into those to train on and those held out for validation.
-
-    Args:
-        patterns: names of scenes to hold out, with * and ? as in file names.
-        split: file of the names of the scenes to train on; None = all that are not held out.
-        holdout_split: file of the names of the scenes to hold out, in place of patterns.
-    """
+    """Splits scenes into those to train on and those held out for validation: by patterns of names to hold out, with *
+    and ? as in file names, or by files of names to hold out and to train on."""
     names = [path.name for path in paths]
     if (repeated := first_repeated(names)) is not None:
         raise InputError(f"paths: two scenes are called {repeated[0]!r}; prepared scenes need distinct names")

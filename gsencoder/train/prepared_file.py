@@ -1,7 +1,6 @@
 """The file of a prepared scene: Gaussians, their targets, and the rows of the render loss of every view.
 
-Targets and the teacher's vectors in the rows are float16, or integers of eight bits and a scale for each column. The
-file is memory-mapped: a sample reads only its Gaussians and views, and data workers on one machine share the page
+The file is memory-mapped: a sample reads only its Gaussians and views, and data workers on one machine share the page
 cache. Data is verified against checksums when it is first read.
 """
 

@@ -147,29 +147,17 @@ def drop_random(rows: Int64[np.ndarray, " n"], max_share: float, rng: np.random.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Augmentation:
-    """Strengths of the random changes to a training sample; 0 = none.
+    """Strengths of the random changes to a training sample; 0 = none."""
 
-    Attributes:
-        turn: largest rotation about the up axis in either direction, degrees.
-        tilt: standard deviation of the tilt of the up axis, degrees.
-        mirror: probability of mirroring.
-        scale: largest relative change of size.
-        jitter: standard deviation of the shift of each center, voxels.
-        drop: largest share of Gaussians that is dropped at random.
-        light: largest relative change of brightness.
-        tint: largest relative change of each color channel, and largest shift of black.
-        noise: standard deviation of the noise added to each Gaussian's color; white = 1.
-    """
-
-    turn: float = 180.0
-    tilt: float = 3.0
-    mirror: float = 0.5
-    scale: float = 0.1
-    jitter: float = 0.1
-    drop: float = 0.2
-    light: float = 0.2
-    tint: float = 0.08
-    noise: float = 0.02
+    turn: float = 180.0  # largest rotation about the up axis in either direction, degrees
+    tilt: float = 3.0  # standard deviation of the tilt of the up axis, degrees
+    mirror: float = 0.5  # probability
+    scale: float = 0.1  # largest relative change of size
+    jitter: float = 0.1  # standard deviation of the shift of each center, voxels
+    drop: float = 0.2  # largest share of Gaussians that is dropped at random
+    light: float = 0.2  # largest relative change of brightness
+    tint: float = 0.08  # largest relative change of each color channel, and largest shift of black
+    noise: float = 0.02  # standard deviation of the noise added to each Gaussian's color; white = 1
 
 
 def augment(

@@ -1,10 +1,8 @@
 """What the scenes of a dataset share: the output space (mean, scale and basis), and adapter heads of its teacher.
 
 A coded teacher's space is that of its tables. That of a dense one is of the moments of maps that are evenly distributed
-over the scenes and their views. Heads are measured over the same maps: distilled features must work with them as the
-teacher's features do, so the render loss can be computed on their outputs (SplatDistill Eq. 4). Both sides of the loss
-are decoded from the dataset's basis first, so a head sees the teacher's vectors without what the basis drops; the file
-of heads holds what that costs each of them.
+over the scenes and their views, over which heads are measured, too. Distilled features must work with the heads as the
+teacher's features do (SplatDistill Eq. 4); both sides of that loss are decoded from the dataset's basis.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
