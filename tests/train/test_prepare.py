@@ -4,6 +4,7 @@ import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -446,13 +447,15 @@ def test_the_space_of_a_coded_teacher_has_the_names_of_all_scenes() -> None:
     assert len(codebook) == len(SideTeacher.table) + 5
 
 
-def test_the_basis_is_of_the_maps_of_the_scenes_that_have_the_teacher() -> None:
+def test_the_basis_is_of_the_maps_of_the_scenes_that_have_the_teacher(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(import_module("gsencoder.fusion.fuse"), "NARROW", 0)
+
     def open_scene(path: Path) -> tuple[Scene, Any]:
         if path.name in ("wall_0", "wall_3"):
             raise MissingInput("no labels")
         return opener(NoiseTeacher)(path)
 
-    config = PrepareConfig(basis_views=6, fusion=FuseConfig(narrow=0))
+    config = PrepareConfig(basis_views=6)
     maps = [each.features.reshape(-1, CHANNELS) for _, _, each in sampled_maps(WALLS, open_scene, 6, optional=True)]
     assert len(maps) == 6
     every = np.concatenate(maps).astype(np.float64)
