@@ -1,6 +1,7 @@
 """Cameras around a bare splat, for splats that come without views."""
 
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -98,14 +99,8 @@ def robust_ball(gaussians: Gaussians) -> tuple[Float64[np.ndarray, "3"], float]:
     weights = gaussians.opacities.astype(np.float64)
     if not weights.sum() > 0:
         weights = np.ones(len(means))
-    center = np.array([_weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
-    distances = np.linalg.norm(means - center, axis=1)
-    middle, far = (_weighted_quantile(distances, weights, share) for share in (0.5, COVERED))
-    size = _weighted_quantile(gaussians.scales.max(axis=1).astype(np.float64), weights, 0.5)
-    return center, max(MARGIN * min(far, MAX_COVERED * middle), 3 * size)
-
-
-def _weighted_quantile(values: Float64[np.ndarray, " N"], weights: Float64[np.ndarray, " N"], share: float) -> float:
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    return float(values[order[np.searchsorted(total, total[-1] * share)]])
+    weighted: Any = {"weights": weights, "method": "inverted_cdf"}
+    center = np.quantile(means, 0.5, axis=0, **weighted)
+    middle, far = np.quantile(np.linalg.norm(means - center, axis=1), (0.5, COVERED), **weighted)
+    size = np.quantile(gaussians.scales.max(axis=1).astype(np.float64), 0.5, **weighted)
+    return center, float(max(MARGIN * min(far, MAX_COVERED * middle), 3 * size))
