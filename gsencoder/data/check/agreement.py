@@ -260,12 +260,8 @@ def color_correlations(
 
 def view_correlations(correlations: Float64[np.ndarray, "V V"]) -> Float64[np.ndarray, " V"]:
     """The median correlation of each view with the others, in both directions; NaN for a view that shares nothing."""
-    both = np.concatenate((correlations, correlations.T), axis=1)
-    result = np.full(len(both), np.nan)
-    for view, row in enumerate(both):
-        if np.isfinite(row).any():
-            result[view] = np.nanmedian(row)
-    return result
+    both = np.ma.masked_invalid(np.concatenate((correlations, correlations.T), axis=1))
+    return np.asarray(np.ma.median(both, axis=1).filled(np.nan))
 
 
 PICTURE_SIZE = 640  # Longer side in pixels of the photographs that are compared; smaller ones keep theirs
