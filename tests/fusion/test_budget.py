@@ -94,9 +94,10 @@ def test_few_views_of_a_cheap_teacher_are_fused_exactly_and_none_is_looked_at(rn
 
 
 def test_views_that_see_nothing_are_not_used(rng: np.random.Generator) -> None:
-    scene, teacher = with_turned(make_scene(count=30), [0, 3, 4]), coded(30, rng)
-    made = fuse_within(scene, teacher, BASE, FusionBudget(error=1e-6))
-    assert not {0, 3, 4} & set(made.fusion.views)
+    # These are looked at.
+    scene, teacher = with_turned(make_scene(count=30), [7, 15, 22]), coded(30, rng)
+    made = fuse_within(scene, teacher, BASE, FusionBudget(error=0.1))
+    assert not {7, 15, 22} & set(made.fusion.views)
 
 
 @pytest.mark.parametrize("nothing", ["no view sees anything", "no features"])
