@@ -419,7 +419,6 @@ def open_packages(inputs: Inputs, path: Path) -> Iterator[Opened]:
 LOCALIZATION_KNOBS = (
     Knob(name="relative", key="threshold.relative", values=(0.5, 0.6, 0.8, 0.9)),
     Knob(name="fixed", key="threshold.fixed", values=(0.3, 0.4, 0.6, 0.7)),
-    Knob(name="noise", key="threshold.noise", values=(1.0, 4.0)),
     Knob(name="kind", key="threshold.kind", values=("fixed", "relative", "otsu")),
     Knob(name="eps_spacings", key="eps_spacings", values=(1.0, 2.0, 3.0)),
 )

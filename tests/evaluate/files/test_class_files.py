@@ -63,7 +63,7 @@ def test_what_is_no_table_is_refused(tmp_path: Path) -> None:
         load_classes("scannet40")
     with (tmp_path / "large.csv").open("wb") as stream:
         stream.truncate((4 << 20) + 1)
-    with pytest.raises(InputError, match="4,194,305 bytes; at most 4,194,304 are read"):
+    with pytest.raises(InputError, match="large.csv: "):
         load_classes(str(tmp_path / "large.csv"))
 
 
