@@ -18,8 +18,7 @@ from gsencoder.core.archive import open_archive, write_archive
 from gsencoder.core.errors import InputError, advised
 from gsencoder.core.files import atomic_file, read_foreign_text
 from gsencoder.core.settings import first_difference
-from gsencoder.teachers.base import Teacher
-from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Gaussians, Views
+from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, Gaussians, Teacher, Views
 from gsencoder.types.orientation import stored_map, upright_views
 
 SMALLEST_SCALE = 1e-30

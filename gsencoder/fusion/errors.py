@@ -1,6 +1,6 @@
 """How well a basis represents vectors that it was not fitted to: the energy and the directions that it keeps.
 
-A basis keeps a stated share of the energy of the vectors that it was fitted to. Of other scenes it may keep less, and
+A basis keeps a share of the energy of the vectors that it was fitted to. Of other scenes it may keep less, and
 no features in its coordinates can be closer to the teacher's than the projections of the teacher's own vectors are.
 """
 
@@ -14,8 +14,7 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 from gsencoder.fusion.basis import WORST, to_coordinates
 from gsencoder.fusion.checkpoint import upright
-from gsencoder.teachers.base import Teacher
-from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Views
+from gsencoder.types import FeatureBasis, FeatureMap, GaussianFeatures, Teacher, Views
 
 BINS = 1000
 """Bins of the histogram of cosines from 0 to 1, from which quantiles are interpolated."""
@@ -110,7 +109,7 @@ def project_maps(basis: FeatureBasis, teacher: Teacher, views: Views, rows: Iter
 
 
 MAX_CELLS = 32_768
-"""Approximate limit of the cells of a sample: a mean of so many is known to 1/180 of the scale."""
+"""Approximate limit of the cells of a sample: a mean of this many is known to 1/180 of the scale."""
 
 
 class CellSample:

@@ -27,8 +27,7 @@ from gsencoder.fusion.basis import Moments, distinct_rows, fit_basis, table_basi
 from gsencoder.fusion.checkpoint import cached_maps, upright
 from gsencoder.fusion.lift import FeatureSums, VisibilityConfig, covering_views, resolve, view_matrix
 from gsencoder.render import Blend, BlendConfig
-from gsencoder.teachers.base import Teacher
-from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, Scene, Views
+from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, Scene, Teacher, Views
 
 VIEWS_AT_ONCE = 4
 """Largest number of views whose matrices are made at the same time, each on threads of its own: steps that have one
@@ -58,7 +57,7 @@ class FuseConfig:
     views: int = option(0, "views used; 0 = all", ge=0)
     view_share: float = option(1.0, "share of the views used; with views= the fewer of both", gt=0, le=1)
     view_choice: Literal["even", "coverage"] = option(
-        "even", "which views are used: evenly spaced ones, or those that show most of the Gaussians"
+        "even", "which views are used: evenly spaced ones, or the ones that show most of the Gaussians"
     )
 
     def __post_init__(self) -> None:
@@ -117,7 +116,7 @@ def fuse(
     Args:
         basis: fuse in the coordinates of this basis, which scenes that are trained on together share; None = one of the
             scene's own, where `config` asks for one.
-        rows: numbers of the views that are lifted, in this order; None = those that `config` chooses.
+        rows: numbers of the views that are lifted, in this order; None = as `config` chooses.
         work: folder where maps of a costly teacher are cached as float16 files, because computing them again costs far
             more than reading them: an interrupted run continues from it with the same bits.
         device: where B is made, held against depth maps, and multiplied; "auto" = a GPU if torch sees one. Features of

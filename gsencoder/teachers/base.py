@@ -2,61 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, runtime_checkable
-
-import numpy as np
-from jaxtyping import Float32
+from typing import Any, ClassVar
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.pretrained import find_file
 from gsencoder.core.settings import check_limits
 from gsencoder.text.table import TextTable, load_text_table
 from gsencoder.text.vocabulary import Words
-from gsencoder.types import FeatureMap, FeatureSpace, Scene, Views
+from gsencoder.types import FeatureSpace, Scene
+from gsencoder.types import Teacher as Teacher
 
 
 class MissingInput(InputError):
     """A scene does not have what a teacher needs of every scene, such as labels. A training with several teachers
     leaves the teacher out in such a scene."""
-
-
-@runtime_checkable
-class Teacher(Protocol):
-    """Turns one view into a feature map.
-
-    A teacher may also have `kinds`, the names that its maps show; they are stored with the features as words.
-
-    Attributes:
-        space: what its vectors are.
-        table: the vectors that all its maps are codes into or shares of; None where maps are dense or each has its own
-            table.
-        mean: the space's mean, where it is known without looking at the scene.
-        needs_images: whether it looks at photographs (a splat without views is then rendered for it).
-        cheap: whether making a map twice costs less than keeping it on disk.
-    """
-
-    @property
-    def space(self) -> FeatureSpace: ...
-
-    @property
-    def table(self) -> Float32[np.ndarray, "C D"] | None: ...
-
-    @property
-    def mean(self) -> Float32[np.ndarray, " D"] | None: ...
-
-    @property
-    def needs_images(self) -> bool: ...
-
-    @property
-    def cheap(self) -> bool: ...
-
-    def feature_map(self, views: Views, view: int) -> FeatureMap:
-        """The features of one view. What calls it (`gsencoder.fusion.checkpoint.upright`) gives upright views."""
-        ...
-
-    def settings(self) -> dict[str, Any]:
-        """Everything that changes its output, as JSON values: stored with the features, compared on resuming."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

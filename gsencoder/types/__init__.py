@@ -17,7 +17,17 @@ from gsencoder.types.features import (
     MemoryBank,
     QueryMemory,
 )
-from gsencoder.types.scene import SH_C0, Cameras, Gaussians, MeshLabels, Scene, SceneObject, Views, sh_from_colors
+from gsencoder.types.scene import (
+    SH_C0,
+    Cameras,
+    Gaussians,
+    MeshLabels,
+    Scene,
+    SceneObject,
+    Teacher,
+    Views,
+    sh_from_colors,
+)
 
 __all__ = [
     "SH_C0",
@@ -35,6 +45,7 @@ __all__ = [
     "QueryMemory",
     "Scene",
     "SceneObject",
+    "Teacher",
     "Views",
     "check_unit",
     "sh_from_colors",

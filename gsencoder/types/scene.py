@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
@@ -26,7 +26,7 @@ from gsencoder.types.checks import (
     move_origin,
     transform,
 )
-from gsencoder.types.features import GaussianFeatures
+from gsencoder.types.features import FeatureMap, FeatureSpace, GaussianFeatures
 
 SH_C0 = 0.5 / math.sqrt(math.pi)  # A color is ½ + SH_C0 times its degree-0 coefficient, plus what depends on direction
 
@@ -483,3 +483,42 @@ class MeshLabels:
         upper = np.maximum.reduceat(vertices[rows], starts, axis=0)
         corners = {int(number): (low, high) for number, low, high in zip(ids, lower, upper, strict=True)}
         return {number: corners[number] for number, _ in self.objects if number in corners}
+
+
+@runtime_checkable
+class Teacher(Protocol):
+    """Turns one view into a feature map.
+
+    A teacher may also have `kinds`, the names that its maps show; they are stored with the features as words.
+
+    Attributes:
+        space: what its vectors are.
+        table: the vectors that all its maps are codes into or shares of; None where maps are dense or each has its own
+            table.
+        mean: the space's mean, where it is known without looking at the scene.
+        needs_images: whether it looks at photographs (a splat without views is then rendered for it).
+        cheap: whether making a map twice costs less than keeping it on disk.
+    """
+
+    @property
+    def space(self) -> FeatureSpace: ...
+
+    @property
+    def table(self) -> Float32[np.ndarray, "C D"] | None: ...
+
+    @property
+    def mean(self) -> Float32[np.ndarray, " D"] | None: ...
+
+    @property
+    def needs_images(self) -> bool: ...
+
+    @property
+    def cheap(self) -> bool: ...
+
+    def feature_map(self, views: Views, view: int) -> FeatureMap:
+        """The features of one view. What calls it (`gsencoder.fusion.checkpoint.upright`) gives upright views."""
+        ...
+
+    def settings(self) -> dict[str, Any]:
+        """Everything that changes its output, as JSON values: stored with the features, compared on resuming."""
+        ...
