@@ -4,8 +4,6 @@ Lifting and rendering are linear, so features may be fused, stored and rendered 
 channels. Because rows of B sum to alpha and not to 1, a rendered map decodes as `(B @ z) @ components + alpha·mean`.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
@@ -74,18 +72,13 @@ class Moments:
         shift = np.zeros(len(self.sum), np.float32) if self._shift is None else self._shift
         return {"count": np.array([self.count]), "sum": self.sum, "outer": self.outer, "shift": shift}
 
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continues from the arrays of `state`."""
-        self.count, self.sum, self.outer = float(state["count"][0]), state["sum"], state["outer"]
-        self._shift = state["shift"] if self.count else None
-
     @classmethod
     def read(cls, file: Archive, channels: int) -> "Moments":
         """Moments from the arrays of a file."""
         moments = cls(channels)
-        moments.restore(
-            {name: file.array(name, value.dtype.name, value.shape) for name, value in moments.state().items()}
-        )
+        state = {name: file.array(name, each.dtype.name, each.shape) for name, each in moments.state().items()}
+        moments.count, moments.sum, moments.outer = float(state["count"][0]), state["sum"], state["outer"]
+        moments._shift = state["shift"] if moments.count else None
         return moments
 
     @property

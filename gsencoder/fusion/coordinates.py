@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.budget import MEGABYTE, Budget
 from gsencoder.fusion.folder import features_bytes
+from gsencoder.fusion.quantize import centered_rows
 from gsencoder.types import FeatureBasis, GaussianFeatures
 
 SAMPLE = 20_000
@@ -43,7 +44,7 @@ class PrincipalAxes:
         seen = np.flatnonzero(features.seen)
         for start in range(0, len(seen), BLOCK):
             rows = seen[start : start + BLOCK]
-            values[rows] = _about_mean(features, rows) @ axes.T
+            values[rows] = centered_rows(features, rows) @ axes.T
         return GaussianFeatures(
             features=values,
             weights=features.weights,
@@ -61,7 +62,7 @@ class PrincipalAxes:
 def principal_axes(features: GaussianFeatures) -> PrincipalAxes:
     """The axes of features without an index, on an evenly spaced sample; each direction counts the same."""
     seen = np.flatnonzero(features.seen)
-    values = _about_mean(features, seen[even_indices(len(seen), SAMPLE)])
+    values = centered_rows(features, seen[even_indices(len(seen), SAMPLE)])
     norms = np.linalg.norm(values, axis=1, keepdims=True)
     unit = values[norms[:, 0] > 0] / norms[norms[:, 0] > 0]
     _, vectors = np.linalg.eigh(unit.T @ unit)
@@ -74,11 +75,6 @@ def principal_axes(features: GaussianFeatures) -> PrincipalAxes:
         errors=np.maximum(1 - np.sqrt(shares).mean(axis=0), 0),
         energies=np.minimum(shares.mean(axis=0), 1),
     )
-
-
-def _about_mean(features: GaussianFeatures, rows: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, "n R"]:
-    values = features.stored(rows).astype(np.float64)
-    return values if features.basis is not None else values - features.mean
 
 
 class Reduced(NamedTuple):

@@ -2,7 +2,7 @@
 
 A splat in another world than the cameras fuses without an error, to features of whatever its cameras happen to see.
 Renderings and photographs are compared after a band pass, which leaves edges and removes exposure, by their
-correlation where the rendering is opaque: splats that fit have 0.6 to 0.9, those that do not 0.4 at most.
+correlation where the rendering is opaque: splats that fit have 0.6 to 0.9, others 0.4 at most.
 """
 
 import json

@@ -54,7 +54,7 @@ def resolve(config: VisibilityConfig, views: Views, lift: str) -> VisibilityConf
 def _interval(
     low: np.ndarray, high: np.ndarray, config: VisibilityConfig
 ) -> tuple[Float32[np.ndarray, " n"], Float32[np.ndarray, " n"]]:
-    """The depths that pass beside measured ones from `low` to `high`.
+    """The depths that pass where `low` to `high` were measured.
 
     Depth 0 means none: such rays say nothing was measured there, and nothing passes (as in OpenScene).
     """
@@ -156,10 +156,9 @@ class FeatureSums:
         with_mean: bool = False,
     ) -> None:
         """Args:
-        gaussians: number of rows.
         basis: whose coordinates are summed; None = channels.
         table: that all maps share; None = dense maps, or maps with a table each. Sums are by its rows, unless it
-            has so many that sums of vectors are far narrower.
+            has many more than there are coordinates.
         device: where sums are, and the matrices of the views that are added.
         with_mean: whether the mean of the maps' vectors is computed on the way.
         """

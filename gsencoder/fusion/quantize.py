@@ -288,7 +288,7 @@ def _allocation(
     features: GaussianFeatures, sample: Int64[np.ndarray, " k"]
 ) -> tuple[BitAllocation, Float64[np.ndarray, "R R"]]:
     """No bits yet, and the axes in which coordinates have them."""
-    centered = _centered(features, sample)
+    centered = centered_rows(features, sample)
     norms = np.sqrt((centered * centered).sum(axis=1))
     centered, norms = centered[norms > 0], norms[norms > 0]
     if not len(norms):
@@ -301,7 +301,8 @@ def _allocation(
     return BitAllocation(centered @ rotated, row_weight, rarity), rotated
 
 
-def _centered(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarray, "n R"]:
+def centered_rows(features: GaussianFeatures, rows: np.ndarray) -> Float64[np.ndarray, "n R"]:
+    """Some rows about the mean of the features, in the coordinates of their basis."""
     values = features.stored(rows).astype(np.float64)
     return values if features.basis is not None else values - features.mean
 
@@ -326,7 +327,7 @@ def _encode(
     codes = np.empty((len(rows), -(-int(bits.sum()) // 8)), np.uint8)
     cosines = np.ones(len(rows))
     for start in range(0, len(rows), BLOCK):
-        centered = _centered(features, rows[start : start + BLOCK])
+        centered = centered_rows(features, rows[start : start + BLOCK])
         values = centered @ rotated[:, used]
         ones, rounded = [], np.empty_like(values)
         for number, (each, width) in enumerate(zip(levels, bits, strict=True)):

@@ -176,7 +176,7 @@ def rows_to_keep(
 
     Args:
         views: photographs that count, at any size, gone through once.
-        most: the most rows that are left, those that contribute most to some view; None = no limit.
+        most: the most rows that are left, the ones that contribute most to some view; None = no limit.
 
     Raises:
         InputError: nothing would be left.
@@ -270,13 +270,7 @@ class Optimizer:
         exposures: Tensor | None = None,
         step: int = 0,
     ) -> None:
-        """Args:
-        adam: the initial parameters, on the device to compute on.
-        photographs: those of all views.
-        training: numbers of the views that are fitted.
-        exposures: color maps [V, 3, 4] of a run that is continued; None = identities at step 0, no maps later.
-        step: number of steps done.
-        """
+        """`exposures` are color maps [V, 3, 4] of a run that is continued; None = identities at step 0, later none."""
         self.photographs, self.training, self.config = photographs, tuple(training), config
         self.pruning, self.raster = prune, raster
         self.most: int | None = None

@@ -31,7 +31,7 @@ Parameters = dict[str, Tensor]
 
 
 def parameters_from(gaussians: Gaussians, sh_degree: int, device: torch.device | str = "cpu") -> Parameters:
-    """The parameters of a splat; color coefficients above those that it has begin at zero, more are cut."""
+    """The parameters of a splat; color coefficients that it lacks begin at zero, more are cut."""
     n, num_coefficients = len(gaussians), (sh_degree + 1) ** 2
     sh = np.zeros((n, num_coefficients, 3), np.float32)
     common = min(num_coefficients, gaussians.sh.shape[1])
@@ -283,7 +283,7 @@ class Anchor:
     """Initial means of Gaussians, and how far each may move from there.
 
     A step of Adam moves a coordinate by its rate at most, or little more. Pulling back by rate / reach of the way after
-    each step therefore leaves it within about one reach, whatever its gradients say; those that disagree from one
+    each step therefore leaves it within about one reach, whatever its gradients say; gradients that disagree from one
     photograph to the next move it less. It is AdamW's decay (Loshchilov & Hutter 2019), towards the seed instead of 0.
 
     Attributes:
@@ -369,7 +369,7 @@ def load_state(path: Path, settings: Mapping[str, Any], *, sh_degree: int, devic
     Raises:
         InputError: damaged, or of a run with other settings; the first that differs is named.
     """
-    with advised(f"give resume=false to begin anew, or remove {path}"), open_archive(path) as file:
+    with advised(f"give resume=false to start again, or remove {path}"), open_archive(path) as file:
         earlier = file.value("settings", dict)
         if earlier != settings:
             raise InputError(f"{path}: was made with {first_difference(earlier, settings)}")

@@ -81,12 +81,8 @@ class ReconstructBudget(Budget):
 
 
 def step_seconds(pixels: float, gaussians: float, device: torch.device, config: OptimizeConfig) -> float:
-    """Expected seconds of a step, on average over the stages.
-
-    Args:
-        pixels: of a photograph at its full size.
-        gaussians: in view.
-    """
+    """Expected seconds of a step, on average over the stages, by the pixels of a photograph at its full size and the
+    Gaussians in view."""
     seen = sum(share * pixels / shrink**2 for share, shrink in zip(config.shares, config.shrinks, strict=True))
     seconds = OVERHEAD * (FIXED_SECONDS + PIXEL_SECONDS * seen + GAUSSIAN_SECONDS * gaussians)
     if device.type == "cuda":
@@ -225,14 +221,10 @@ def make_plan(
     """Plans a reconstruction that has not begun, and sets its colors; `apply_plan` carries the rest out.
 
     Args:
-        optimizer: with the seeds.
         held_out: views that are validated on.
         validations: how many there are in a number of steps.
         double_means: whether the splat's positions are written as doubles.
         spent: seconds until now.
-
-    Raises:
-        InputError: megabytes into which not one Gaussian fits, or seconds that are over.
     """
     plan = Plan(steps=optimizer.config.steps, sh_degree=optimizer.config.sh_degree)
     if budget.megabytes is not None:

@@ -58,7 +58,7 @@ from gsencoder.reconstruct.score import (
 from gsencoder.render.rasterize import RasterConfig
 from gsencoder.types import Gaussians, Scene
 
-START_AGAIN = "give resume=false to begin anew"
+START_AGAIN = "give resume=false to start again"
 Report = Callable[[str], None]
 """Receives one line of text for people."""
 
@@ -246,7 +246,7 @@ def checkpointed(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reconstruction:
-    """A splat that was fitted to photographs, and how well it predicts those that were held out.
+    """A splat that was fitted to photographs, and how well it predicts the held-out ones.
 
     Attributes:
         gaussians: relative to the scene's origin.

@@ -1,4 +1,4 @@
-"""Scores of a splat on held-out photographs: over all pixels, and over those that a fitted photograph shows, in the
+"""Scores of a splat on held-out photographs: over all pixels, and over the ones that a fitted photograph shows, in the
 exposures that the fitted ones let expect."""
 
 import warnings
@@ -57,7 +57,7 @@ class ExposurePrediction(NamedTuple):
 
 
 def predict_exposures(exposures: Exposures | None, cameras: Cameras, queries: Sequence[int]) -> ExposurePrediction:
-    """Predicts the maps of photographs that were not fitted, from the maps of those that were, without a look at their
+    """Predicts the maps of photographs that were not fitted, from the maps of the fitted ones, without a look at their
     pixels. How far exposure drifts along the recording, or with what a camera looks at, is measured on the fitted
     photographs alone: the map of each is predicted from the others, and what predicts these predicts the rest.
 
@@ -197,21 +197,21 @@ def covisible_pixels(
         photographs: of all views; views without measured depth are left out of the result.
         training: the photographs that a splat is fitted to.
     """
-    depths, points, shown = {}, {}, {}
+    depths, points, visible = {}, {}, {}
     for view in views:
         photo = photographs.at_scale(view)
         if photo.depth is not None:
             depths[view] = photo.depth
             points[view] = world_points(photo.depth, photo, _pose(photographs, view))[photo.depth > 0]
-            shown[view] = torch.zeros(len(points[view]), dtype=torch.bool)
+            visible[view] = torch.zeros(len(points[view]), dtype=torch.bool)
     # One fitted photograph after the other, so that not all of them are held at once.
     for other in training if points else ():
         photo = photographs.at_scale(other)
         for view, positions in points.items():
             if photo.depth is not None:
                 z, measured = sample_depth(positions, photo.depth, photo, _pose(photographs, other))
-                shown[view] |= confirms(z, measured, SAME_DEPTH)
-    return {view: (depth > 0).masked_scatter(depth > 0, shown[view]) for view, depth in depths.items()}
+                visible[view] |= confirms(z, measured, SAME_DEPTH)
+    return {view: (depth > 0).masked_scatter(depth > 0, visible[view]) for view, depth in depths.items()}
 
 
 def _pose(photographs: Photographs, view: int) -> Float[Tensor, "4 4"]:
@@ -304,7 +304,7 @@ def describe_exposure(darkest: float, brightest: float, source: str) -> str | No
 
 
 def compare(optimizer: Optimizer, held_out: Sequence[int], *, matched: bool) -> tuple[Comparison, ...]:
-    """Evenly spaced held-out photographs beside renders of their views, whose exposure is matched if so wanted."""
+    """Evenly spaced held-out photographs with renders of their views, whose exposure is matched if so wanted."""
     chosen = [held_out[index] for index in even_indices(len(held_out), MAX_COMPARISONS)]
     predicted = predict_exposures(optimizer.exposures, optimizer.photographs.cameras, chosen)
 

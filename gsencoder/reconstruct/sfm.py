@@ -258,7 +258,7 @@ def _map(
     return list(pycolmap.incremental_mapping(database, folder, work, options=mapping).values())
 
 
-START_AGAIN = "give resume=false to begin anew"
+START_AGAIN = "give resume=false to start again"
 FRAMES_FOLDER = "images"
 """Frames of a video, in the working folder and in the results; the name that COLMAP scenes use."""
 
@@ -360,7 +360,7 @@ def open_scene(
         raise InputError(
             f"{work}: a run was cut off here, and where its photographs were placed ({PLACED_FILE}, sparse/0) is "
             "gone or damaged, or belongs to other photographs or settings; put these back, or give resume=false to "
-            "begin anew"
+            "start again"
         )
     if placed is None:
         with clock("place"):

@@ -225,7 +225,7 @@ def blend(
     Args:
         patch: pixels along the side of a square patch; None for one row a pixel.
         like: a feature map whose grid the rows follow, in place of `patch`.
-        stride: where the rows are pixels, only every so many of them, in both directions.
+        stride: where the rows are pixels, every how many of them, in both directions.
         between: smallest and largest depth of the entries of each row, as `Blend.keep_between` takes them: it gives the
             same, and what lies behind is not composited at all.
         device: where the result is made and lives; the numba backend computes on a CPU alone.

@@ -18,7 +18,7 @@ from typing import Any, Literal, NamedTuple, no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int32, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from gsencoder import geometry
@@ -136,27 +136,26 @@ class _Composite(torch.autograd.Function):
         tiles_x, tiles_y, everything = -(-width // TILE), -(-height // TILE), np.arange(len(splats), dtype=np.int32)
         # Pixel i is hit at i + ½.
         last = (float(width - 1), float(height - 1))
-        tiles = Tiles(*bin_tiles(splats, everything, order, TILE, tiles_x, tiles_y, 0.5, *last))
+        starts, members, *by_splat = bin_tiles(splats, everything, order, TILE, tiles_x, tiles_y, 0.5, *last)
         colors, out = np.ascontiguousarray(values.numpy()), np.empty((height, width, CHANNELS), np.float64)
-        cuts, size = even_cuts(tiles.starts), (width, height, tiles_x)
-        arrays = (tiles.starts, tiles.members, splats, colors, size, stop, out)
+        cuts, size = even_cuts(starts), (width, height, tiles_x)
+        arrays = (starts, members, splats, colors, size, stop, out)
         parallel(lambda piece: _composite(cuts[piece], cuts[piece + 1], *arrays), range(PIECES))
-        ctx.saved = (tiles, cuts, arrays)
+        ctx.saved = (cuts, arrays, by_splat)
         return torch.from_numpy(out).to(values.dtype)
 
     @staticmethod
     def backward(ctx: Any, grads: Float[Tensor, "H W 5"]) -> tuple[Tensor | None, ...]:
         """Partial sums are kept for each tile that a splat touches, and added in one order, so that a rerun gives the
         same bits however many threads there are."""
-        tiles, cuts, arrays = ctx.saved
-        splats, slopes = arrays[2], grads.contiguous().numpy()
-        partials = np.empty((len(tiles.members), PARTIAL), splats.dtype)
+        cuts, arrays, (owners, entries) = ctx.saved
+        members, splats, slopes = arrays[1], arrays[2], grads.contiguous().numpy()
+        partials = np.empty((len(members), PARTIAL), splats.dtype)
         parallel(lambda piece: _differentiate(cuts[piece], cuts[piece + 1], *arrays, slopes, partials), range(PIECES))
-        sums, parts = np.empty((len(splats), PARTIAL), splats.dtype), even_cuts(tiles.owners)
-        entries = (tiles.owners, tiles.entries, partials, sums)
-        parallel(lambda piece: _gather(parts[piece], parts[piece + 1], *entries), range(PIECES))
-        by_splat = torch.from_numpy(sums)
-        return by_splat[:, :2], by_splat[:, 2:5], by_splat[:, 5], by_splat[:, 6:], *(None,) * 6
+        sums, parts = np.empty((len(splats), PARTIAL), splats.dtype), even_cuts(owners)
+        parallel(lambda piece: _gather(parts[piece], parts[piece + 1], owners, entries, partials, sums), range(PIECES))
+        by = torch.from_numpy(sums)
+        return by[:, :2], by[:, 2:5], by[:, 5], by[:, 6:], *(None,) * 6
 
 
 TILE = 16
@@ -166,22 +165,6 @@ SPLAT = 9
 """Columns of a splat on the image plane: u, v, half width, half height, conic a, b, c, squared radius, opacity."""
 PARTIAL = 10
 """Partial derivatives of a splat: by u, v, conic a, b, c, opacity, and the four values."""
-
-
-class Tiles(NamedTuple):
-    """Which splats touch which tiles, front to back.
-
-    Attributes:
-        starts: first entry of each tile in `members`, row-major, and the number of all.
-        members: splats of each tile by depth.
-        owners: first entry of each splat in `entries`, and the number of all.
-        entries: where in `members` each splat stands.
-    """
-
-    starts: Int64[np.ndarray, " tiles_plus_1"]
-    members: Int32[np.ndarray, " entries"]
-    owners: Int64[np.ndarray, " M_plus_1"]
-    entries: Int64[np.ndarray, " entries"]
 
 
 @kernel

@@ -44,7 +44,6 @@ def turned(cameras: Cameras, rows: list[int]) -> Cameras:
 
 
 def with_turned(scene: Scene, rows: list[int]) -> Scene:
-    assert scene.views is not None
     return replace(scene, views=replace(scene.views, cameras=turned(scene.views.cameras, rows)))
 
 

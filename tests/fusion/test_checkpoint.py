@@ -33,7 +33,6 @@ def a_map(folder: Path, settings: dict[str, Any], teacher: Teacher | None = None
 
 
 def views_of(made: Scene) -> Views:
-    assert made.views is not None
     return made.views
 
 
@@ -92,7 +91,6 @@ class ScaledTeacher(DenseSideTeacher):
     def feature_map(self, views: Views, view: int) -> FeatureMap:
         self.calls += 1
         plain = super().feature_map(views, view)
-        assert plain.features is not None
         return replace(plain, features=plain.features * self.scales)
 
 
@@ -100,20 +98,16 @@ def test_each_channel_keeps_three_digits_whatever_its_magnitude(tmp_path: Path) 
     made = ScaledTeacher().feature_map(views_of(scene(0)), 0)
     write_map(tmp_path / "m", made)
     again = read_map(tmp_path / "m", SPACE)
-    assert made.features is not None
-    assert again.features is not None
     np.testing.assert_allclose(again.features, made.features, rtol=1e-3)
     np.testing.assert_array_equal(again.grid_from_image, made.grid_from_image)
 
 
 def test_cells_without_a_vector_stay_without_one(tmp_path: Path) -> None:
     made = ScaledTeacher().feature_map(views_of(scene(0)), 0)
-    assert made.features is not None
     made.features[1, 2, 3] = np.nan
     made.features[0, 0, 0] = np.inf
     write_map(tmp_path / "m", made)
     again = read_map(tmp_path / "m", SPACE).features
-    assert again is not None
     missing = np.isnan(again)
     assert missing[1, 2].all()
     assert missing[0, 0].all()
@@ -124,7 +118,6 @@ def test_cells_without_a_vector_stay_without_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize("value", [0.0, 1e-38, 3e38])
 def test_the_ends_of_the_range_are_kept(tmp_path: Path, value: float) -> None:
     made = ScaledTeacher().feature_map(views_of(scene(0)), 0)
-    assert made.features is not None
     made.features[:] = value
     write_map(tmp_path / "m", made)
     np.testing.assert_allclose(read_map(tmp_path / "m", SPACE).features, made.features, rtol=1e-3, atol=1e-35)

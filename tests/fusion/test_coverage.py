@@ -25,8 +25,6 @@ def test_sampled_rays_have_the_weights_of_b_at_their_pixels(
     depths = [rng.uniform(1.5, 3.0, (24, 33)).astype(np.float32) for _ in range(5)]
     masks = [rng.uniform(size=(24, 33)) > 0.3 for _ in range(5)]
     scene = make_scene(n=400, masks=masks, **({"depths": depths} if depth else {}))
-    assert scene.gaussians is not None
-    assert scene.views is not None
     config = BlendConfig(stop_transmittance=1e-6)
     visibility = VisibilityConfig(against=("sensor",), relative=0.2) if depth else OPEN
     sampled = sample_view(scene.gaussians, scene.views, 2, visibility, config)
@@ -59,8 +57,6 @@ def test_a_view_of_the_same_gaussians_comes_after_one_that_shows_another() -> No
 def test_views_by_coverage_see_more_than_evenly_spaced_ones() -> None:
     """All but two cameras stand together and look at one end; evenly spaced ones are of these."""
     scene = make_scene(n=600, count=9)
-    assert scene.gaussians is not None
-    assert scene.views is not None
     poses = scene.views.cameras.cam_from_world.copy()
     poses[:, 0, 3] = 2.0
     poses[[3, 5], 0, 3] = [0.0, -2.0]
@@ -75,8 +71,6 @@ def test_views_by_coverage_see_more_than_evenly_spaced_ones() -> None:
 
 def test_all_views_need_no_choice_and_rows_are_those_that_are_given() -> None:
     scene, teacher = make_scene(), FixedTeacher([np.ones((6, 8, 6), np.float32)] * 5)
-    assert scene.gaussians is not None
-    assert scene.views is not None
     assert covering_views(scene.gaussians, scene.views, OPEN, BlendConfig(), 9) == (0, 1, 2, 3, 4)
     of_rows, even = fuse(scene, teacher, EXACT, rows=(0, 2, 4)), fuse(scene, teacher, replace(EXACT, views=3))
     assert of_rows.views == even.views == (0, 2, 4)
@@ -95,7 +89,6 @@ def test_views_in_the_order_of_bisection_are_spread_however_many_are_taken() -> 
 def test_what_a_map_shows_at_rays_is_the_cell_that_each_ray_meets_and_nothing_outside() -> None:
     teacher = FixedTeacher([np.arange(6 * 8 * 6, dtype=np.float32).reshape(6, 8, 6)], stride=4)
     scene = make_scene()
-    assert scene.views is not None
     feature_map = teacher.feature_map(scene.views, 0)
     lattice = strided_lattice(40, 24, 3)  # The map ends after 32 pixels.
     at_rays = map_at_rays(feature_map, lattice)

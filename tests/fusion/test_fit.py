@@ -61,7 +61,6 @@ def scene(field_room: FieldRoom) -> Scene:
 
 
 def gaussians_of(scene: Scene) -> Gaussians:
-    assert scene.gaussians is not None
     return scene.gaussians
 
 
@@ -91,7 +90,6 @@ def test_a_splat_in_the_world_of_its_cameras_is_left_alone(scene: Scene, field_r
 
 
 def test_moving_the_cameras_shows_what_moving_the_splat_does(scene: Scene) -> None:
-    assert scene.views is not None
     views, splat, origin = SmallViews(scene.views), gaussians_of(scene), np.array([1000.0, -2000.0, 0.0])
     for frame in (NERFSTUDIO, replace(NERFSTUDIO, intrinsics_factor=0.5)):
         there = moved(splat, inverse(frame), ORIGIN)
@@ -203,8 +201,6 @@ def test_files_that_state_no_frame_are_refused_by_name(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_told_is_a_warning(scene: Scene, field_room: FieldRoom) -> None:
-    assert scene.views is not None
-    assert scene.views.images is not None
     # Another exposure is no other world.
     dark = replace(scene, gaussians=replace(gaussians_of(scene), sh=gaussians_of(scene).sh * np.float32(0.3) - 0.6))
     assert checked(dark, field_room.splat) == (dark, [])

@@ -230,17 +230,6 @@ def test_rows_that_are_equal_are_computed_once(monkeypatch: pytest.MonkeyPatch) 
     assert sum(computed) == 11
 
 
-def test_features_of_another_backbone_are_refused() -> None:
-    with pytest.raises(InputError, match=r"siglip\.summary: the heads take features of \(radio.*other.*radio · 6 chan"):
-        head_features(fields(), measured(), replace(SPACE, weights="other"))
-
-
-def test_a_scene_in_which_nothing_was_seen_has_no_outputs() -> None:
-    features = fields()
-    unseen = replace(features, features=np.zeros_like(features.features), weights=np.zeros_like(features.weights))
-    assert not head_features(unseen, measured(), SPACE).features.any()
-
-
 def test_tokens_go_through_a_head_one_by_one() -> None:
     tokens, head = torch.randn(2, 5, 6), measured()
     made = head_tokens(tokens, head)

@@ -44,7 +44,6 @@ def box_of_discs(rng: np.random.Generator, size: tuple[float, float, float], cou
 def test_a_room_is_seen_from_inside(rng: np.random.Generator, up: np.ndarray | None) -> None:
     room = box_of_discs(rng, (5.0, 4.0, 2.5))
     made = interior_views(room, 12, up=up)
-    assert made is not None
     assert made.covered > 0.9
     assert made.filled > 0.9
     assert (np.abs(made.cameras.centers) < [2.5, 2.0, 1.25]).all()
@@ -63,7 +62,6 @@ def test_an_object_is_seen_from_around(rng: np.random.Generator) -> None:
     assert made is None or made.covered < 0.2
     scene = Scene(name="ball", gaussians=gaussians)
     views = with_views(scene, 8)[0].views
-    assert views is not None
     assert views.names[0] == "orbit_000"
 
 
@@ -81,7 +79,6 @@ def test_where_cameras_stand_can_be_stated(rng: np.random.Generator) -> None:
     scene = Scene(name="room", gaussians=Gaussians(**both), up=UP)
     for cameras, begin in (("auto", "inside_000"), ("inside", "inside_000"), ("around", "orbit_000")):
         views = with_views(scene, 6, cameras=cameras)[0].views  # type: ignore[arg-type]
-        assert views is not None
         assert views.names[0] == begin
         assert len(views) <= 6
 

@@ -97,7 +97,6 @@ def test_maps_with_tables_of_their_own_are_made_once_and_read_as_they_were(
     teacher = OwnTables(rng, dense=False, cheap=False)
     cached = CachedTeacher(teacher, tmp_path)
     views = scene_of().views
-    assert views is not None
     for _ in range(2):
         for view, made in enumerate(teacher.maps):
             read = cached.feature_map(views, view)

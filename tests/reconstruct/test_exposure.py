@@ -37,7 +37,6 @@ CONFIG = OptimizeConfig(steps=60, sh_degree=1, shrinks=(1,), shares=(1.0,))
 
 def exposed_views(gains: np.ndarray) -> Views:
     views = wall_views(len(gains), depth=True)
-    assert views.images is not None
     # A third of the range, so that no gain makes a color white.
     images = [
         (np.asarray(image) / 1.5 * gain + 0.5).astype(np.uint8) for image, gain in zip(views.images, gains, strict=True)
@@ -122,7 +121,6 @@ def test_maps_are_given_up_after_three_looks_at_each_photograph_if_they_do_not_d
         again = Optimizer(
             late.adam, late.photographs, TRAINING, CONFIG, prune=PruneConfig(), exposures=maps, step=rounds
         )
-        assert again.exposures is not None
         assert again.exposures.maps is maps
 
 
@@ -130,7 +128,6 @@ def test_maps_are_given_up_after_three_looks_at_each_photograph_if_they_do_not_d
 def test_gains_of_photographs_are_found_and_the_held_out_view_gains() -> None:
     views, config = exposed_views(GAINS), replace(CONFIG, steps=60)
     on, off = fitted(views, config), fitted(views, replace(config, exposure=False))
-    assert on.exposures is not None
     assert off.exposures is None
     expected = GAINS[list(TRAINING)] / GAINS[list(TRAINING)].mean()
     np.testing.assert_allclose(on.exposures.brightness().numpy(), expected, atol=0.03)
@@ -217,7 +214,6 @@ def test_where_the_order_is_none_the_nearest_cameras_tell() -> None:
 def test_scores_and_pictures_are_in_the_exposure_that_is_predicted() -> None:
     held_out, training = [1, 8], np.array([0, 2, 3, 4, 5, 6, 7, 9])
     views = wall_views(10, depth=True)
-    assert views.images is not None
     gains = np.linspace(0.7, 1.3, 10)
     relative = gains - gains[training].mean() + 1
     images = [(np.asarray(image) / 1.5).astype(np.uint8) for image in views.images]

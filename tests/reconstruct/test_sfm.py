@@ -68,7 +68,6 @@ def test_poses_of_a_scene_are_taken_as_they_are(posed: Path, work: Path, monkeyp
     monkeypatch.setattr(opening, "register_photographs", None)
     opened = open_scene(posed, work)
     assert (opened.sfm, opened.photographs, opened.is_video) == (None, None, False)
-    assert opened.scene.views is not None
     assert len(opened.scene.views) == 2
     assert opened.seconds == {}
 

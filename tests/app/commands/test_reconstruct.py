@@ -197,7 +197,7 @@ def test_a_run_does_not_go_on_with_other_photographs_or_a_damaged_log(
     log.write_text(text.replace(".", "x"))
     problem = refusal(capsys, *words)
     assert "log.csv: damaged: could not convert" in problem
-    assert problem.endswith("give resume=false to begin anew")
+    assert problem.endswith("give resume=false to start again")
     log.write_text(text)
     first, second = sorted((scene / "images").iterdir())[:2]
     shutil.copy(second, first)
