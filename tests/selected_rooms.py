@@ -1,10 +1,15 @@
 """A table with two boxes on it, whose features fade at their edges, that tests of selections stand on."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
 from gsencoder.data.orbits import looking_cameras
+from gsencoder.data.splats.files import load_property, load_splat
+from gsencoder.infer.select_files import LABELS_JSON, LABELS_PLY, PROPERTY
 from gsencoder.text.table import TextTable, make_text_table
 from gsencoder.types import Cameras, FeatureSpace, GaussianFeatures, Gaussians, Scene, Views
 
@@ -107,3 +112,15 @@ def permuted(scene: Scene, order: np.ndarray) -> Scene:
     features = scene.features["names"]
     moved = replace(features, features=features.features[order], weights=features.weights[order])
     return replace(scene, gaussians=scene.gaussians.select(order), features={"names": moved})
+
+
+def read_labels(folder: Path) -> SimpleNamespace:
+    """The splat, the label of each Gaussian, and what the labels stand for, of the files of `select`."""
+    content = json.loads((folder / LABELS_JSON).read_text())
+    origin = np.array(content["origin"])
+    return SimpleNamespace(
+        gaussians=load_splat(folder / LABELS_PLY, origin=origin),
+        labels=load_property(folder / LABELS_PLY, PROPERTY).astype(np.int32),
+        origin=origin,
+        names=[SimpleNamespace(**row) for row in content["labels"]],
+    )

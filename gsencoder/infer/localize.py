@@ -27,8 +27,6 @@ from gsencoder.types import Box, GaussianFeatures, Gaussians, Localization, Scen
 from gsencoder.types.checks import perpendicular
 
 Extent = Literal["means", "sigma"]
-
-
 NEGATIVES = ("object", "things", "stuff", "texture")
 """Negative words of LERF's contrast."""
 MIN_SAMPLES = 3
@@ -37,6 +35,8 @@ MIN_SHARE = 0.05
 """Clusters with less than this share of the best cluster's weight are floaters."""
 MAX_BOXES = 10
 """Boxes of a word, at most."""
+EMPTY_EXTENT = 1e-5
+"""Share of the largest extent below which a direction counts as empty (float32 coordinates are good to 1e-7)."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -348,7 +348,7 @@ def cluster(points: Float32[np.ndarray, "n 3"], eps: float, min_samples: int) ->
     number of points, and points take the label of their cell: distances are then off by up to 0.43 eps.
 
     Args:
-        eps: radius, in their unit. Points at this distance are neighbors, also where their float32 coordinates round.
+        eps: radius. Points at this distance are neighbors, also where their float32 coordinates round.
         min_samples: points within the radius, the point itself included, that make it a core point.
     """
     if len(points) == 0:
@@ -408,7 +408,7 @@ def score_clusters(
 
     Args:
         labels: cluster of each selected Gaussian, −1 = none.
-        rows: row numbers of the selected Gaussians.
+        rows: the selected Gaussians.
         min_share: clusters with less than this share of the best one's weight are floaters and are left out.
     """
     total = float(weights.sum(dtype=np.float64))
@@ -430,19 +430,9 @@ def score_clusters(
     return [each for each in clusters if each.weight >= min_share * clusters[0].weight]
 
 
-EMPTY_EXTENT = 1e-5
-"""Share of the largest extent below which a direction counts as empty (float32 coordinates are good to 1e-7)."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Extents:
-    """Axis-aligned and oriented box, in the frame of the points; float64.
-
-    Attributes:
-        center: of the oriented box.
-        rotation: its axes as columns, right-handed.
-        size: its full side lengths, ≥ 0.
-    """
+    """Axis-aligned box, and the oriented one: its center, its axes as columns, right-handed, and its side lengths."""
 
     aabb_min: Float64[np.ndarray, "3"]
     aabb_max: Float64[np.ndarray, "3"]
@@ -458,10 +448,9 @@ def box_around(
     extent: Extent = "means",
     up: Float64[np.ndarray, "3"] | None = None,
 ) -> Extents:
-    """The axis-aligned and the oriented box of some Gaussians.
+    """The axis-aligned and the oriented box of one or more Gaussians.
 
     Args:
-        rows: at least one of its rows.
         extent: "means" bounds the centers; "sigma" bounds the ellipsoids of one standard deviation, whose half-width
             along a unit vector a is √(aᵀΣa).
         up: direction of the last axis of the oriented box; None = the smallest box of any orientation.
@@ -496,12 +485,11 @@ def oriented_axes(
     """Axes (columns, right-handed) of the smallest box around points, or of the smallest with an axis along `up`.
 
     Points in a plane, on a line or in one place have no volume to minimize: the box then lies in the plane with the
-    smallest area, along the line, or along the world's axes.
+    smallest area, along the line, or along the world's axes. So does one whose convex hull cannot be found.
     """
     centered = points - points.mean(axis=0)
     if up is not None:
-        normal = up / math.sqrt(float(up @ up))
-        return _axes_about(normal, _smallest_rectangle(centered @ _plane_axes(normal)))
+        return _axes_about(up / math.sqrt(float(up @ up)), centered)
     # Eigenvectors of the 3×3 scatter suffice to tell which directions are empty; extents are measured along them.
     _, axes = np.linalg.eigh(centered.T @ centered)
     spans = np.ptp(centered @ axes, axis=0)[::-1]
@@ -509,27 +497,30 @@ def oriented_axes(
     empty = spans <= EMPTY_EXTENT * max(float(spans.max(initial=0)), 1e-300)
     if spans.max(initial=0) == 0:
         return np.eye(3)
-    if not empty[2]:
-        # In units of its size: trimesh has no box for a volume of 1e-12.
-        return _smallest_box_axes(centered / spans.max(), axes)
     if empty[1]:
         return _right_handed(axes)
-    return _axes_about(axes[:, 2], _smallest_rectangle(centered @ _plane_axes(axes[:, 2])))
-
-
-def _smallest_box_axes(centered: Float64[np.ndarray, "n 3"], principal: np.ndarray) -> Float64[np.ndarray, "3 3"]:
-    """The box of least volume with a side on a face of the convex hull (trimesh); principal axes without a hull."""
+    if empty[2]:
+        return _axes_about(axes[:, 2], centered)
     from scipy.spatial import QhullError
     from trimesh.bounds import oriented_bounds
 
     try:
-        to_origin, _ = oriented_bounds(centered, ordered=False)
+        # In units of its size: trimesh has no box for a volume of 1e-12.
+        to_origin, _ = oriented_bounds(centered / spans.max(), ordered=False)
     except (QhullError, ValueError):
-        return _right_handed(principal)
-    axes = to_origin[:3, :3].T
+        return _right_handed(axes)
     # trimesh rounds its transform; the nearest rotation is exact.
-    u, _, vt = np.linalg.svd(axes)
+    u, _, vt = np.linalg.svd(to_origin[:3, :3].T)
     return _right_handed(u @ vt)
+
+
+def _axes_about(normal: Float64[np.ndarray, "3"], points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "3 3"]:
+    """The axes of the smallest box with its last axis along a unit vector; x, y and z of an upright square."""
+    second = perpendicular(normal)
+    first = np.cross(second, normal)
+    angle = _smallest_rectangle(points @ np.stack([first, second], axis=1))
+    c, s = math.cos(angle), math.sin(angle)
+    return np.stack([c * first + s * second, c * second - s * first, normal], axis=1)
 
 
 def _smallest_rectangle(plane_points: Float64[np.ndarray, "n 2"]) -> float:
@@ -556,18 +547,6 @@ def _smallest_rectangle(plane_points: Float64[np.ndarray, "n 2"]) -> float:
     return float(angles[np.flatnonzero(areas <= areas.min() * (1 + 1e-9))[0]])
 
 
-def _plane_axes(normal: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 2"]:
-    """Two axes across a unit vector, so that (first, second, normal) is right-handed; x and y for normal = z."""
-    second = perpendicular(normal)
-    return np.stack([np.cross(second, normal), second], axis=1)
-
-
-def _axes_about(normal: Float64[np.ndarray, "3"], angle: float) -> Float64[np.ndarray, "3 3"]:
-    first, second = _plane_axes(normal).T
-    c, s = math.cos(angle), math.sin(angle)
-    return np.stack([c * first + s * second, c * second - s * first, normal], axis=1)
-
-
 def _right_handed(axes: np.ndarray) -> Float64[np.ndarray, "3 3"]:
     axes = np.array(axes, np.float64)
     if np.linalg.det(axes) < 0:
@@ -576,7 +555,7 @@ def _right_handed(axes: np.ndarray) -> Float64[np.ndarray, "3 3"]:
 
 
 def localization_to_json(localization: Localization) -> list[dict[str, Any]]:
-    """The boxes as JSON values, best first within each word; see `box_to_json`."""
+    """The boxes as JSON values, best first within each word."""
     return [box_to_json(box) for box in localization.boxes]
 
 
@@ -606,15 +585,8 @@ def box_to_json(box: Box) -> dict[str, Any]:
 def words_to_json(localization: Localization) -> list[dict[str, Any]]:
     """What is known of each word as JSON values: query, probability, absent, threshold and its number of boxes."""
     counts = Counter(box.query for box in localization.boxes)
+    probabilities, cutoffs = localization.probabilities.tolist(), localization.thresholds.tolist()
     return [
-        {
-            "query": word,
-            "probability": float(probability),
-            "absent": not counts[word],
-            "threshold": float(cutoff),
-            "boxes": counts[word],
-        }
-        for word, probability, cutoff in zip(
-            localization.queries, localization.probabilities, localization.thresholds, strict=True
-        )
+        {"query": word, "probability": value, "absent": not counts[word], "threshold": cutoff, "boxes": counts[word]}
+        for word, value, cutoff in zip(localization.queries, probabilities, cutoffs, strict=True)
     ]

@@ -63,24 +63,6 @@ def test_points_in_one_place_have_no_spacing(count: int) -> None:
     assert scene_spacing(np.full((count, 3), 1.5, np.float32)) == 0
 
 
-def two_groups(rng: np.random.Generator) -> np.ndarray:
-    return np.concatenate([rng.normal(0, 0.05, (200, 3)), rng.normal(1, 0.05, (100, 3)), [[5.0, 5, 5]]]).astype(
-        np.float32
-    )
-
-
-@pytest.mark.parametrize("grid_above", [0, 10**12])
-def test_two_groups_and_a_floater_are_told_apart_on_the_grid_and_without(
-    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch, grid_above: int
-) -> None:
-    monkeypatch.setattr("gsencoder.infer.localize.MAX_NEIGHBORS", grid_above)
-    labels = cluster(two_groups(rng), 0.2, 3)
-    assert len(set(labels[:200])) == 1
-    assert len(set(labels[200:300])) == 1
-    assert labels[0] != labels[200]
-    assert labels[300] == -1
-
-
 def test_clusters_on_the_grid_are_those_of_dbscan_on_a_surface(
     rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,14 +102,6 @@ def test_floaters_are_dropped_by_their_share_of_the_best_clusters_weight() -> No
     assert [one.rows.tolist() for one in clusters] == [list(range(7, 103))]
 
 
-def test_scores_do_not_change_when_all_weights_are_scaled(rng: np.random.Generator) -> None:
-    labels, scores = rng.integers(-1, 3, 60), rng.random(60).astype(np.float32)
-    weights = rng.random(60).astype(np.float32) + np.float32(0.1)
-    a = score_clusters(labels, np.arange(60), scores, weights)
-    b = score_clusters(labels, np.arange(60), scores, weights * np.float32(1e4))
-    np.testing.assert_allclose([one.score for one in a], [one.score for one in b], rtol=1e-5)
-
-
 @given(
     st.integers(1, 40),
     st.sampled_from(["volume", "plane", "line", "place", "tilted plane"]),
@@ -160,16 +134,6 @@ def test_boxes_hold_their_points_and_have_sides_of_no_negative_length(
         np.testing.assert_allclose(box.rotation[:, 2], [0, 0, 1], atol=1e-12)
 
 
-def test_the_oriented_box_of_a_turned_brick_is_the_brick(rng: np.random.Generator) -> None:
-    brick = rng.uniform(-0.5, 0.5, (3000, 3)) * [3, 2, 1]
-    corners = np.array([[x, y, z] for x in (-1.5, 1.5) for y in (-1, 1) for z in (-0.5, 0.5)])
-    turn = Rotation.from_euler("xyz", [0.3, -0.7, 1.1]).as_matrix()
-    points = (np.concatenate([brick, corners]) @ turn.T).astype(np.float32)
-    box = bounds(points)
-    np.testing.assert_allclose(np.sort(box.size), [1, 2, 3], rtol=0.02)
-    np.testing.assert_allclose(box.center, 0, atol=0.01)
-
-
 def test_the_upright_box_of_a_brick_turned_about_up_is_the_brick(rng: np.random.Generator) -> None:
     corners = np.array([[x, y, z] for x in (-1.5, 1.5) for y in (-1, 1) for z in (-0.5, 0.5)])
     for up in np.array([[0.0, 0, 1], [0, -1, 0], [0.6, 0, 0.8]]):
@@ -179,12 +143,6 @@ def test_the_upright_box_of_a_brick_turned_about_up_is_the_brick(rng: np.random.
         np.testing.assert_allclose(np.sort(box.size), [1, 2, 3], rtol=1e-4)
         np.testing.assert_allclose(box.rotation[:, 2], up, atol=1e-12)
         assert box.size[2] == pytest.approx(1, rel=1e-4)
-
-
-def test_a_flat_turned_rectangle_has_its_smallest_area() -> None:
-    corners = np.array([[x, y, 0] for x in (-2.0, 2) for y in (-1, 1)])
-    points = Rotation.from_euler("xyz", [0.5, 0.2, 0.9]).apply(corners).astype(np.float32)
-    np.testing.assert_allclose(np.sort(bounds(points).size), [0, 2, 4], atol=1e-5)
 
 
 def test_points_on_a_line_have_a_box_along_it() -> None:
@@ -319,7 +277,7 @@ def things(points: np.ndarray, radius: float = RADIUS) -> int:
     return int((sizes >= 0.05 * sizes.max()).sum())
 
 
-def test_the_parts_of_a_thing_are_one() -> None:
+def test_the_parts_of_a_thing_are_one_and_chairs_that_stand_apart_are_as_many_as_they_are() -> None:
     """A table whose legs are hidden below its top for 24 cm, and a chair of six parts."""
     table = np.concatenate(
         [plate((0, 0, 0.8), (1.8, 0.7, 0.8)), *(plate((x, 0, 0), (x, 0.06, 0.56)) for x in (0, 1.8))]
@@ -327,12 +285,8 @@ def test_the_parts_of_a_thing_are_one() -> None:
     for points, parts in ((table, 3), (chair(), 6)):
         assert cluster(points.astype(np.float32), RADIUS, 3).max() == parts - 1
         assert things(points) == 1
-
-
-@pytest.mark.parametrize("gap", [0.3, 0.6, 3.0])
-def test_chairs_that_stand_apart_are_as_many_as_they_are(gap: float) -> None:
-    for count in (2, 3):
-        assert things(np.concatenate([chair(k * (0.44 + gap)) for k in range(count)])) == count
+    for gap in (0.3, 3.0):
+        assert things(np.concatenate([chair(k * (0.44 + gap)) for k in range(3)])) == 3
 
 
 def test_small_things_side_by_side_and_a_thing_far_from_a_large_one_stay_apart() -> None:

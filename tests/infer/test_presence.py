@@ -15,7 +15,6 @@ from gsencoder.infer.localize import (
     LocalizeConfig,
     WordCandidates,
     find_candidates,
-    localization_to_json,
     localize,
     select_features,
     words_to_json,
@@ -34,7 +33,7 @@ from gsencoder.infer.relevancy import (
     relevancy,
 )
 from gsencoder.text.table import TextEncoder, TextTable, make_text_table
-from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, Localization, Scene
+from gsencoder.types import FeatureBasis, GaussianFeatures, Gaussians, Localization, Scene
 
 WORDS = ("mug", "cup", "chair", "lamp", "spoon")
 EVERYTHING = LocalizeConfig(min_probability=0.0)
@@ -142,12 +141,6 @@ def test_the_evidence_equals_that_of_decoded_features(basis: bool) -> None:
     assert (evidence.size, evidence.share) == (pytest.approx(math.log10(125)), 0.25)
 
 
-def test_a_word_that_fits_better_than_its_rivals_is_more_probable() -> None:
-    evidence = Evidence(mean=0.5, margin=0.0, prominence=2.0, size=2.0, share=1.0)
-    values = [probability(replace(evidence, margin=margin)) for margin in (-0.5, -0.1, 0.1, 0.5)]
-    assert (np.diff(values) > 0).all()
-
-
 def test_a_word_that_another_answers_better_is_absent_and_boxed_only_when_everything_is() -> None:
     with pytest.warns(SceneWarning, match=r"1 of 2 words have no box \('spoon'\).*\(probability 0\.0"):
         localization = localize(SCENE, ["mug", "spoon"], TABLE)
@@ -160,15 +153,6 @@ def test_a_word_that_another_answers_better_is_absent_and_boxed_only_when_everyt
     everything = quietly(SCENE, ["mug", "spoon"], TABLE, EVERYTHING)
     assert {box.query for box in everything.boxes} == {"mug", "spoon"}
     np.testing.assert_array_equal(everything.probabilities, localization.probabilities)
-
-
-def test_the_probability_of_a_word_is_that_of_its_most_probable_box() -> None:
-    localization = quietly(SCENE, ["mug", "chair", "lamp"], TABLE, EVERYTHING)
-    for word, value in zip(localization.queries, localization.probabilities, strict=True):
-        assert value == pytest.approx(
-            max((box.probability for box in localization.boxes if box.query == word), default=0)
-        )
-    assert all(0 <= each["probability"] <= 1 for each in localization_to_json(localization))
 
 
 def test_a_text_encoder_without_names_gives_probabilities_too() -> None:
@@ -195,17 +179,6 @@ def test_evidence_is_of_cosines_however_relevancy_is_scored(monkeypatch: pytest.
     )
     np.testing.assert_array_equal(plain.clusters[0].rows, contrast.clusters[0].rows)
     assert replace(plain.evidence[0], share=0.0) == replace(contrast.evidence[0], share=0.0)
-
-
-def test_a_space_of_one_direction_has_a_spread_that_counts_as_a_thousandth() -> None:
-    space = FeatureSpace(name="s", channels=16, text_encoder="toy")
-    features = GaussianFeatures(
-        features=np.tile(TABLE.embeddings[:1], (9, 1)), weights=np.ones(9, np.float32), mean=TABLE.mean, space=space
-    )
-    cosines = relevancy(features, TABLE.encode(["mug"]), TABLE.mean)[0]
-    cluster = Cluster(rows=np.arange(9), score=1.0, weight=9.0, share=1.0)
-    (evidence,) = Presence(features, TABLE.mean, TABLE).evidence(TABLE.encode(["mug"])[0], cosines, [cluster])
-    assert math.isfinite(evidence.prominence)
 
 
 def test_words_that_an_encoder_was_trained_on_and_others_have_coefficients_of_their_own() -> None:
@@ -264,7 +237,7 @@ def test_a_phrase_is_judged_relative_to_the_name_that_comes_nearest_to_it(likene
     assert of_phrase.margin == pytest.approx(of_phrase.mean - (of_name.mean - of_name.margin), abs=0.02)
 
 
-@pytest.mark.parametrize("trained", [None, (), ("mug",), ("spoon", "chair")])
+@pytest.mark.parametrize("trained", [None, ("mug",)])
 def test_boxes_are_as_probable_as_is_asked_whatever_was_trained_on(trained: tuple[str, ...] | None) -> None:
     table, words = replace(TABLE, trained=trained), ["mug", "spoon", "chair"]
     everything = quietly(SCENE, words, table, EVERYTHING)
@@ -272,6 +245,11 @@ def test_boxes_are_as_probable_as_is_asked_whatever_was_trained_on(trained: tupl
         localization = quietly(SCENE, words, table, LocalizeConfig(min_probability=least))
         expected = [(box.query, box.probability) for box in everything.boxes if box.probability >= least]
         assert [(box.query, box.probability) for box in localization.boxes] == expected
+        for word, value in zip(words, localization.probabilities, strict=True):
+            likely = [box.probability for box in everything.boxes if box.query == word]
+            assert value == pytest.approx(max(likely, default=0))
+            ranks = [box.rank for box in localization.boxes if box.query == word]
+            assert ranks == list(range(len(ranks)))
 
 
 def test_of_several_feature_sets_the_named_one_is_asked_by_key_space_or_teacher() -> None:

@@ -52,18 +52,6 @@ def test_relevancy_in_coordinates_is_the_cosine_of_decoded_vectors(rng: np.rando
     assert np.isnan(scores[:, ~seen]).all()
 
 
-@pytest.mark.parametrize("mode", ["raw", "centered"])
-@pytest.mark.parametrize("with_negatives", [False, True])
-def test_features_in_a_basis_and_decoded_ones_score_alike(
-    rng: np.random.Generator, mode: str, with_negatives: bool
-) -> None:
-    features, text, text_mean = in_basis(rng), words(rng), rng.normal(size=24).astype(np.float32) / 9
-    negatives = words(rng, 2) if with_negatives else None
-    a = relevancy(features, text, text_mean, negatives=negatives, mode=mode)
-    b = relevancy(decoded(features), text, text_mean, negatives=negatives, mode=mode)
-    np.testing.assert_allclose(a, b, atol=2e-6)
-
-
 def test_a_mean_that_is_not_the_bases_own_is_removed_exactly(rng: np.random.Generator) -> None:
     features, text = in_basis(rng), words(rng)
     other = rng.normal(size=24).astype(np.float32)
@@ -112,32 +100,11 @@ def test_a_zero_feature_and_a_zero_word_score_zero() -> None:
     assert np.array_equal(relevancy(features, text, np.zeros(24, np.float32), mode="raw"), np.zeros((1, 2), np.float32))
 
 
-def test_words_one_by_one_score_as_they_do_together(rng: np.random.Generator) -> None:
-    features, text, mean = in_basis(rng), words(rng, 4), np.zeros(24, np.float32)
-    together = relevancy(features, text, mean)
-    np.testing.assert_allclose(
-        together, np.concatenate([relevancy(features, row[None], mean) for row in text]), atol=1e-7
-    )
-
-
 def test_chunks_do_not_change_scores(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     features, text, mean = in_basis(rng), words(rng), np.zeros(24, np.float32)
     whole = relevancy(features, text, mean)
     monkeypatch.setattr("gsencoder.infer.relevancy.CHUNK_BYTES", 1000)
     np.testing.assert_allclose(relevancy(features, text, mean), whole, atol=1e-7)
-
-
-def test_permuting_the_gaussians_permutes_the_scores(rng: np.random.Generator) -> None:
-    features, text, mean = in_basis(rng), words(rng), np.zeros(24, np.float32)
-    order = rng.permutation(len(features))
-    moved = GaussianFeatures(
-        features=features.features[order],
-        weights=features.weights[order],
-        mean=features.mean,
-        space=SPACE,
-        basis=features.basis,
-    )
-    np.testing.assert_allclose(relevancy(moved, text, mean), relevancy(features, text, mean)[:, order], atol=1e-7)
 
 
 def test_contrast_is_the_smallest_pairwise_softmax(rng: np.random.Generator) -> None:

@@ -1,11 +1,9 @@
 """The share of an object in a feature: who is asked, and what stands for the object and for its surroundings."""
 
 import numpy as np
-import pytest
 from scipy.spatial.distance import cdist
 from selected_rooms import SPACE
 
-from gsencoder.infer import select as module
 from gsencoder.infer.select import object_shares
 from gsencoder.types import GaussianFeatures
 
@@ -162,23 +160,7 @@ def test_where_object_and_surroundings_have_one_feature_all_stays_as_it_started(
         assert (made[(made > -1) & ~PART] == 0).all()
 
 
-def test_only_what_is_farther_than_two_spacings_from_all_others_is_inside() -> None:
-    vectors = VECTORS.copy()
-    middle, edge = (np.abs(PLACES - [x, 0, 0]).max(axis=1) < 0.5 for x in (0, 4))
-    vectors[middle | edge] = TABLE
-    made = shares(vectors=vectors, relevancy=PART.astype(float))
-    assert made[middle] == 1
-    assert made[edge] < 0.5
-
-
 def test_a_part_without_any_feature_has_itself_alone_and_no_shares() -> None:
     made = shares(seen=~PART)
     assert np.isnan(made[PART]).all()
     assert (made[~PART] == -1).all()
-
-
-def test_shares_do_not_depend_on_the_size_of_the_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = np.random.default_rng(9).uniform(size=len(PLACES)) > 0.2
-    whole = shares(seen=seen)
-    monkeypatch.setattr(module, "BLOCK_BYTES", 8 * module.NEIGHBORS * 8 * 7)
-    np.testing.assert_array_equal(shares(seen=seen), whole)

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_runs import refusal, results_of
-from selected_rooms import EMBEDDINGS, SPACE, selected_room, words
+from selected_rooms import EMBEDDINGS, SPACE, read_labels, selected_room, words
 
 from gsencoder.app import main as cli
 from gsencoder.data.splats.files import load_splat
 from gsencoder.fusion.folder import WORDS_FILE, save_features, save_memories
-from gsencoder.infer.select_files import read_labels
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import MemoryBank, QueryMemory
 

@@ -7,14 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_runs import refusal, results_of
-from selected_rooms import EMBEDDINGS, selected_room, words
+from selected_rooms import EMBEDDINGS, read_labels, selected_room, words
 
 from gsencoder.app import main as cli
 from gsencoder.data.splats.files import load_splat
 from gsencoder.data.up import with_up
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.infer.select import find_holes, sample_views, select
-from gsencoder.infer.select_files import read_labels
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.types import Scene
 
