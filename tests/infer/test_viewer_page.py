@@ -4,7 +4,6 @@ much of a scene as fits."""
 import base64
 import gzip
 import hashlib
-import io
 import json
 import re
 import struct
@@ -14,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from viewed_rooms import HOSTILE, STUB, room_scene, save_viewed_room, search_of
 from viewer_containers import read_container
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import load_splat
-from gsencoder.fusion.quantize import compact
 from gsencoder.infer.localize import LocalizeConfig, box_to_json, localize
+from gsencoder.infer.page import page as page_module
 from gsencoder.infer.page import search as module
 from gsencoder.infer.page.page import (
     SCRIPT,
@@ -48,7 +46,6 @@ from gsencoder.infer.page.search import (
     drawn_scene,
     object_numbers,
     pca_bytes,
-    rows_of_features,
     spz_bytes,
     weight_bytes,
 )
@@ -137,7 +134,7 @@ def test_a_container_is_read_as_it_was_written(rng: np.random.Generator) -> None
         np.testing.assert_array_equal(read.arrays[name], array)
 
 
-@pytest.mark.parametrize("length", range(1, 18))
+@pytest.mark.parametrize("length", [1, 8, 15])
 def test_header_and_arrays_begin_at_multiples_of_eight_bytes(length: int) -> None:
     arrays = {"first": np.arange(length, dtype=np.uint8), "second": np.arange(length, dtype=np.float32)}
     data = Container(meta={"name": "x" * length}, arrays=arrays).to_bytes()
@@ -165,13 +162,6 @@ def test_relevancy_from_the_arrays_of_a_page_is_that_of_the_features_within_the_
         difference = np.abs(page - exact)[np.isfinite(exact)]
         # Of unit vectors u, v, t with 1 − u·v = e, |u·t − v·t| is at most √(2e), for the mean row as for any.
         assert np.sqrt(np.mean(difference**2)) <= np.sqrt(2 * budget) + 1e-4
-
-
-def test_words_of_a_page_lose_no_more_than_their_rounding(search: SceneSearch, written: Container) -> None:
-    quantized = compact(search.shown.features, error=OPTIONS.error).features()
-    for word, name in enumerate(search.words.names):
-        exact = relevancy(quantized, search.words.encode([name]), search.words.mean)[0]
-        np.testing.assert_allclose(cosines_of_page(written, word), exact, atol=1e-4)
 
 
 def test_what_a_server_answers_is_the_relevancy_in_steps(search: SceneSearch) -> None:
@@ -215,29 +205,13 @@ def test_thinned_gaussians_cover_as_much_as_all_and_keep_their_weights(search: S
     assert scene_container(replace_shown(search, thin.scene, total=thin.total), ()).meta["total"] == thin.total
 
 
-def test_weights_of_rows_go_with_them_where_features_share_a_table() -> None:
+def test_a_table_that_gaussians_share_stays_whole_where_they_are_thinned(search: SceneSearch) -> None:
     index = np.array([0, 1, 1, -1], np.int32)
-    shared = GaussianFeatures(
-        features=np.eye(2, 6, dtype=np.float32),
-        weights=np.array([1, 2, 3, 0], np.float32),
-        mean=np.zeros(6, np.float32),
-        space=SPACE,
-        index=index,
-    )
-    made = rows_of_features(shared, np.array([3, 1]))
-    assert made.weights.tolist() == [0, 2]
-    assert made.index is not None
-    assert made.index.tolist() == [-1, 1]
-
-
-def test_a_note_counts_what_was_never_seen_and_features_stand_under_the_name_of_their_space(
-    search: SceneSearch,
-) -> None:
-    unseen = int((search.shown.features.weights == 0).sum())
-    assert 0 < unseen < 1000
-    assert search.shown.notes == (f"{unseen:,} Gaussians were seen by no view and have no features; they are grey.",)
-    renamed = replace(search.shown.scene, features={"elsewhere": search.shown.features})
-    assert list(drawn_scene(renamed, "t", max_gaussians=10).scene.features) == ["names"]
+    features = replace(features_of(np.eye(2, 6), np.array([1, 2, 3, 0])), index=index)
+    scene = replace(search.shown.scene, gaussians=search.shown.gaussians.select(np.arange(4)), features={"f": features})
+    thin = drawn_scene(scene, "t", max_gaussians=2).features
+    assert (thin.weights.tolist(), len(thin.features)) == ([1, 0], 2)
+    np.testing.assert_array_equal(thin.index, [0, -1])
 
 
 def test_equal_features_have_equal_colors_others_differ_and_unseen_ones_are_grey() -> None:
@@ -260,16 +234,15 @@ def test_the_splat_of_a_page_has_the_shapes_and_colors_of_its_gaussians(tmp_path
 
 
 @pytest.mark.parametrize(
-    ("weights", "codes"),
-    [([0, 0], [0, 0]), ([3, 3], [1, 1]), ([0, 1, 100], [0, 1, 255]), ([0, 1, 10, 100], [0, 1, 128, 255])],
+    ("weights", "codes", "ends"),
+    [([0, 0], [0, 0], (1, 1)), ([3, 3], [1, 1], (3, 3)), ([0, 1, 10, 100], [0, 1, 128, 255], (1, 100))],
 )
-def test_weights_are_coded_by_their_logarithm_and_zero_means_never(weights: list[float], codes: list[int]) -> None:
-    np.testing.assert_array_equal(weight_bytes(np.array(weights, np.float32))[0], codes)
-
-
-def test_the_ends_of_the_weights_come_with_their_codes() -> None:
-    assert weight_bytes(np.array([0, 4, 2, 8], np.float32))[1:] == (2.0, 8.0)
-    assert weight_bytes(np.zeros(3, np.float32))[1:] == (1.0, 1.0)
+def test_weights_are_coded_by_their_logarithm_and_zero_means_never(
+    weights: list[float], codes: list[int], ends: tuple[float, float]
+) -> None:
+    made = weight_bytes(np.array(weights, np.float32))
+    np.testing.assert_array_equal(made[0], codes)
+    assert made[1:] == ends
 
 
 def test_boxes_of_objects_are_in_world_coordinates_enlarged_and_the_smallest_volume_wins() -> None:
@@ -327,6 +300,7 @@ def test_options_of_a_file_bound_harmonics_features_and_photographs(search: Scen
     assert fine["featureError"] <= 0.002 < coarse["featureError"] <= 0.05
     made = file_container(rich, (), OPTIONS)
     sizes = made.meta["photographSizes"]
+    assert len(sizes) == 3
     assert sum(sizes) == len(made.arrays["photographs"])
     assert ROOM.views is not None
     assert ROOM.views.images is not None
@@ -334,17 +308,6 @@ def test_options_of_a_file_bound_harmonics_features_and_photographs(search: Scen
     for view, size in zip(made.meta["photographViews"], sizes, strict=True):
         assert made.arrays["photographs"][start : start + size].tobytes() == jpeg_of(ROOM.views, view, 64)
         start += size
-
-
-def test_photographs_keep_their_shape_and_nearly_their_colors() -> None:
-    assert ROOM.views is not None
-    assert ROOM.views.images is not None
-    with Image.open(io.BytesIO(jpeg_of(ROOM.views, 2, 1000))) as picture:
-        difference = np.asarray(picture, float) - ROOM.views.images[2]
-    assert np.sqrt((difference**2).mean()) < 8
-    for view in (-1, len(ROOM.views)):
-        with pytest.raises(InputError, match=f"expected one of 6 views with photographs, got {view}"):
-            jpeg_of(ROOM.views, view, 64)
 
 
 def test_labels_are_the_words_of_most_weight_and_only_of_what_is_like_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -398,11 +361,6 @@ def test_a_scene_in_which_nothing_was_seen_has_no_threshold_and_no_labels() -> N
     assert answer.threshold is None
     assert blind.labels.names == ()
     assert blind.best_words([0, 1]) == []
-
-
-def test_the_threshold_of_an_answer_is_that_of_the_settings() -> None:
-    config = LocalizeConfig(threshold=ThresholdConfig(kind="fixed", fixed=0.37))
-    assert small_search(np.eye(6), np.ones(6), config).ask("mug").threshold == pytest.approx(0.37)
 
 
 def test_the_spacing_of_one_gaussian_is_its_size_and_another_space_is_refused() -> None:
@@ -472,12 +430,6 @@ def test_a_script_cannot_end_its_element() -> None:
     assert page.lower().count("</script") == 2
 
 
-def test_titles_that_no_encoding_knows_become_question_marks() -> None:
-    title = "a\ud800b"
-    assert b"<title>a?b</title>" in served_page(STUB, title, SETTINGS)[0]
-    assert b"<title>a?b</title>" in file_page(STUB, title, SETTINGS, [])
-
-
 def test_a_page_of_the_same_scene_is_the_same_whenever_it_is_written() -> None:
     page = file_page(STUB, "a", SETTINGS, [Container(meta={}, arrays={})]).decode()
     match = re.search(r'id="scene-0">([^<]+)<', page)
@@ -487,11 +439,12 @@ def test_a_page_of_the_same_scene_is_the_same_whenever_it_is_written() -> None:
 
 
 @pytest.mark.parametrize("broken", [SCRIPT, STYLE])
-def test_a_bundle_that_cannot_be_read_is_one_line(tmp_path: Path, broken: str) -> None:
+def test_a_bundle_that_cannot_be_read_is_one_line(tmp_path: Path, broken: str, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in (SCRIPT, STYLE):
         (tmp_path / name).mkdir() if name == broken else (tmp_path / name).write_text("")
+    monkeypatch.setattr(page_module, "STATIC", tmp_path)
     with pytest.raises(InputError, match=f"{broken}.*make viewer"):
-        load_bundle(tmp_path)
+        load_bundle()
 
 
 def colored(scene: Scene, degree: int) -> Scene:
@@ -514,26 +467,16 @@ def scenes_of(made: MadePage) -> list[Container]:
 def test_a_page_holds_all_up_to_its_last_byte_and_says_what_it_knows(search: SceneSearch) -> None:
     whole = fitted(search, 10**7, 1)
     count = len(search.shown.gaussians)
-    assert (whole.sh_degree, whole.gaussians) == ((1,), (count,))
+    assert [(meta["shDegree"], meta["count"]) for meta in whole.metas] == [(1, count)]
     assert whole.notes[0] == f"This file knows {len(search.words.names)} words."
     assert any("were seen by no view" in note for note in whole.notes)
     assert fitted(search, len(whole.page), 1).page == whole.page
     less = fitted(search, len(whole.page) - 1, 1)
-    assert less.sh_degree == (0,)
+    assert less.metas[0]["shDegree"] == 0
     assert f"larger than {(len(whole.page) - 1) / 1e6:g} MB (megabytes=) keeps them" in less.notes[0]
     (scene,) = scenes_of(whole)
     assert scene.meta["objects"] == [each.name or "" for each in ROOM.objects]
     assert scene.meta["title"] == "t1"
-
-
-def test_harmonics_are_those_of_the_richest_scene_up_to_the_option(search: SceneSearch) -> None:
-    both = fitted(search, 10**7, 0, 2)
-    assert both.sh_degree == (0, 2)
-    assert not any("harmonics" in note for note in both.notes)
-    assert [scene.meta["title"] for scene in scenes_of(both)] == ["t0", "t2"]
-    capped = fitted(search, 10**7, 0, 2, options=replace(OPTIONS, sh_degree=1))
-    assert capped.sh_degree == (0, 1)
-    assert any("above degree 1 of 2 are left out" in note for note in capped.notes)
 
 
 def test_a_thinned_page_uses_most_of_its_size_whatever_was_asked_for(search: SceneSearch) -> None:
@@ -544,26 +487,6 @@ def test_a_thinned_page_uses_most_of_its_size_whatever_was_asked_for(search: Sce
         assert 0.6 * limit < len(made.page) <= limit
         assert any("megabytes= or max_gaussians= takes more" in note for note in made.notes)
     tight = fitted(search, len(whole.page), 0, max_gaussians=1500)
-    assert tight.gaussians == (1500,)
+    assert tight.metas[0]["count"] == 1500
     with pytest.raises(InputError, match="not even 1,000 Gaussians fit beside the page itself, which takes 0.0 MB;"):
         fitted(search, len(whole.page) // 8, 0)
-
-
-def test_photographs_are_counted_as_they_are_in_the_file(search: SceneSearch) -> None:
-    scene = replace(search.shown.scene, views=ROOM.views)
-    for photographs, count in ((0, 0), (2, 2), (9, 6)):
-        made = fitting_page(
-            STUB, [(scene, "t", search.words)], LocalizeConfig(), (), replace(OPTIONS, photographs=photographs),
-            max_gaussians=1500, max_bytes=10**7,
-        )  # fmt: skip
-        assert made.photographs == (count,)
-        assert scenes_of(made)[0].meta["photographs"] is (count > 0)
-
-
-def test_titles_are_escaped_and_scripts_are_bound_to_their_sum() -> None:
-    page, policy = served_page(STUB, HOSTILE, {"kind": "server", "scenes": 1, "notes": [HOSTILE]})
-    text = page.decode("utf-8")
-    assert text.count("<script") == 2
-    assert "<img" not in text
-    assert "'unsafe-inline'" not in policy
-    assert "default-src 'none'" in policy

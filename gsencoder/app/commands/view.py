@@ -168,17 +168,17 @@ def _write(
     run.results.update(
         page=str(out),
         bytes=len(page.page),
-        gaussians=page.gaussians,
-        sh_degree=page.sh_degree,
-        photographs=page.photographs,
-        feature_error=page.feature_error,
+        gaussians=[meta["count"] for meta in page.metas],
+        sh_degree=[meta["shDegree"] for meta in page.metas],
+        photographs=[len(meta["photographViews"]) for meta in page.metas],
+        feature_error=[meta["featureError"] for meta in page.metas],
         left_out=list(page.notes),
     )
     with run.file(out), run.step("write"):
         write_bytes(out, page.page)
     run.print(*page.notes)
-    counts = " and ".join(f"{count:,}" for count in page.gaussians)
+    counts = " and ".join(f"{meta['count']:,}" for meta in page.metas)
     run.print(
         f"{out}: {len(page.page) / 1e6:.1f} MB; {counts} Gaussians, spherical harmonics of degree "
-        f"{max(page.sh_degree)}; opens in a browser without a network"
+        f"{max(run.results['sh_degree'])}; opens in a browser without a network"
     )

@@ -24,7 +24,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 from PIL import Image
 
 from gsencoder.core.arrays import even_indices
@@ -49,16 +48,11 @@ class Bundle:
     style: str
 
 
-def load_bundle(folder: Path | None = None) -> Bundle:
-    """Reads the bundle.
-
-    Args:
-        folder: where it lies; None = `STATIC`.
-    """
-    folder = STATIC if folder is None else folder
+def load_bundle() -> Bundle:
+    """Reads the bundle in `STATIC`."""
     try:
         return Bundle(
-            script=(folder / SCRIPT).read_text(encoding="utf-8"), style=(folder / STYLE).read_text(encoding="utf-8")
+            script=(STATIC / SCRIPT).read_text(encoding="utf-8"), style=(STATIC / STYLE).read_text(encoding="utf-8")
         )
     except OSError as error:
         raise InputError(
@@ -72,12 +66,7 @@ MAGIC = b"GSVIEW01"
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Container:
-    """Values and arrays for the page.
-
-    Attributes:
-        meta: JSON values; numbers that are not finite become null.
-        arrays: by name; 8- to 32-bit integers or float32.
-    """
+    """JSON values, of which numbers that are not finite become null, and arrays of 8- to 32-bit integers or float32."""
 
     meta: Mapping[str, Any]
     arrays: Mapping[str, np.ndarray]
@@ -110,11 +99,7 @@ def json_in_script(value: Any) -> str:
 
 
 def served_page(bundle: Bundle, title: str, settings: Mapping[str, Any]) -> tuple[bytes, str]:
-    """The page of a server, and the content security policy that its response states.
-
-    Args:
-        settings: for the script: `kind` is "server", and `scenes` the number of scenes.
-    """
+    """The page of a server, and the content security policy of its response; see `PageSettings` of the script."""
     policy = content_policy(bundle, connect="'self'")
     return _html(bundle, title, settings, [], "").encode("utf-8", "replace"), policy
 
@@ -170,14 +155,8 @@ PHOTO_QUALITY = 82
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FileOptions:
-    """What a page that is one file holds.
-
-    Attributes:
-        error: budget of the quantized features, as of `pack`.
-        sh_degree: largest degree of spherical harmonics.
-        photographs: at most so many; 0 = none.
-        photograph_side: their longer side, pixels.
-    """
+    """What a page that is one file holds: quantized features within `error`, as of `pack`, spherical harmonics up to
+    `sh_degree`, and at most `photographs` photographs, whose longer side has `photograph_side` pixels."""
 
     error: float
     sh_degree: int
@@ -186,12 +165,7 @@ class FileOptions:
 
 
 def scene_container(search: SceneSearch, objects: tuple[SceneObject, ...], *, sh_degree: int = 3) -> Container:
-    """What a page needs of a scene whose words a server answers.
-
-    Args:
-        objects: labeled ones with boxes in world coordinates; may be empty.
-        sh_degree: largest degree of spherical harmonics.
-    """
+    """What a page needs of a scene whose words a server answers; boxes of labeled objects are in world coordinates."""
     shown = search.shown
     scene, gaussians, features = shown.scene, shown.gaussians, shown.features
     codes, lightest, heaviest = weight_bytes(features.weights)
@@ -245,8 +219,11 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
     seen[compacted.rows] = True
     labels = search.labels
     words = directions @ compacted.basis.components.astype(np.float64).T
-    views = search.shown.scene.views
-    photographs, listed = photograph_bytes(views, options)
+    views, listed = search.shown.scene.views, list[int]()
+    if views is not None and views.images is not None and options.photographs:
+        # Evenly spaced where there are more than a page holds.
+        listed = even_indices(len(views), options.photographs).tolist()
+    photographs = [np.frombuffer(jpeg_of(views, view, options.photograph_side), np.uint8) for view in listed]
     meta = {
         **base.meta,
         "rank": compacted.basis.rank,
@@ -272,17 +249,11 @@ def file_container(search: SceneSearch, objects: tuple[SceneObject, ...], option
     return Container(meta=meta, arrays=arrays)
 
 
-def photograph_bytes(views: Views | None, options: FileOptions) -> tuple[list[UInt8[np.ndarray, " n"]], list[int]]:
-    """Photographs as small JPEGs, evenly spaced where there are more than a page holds, and their views."""
-    if views is None or views.images is None or not options.photographs:
-        return [], []
-    listed = even_indices(len(views), options.photographs).tolist()
-    return [np.frombuffer(jpeg_of(views, view, options.photograph_side), np.uint8) for view in listed], listed
-
-
-def jpeg_of(views: Views, view: int, side: int) -> bytes:
+def jpeg_of(views: Views | None, view: int, side: int) -> bytes:
     """The photograph of a view as JPEG, its longer side at most `side` pixels."""
-    if views.images is None or not 0 <= view < len(views):
+    if views is None or views.images is None:
+        raise InputError("the scene has no photographs")
+    if not 0 <= view < len(views):
         raise InputError(f"photograph: expected one of {len(views)} views with photographs, got {view}")
     image = Image.fromarray(np.ascontiguousarray(views.images[view]))
     image.thumbnail((side, side), Image.Resampling.LANCZOS)
@@ -299,18 +270,10 @@ THINNING = 0.9
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MadePage:
-    """A page and what became of the scenes in it.
-
-    Attributes:
-        feature_error: what quantization cost, 1 − mean centered cosine, of each scene.
-        notes: what was left out, a sentence each.
-    """
+    """A page, what it says of each of its scenes (see `file_container`), and what was left out, a sentence each."""
 
     page: bytes
-    gaussians: tuple[int, ...]
-    sh_degree: tuple[int, ...]
-    photographs: tuple[int, ...]
-    feature_error: tuple[float, ...]
+    metas: tuple[Mapping[str, Any], ...]
     notes: tuple[str, ...]
 
 
@@ -328,11 +291,10 @@ def fitting_page(
 
     Args:
         scenes: each with its title and words.
-        objects: labeled ones, which may be none.
         options: what the file holds at most.
     """
-    highest = max(_degree(scene) for scene, _, _ in scenes)
-    largest = max(len(select_features(scene, None)[0]) for scene, _, _ in scenes)
+    splats = [select_features(scene, None)[0] for scene, _, _ in scenes]
+    highest, largest = max(each.sh_degree for each in splats), max(map(len, splats))
     limit, degree = max_gaussians, min(options.sh_degree, highest)
     searches: list[SceneSearch] = []
     while True:
@@ -374,16 +336,5 @@ def fitting_page(
                 f"which takes {fixed / 1e6:.1f} MB; give megabytes= a larger number"
                 + (", or photographs=0" if any(each.meta["photographViews"] for each in containers) else "")
             )
-    metas = [each.meta for each in containers]
-    return MadePage(
-        page=page,
-        gaussians=tuple(meta["count"] for meta in metas),
-        sh_degree=tuple(meta["shDegree"] for meta in metas),
-        photographs=tuple(len(meta["photographViews"]) for meta in metas),
-        feature_error=tuple(meta["featureError"] for meta in metas),
-        notes=(*notes, *(note for meta in metas for note in meta["notes"])),
-    )
-
-
-def _degree(scene: Scene) -> int:
-    return 0 if scene.gaussians is None else scene.gaussians.sh_degree
+    metas = tuple(each.meta for each in containers)
+    return MadePage(page=page, metas=metas, notes=(*notes, *(note for meta in metas for note in meta["notes"])))

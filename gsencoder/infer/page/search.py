@@ -23,21 +23,13 @@ from gsencoder.text.table import TextTable, check_space
 from gsencoder.text.vocabulary import Words, closed_table
 from gsencoder.types import GaussianFeatures, Gaussians, Scene, SceneObject
 
-NO_OBJECT = 0
-"""Number of the object of Gaussians that lie in no object's box; the others are numbered from 1."""
 GREY = 90
 """Color of Gaussians that were never seen, in red, green and blue."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ShownScene:
-    """A scene with one feature set, as it is drawn.
-
-    Attributes:
-        scene: its Gaussians, and the features under the name of their space alone.
-        title: for people; the name of the folder.
-        notes: what was left out or changed, a sentence each.
-    """
+    """A scene with one feature set, as it is drawn, of `total` Gaussians; the notes say what was left out."""
 
     scene: Scene
     title: str
@@ -55,13 +47,8 @@ class ShownScene:
 
 
 def drawn_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "") -> ShownScene:
-    """A scene with at most so many Gaussians, evenly chosen and enlarged so that surfaces stay closed.
-
-    Args:
-        scene: with one feature set, or one that words lead into.
-        max_gaussians: at least 1.
-        advice: what a note about thinning ends with.
-    """
+    """A scene with at most `max_gaussians`, evenly chosen and enlarged so that surfaces stay closed; a note about that
+    ends with `advice`."""
     gaussians, features = select_features(scene, None)
     total = len(gaussians)
     notes: list[str] = []
@@ -71,7 +58,11 @@ def drawn_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "
         factor = np.float32(np.sqrt(total / len(rows)))
         gaussians = gaussians.select(rows)
         gaussians = replace(gaussians, scales=gaussians.scales * factor)
-        features = rows_of_features(features, rows)
+        features = replace(features, weights=features.weights[rows])
+        if features.index is None:
+            features = replace(features, features=features.features[rows])
+        else:  # The table that Gaussians share stays whole.
+            features = replace(features, index=features.index[rows])
         notes.append(
             f"{len(rows):,} of {total:,} Gaussians are drawn and searched: evenly chosen, and enlarged {factor:.2f} "
             f"times. {advice or f'max_gaussians={total} takes all, a smaller number draws faster'}."
@@ -83,20 +74,8 @@ def drawn_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "
     return ShownScene(scene=chosen, title=title, total=total, notes=tuple(notes))
 
 
-def rows_of_features(features: GaussianFeatures, rows: Int64[np.ndarray, " n"]) -> GaussianFeatures:
-    """The features of some Gaussians, in that order; a table that Gaussians share stays whole."""
-    if features.index is not None:
-        return replace(features, index=features.index[rows], weights=features.weights[rows])
-    return replace(features, features=features.features[rows], weights=features.weights[rows])
-
-
 def spz_bytes(gaussians: Gaussians, *, sh_degree: int = 3) -> bytes:
-    """The splat as a file of .spz version 3, in the order of its rows.
-
-    Args:
-        gaussians: relative to the scene's origin, which is not added.
-        sh_degree: largest degree of spherical harmonics that is written.
-    """
+    """The splat as a file of .spz version 3, in the order of its rows, without the scene's origin."""
     degree = min(sh_degree, gaussians.sh_degree)
     raw = RawSplat(
         means=gaussians.means.astype(np.float64),
@@ -122,11 +101,8 @@ def pca_bytes(features: GaussianFeatures) -> UInt8[np.ndarray, "N 3"]:
 
 
 def weight_bytes(weights: Float32[np.ndarray, " N"]) -> tuple[UInt8[np.ndarray, " N"], float, float]:
-    """Visibility weights on a logarithmic scale: 0 = never seen, 1 = the smallest weight, 255 = the largest.
-
-    Returns:
-        The codes, the smallest and the largest weight; 1 and 1 where nothing was seen.
-    """
+    """Visibility weights on a logarithmic scale: 0 = never seen, 1 = the smallest weight, 255 = the largest; and these
+    two weights, 1 and 1 where nothing was seen."""
     seen = weights > 0
     if not seen.any():
         return np.zeros(len(weights), np.uint8), 1.0, 1.0
@@ -140,15 +116,11 @@ def weight_bytes(weights: Float32[np.ndarray, " N"]) -> tuple[UInt8[np.ndarray, 
 def object_numbers(
     means: Float32[np.ndarray, "N 3"], objects: Sequence[SceneObject], origin: np.ndarray, margin: float
 ) -> UInt16[np.ndarray, " N"]:
-    """For each Gaussian the place, from 1, of the smallest object whose box holds its mean; 0 = none.
-
-    Args:
-        objects: with boxes in world coordinates.
-        margin: by which boxes are enlarged on each side, world units.
-    """
+    """For each Gaussian the place, from 1, of the smallest object whose box, enlarged by `margin`, holds its mean; 0 =
+    none. Boxes are in world coordinates."""
     if len(objects) >= 1 << 16:
         raise InputError(f"expected fewer than {1 << 16:,} objects, got {len(objects):,}")
-    numbers = np.full(len(means), NO_OBJECT, np.uint16)
+    numbers = np.zeros(len(means), np.uint16)
     volumes = [float(np.prod(each.aabb_max - each.aabb_min)) for each in objects]
     for row in np.argsort(volumes, kind="stable")[::-1]:
         low, high = objects[row].aabb_min - origin - margin, objects[row].aabb_max - origin + margin
@@ -174,27 +146,16 @@ LABEL_BLOCK = 4096
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Answer:
-    """What the page paints for a word.
+    """Relevancy of every Gaussian for a word, in steps of `RELEVANCY_STEP`, `UNSEEN` where there is no feature, and the
+    relevancy from which on Gaussians are taken, None where nothing was seen."""
 
-    Attributes:
-        word: as it was asked.
-        relevancy: of every Gaussian, in steps of `RELEVANCY_STEP`; `UNSEEN` where there is no feature.
-        threshold: relevancy from which on Gaussians are taken; None where nothing was seen.
-    """
-
-    word: str
     relevancy: Int16[np.ndarray, " N"]
     threshold: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Labels:
-    """The best word of every Gaussian that is like one.
-
-    Attributes:
-        names: the words, most weight first.
-        numbers: for each Gaussian the place of its word in `names`, or `NO_LABEL` where none comes near.
-    """
+    """Words, most weight first, and for each Gaussian the place of its best one, or `NO_LABEL` where none is near."""
 
     names: tuple[str, ...]
     numbers: UInt16[np.ndarray, " N"]
@@ -246,7 +207,7 @@ class SceneSearch:
         steps = np.full(len(scores), UNSEEN, np.int16)
         seen = np.isfinite(scores)
         steps[seen] = np.rint(scores[seen] / np.float32(RELEVANCY_STEP)).astype(np.int16)
-        return Answer(word=word, relevancy=steps, threshold=cutoff if np.isfinite(cutoff) else None)
+        return Answer(relevancy=steps, threshold=cutoff if np.isfinite(cutoff) else None)
 
     def boxes(self, word: str, cutoff: float | None = None) -> dict[str, Any]:
         """The boxes of a word with their probabilities, as `gsencoder localize` writes them, and that of the word; at

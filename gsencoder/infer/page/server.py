@@ -175,8 +175,6 @@ class _Handler(BaseHTTPRequestHandler):
                 return Container(meta={"names": labels.names}, arrays={"numbers": labels.numbers}).to_bytes(), BINARY
             case ["photograph", number, view]:
                 views = server.search_of(_whole(number)).shown.scene.views
-                if views is None:
-                    raise RefusedError(HTTPStatus.NOT_FOUND, "the scene has no photographs")
                 return jpeg_of(views, _whole(view), PHOTOGRAPH_SIDE), "image/jpeg"
         raise RefusedError(HTTPStatus.NOT_FOUND, "there is nothing at this address")
 
@@ -208,7 +206,7 @@ class _Handler(BaseHTTPRequestHandler):
                 raise RefusedError(HTTPStatus.BAD_REQUEST, "threshold: expected a relevancy in [-1, 1]")
             return _json(search.boxes(word.strip(), cutoff))
         answer = search.ask(word.strip())
-        meta = {"word": answer.word, "threshold": answer.threshold, "step": RELEVANCY_STEP, "unseen": UNSEEN}
+        meta = {"word": word.strip(), "threshold": answer.threshold, "step": RELEVANCY_STEP, "unseen": UNSEEN}
         return Container(meta=meta, arrays={"relevancy": answer.relevancy}).to_bytes(), BINARY
 
     def _body(self) -> Mapping[str, Any]:
