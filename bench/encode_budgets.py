@@ -21,9 +21,8 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.fusion.errors import field_error, judge
-from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import EncodeConfig, load_encoder
 from gsencoder.infer.encode_budget import EncodeBudget, encode_within
-from gsencoder.infer.load import load_encoder
 
 
 def main() -> None:

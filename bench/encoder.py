@@ -26,8 +26,8 @@ from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.compose import compose
 from gsencoder.core.device import autocast_dtype
 from gsencoder.core.process import retain_freed_memory
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encode import encode
+from gsencoder.infer.encode import EncodeConfig, Encoder
+from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.models.encoder import GaussianEncoder, encoder_inputs
 from gsencoder.models.neighbors import _append_zero_row, _gather_neighborhoods, _row_blocks
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
@@ -172,12 +172,8 @@ def main() -> None:
             by_teacher={"s": OutputSpace(space=space, mean=np.zeros(CHANNELS, np.float32), scale=1.0)}
         )
         start = time.perf_counter()
-        encode(
-            splat,
-            GaussianEncoder(config.model, CHANNELS),
-            outputs,
-            EncodeConfig(chunk=chosen.chunk, precision=chosen.precision),
-        )
+        encoder = Encoder(TorchNetwork(GaussianEncoder(config.model, CHANNELS), outputs))
+        encoder.encode(splat, EncodeConfig(chunk=chosen.chunk, precision=chosen.precision))
         took = time.perf_counter() - start
         print(f"{len(splat):,} Gaussians in chunks of {chosen.chunk:,}: {took:.1f} s, {peak_gib():.2f} GiB at most")
         return

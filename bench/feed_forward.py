@@ -24,7 +24,7 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.evaluate.benchmarks.naming import compare_names, naming_scores
 from gsencoder.fusion.fuse import fuse
-from gsencoder.infer.load import load_encoder
+from gsencoder.infer.encode import load_encoder
 from gsencoder.memory.bank import MapStream, build_bank, memory_of_features
 from gsencoder.memory.index import index_features
 from gsencoder.teachers.base import Teacher

@@ -382,16 +382,16 @@ def onnx(setting: Setting) -> Iterator[Row]:
         raise Skipped("no CUDA device")
     if "CUDAExecutionProvider" not in onnxruntime.get_available_providers():
         raise Skipped("package missing: onnxruntime-gpu (this onnxruntime has no CUDAExecutionProvider)")
-    from gsencoder.infer.load import load_encoder
-    from gsencoder.infer.onnx.export import export_onnx, lower
-    from gsencoder.infer.onnx.runtime import OnnxEncoder, feed_of
+    from gsencoder.infer.onnx.export import export_onnx
+    from gsencoder.infer.onnx.runtime import OnnxNetwork, feed_of
+    from gsencoder.infer.torch_network import TorchNetwork
 
-    encoder = load_encoder("house_cpu", "cpu")
-    file = export_onnx(encoder, lower(encoder))  # type: ignore[arg-type]
+    network = TorchNetwork.load("house_cpu")
+    file = export_onnx(network.header, network.lower())
     feed = feed_of(surface(20_000), None, 0.02)
     given = []
     for device in ("cuda", "cpu"):
-        session = OnnxEncoder(file, device=device)._session  # type: ignore[arg-type]
+        session = OnnxNetwork(file, device=device).session  # type: ignore[arg-type]
         row: Row = {"what": f"20,000 tokens on {device}"}
         session.run(None, feed)
         with measured(setting, row):

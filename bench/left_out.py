@@ -30,7 +30,7 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.data.splats.files import save_splat
 from gsencoder.fusion.fuse import FuseConfig, fuse
-from gsencoder.infer.load import load_encoder
+from gsencoder.infer.encode import load_encoder
 from gsencoder.render import blend
 from gsencoder.teachers.build import build_teacher, words_of
 from gsencoder.types import FeatureMap, GaussianFeatures, Gaussians, Scene

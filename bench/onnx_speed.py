@@ -27,8 +27,7 @@ def measure(model: str, splat: str) -> dict[str, float]:
     from gsencoder.app.output import peak_memory_mb
     from gsencoder.core.process import retain_freed_memory
     from gsencoder.data.splats.files import load_splat
-    from gsencoder.infer.chunks import EncodeConfig
-    from gsencoder.infer.load import load_encoder
+    from gsencoder.infer.encode import EncodeConfig, load_encoder
 
     gaussians = load_splat(splat)
     retain_freed_memory()

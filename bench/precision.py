@@ -16,8 +16,7 @@ from json_option import add_json_option, write_figures
 from gsencoder.data.scenes import load_scene
 from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.fusion.errors import row_cosines
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.onnx.runtime import OnnxEncoder
+from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.types import GaussianFeatures
 
 PASSES = 3
@@ -37,7 +36,7 @@ def main() -> None:
     add_json_option(parser)
     chosen = parser.parse_args()
     config = EncodeConfig(chunk=0, device="cpu")
-    encoders = {name: OnnxEncoder(name, device="cpu") for name in chosen.models}
+    encoders = {name: Encoder.load(name, "cpu") for name in chosen.models}
     means, lows, seconds = ({name: list[float]() for name in encoders} for _ in range(3))
     for scene in chosen.scenes:
         gaussians = with_gaussians(load_scene(scene)).gaussians
@@ -57,14 +56,14 @@ def main() -> None:
     size = Path(chosen.models[0]).stat().st_size
     figures = {}
     for name, encoder in encoders.items():
-        figures[encoder.header.precision] = {
+        figures[encoder.network.header.precision] = {
             "size": Path(name).stat().st_size / size,
             "cosine": np.mean(means[name]),
             "1 % below": np.mean(lows[name]),
             "seconds": np.median(seconds[name]),
         }
         print(
-            f"{encoder.header.precision}: bytes {Path(name).stat().st_size / size:.3f}; centered cosine "
+            f"{encoder.network.header.precision}: bytes {Path(name).stat().st_size / size:.3f}; centered cosine "
             f"{np.mean(means[name]):.5f} (worst scene {min(means[name]):.5f}), 1 % below {np.mean(lows[name]):.4f}; "
             f"seconds {np.median(seconds[name]):.2f} ({min(seconds[name]):.2f} to {max(seconds[name]):.2f})"
         )

@@ -23,7 +23,7 @@ from gsencoder.data.scenes import find_scenes, load_scene
 from gsencoder.data.seeding.seed import SeedConfig
 from gsencoder.evaluate.benchmarks.absent import AbsentProtocol, names_of, words_to_ask
 from gsencoder.evaluate.sources import encoder_source, fusion_source, with_features
-from gsencoder.infer.load import load_encoder
+from gsencoder.infer.encode import load_encoder
 from gsencoder.infer.localize import find_candidates
 from gsencoder.teachers.build import words_of
 from gsencoder.teachers.labels import LabelsConfig

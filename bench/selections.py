@@ -45,7 +45,7 @@ from gsencoder.data.seeding.seed import with_gaussians
 from gsencoder.evaluate.benchmarks.localization import is_seen, queryable_objects, score_boxes
 from gsencoder.fusion.fuse import fuse
 from gsencoder.fusion.lift import VisibilityConfig, keep_visible
-from gsencoder.infer.load import load_encoder
+from gsencoder.infer.encode import load_encoder
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.select import select
 from gsencoder.render import Blend, blend

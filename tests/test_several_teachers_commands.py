@@ -11,8 +11,7 @@ from named_rooms import write_words
 from gsencoder.app import main as cli
 from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.fusion.folder import load_features
-from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.onnx.export import header_of
+from gsencoder.infer.encode import Encoder
 from gsencoder.infer.onnx.runtime import from_metadata, to_metadata
 from gsencoder.models.weights import load_weights
 
@@ -93,7 +92,7 @@ def test_encoding_writes_the_features_of_all_teachers_or_of_those_that_are_named
     assert set(scene.features) == {"labels", "palette"}
     assert set(results_of(encoded)["teachers"]) == {"labels", "palette"}
     assert scene.gaussians is not None
-    direct = TorchEncoder(str(trained)).encode_spaces(scene.gaussians, metres_per_unit=1.0)
+    direct = Encoder.load(str(trained)).encode_spaces(scene.gaussians, metres_per_unit=1.0)
     for name, features in direct.items():
         np.testing.assert_allclose(scene.features[name].features, features.features, atol=5e-3)
     words = ["encode", str(rooms / "room_2"), f"weights={trained}", "quiet=true"]
@@ -156,8 +155,8 @@ def test_fusing_in_the_basis_of_one_of_several_teachers_needs_a_teacher_of_its_s
 
 
 def test_an_exported_header_carries_all_spaces_and_their_words(trained: Path) -> None:
-    encoder = TorchEncoder(str(trained))
-    header = header_of(encoder)
+    encoder = Encoder.load(str(trained))
+    header = encoder.network.header
     entries = to_metadata(header)
     assert json.loads(entries["gsencoder"])["version"] == 3
     again = from_metadata(entries)

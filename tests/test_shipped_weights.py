@@ -16,8 +16,7 @@ from gsencoder.evaluate.benchmarks.naming import NamingProtocol, naming_scores
 from gsencoder.evaluate.benchmarks.protocol import Evaluation
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import load_tables
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.infer.localize import localize
 from gsencoder.models.output_space import SHIPPED_WEIGHTS
 from gsencoder.models.weights import load_weights
@@ -71,7 +70,7 @@ def test_those_of_several_teachers_have_the_settings_of_their_experiment() -> No
 
 def test_phrases_lead_into_the_space_of_a_sentence_encoder(shared: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GSENCODER_MODELS", str(shared / "models"))
-    encoder = TorchEncoder("house")
+    encoder = Encoder.load("house")
     scene = with_gaussians(load_scene(shared / "scenes" / "house" / "train_045"))
     assert scene.gaussians is not None
     encoded = encoder.encode_spaces(scene.gaussians)
@@ -87,7 +86,7 @@ def test_phrases_lead_into_the_space_of_a_sentence_encoder(shared: Path, monkeyp
 
 @pytest.mark.parametrize(("name", "number"), [("house_cpu", 40), ("house", 45)])
 def test_rooms_that_they_never_saw_are_named_in_parts_as_in_one(shared: Path, name: str, number: int) -> None:
-    encoder = TorchEncoder(name)
+    encoder = Encoder.load(name)
     words = encoder.tables["labels"]
     # What eight views show is enough for several parts, of which each has neighbors.
     views = SceneConfig(max_views=8)

@@ -11,8 +11,9 @@ from gsencoder.app.commands.train import TrainCommandConfig
 from gsencoder.app.compose import compose
 from gsencoder.core.errors import InputError
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.encode import Encoder
 from gsencoder.infer.onnx.export import random_cloud
+from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.models.output_space import OutputSpace
 from gsencoder.models.weights import load_weights
 from gsencoder.train.losses import LossConfig
@@ -100,7 +101,7 @@ def test_its_encoder_gives_the_teachers_vectors_themselves(trained: Path) -> Non
     assert encoder.stem.weight.shape[0] == 125
     assert (outputs.basis, outputs.centered, outputs.scaled) == (None, False, False)
     assert outputs.channels == outputs.space.channels
-    features = TorchEncoder(str(trained)).encode(random_cloud(200, encoder.config.voxel))
+    features = Encoder.load(str(trained)).encode(random_cloud(200, encoder.config.voxel))
     assert features.features.shape == (200, outputs.space.channels)
     np.testing.assert_array_equal(features.mean, outputs.mean)
     assert np.linalg.norm(outputs.mean) > 0
@@ -136,8 +137,7 @@ def as_train_config(config: TrainCommandConfig) -> TrainConfig:
 
 @pytest.mark.slow
 def test_an_output_space_without_centering_passes_through_an_exported_header(trained: Path) -> None:
-    from gsencoder.infer.onnx.export import header_of
     from gsencoder.infer.onnx.runtime import from_metadata, to_metadata
 
-    outputs: OutputSpace = from_metadata(to_metadata(header_of(TorchEncoder(str(trained))))).outputs.select()
+    outputs: OutputSpace = from_metadata(to_metadata(TorchNetwork.load(str(trained)).header)).outputs.select()
     assert (outputs.centered, outputs.scaled) == (False, False)

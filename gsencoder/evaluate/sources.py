@@ -25,8 +25,7 @@ from gsencoder.fusion.errors import sample_cells
 from gsencoder.fusion.fuse import FuseConfig, fuse
 from gsencoder.fusion.lift import VisibilityConfig, keep_visible
 from gsencoder.fusion.measured_heads import HeadSet, MeasuredHead, head_features, measure_heads
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.load import Encoder
+from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.infer.relevancy import relevancy
 from gsencoder.render import blend
 from gsencoder.teachers.build import TeacherConfig, build_teacher

@@ -15,9 +15,9 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 
 from gsencoder.core.errors import about
 from gsencoder.core.process import Track, untracked
-from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.draw import contact_sheet, fit_pca_colors, pca_picture
-from gsencoder.infer.encode import encode_spaces
+from gsencoder.infer.encode import EncodeConfig, Encoder
+from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.render import blend
@@ -139,11 +139,12 @@ def validate_encoder(
         teacher: ClassAccuracy(outputs[teacher], codebook, pictured=len(with_pictures))
         for teacher, codebook in codebooks.items()
     }
+    network = Encoder(TorchNetwork(encoder, outputs))
     for scene in track(share, "validation"):
         gaussians = scene.first.gaussians(np.arange(len(scene.first)))
         with about(f"scene {scene.name}"):
             unit = scene.first.metres_per_unit or 1.0
-            encoded = encode_spaces(gaussians, encoder, outputs, config, metres_per_unit=unit)
+            encoded = network.encode_spaces(gaussians, config, metres_per_unit=unit)
         for (teacher, accuracy), part in zip(accuracies.items(), scene.parts, strict=True):
             if part is not None:
                 accuracy.add(part, encoded[teacher].features)

@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -31,8 +31,7 @@ from gsencoder.core.settings import option
 from gsencoder.fusion.coordinates import reduce_to_fit
 from gsencoder.fusion.errors import FieldError, judge, row_cosines
 from gsencoder.fusion.folder import features_bytes
-from gsencoder.infer.chunks import Chunk, EncodeConfig, cut, scene_regions
-from gsencoder.infer.load import Encoder
+from gsencoder.infer.encode import Chunk, EncodeConfig, Encoder, cut, scene_regions
 from gsencoder.types import GaussianFeatures, Gaussians
 
 OPTIONS_SET_BY_BUDGET = ("halo", "precision")
@@ -41,11 +40,7 @@ OPTIONS_SET_BY_BUDGET = ("halo", "precision")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncodeBudget(Budget):
-    """What an encoding may cost, or must reach. Where they conflict, the one that stands first here wins.
-
-    A budget of error alone takes the cheapest setting that keeps it; budgets of seconds and megabytes without one take
-    the most exact setting that keeps them.
-    """
+    """What an encoding may cost, or must reach. Where they conflict, the one that stands first here wins."""
 
     error: float | None = option(
         None,
@@ -79,13 +74,12 @@ BINS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """A part of the scene that was encoded whole, and in halves where the scene is cut.
+    """A part of the scene, of `rows` Gaussians, that was encoded whole, and in halves where the scene is cut.
 
     Attributes:
-        rows: its number of Gaussians.
         seconds: of encoding it whole, by precision; empty if they do not matter.
         distances: from which on an error of `cutting` is made, ascending, metres; empty where the scene is not cut.
-        cutting: error where the scene is cut so far away; never rises.
+        cutting: error where the scene is cut this far away; never rises.
     """
 
     rows: int
@@ -118,14 +112,11 @@ class BudgetEncoding:
     """An encoding within a budget.
 
     Attributes:
-        features: by teacher, with as few coordinates as a limit of megabytes asks for.
-        encoded: the same before any were left out.
-        choice: of the setting.
+        features: by teacher, with as few coordinates as a limit of megabytes asks for; `encoded` before that.
         exact: the setting that errors are measured against.
         ranks: coordinates, by teacher; empty without a limit of megabytes.
         predicted: by limit.
-        choosing: seconds of the choice.
-        seconds: from its beginning to the features.
+        choosing: seconds of the choice; `seconds` from its beginning to the features.
         notes: warnings about limits that are expected to be broken.
     """
 
@@ -154,10 +145,11 @@ def encode_within(
 ) -> BudgetEncoding:
     """Encodes a splat by the setting that keeps a budget.
 
+    A budget of error alone takes the cheapest setting that keeps it; budgets of seconds and megabytes without one take
+    the most exact setting that keeps them.
+
     Args:
-        teachers: whose features are wanted.
         config: options that the budget does not choose.
-        metres_per_unit: see `Encoder.encode`.
         header: the settings that are written with the features, which take bytes.
     """
     check_any_limit(budget)
@@ -215,9 +207,7 @@ class SampledEncoding:
         metres_per_unit: float,
         clock: Callable[[], float] | None = None,
     ) -> None:
-        """Args:
-        clock: seconds; None if they do not matter.
-        """
+        """`clock` gives seconds; None if they do not matter."""
         self._gaussians, self._encoder, self._exact, self._unit = gaussians, encoder, exact, metres_per_unit
         self._clock = clock
         self._regions = scene_regions(gaussians.means, encoder.voxel / metres_per_unit)
@@ -229,7 +219,6 @@ class SampledEncoding:
         # Precision changes less than a cut and costs more: the exact one is for the exact setting.
         self.settings = [replace(exact, halo=halo, precision=precisions[-1]) for halo in halos]
         self.settings += [replace(exact, precision=precision) for precision in precisions[-2::-1]]
-        self._parts = cache(self._measured_parts)
         self._rounding = cache(self._measured_rounding)
         self._chunks = cache(self._counted_chunks)
 
@@ -240,7 +229,7 @@ class SampledEncoding:
         errors = np.full(1, self._rounding(setting.precision))
         if setting.halo != self._exact.halo:
             _, seen = self._chunks(setting.halo)
-            errors = errors + np.array([part.cutting_error(seen) for part in self._parts()])
+            errors = errors + np.array([part.cutting_error(seen) for part in self._parts])
         return float(errors.mean()), error_bound(errors, SAFETY)
 
     def seconds(self, setting: EncodeConfig) -> float:
@@ -250,7 +239,7 @@ class SampledEncoding:
         sizes, _ = self._chunks(setting.halo)
         # The first pass of a process loads kernels, which no later one pays for.
         return min(
-            float(part.seconds[setting.precision] * ((sizes / part.rows) ** EXPONENT).sum()) for part in self._parts()
+            float(part.seconds[setting.precision] * ((sizes / part.rows) ** EXPONENT).sum()) for part in self._parts
         )
 
     def _counted_chunks(self, halo: float) -> tuple[Float64[np.ndarray, " C"], Float64[np.ndarray, " n"]]:
@@ -272,7 +261,8 @@ class SampledEncoding:
         )
         return float(_errors(rounded, exact).mean())
 
-    def _measured_parts(self) -> list[Part]:
+    @cached_property
+    def _parts(self) -> list[Part]:
         """Parts that are encoded whole, and in halves where the scene is cut into chunks."""
         count = max(min(len(self._gaussians) // SHARE, MOST_ROWS), LEAST_ROWS)
         precisions = dict.fromkeys(setting.precision for setting in self.settings)
@@ -281,11 +271,11 @@ class SampledEncoding:
         for center in self._centers():
             part = self._gaussians.select(_box_around(self._gaussians, center, count))
             seconds: dict[Precision, float] = {}
-            for precision in precisions if self._clock is not None else ():
-                assert self._clock is not None
-                begun = self._clock()
-                self._encode(part, replace(uncut, precision=precision))
-                seconds[precision] = self._clock() - begun
+            if self._clock is not None:
+                for precision in precisions:
+                    begun = self._clock()
+                    self._encode(part, replace(uncut, precision=precision))
+                    seconds[precision] = self._clock() - begun
             distances, cutting = np.zeros(0), np.zeros(0)
             if self.is_cut:
                 halves = replace(uncut, chunk=max(len(part) * 2 // 3, 1), halo=0.0)

@@ -22,7 +22,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.settings import value_at
 from gsencoder.fusion.budget import exact_config
 from gsencoder.fusion.fuse import FuseConfig
-from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import EncodeConfig
 from gsencoder.infer.encode_budget import exact_encoding
 
 

@@ -12,6 +12,7 @@ from splats import random_gaussians
 from gsencoder.app.commands import evaluate as evaluate_sources
 from gsencoder.core.errors import InputError
 from gsencoder.evaluate.sources import FeatureSource, encoder_source, space_of_words
+from gsencoder.infer.encode import Encoder
 from gsencoder.text.table import TextTable, make_text_table, save_text_table
 from gsencoder.text.vocabulary import with_training_names
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, Scene
@@ -20,19 +21,12 @@ WORDS = {name: make_text_table(("mug", "cup"), np.eye(2, dtype=np.float32), f"{n
 TRAINED = {name: replace(table, trained=("cup",)) for name, table in WORDS.items()}
 
 
-class Stub:
+class Stub(Encoder):
     """An encoder whose features say nothing but which space they are of."""
 
-    voxel = 0.02
-    made_by: Mapping[str, Any] = {}
-
     def __init__(self, tables: Mapping[str, TextTable] = TRAINED) -> None:
-        self.tables = tables
+        self.voxel, self.made_by, self.tables = 0.02, {}, tables
         self.spaces = {name: FeatureSpace(name=name, channels=2, text_encoder=f"{name}-words") for name in WORDS}
-        self.words = next(iter(tables.values()), None)
-
-    def precisions(self, device: str) -> tuple[str, ...]:
-        return ("float32",)
 
     def encode_spaces(self, gaussians: Gaussians, *_: object, **__: object) -> dict[str, GaussianFeatures]:
         rows = np.ones((len(gaussians), 2), np.float32)

@@ -8,7 +8,7 @@ from training_scenes import prepared, small_encoder
 
 from gsencoder.evaluate import validation
 from gsencoder.evaluate.validation import ClassAccuracy, nearest_classes, validate_encoder, validate_names
-from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import EncodeConfig
 from gsencoder.models.output_space import OutputSpaces
 from gsencoder.train.samples import TrainingScene
 from gsencoder.types import GaussianFeatures
@@ -46,7 +46,7 @@ def judged(
         features = space.restore(values)
         return {"sides": GaussianFeatures(features=features, weights=weights, mean=space.mean, space=space.space)}
 
-    monkeypatch.setattr(validation, "encode_spaces", encode_spaces)
+    monkeypatch.setattr(validation.Encoder, "encode_spaces", encode_spaces)
     return validate_encoder(scenes, small_encoder(), outputs, {"sides": codebook})["sides"]
 
 

@@ -10,8 +10,7 @@ import torch
 from symbolic import symbolic_sizes
 
 from gsencoder.app import main as cli
-from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.onnx.export import lower
+from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.transformer import TransformerConfig
@@ -57,14 +56,14 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lowered(weights: Path) -> Any:
     """The encoder as a graph whose convolutions are still one operator each, which takes as long as all else."""
     with symbolic_sizes():
-        return lower(TorchEncoder(str(weights)))
+        return TorchNetwork.load(str(weights)).lower()
 
 
 @pytest.fixture(scope="session")
 def exported(weights: Path, lowered: Any) -> Path:
     """The same folder, and in it what the command exported the encoder to."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gsencoder.app.commands.export.lower", lambda _: lowered)
+        patch.setattr(TorchNetwork, "lower", lambda _: lowered)
         words = [f"weights={weights}", f"out={weights / 'encoder.onnx'}", "sizes=[1,50]", "quiet=true"]
         assert cli.main(["export", *words]) == 0
     return weights

@@ -12,13 +12,11 @@ from splats import random_gaussians
 from gsencoder.app import main as cli
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.files import save_splat
-from gsencoder.fusion.coordinates import principal_axes
 from gsencoder.fusion.errors import field_error
 from gsencoder.fusion.folder import features_bytes, load_features, save_features
-from gsencoder.infer import chunks
-from gsencoder.infer import encode_budget as encode_within_module
-from gsencoder.infer.chunks import EncodeConfig, cut
-from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer import encode as encode_module
+from gsencoder.infer import encode_budget as module
+from gsencoder.infer.encode import EncodeConfig, Encoder, cut
 from gsencoder.infer.encode_budget import (
     BudgetEncoding,
     EncodeBudget,
@@ -26,8 +24,10 @@ from gsencoder.infer.encode_budget import (
     check_encode_budget,
     encode_within,
     exact_encoding,
+    realised_error,
+    seen_around,
 )
-from gsencoder.types import Gaussians, Scene
+from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, Scene
 
 IN_CHUNKS = EncodeConfig(chunk=700)
 TEACHERS = ["labels"]
@@ -41,27 +41,25 @@ def gaussians() -> Gaussians:
 
 
 @pytest.fixture
-def encoder(weights: Path, monkeypatch: pytest.MonkeyPatch) -> TorchEncoder:
+def encoder(weights: Path, monkeypatch: pytest.MonkeyPatch) -> Encoder:
     """With bfloat16 among its precisions on every machine, and small scenes chosen for as large ones are."""
-    monkeypatch.setattr(encode_within_module, "SMALL_SCENE", 0)
-    monkeypatch.setattr(TorchEncoder, "precisions", lambda *_: ("float32", "bfloat16"))
-    return TorchEncoder(str(weights))
+    monkeypatch.setattr(module, "SMALL_SCENE", 0)
+    monkeypatch.setattr(Encoder, "precisions", lambda *_: ("float32", "bfloat16"))
+    return Encoder.load(str(weights))
 
 
-def within(
-    gaussians: Gaussians, encoder: TorchEncoder, config: EncodeConfig = IN_CHUNKS, **limits: Any
-) -> BudgetEncoding:
+def within(gaussians: Gaussians, encoder: Encoder, config: EncodeConfig = IN_CHUNKS, **limits: Any) -> BudgetEncoding:
     return encode_within(gaussians, encoder, TEACHERS, config, EncodeBudget(**limits))
 
 
-def measured(made: BudgetEncoding, gaussians: Gaussians, encoder: TorchEncoder) -> float:
+def measured(made: BudgetEncoding, gaussians: Gaussians, encoder: Encoder) -> float:
     exact = encoder.encode_spaces(gaussians, made.exact)["labels"]
     return field_error(made.features["labels"], exact, sample=0).total
 
 
 @pytest.mark.parametrize("config", [IN_CHUNKS, EncodeConfig()], ids=["chunks", "whole"])
 def test_a_limit_of_error_is_kept_and_a_looser_one_never_costs_more(
-    gaussians: Gaussians, encoder: TorchEncoder, config: EncodeConfig
+    gaussians: Gaussians, encoder: Encoder, config: EncodeConfig
 ) -> None:
     sample = SampledEncoding(gaussians, encoder, exact_encoding(config), 1.0)
     chosen = []
@@ -74,7 +72,7 @@ def test_a_limit_of_error_is_kept_and_a_looser_one_never_costs_more(
 
 
 def test_megabytes_are_kept_and_more_of_them_are_no_less_exact(
-    gaussians: Gaussians, encoder: TorchEncoder, tmp_path: Path
+    gaussians: Gaussians, encoder: Encoder, tmp_path: Path
 ) -> None:
     full = features_bytes(encoder.spaces["labels"], len(gaussians), 4) / 1e6
     errors, ranks = [], []
@@ -92,7 +90,7 @@ def test_megabytes_are_kept_and_more_of_them_are_no_less_exact(
 
 
 def test_megabytes_that_nothing_fits_into_are_refused_with_those_that_something_does(
-    gaussians: Gaussians, encoder: TorchEncoder
+    gaussians: Gaussians, encoder: Encoder
 ) -> None:
     with pytest.raises(InputError, match="^budget.megabytes=0.005: the smallest result takes ") as refused:
         within(gaussians, encoder, megabytes=0.005)
@@ -101,7 +99,7 @@ def test_megabytes_that_nothing_fits_into_are_refused_with_those_that_something_
 
 
 def test_where_error_and_other_budgets_conflict_the_error_is_kept_and_each_conflict_named(
-    gaussians: Gaussians, encoder: TorchEncoder
+    gaussians: Gaussians, encoder: Encoder
 ) -> None:
     made = within(gaussians, encoder, error=1e-3, seconds=1e-9, megabytes=1e-6)
     assert measured(made, gaussians, encoder) <= 1e-3
@@ -110,7 +108,7 @@ def test_where_error_and_other_budgets_conflict_the_error_is_kept_and_each_confl
 
 
 def test_rooms_that_are_far_apart_are_chosen_for_as_they_are_encoded_and_each_as_if_alone(
-    gaussians: Gaussians, encoder: TorchEncoder
+    gaussians: Gaussians, encoder: Encoder
 ) -> None:
     """Of two that fit into a chunk each, and not together, there is nothing to cut; of a larger chunk's there is."""
     names = ("means", "quats", "scales", "opacities", "sh")
@@ -128,7 +126,7 @@ def test_rooms_that_are_far_apart_are_chosen_for_as_they_are_encoded_and_each_as
 class Clock:
     """Counts a second for each thousand Gaussians that the encoder sees, half of it in bfloat16."""
 
-    def __init__(self, encoder: TorchEncoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, encoder: Encoder, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now, plain = 0.0, encoder.encode_spaces
 
         def counted(gaussians: Gaussians, config: EncodeConfig, **options: Any) -> Any:
@@ -143,7 +141,7 @@ class Clock:
 
 
 def test_seconds_are_kept_and_more_of_them_are_no_less_exact(
-    gaussians: Gaussians, encoder: TorchEncoder, monkeypatch: pytest.MonkeyPatch
+    gaussians: Gaussians, encoder: Encoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock, errors = Clock(encoder, monkeypatch), []
     for seconds in (9.0, 16.0, 1000.0):
@@ -159,29 +157,10 @@ def test_seconds_are_kept_and_more_of_them_are_no_less_exact(
     assert "the fastest setting takes about" in made.notes[0]
 
 
-def test_the_same_scene_makes_the_same_choice_and_the_same_features(
-    gaussians: Gaussians, encoder: TorchEncoder
-) -> None:
-    one, other = (within(gaussians, encoder, error=0.02) for _ in range(2))
-    assert one.choice.setting == other.choice.setting
-    assert one.choice.estimate.error == other.choice.estimate.error
-    np.testing.assert_array_equal(one.features["labels"].features, other.features["labels"].features)
-
-
-def test_what_axes_leave_out_is_what_is_measured(gaussians: Gaussians, encoder: TorchEncoder) -> None:
-    features = encoder.encode(gaussians, EncodeConfig())
-    axes = principal_axes(features)
-    for rank in (1, 2, 4):
-        error = field_error(axes.reduced(features, rank), features, sample=0).total
-        assert error == pytest.approx(axes.errors[rank - 1], abs=2e-6)
-        assert axes.rank_within(axes.errors[rank - 1] + 1e-9) == rank
-    assert axes.errors[3] < 1e-6
-
-
 def test_a_small_scene_is_encoded_exactly_without_a_choice(
-    gaussians: Gaussians, encoder: TorchEncoder, monkeypatch: pytest.MonkeyPatch
+    gaussians: Gaussians, encoder: Encoder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(encode_within_module, "SMALL_SCENE", len(gaussians) + 1)
+    monkeypatch.setattr(module, "SMALL_SCENE", len(gaussians) + 1)
     made = within(gaussians, encoder, EncodeConfig(), error=0.5)
     assert made.choice.setting == made.exact
 
@@ -221,7 +200,7 @@ def test_the_command_prints_and_records_each_limit_and_what_became_of_it(
 def test_the_command_says_before_it_cuts_how_many_chunks_there_are_at_least_and_records_a_warning_of_much_work(
     splat: Path, weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chunks, "MUCH_WORK", 1000)
+    monkeypatch.setattr(encode_module, "MUCH_WORK", 1000)
     out = tmp_path / "out"
     words = [str(splat), f"weights={weights}", "data.metres_per_unit=1", f"out={out}", "encode.chunk=100"]
     assert cli.main(["encode", *words]) == 0
@@ -230,3 +209,139 @@ def test_the_command_says_before_it_cuts_how_many_chunks_there_are_at_least_and_
     (warning,) = json.loads((out / "summary.json").read_text())["warnings"]
     assert warning.startswith("encode.chunk=100: ")
     assert f"warning: {warning}" in printed.err
+
+
+@pytest.mark.parametrize("halo", [0.0, 0.3, 5.0])
+def test_nothing_that_a_chunk_does_not_see_is_nearer_than_it_says(halo: float) -> None:
+    scene = random_gaussians(2000)
+    chunks = cut(scene.means, 500, halo)
+    seen = seen_around(scene.means, chunks)
+    assert np.isfinite(seen).all()
+    for chunk in chunks:
+        unseen = np.setdiff1d(np.arange(len(scene)), chunk.rows)
+        for row in chunk.core_rows[::40]:
+            nearest = np.abs(scene.means[unseen] - scene.means[row]).max(axis=1).min()
+            far = np.linalg.norm(scene.means[unseen] - scene.means[row], axis=1).min()
+            # A halo that was cut is round, others are boxes.
+            assert max(nearest, far) >= seen[row] - 1e-5
+
+
+class NearSighted(Encoder):
+    """Its features turn by an angle that is known: exp(−4 × metres to the end of the chunk), and 0.1 more in bfloat16.
+
+    Features of the teacher "double" turn by twice that. Two of the four channels are small.
+    """
+
+    def __init__(self) -> None:
+        self.voxel = 0.05
+        self.spaces = {name: FeatureSpace(name=name, channels=4) for name in ("single", "double")}
+
+    def precisions(self, device: str) -> tuple[str, ...]:
+        return "float32", "bfloat16"
+
+    def encode_spaces(
+        self, gaussians: Gaussians, config: EncodeConfig = EncodeConfig(), *, metres_per_unit: float = 1.0, **_: Any
+    ) -> dict[str, GaussianFeatures]:
+        chunks = cut(gaussians.means, config.chunk, config.halo / metres_per_unit)
+        angles = np.exp(-4 * seen_around(gaussians.means, chunks) * metres_per_unit) + 0.1 * (
+            config.precision == "bfloat16"
+        )
+        x, y, z, w = (gaussians.quats * np.array([1, 1, 0.3, 0.3])).T
+        made = {}
+        for name, times in (("single", 1), ("double", 2)):
+            c, s = np.cos(times * angles), np.sin(times * angles)
+            turned = np.stack([c * x - s * y, s * x + c * y, c * z - s * w, s * z + c * w], axis=1)
+            made[name] = GaussianFeatures(
+                features=turned.astype(np.float32),
+                weights=np.ones(len(gaussians), np.float32),
+                mean=np.zeros(4, np.float32),
+                space=self.spaces[name],
+            )
+        return made
+
+
+EXACT = replace(exact_encoding(IN_CHUNKS), precision="float32")
+
+
+def sampled(gaussians: Gaussians, exact: EncodeConfig = EXACT, clock: Any = None, unit: float = 1.0) -> SampledEncoding:
+    return SampledEncoding(gaussians, NearSighted(), exact, unit, clock)
+
+
+def test_a_splat_in_other_units_of_length_gets_the_same_setting_and_the_same_errors(gaussians: Gaussians) -> None:
+    quarters = replace(gaussians, means=gaussians.means * np.float32(4), scales=gaussians.scales * np.float32(4))
+    made = []
+    for one, unit in ((gaussians, 1.0), (quarters, 0.25)):
+        sample = sampled(one, unit=unit)
+        errors = [sample.error(setting) for setting in sample.settings]
+        encoding = encode_within(
+            one, NearSighted(), ["double"], IN_CHUNKS, EncodeBudget(error=0.9), metres_per_unit=unit
+        )
+        assert encoding.choice.setting != encoding.exact
+        error = realised_error(encoding, one, NearSighted(), metres_per_unit=unit)["double"].total
+        made.append((errors, encoding.choice.setting, encoding.features["double"].features.tolist(), error))
+    assert made[0] == made[1]
+
+
+def test_the_error_that_is_predicted_is_near_that_of_the_worst_teacher(
+    gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parts as large as the scene predict best."""
+    monkeypatch.setattr(module, "LEAST_ROWS", len(gaussians))
+    monkeypatch.setattr(NearSighted, "precisions", lambda *_: ("float32",))
+    near, sample = NearSighted(), sampled(gaussians)
+    exact = near.encode_spaces(gaussians, EXACT)
+    assert sample.error(EXACT) == (0, 0)
+    for setting in sample.settings[:-1]:
+        made = near.encode_spaces(gaussians, setting)
+        error = max(field_error(made[name], exact[name], sample=0).total for name in exact)
+        predicted, bound = sample.error(setting)
+        assert error <= predicted <= min(5 * error, bound)
+        if setting.halo == 0:
+            assert predicted == pytest.approx(error, rel=0.1)
+
+
+def test_seconds_of_a_first_pass_that_loads_kernels_are_not_predicted_for_later_ones(gaussians: Gaussians) -> None:
+    def seconds(first: float) -> list[float]:
+        sample = sampled(gaussians, clock=iter([0.0, first, *np.arange(1000.0, 1099.0)]).__next__)
+        return [sample.seconds(setting) for setting in sample.settings]
+
+    assert seconds(500.0) == seconds(1.0)
+
+
+def test_a_small_scene_has_all_precisions_to_choose_among_where_seconds_are_limited(
+    gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "SMALL_SCENE", len(gaussians) + 1)
+    whole = replace(EXACT, chunk=0)
+    timed, untimed = sampled(gaussians, whole, clock=lambda: 0.0), sampled(gaussians, whole)
+    assert [setting.precision for setting in timed.settings] == ["bfloat16", "float32"]
+    assert untimed.settings == [whole]
+
+
+def test_megabytes_are_those_of_the_files_of_all_teachers_together(gaussians: Gaussians, tmp_path: Path) -> None:
+    near, teachers = NearSighted(), ["single", "double"]
+    with pytest.raises(InputError, match="the smallest result takes ") as refused:
+        encode_within(gaussians, near, teachers, EXACT, EncodeBudget(megabytes=0.005))
+    smallest = float(str(refused.value).split("takes ")[1].split(" MB;")[0])
+    with pytest.raises(InputError, match="give more"):
+        encode_within(gaussians, near, teachers, EXACT, EncodeBudget(megabytes=0.99 * smallest))
+    scene, ranks = Scene(name="s", gaussians=gaussians, origin=np.zeros(3)), []
+    for size in (smallest, 1.3 * smallest, 5 * smallest):
+        made = encode_within(gaussians, near, teachers, EXACT, EncodeBudget(megabytes=size))
+        for name in teachers:
+            save_features(tmp_path / name, scene, made.features[name])
+        assert sum(file.stat().st_size for file in tmp_path.glob("*/features.safetensors")) <= size * 1e6
+        ranks.append(tuple(made.ranks.values()))
+    assert (ranks[0], ranks[-1]) == ((1, 1), (4, 4))
+
+
+def test_a_setting_and_the_coordinates_left_out_share_the_limit_of_error(
+    gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "SMALL_SCENE", 0)
+    for error in (0.05, 0.2, 0.45):
+        made = encode_within(
+            gaussians, NearSighted(), ["single"], EncodeConfig(), EncodeBudget(error=error, megabytes=1e-6)
+        )
+        left_out = made.predicted["error"] - made.choice.estimate.error
+        assert made.choice.estimate.bound + left_out <= error

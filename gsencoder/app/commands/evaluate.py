@@ -46,8 +46,7 @@ from gsencoder.fusion.fit import with_fitting_splat
 from gsencoder.fusion.folder import find_heads, load_features
 from gsencoder.fusion.fuse import FuseConfig
 from gsencoder.fusion.measured_heads import find_head, load_heads
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.load import file_of_encoder, load_encoder
+from gsencoder.infer.encode import EncodeConfig, file_of_encoder, load_encoder
 from gsencoder.infer.localize import LocalizeConfig
 from gsencoder.teachers.build import TeacherConfig, load_teacher_heads, words_of
 from gsencoder.teachers.labels import LabelsConfig

@@ -1,7 +1,7 @@
 """`gsencoder export weights=… out=FILE.onnx`: an encoder as one file that runs without torch."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +16,8 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.data.splats.files import READABLE
 from gsencoder.fusion.folder import copy_heads, find_heads, heads_of_graph, load_memories
-from gsencoder.infer.encode import TorchEncoder
-from gsencoder.infer.load import file_of_encoder
-from gsencoder.infer.onnx.export import (
-    COSINE,
-    TOLERANCE,
-    Cloud,
-    check_cosines,
-    check_parity,
-    export_onnx,
-    lower,
-    random_cloud,
-)
+from gsencoder.infer.encode import COSINE, TOLERANCE, Cloud, Encoder, check_cosines, check_parity, file_of_encoder
+from gsencoder.infer.onnx.export import export_onnx, random_cloud
 from gsencoder.infer.onnx.runtime import SUFFIX
 from gsencoder.memory.attention import export_memory
 from gsencoder.types import QueryMemory
@@ -106,14 +96,15 @@ def run(config: ExportConfig, run: Run) -> None:
         _export_memory(config, config.out, run)
         return
     with run.step("load"):
-        encoder = TorchEncoder(config.weights)
+        encoder = Encoder.load(config.weights)
+        network = encoder.network
         heads = find_heads(file_of_encoder(config.weights))
         clouds = [Cloud(f"{size} random Gaussians", random_cloud(size, encoder.voxel)) for size in config.sizes]
         scenes = _scenes(config, encoder.voxel, run.track)
     run.print("translating the graph, which takes about a minute")
     with run.step("export"):
-        lowered = lower(encoder)
-        exact = model = export_onnx(encoder, lowered)
+        lowered = network.lower()
+        exact = model = export_onnx(network.header, lowered)
     with run.step("compare"):
         parity = check_parity(exact, encoder, [*clouds, *scenes], tolerance=config.tolerance, track=run.track)
     agreement = f"within {max(parity.values()):.1g} of torch's largest output"
@@ -121,8 +112,8 @@ def run(config: ExportConfig, run: Run) -> None:
     if config.precision != "float32":
         with run.step("convert"):
             if config.precision == "float16":
-                lowered = lower(encoder, half=True)
-            model = export_onnx(encoder, lowered, config.precision)
+                lowered = network.lower(half=True)
+            model = export_onnx(replace(network.header, precision=config.precision), lowered)
         with run.step("judge"):
             cosines = check_cosines(model, exact, scenes or clouds, cosine=config.cosine, track=run.track)
         agreement = (
@@ -187,7 +178,7 @@ def _memory_of(memories: Mapping[str | None, QueryMemory], space: str) -> QueryM
     return by_name[space]
 
 
-def space_figures(encoder: TorchEncoder) -> dict[str, Any]:
+def space_figures(encoder: Encoder) -> dict[str, Any]:
     """Channels, rank, words and space of an encoder; of each teacher by its name where there are several."""
     figures = {
         name: {

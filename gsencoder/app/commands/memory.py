@@ -21,8 +21,7 @@ from gsencoder.data.scenes import find_scenes
 from gsencoder.data.seeding.points import unit_of
 from gsencoder.evaluate.sources import RenderedErrors, RenderedTally
 from gsencoder.fusion.folder import MEMORY_FILE, file_of_teacher, save_memories, save_tables
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.load import load_encoder
+from gsencoder.infer.encode import EncodeConfig, load_encoder
 from gsencoder.memory.bank import BankConfig, RawSample
 from gsencoder.models.output_space import check_distinct, name_of_space
 from gsencoder.teachers.build import build_teacher, stored_words, words_by_teacher

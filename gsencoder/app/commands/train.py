@@ -20,7 +20,7 @@ from gsencoder.evaluate.validation import validate_names
 from gsencoder.fusion.errors import total_fit
 from gsencoder.fusion.folder import HEADS_FILE, save_tables
 from gsencoder.fusion.measured_heads import HeadSet, save_heads
-from gsencoder.infer.chunks import EncodeConfig
+from gsencoder.infer.encode import EncodeConfig
 from gsencoder.models.output_space import WEIGHTS_FILE, OutputSpace
 from gsencoder.models.weights import save_weights
 from gsencoder.train.distributed import fail_together

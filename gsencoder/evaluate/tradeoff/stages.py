@@ -41,11 +41,10 @@ from gsencoder.fusion.package import (
     save_package,
     save_ply,
 )
-from gsencoder.infer.chunks import EncodeConfig
 from gsencoder.infer.draw import Picture
-from gsencoder.infer.encode import TorchEncoder
+from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.infer.localize import LocalizeConfig, localize, select_features
-from gsencoder.infer.onnx.runtime import OnnxEncoder
+from gsencoder.infer.torch_network import TorchNetwork
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.pictures import view_pictures
 from gsencoder.infer.views.scores import score_views
@@ -315,27 +314,28 @@ ENCODER_KNOBS = (
 
 
 @lru_cache(maxsize=4)
-def encoder_of(weights: str, voxel: float, patch: int) -> TorchEncoder:
+def encoder_of(weights: str, voxel: float, patch: int) -> Encoder:
     """Weights with another grid or other patches than they were trained with; 0 = those of the training."""
-    encoder = TorchEncoder(weights)
-    config = encoder.network.config
+    network = TorchNetwork.load(weights)
+    config, header = network.module.config, network.header
     shape = replace(config.transformer, patch=patch or config.transformer.patch)
     # Both are settings of the grid, from which no parameter has its size.
-    encoder.network.config = replace(config, voxel=voxel or config.voxel, transformer=shape)
-    return encoder
+    network.module.config = replace(config, voxel=voxel or config.voxel, transformer=shape)
+    return Encoder(TorchNetwork(network.module, header.outputs, header.tables, header.made_by))
 
 
 @lru_cache(maxsize=8)
-def graph_of(weights: str, voxel: float, patch: int, graph: Graph) -> OnnxEncoder:
+def graph_of(weights: str, voxel: float, patch: int, graph: Graph) -> Encoder:
     """The same as an ONNX graph."""
-    from gsencoder.infer.onnx.export import export_onnx, lower
+    from gsencoder.infer.onnx.export import export_onnx
 
     assert graph != "none"
-    encoder = encoder_of(weights, voxel, patch)
+    network = encoder_of(weights, voxel, patch).network
     with tempfile.TemporaryDirectory(prefix="gsencoder_graph_") as folder:
         file = Path(folder) / "encoder.onnx"
-        file.write_bytes(export_onnx(encoder, lower(encoder, half=graph == "float16"), graph))
-        return OnnxEncoder(str(file), device="cpu")
+        lowered = network.lower(half=graph == "float16")
+        file.write_bytes(export_onnx(replace(network.header, precision=graph), lowered))
+        return Encoder.load(str(file), "cpu")
 
 
 @contextmanager

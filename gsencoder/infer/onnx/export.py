@@ -1,15 +1,11 @@
-"""Export of an encoder to one ONNX file that takes raw Gaussians, with metadata and a parity check.
-
-Translations of operators that the exporter does not know into standard ONNX operators.
+"""Export of an encoder to one ONNX file that takes raw Gaussians, with metadata, in float32 or cheaper precisions.
 
 Convolutions stay operators of our own (`gsencoder::convolve`) until a graph is finished, so that what changes the
 graph's precision finds them; `in_standard_operators` then writes them out.
 
-Quantization of an exported encoder to eight bits: its weights alone, or its products too.
-
-A weight matrix is rounded to int8 with a scale for each output channel. In a product of integers the other factor is
-rounded to uint8 with one scale and one zero point, which are computed when the graph runs (dynamic quantization). Sums
-are int32, and everything between products stays float32.
+In eight bits a weight matrix is rounded to int8 with a scale for each output channel. In a product of integers the
+other factor is rounded to uint8 with one scale and one zero point, which are computed when the graph runs (dynamic
+quantization). Sums are int32, and everything between products stays float32.
 
 Processors without VNNI add two products of bytes in 16 bits, which 255 · 127 twice overflows without an error. Weights
 of integer products are therefore at most `PRODUCT_LIMIT`.
@@ -20,7 +16,6 @@ import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,59 +33,33 @@ import gsencoder.models.neighbors
 import gsencoder.models.raw_encoder  # noqa: F401  these two define the operators that are translated
 from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError
-from gsencoder.core.process import Stored, Track, untracked
-from gsencoder.fusion.errors import field_error
-from gsencoder.infer.chunks import EncodeConfig
-from gsencoder.infer.encode import TorchEncoder
 from gsencoder.infer.onnx.runtime import (
     FIELDS,
     NO_SUM,
     OUTPUT,
     SETTINGS,
     SUM,
-    OnnxEncoder,
-    OnnxHeader,
+    EncoderHeader,
     inputs_of,
     to_metadata,
     with_sum,
 )
+from gsencoder.models.encoder import GaussianEncoder
 from gsencoder.models.grid import MAX_LEVELS, hilbert_table, start_orientation
 from gsencoder.models.raw_encoder import RawEncoder
 from gsencoder.types import Gaussians
 
-TOLERANCE = 1e-4
-"""Largest difference from torch, as a share of the largest output."""
 KNOWN_TORCH = "2.13"
 """The earliest release whose exporter translates encoders: 2.11 fails on slices whose sizes follow from data."""
-COSINE = 0.99
-"""Smallest mean centered cosine of a cheaper precision's features to float32's."""
-
-ON_CPU = EncodeConfig(precision="float32", device="cpu")
 
 
-class Cloud(NamedTuple):
-    """Gaussians to compare on."""
-
-    name: str
-    gaussians: Gaussians
-    metres_per_unit: float = 1.0
-
-
-def lower(encoder: TorchEncoder, *, half: bool = False) -> Any:
-    """The encoder as an ONNX graph whose convolutions are still operators of ours; see
-    `gsencoder.infer.onnx.export`.
+def lower(module: GaussianEncoder, header: EncoderHeader, *, half: bool = False) -> Any:
+    """A network as an ONNX graph whose convolutions are still operators of ours.
 
     Args:
         half: compute in float16 once Gaussians have been merged into tokens.
     """
-    try:
-        import onnx  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise InputError(f"export needs the package {error.name}: pip install 'gsencoder[export]'") from error
-
-    header = header_of(encoder)
-    network = deepcopy(encoder.network).half() if half else encoder.network
+    network = deepcopy(module).half() if half else module
     cloud = random_cloud(300, header.voxel)
     clouds, patches = torch.export.Dim("gaussians"), torch.export.Dim("patches")
     example = [torch.from_numpy(value) for value in inputs_of(cloud).values()]
@@ -124,23 +93,16 @@ def lower(encoder: TorchEncoder, *, half: bool = False) -> Any:
     return simplified(exported.model)
 
 
-def export_onnx(
-    encoder: TorchEncoder,
-    lowered: Any,
-    precision: Stored = "float32",
-) -> bytes:
+def export_onnx(header: EncoderHeader, lowered: Any) -> bytes:
     """What the file is to hold: the graph, and what a runtime must know of it.
 
     Args:
-        lowered: what `lower` made of it, in half precision for float16.
-        precision: what the graph is to compute in.
+        header: with the precision that the graph is to compute in.
+        lowered: what `lower` made of the network, in half precision for float16.
     """
-    import onnx
-
-    header = header_of(encoder, precision)
-    if precision == "int8_weights":
+    if header.precision == "int8_weights":
         lowered = weights_in_int8(lowered)
-    elif precision == "int8_dynamic":
+    elif header.precision == "int8_dynamic":
         lowered = products_in_int8(lowered)
     model = in_standard_operators(lowered)
     for name, value in _settings(header).items():
@@ -151,22 +113,7 @@ def export_onnx(
     return with_sum(model.SerializeToString())
 
 
-def header_of(encoder: TorchEncoder, precision: Stored = "float32") -> OnnxHeader:
-    """What a runtime must know of an encoder that was exported."""
-    shape = encoder.network.config.transformer
-    return OnnxHeader(
-        voxel=encoder.voxel,
-        levels=shape.levels,
-        orders=shape.orders,
-        patch=shape.patch,
-        outputs=encoder.outputs,
-        tables=encoder.tables,
-        precision=precision,
-        made_by=encoder.made_by,
-    )
-
-
-def _settings(header: OnnxHeader) -> dict[str, np.ndarray]:
+def _settings(header: EncoderHeader) -> dict[str, np.ndarray]:
     """What the settings are where nobody gives any: a splat in metres, that is no part of another."""
     return {
         "voxel": np.array(header.voxel, np.float64),
@@ -205,68 +152,6 @@ def random_cloud(count: int, voxel: float, seed: int = 0) -> Gaussians:
         opacities=rng.uniform(0, 1, count).astype(np.float32),
         sh=rng.normal(size=(count, 1, 3)).astype(np.float32),
     )
-
-
-def check_parity(
-    model: bytes,
-    encoder: TorchEncoder,
-    clouds: Sequence[Cloud],
-    *,
-    tolerance: float = TOLERANCE,
-    track: Track = untracked,
-) -> dict[str, float]:
-    """Runs an exported model, and the encoder that it was made from, on the same clouds.
-
-    Args:
-        model: what `export_onnx` gave, in float32.
-        track: wraps the loop over clouds to show progress.
-
-    Returns:
-        The largest difference on each cloud, as a share of the largest output of the space.
-    """
-    runtime = OnnxEncoder(model, device="cpu")
-    errors: dict[str, float] = {}
-    for name, cloud, unit in track(clouds, "comparing"):
-        theirs = encoder.encode_spaces(cloud, ON_CPU, metres_per_unit=unit)
-        ours = runtime.encode_spaces(cloud, ON_CPU, metres_per_unit=unit)
-        errors[name] = max(_largest_error(ours[space].stored(), theirs[space].stored()) for space in theirs)
-        if not errors[name] <= tolerance:
-            raise InputError(
-                f"export: on {name} onnxruntime and torch differ by {errors[name]:.2g} of the largest output, more "
-                f"than {tolerance:.2g}; no file was written"
-            )
-    return errors
-
-
-def _largest_error(ours: np.ndarray, theirs: np.ndarray) -> float:
-    return float(np.abs(ours - theirs).max() / max(float(np.abs(theirs).max()), 1e-30))
-
-
-def check_cosines(
-    model: bytes, exact: bytes, clouds: Sequence[Cloud], *, cosine: float = COSINE, track: Track = untracked
-) -> dict[str, float]:
-    """Runs a model of a cheaper precision, and the same in float32, on the same clouds.
-
-    Args:
-        exact: what it gave in float32.
-        track: wraps the loop over clouds to show progress.
-
-    Returns:
-        The mean centered cosine of the two's features on each cloud, in the space where it is smallest.
-    """
-    cheap, full = OnnxEncoder(model, device="cpu"), OnnxEncoder(exact, device="cpu")
-    cosines: dict[str, float] = {}
-    for name, cloud, unit in track(clouds, "comparing"):
-        ours, theirs = (
-            each.encode_spaces(cloud, replace(ON_CPU, precision="auto"), metres_per_unit=unit) for each in (cheap, full)
-        )
-        cosines[name] = min(1 - field_error(ours[space], theirs[space]).centered for space in theirs)
-        if not cosines[name] >= cosine:
-            raise InputError(
-                f"export: on {name} {cheap.header.precision} gives features whose mean centered cosine to float32's is "
-                f"{cosines[name]:.4f}, below cosine={cosine}; no file was written. Take another precision"
-            )
-    return cosines
 
 
 OPSET = 20
@@ -446,8 +331,7 @@ def in_standard_operators(model: onnx.ModelProto) -> onnx.ModelProto:
 
     The types of values stay: they are a hundredth of the file, and onnxruntime takes four times as long to find them.
     """
-    standard = onnx.ModelProto()
-    standard.CopyFrom(model)
+    standard = deepcopy(model)
     for function in FUNCTIONS:
         proto = function.to_function_proto()
         # Annotations are types here, and floats may be of either width.
@@ -467,14 +351,6 @@ def in_standard_operators(model: onnx.ModelProto) -> onnx.ModelProto:
     return simplified(graph)
 
 
-def _convolve(x: Any, neighbors: Any, weight: Any) -> Any:
-    return OURS.convolve(x, neighbors, weight)
-
-
-def _hilbert(morton: Any) -> Any:
-    return OURS.hilbert(morton)
-
-
 def _searchsorted(keys: Any, wanted: Any, right: bool = False, **others: Any) -> Any:
     assert not any(others.values()), f"searchsorted is translated without {others}"
     return search(keys, wanted, traced.Constant(value_int=int(right)))
@@ -491,8 +367,8 @@ def _sort(values: Any, *, dim: int = -1, descending: bool = False, **others: Any
 
 
 TRANSLATIONS: dict[Any, Any] = {
-    torch.ops.gsencoder.convolve.default: _convolve,
-    torch.ops.gsencoder.hilbert.default: _hilbert,
+    torch.ops.gsencoder.convolve.default: lambda x, neighbors, weight: OURS.convolve(x, neighbors, weight),
+    torch.ops.gsencoder.hilbert.default: lambda morton: OURS.hilbert(morton),
     torch.ops.aten.searchsorted.Tensor: _searchsorted,
     torch.ops.aten.sort.stable: _sort,
 }
@@ -503,13 +379,8 @@ PRODUCT_LIMIT = 63
 
 
 class Product(NamedTuple):
-    """A product with weights that do not change: a linear layer or a convolution.
-
-    Attributes:
-        weight: name of the weights.
-        matrix: the same, a column for each output channel.
-        cells: cells of a convolution's neighborhood; 1 for a linear layer.
-    """
+    """A product with weights that do not change, a column of `matrix` for each output channel: a linear layer, or a
+    convolution over neighborhoods of `cells`."""
 
     node: onnx.NodeProto
     x: str
@@ -519,13 +390,12 @@ class Product(NamedTuple):
 
     @property
     def convolves(self) -> bool:
-        """Whether it is a convolution."""
         return bool(self.node.domain == OURS.domain)
 
 
 def weights_in_int8(model: onnx.ModelProto) -> onnx.ModelProto:
     """Weights are stored as int8 and made float32 when the graph runs; all arithmetic stays what it was."""
-    done = _copy(model)
+    done = deepcopy(model)
     products = {each.node.output[0]: each for each in _products(done.graph)}
     nodes: list[onnx.NodeProto] = []
     for node in done.graph.node:
@@ -545,7 +415,7 @@ def weights_in_int8(model: onnx.ModelProto) -> onnx.ModelProto:
 
 def products_in_int8(model: onnx.ModelProto) -> onnx.ModelProto:
     """Replaces products of floats by products of integers, in a graph whose convolutions are not yet written out."""
-    done = _copy(model)
+    done = deepcopy(model)
     products = {each.node.output[0]: each for each in _products(done.graph)}
     nodes: list[onnx.NodeProto] = []
     as_bytes: dict[str, tuple[str, str, str]] = {}
@@ -586,12 +456,6 @@ def _store(graph: onnx.GraphProto, weight: str, **arrays: np.ndarray) -> list[st
         for name, array in zip(names, arrays.values(), strict=True)
     )
     return names
-
-
-def _copy(model: onnx.ModelProto) -> onnx.ModelProto:
-    done = onnx.ModelProto()
-    done.CopyFrom(model)
-    return done
 
 
 def _with_nodes(model: onnx.ModelProto, nodes: Sequence[onnx.NodeProto]) -> onnx.ModelProto:

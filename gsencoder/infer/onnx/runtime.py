@@ -1,9 +1,7 @@
-"""The exported encoder under onnxruntime: features of a splat, and words for them, without torch.
+"""The exported encoder under onnxruntime, without torch, and the metadata of its file, which any program can read.
 
-Metadata of an exported encoder: entries of text beside the graph, which any program can read.
-
-`gsencoder` is JSON: the format's version, the grid, the curves, the feature space (or the spaces of several teachers,
-in whose columns the features are), and for each array its type and shape. `gsencoder.NAME` is the array NAME:
+The entry `gsencoder` is JSON: the format's version, the grid, the curves, the feature space (or the spaces of several
+teachers, in whose columns the features are), and for each array its type and shape. `gsencoder.NAME` is the array NAME:
 little-endian, deflated, in base64. `gsencoder.sum` is the sha256 of the whole file, with zeros in the sum's own place.
 """
 
@@ -15,11 +13,11 @@ import json
 import math
 import warnings
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -28,12 +26,11 @@ from gsencoder.core.arrays import round_columns
 from gsencoder.core.errors import InputError, SceneWarning, about, readable
 from gsencoder.core.files import MODEL_BYTES, read_foreign
 from gsencoder.core.pretrained import find_file
-from gsencoder.core.process import Device, Precision, Stored, Track, untracked
-from gsencoder.infer.chunks import EncodeConfig, encode_by_chunks
-from gsencoder.models.grid import ALIGN, INVALID_CODE, Order, SceneCurves, check_extent, cut_scene_curves
+from gsencoder.core.process import Device, Precision, Stored
+from gsencoder.models.grid import ALIGN, INVALID_CODE, Order, SceneCurves, check_extent
 from gsencoder.models.output_space import OutputSpace, OutputSpaces, output_spaces_parts
 from gsencoder.text.table import TextTable, tower_from_json, tower_to_json, trained_from_json, unrounded
-from gsencoder.types import FeatureBasis, FeatureSpace, GaussianFeatures, Gaussians, check_unit
+from gsencoder.types import FeatureBasis, FeatureSpace, Gaussians
 
 KEY = "gsencoder"
 VERSION, VERSION_OF_SEVERAL = 2, 3
@@ -52,8 +49,8 @@ WORD_STEPS = 63
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class OnnxHeader:
-    """What a runtime must know of an exported encoder.
+class EncoderHeader:
+    """What a runtime must know of an encoder.
 
     Attributes:
         voxel: edge of the finest grid, metres.
@@ -71,25 +68,26 @@ class OnnxHeader:
     patch: int
     outputs: OutputSpaces
     tables: Mapping[str, TextTable] = field(default_factory=dict)
-    precision: Stored | Literal["int8_static"] = "float32"
+    precision: Stored = "float32"
     made_by: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        possible_orders = set(get_args(Order))
+        possible_orders, highest = get_args(Order), ALIGN.bit_length()
         numbers = type(self.levels) is int and type(self.patch) is int
-        if not 0 < self.voxel < math.inf or not numbers or not 1 <= self.levels <= ALIGN.bit_length() or self.patch < 1:
+        if not 0 < self.voxel < math.inf or not numbers or not 1 <= self.levels <= highest or self.patch < 1:
             raise InputError(
-                f"expected a positive voxel, 1 to {ALIGN.bit_length()} levels and patches of 1 or more, got "
-                f"{self.voxel}, {self.levels}, {self.patch}"
+                f"expected a positive voxel, 1 to {highest} levels and patches of 1 or more, got {self.voxel}, "
+                f"{self.levels}, {self.patch}"
             )
         if self.precision not in get_args(Stored):
-            listed = ", ".join(get_args(Stored))
-            raise InputError(f"expected a precision among {listed}, got {str(self.precision)[:40]}")
-        if not self.orders or not set(self.orders) <= possible_orders:
-            raise InputError(f"expected orders among {', '.join(sorted(possible_orders))}, got {str(self.orders)[:80]}")
+            raise InputError(
+                f"expected a precision among {', '.join(get_args(Stored))}, got {str(self.precision)[:40]}"
+            )
+        if not self.orders or not set(self.orders) <= set(possible_orders):
+            raise InputError(f"expected orders among {', '.join(possible_orders)}, got {str(self.orders)[:80]}")
 
 
-def to_metadata(header: OnnxHeader) -> dict[str, str]:
+def to_metadata(header: EncoderHeader) -> dict[str, str]:
     """The entries of text that hold a header."""
     arrays, values = output_spaces_parts(header.outputs)
     values |= {
@@ -117,7 +115,6 @@ def to_metadata(header: OnnxHeader) -> dict[str, str]:
 
 
 def _words_parts(words: TextTable, *, in_int8: bool) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """The arrays and the JSON values that hold a text table."""
     arrays = {"words_mean": words.mean}
     if in_int8:
         arrays["words"], arrays["words_scale"] = round_columns(words.embeddings, WORD_STEPS)
@@ -131,7 +128,7 @@ def _words_parts(words: TextTable, *, in_int8: bool) -> tuple[dict[str, np.ndarr
     return arrays, values
 
 
-def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
+def from_metadata(entries: Mapping[str, str]) -> EncoderHeader:
     """The header that entries of text hold."""
     if KEY not in entries:
         raise InputError("is no encoder that `gsencoder export` wrote")
@@ -166,7 +163,7 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
             by_teacher[teacher] = outputs
             if "words" in part:
                 tables[teacher] = _text_table(part["words"], arrays)
-        return OnnxHeader(
+        return EncoderHeader(
             voxel=float(values["voxel"]),
             levels=values["levels"],
             orders=tuple(values["orders"]),
@@ -183,7 +180,6 @@ def from_metadata(entries: Mapping[str, str]) -> OnnxHeader:
 
 
 def _output_space(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> OutputSpace:
-    """The output space that JSON values and arrays hold."""
     space, mean = FeatureSpace(**values["space"]), arrays["mean"]
     basis = None
     if "components" in arrays:
@@ -194,7 +190,6 @@ def _output_space(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -
 
 
 def _text_table(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TextTable:
-    """The text table that JSON values and arrays hold."""
     return TextTable(
         names=tuple(values["names"]),
         embeddings=unrounded(arrays["words"].astype(np.float32) * arrays.get("words_scale", np.float32(1))),
@@ -259,12 +254,32 @@ SUFFIX = ".onnx"
 CUDA, CPU = "CUDAExecutionProvider", "CPUExecutionProvider"
 
 
-class OnnxEncoder:
+Run = Callable[[Gaussians, SceneCurves | None, int], Float32[np.ndarray, "n channels"]]
+"""Restored outputs of the first n Gaussians of a part of a scene, given the part, the curves of the complete region
+where that was cut, and n."""
+
+
+@runtime_checkable
+class Network(Protocol):
+    """What `gsencoder.infer.encode.Encoder` runs: `OnnxNetwork`, or `gsencoder.infer.torch_network.TorchNetwork`."""
+
+    header: EncoderHeader
+
+    def precisions(self, device: Device, /) -> tuple[Precision, ...]:
+        """The types that it computes in on a device, the most exact one first; others than that are cheaper."""
+
+    def runner(self, precision: Precision, device: Device, voxel: float) -> Run:
+        """Prepares to run on a splat, in whose unit of length the finest grid has cells of `voxel`."""
+
+    def lower(self, *, half: bool = False) -> Any:
+        """The network as an ONNX graph; see `gsencoder.infer.onnx.export.lower`."""
+
+
+class OnnxNetwork:
     """A file of `gsencoder export`, ready to run.
 
     Attributes:
         name: of the file, for messages.
-        header: what it says of itself.
     """
 
     def __init__(self, file: str | Path | bytes, *, device: Device = "auto", threads: int = 0) -> None:
@@ -280,16 +295,15 @@ class OnnxEncoder:
             model = file if isinstance(file, bytes) else read_foreign(self.name, MODEL_BYTES)
         with about(self.name):
             summed = check_sum(model)
-        self._session = open_session(model, self.name, device, threads)
-        try:
-            self.header: OnnxHeader = from_metadata(self._session.get_modelmeta().custom_metadata_map)
-            expected = {f"{name}: {self._type(name)}" for name in (*FIELDS, *SETTINGS)}
-            inputs = {f"{each.name}: {each.type}" for each in self._session.get_inputs()}
-            inputs |= {f"{each.name}: {each.type}" for each in self._session.get_overridable_initializers()}
-            if inputs != expected or OUTPUT not in [each.name for each in self._session.get_outputs()]:
+        self.session = open_session(model, self.name, device, threads)
+        with about(self.name):
+            self.header: EncoderHeader = from_metadata(self.session.get_modelmeta().custom_metadata_map)
+            types = {"voxel": "tensor(double)", "starts": "tensor(int64)"}
+            expected = {f"{name}: {types.get(name, 'tensor(float)')}" for name in (*FIELDS, *SETTINGS)}
+            taken = [*self.session.get_inputs(), *self.session.get_overridable_initializers()]
+            inputs = {f"{each.name}: {each.type}" for each in taken}
+            if inputs != expected or OUTPUT not in [each.name for each in self.session.get_outputs()]:
                 raise InputError(f"expected inputs {', '.join(sorted(expected))}, got {', '.join(sorted(inputs))}")
-        except InputError as error:
-            raise InputError(f"{self.name}: {error}") from error
         if not summed:
             warnings.warn(
                 f"{self.name}: has no entry {SUM}: another program changed it, and damage would not be noticed",
@@ -297,122 +311,34 @@ class OnnxEncoder:
                 stacklevel=2,
             )
 
-    @staticmethod
-    def _type(name: str) -> str:
-        return {"voxel": "tensor(double)", "starts": "tensor(int64)"}.get(name, "tensor(float)")
-
-    @property
-    def voxel(self) -> float:
-        """Edge of the finest grid in metres."""
-        return self.header.voxel
-
-    @property
-    def made_by(self) -> Mapping[str, Any]:
-        """Settings and results of training and export, as JSON values."""
-        return self.header.made_by
-
-    @property
-    def spaces(self) -> Mapping[str, FeatureSpace]:
-        """The feature spaces, by the names of their teachers."""
-        return {name: self.header.outputs[name].space for name in self.header.outputs}
-
-    @property
-    def tables(self) -> Mapping[str, TextTable]:
-        """What turns words into the features' spaces, by teacher, where the file has it."""
-        return self.header.tables
-
-    @property
-    def words(self) -> TextTable | None:
-        """The first of the text tables; None where there is none."""
-        return next(iter(self.tables.values()), None)
-
     def precisions(self, _device: Device) -> tuple[Precision, ...]:
         """That of the file, which it was exported in."""
         return ("auto",)
 
-    def export(self, path: str | Path) -> None:
+    def lower(self, *, half: bool = False) -> Any:  # noqa: ARG002
         """Refuses: the encoder has been exported."""
-        raise InputError(f"export: {path}: the encoder is an ONNX file already; copy it")
+        raise InputError(f"export: {self.name} is an ONNX file already; copy it")
 
-    def encode(
-        self,
-        gaussians: Gaussians,
-        config: EncodeConfig = EncodeConfig(),
-        *,
-        space: str | None = None,
-        metres_per_unit: float = 1.0,
-        track: Track = untracked,
-    ) -> GaussianFeatures:
-        """Features of every Gaussian, all with weight 1; see `gsencoder.infer.encode.encode`, which this equals
-        within rounding.
-
-        Args:
-            config: of its parts; the precision is the file's.
-            space: name of a teacher or of its feature space; None = the only one.
-            metres_per_unit: of the splat's world; the encoder's grid is in metres.
-            track: wraps the loop over chunks to show progress.
-        """
-        teacher = self.header.outputs.resolve(space)
-        values = self._restored(gaussians, [teacher], config, metres_per_unit, track)
-        return self.header.outputs[teacher].features(values[teacher])
-
-    def encode_spaces(
-        self,
-        gaussians: Gaussians,
-        config: EncodeConfig = EncodeConfig(),
-        *,
-        metres_per_unit: float = 1.0,
-        track: Track = untracked,
-    ) -> dict[str, GaussianFeatures]:
-        """Features of every Gaussian in all spaces, by teacher; arguments and errors are those of `encode`."""
-        values = self._restored(gaussians, list(self.spaces), config, metres_per_unit, track)
-        return {teacher: self.header.outputs[teacher].features(values[teacher]) for teacher in self.spaces}
-
-    def _restored(
-        self,
-        gaussians: Gaussians,
-        teachers: Sequence[str],
-        config: EncodeConfig,
-        metres_per_unit: float,
-        track: Track,
-    ) -> dict[str, Float32[np.ndarray, "N _channels"]]:
-        """The graph's outputs for every Gaussian, by teacher."""
-        check_unit(metres_per_unit, "metres_per_unit")
-        header = self.header
-        if config.precision not in ("auto", header.precision):
+    def runner(self, precision: Precision, _device: Device, voxel: float) -> Run:
+        """Runs the session where it was opened, in the precision of the file."""
+        if precision not in ("auto", self.header.precision):
             raise InputError(
-                f"precision: {self.name} computes in {header.precision}, not {config.precision}; "
-                "export another file for that"
+                f"precision: {self.name} computes in {self.header.precision}, not {precision}; export another file for "
+                "that"
             )
-        voxel = header.voxel / metres_per_unit
 
-        def run(subset: Gaussians, scene_curves: SceneCurves | None, count: int) -> Float32[np.ndarray, "n channels"]:
-            return self._run(subset, scene_curves, voxel)[:count]
+        def run(subset: Gaussians, curves: SceneCurves | None, count: int) -> Float32[np.ndarray, "n channels"]:
+            feed = feed_of(subset, curves, voxel)
+            try:
+                (features,) = self.session.run([OUTPUT], feed)
+            except Exception as error:  # onnxruntime raises its own classes, which share only this base
+                raise InputError(f"{self.name}: onnxruntime could not run it: {_first_line(error)}") from error
+            channels = self.header.outputs.channels
+            if features.shape != (len(subset), channels):
+                raise InputError(f"{self.name}: expected {channels} channels, got {features.shape}")
+            return np.asarray(features[:count], np.float32)
 
-        return encode_by_chunks(
-            gaussians,
-            run,
-            lambda means: cut_scene_curves(
-                means, voxel, levels=header.levels, orders=header.orders, patch=header.patch
-            ),
-            config,
-            voxel=voxel,
-            metres_per_unit=metres_per_unit,
-            columns={teacher: header.outputs.columns[teacher] for teacher in teachers},
-            track=track,
-        )
-
-    def _run(
-        self, subset: Gaussians, scene_curves: SceneCurves | None, voxel: float
-    ) -> Float32[np.ndarray, "n channels"]:
-        feed = feed_of(subset, scene_curves, voxel)
-        try:
-            (features,) = self._session.run([OUTPUT], feed)
-        except Exception as error:  # onnxruntime raises its own classes, which share only this base
-            raise InputError(f"{self.name}: onnxruntime could not run it: {_first_line(error)}") from error
-        if features.shape != (len(subset), self.header.outputs.channels):
-            raise InputError(f"{self.name}: expected {self.header.outputs.channels} channels, got {features.shape}")
-        return np.asarray(features, np.float32)
+        return run
 
 
 def feed_of(subset: Gaussians, scene_curves: SceneCurves | None, voxel: float) -> dict[str, np.ndarray]:
@@ -421,9 +347,9 @@ def feed_of(subset: Gaussians, scene_curves: SceneCurves | None, voxel: float) -
     scaled = np.floor(subset.means.astype(np.float64) / voxel)
     check_extent(float((scaled.max(axis=0) - scaled.min(axis=0)).max()) + 1, voxel)
     feed = inputs_of(subset) | {"voxel": np.array(voxel, np.float64)}
-    return (
-        feed if scene_curves is None else feed | {"corner": scene_curves.corner, "starts": starts_table(scene_curves)}
-    )
+    if scene_curves is not None:
+        feed |= {"corner": scene_curves.corner, "starts": starts_table(scene_curves)}
+    return feed
 
 
 def inputs_of(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -460,7 +386,10 @@ def open_session(model: bytes, name: str, device: Device, threads: int = 0) -> A
     if on_gpu:
         # TensorFloat-32, onnxruntime's default, moves features by 2 % of the largest.
         providers.insert(0, (CUDA, {"use_tf32": "0"}))
-        _load_cuda()
+        if hasattr(onnxruntime, "preload_dlls"):
+            # CUDA and cuDNN of pip's packages, where the system has none. It prints what it does not load.
+            with redirect_stdout(io.StringIO()):
+                onnxruntime.preload_dlls()
     try:
         session = onnxruntime.InferenceSession(model, options, providers=providers)
     except Exception as error:  # as above
@@ -472,16 +401,6 @@ def open_session(model: bytes, name: str, device: Device, threads: int = 0) -> A
             raise InputError(f"device=cuda: {problem}; install the libraries that it needs, or give device=cpu")
         warnings.warn(f"device=auto: {problem}; computing on the CPU", SceneWarning, stacklevel=2)
     return session
-
-
-def _load_cuda() -> None:
-    """Loads CUDA and cuDNN from pip's packages where they are installed, as torch does, for systems that have none."""
-    import onnxruntime
-
-    if hasattr(onnxruntime, "preload_dlls"):
-        # It prints what it does not load, although the system's own libraries may do.
-        with redirect_stdout(io.StringIO()):
-            onnxruntime.preload_dlls()
 
 
 def _first_line(error: Exception) -> str:

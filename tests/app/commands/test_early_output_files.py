@@ -39,7 +39,7 @@ def inputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module, names in {
         view: ("load_features", "load_scene"),
         repair: ("read_raw", "load_scene"),
-        export: ("TorchEncoder", "load_memories"),
+        export: ("Encoder", "load_memories"),
     }.items():
         for name in names:
             monkeypatch.setattr(module, name, work)

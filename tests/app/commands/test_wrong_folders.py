@@ -15,7 +15,7 @@ from gsencoder.data.scenes import find_scenes
 from gsencoder.data.splats.files import read_raw
 from gsencoder.fusion.folder import FEATURES_FILE, MEMORY_FILE, SCENE_FILE, load_features, load_memories
 from gsencoder.fusion.package import PACKAGE_FILE
-from gsencoder.infer.load import load_encoder
+from gsencoder.infer.encode import load_encoder
 from gsencoder.models.output_space import WEIGHTS_FILE, load_output_spaces
 
 WRITTEN = {
