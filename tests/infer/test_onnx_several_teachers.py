@@ -64,7 +64,8 @@ def test_an_encoder_with_several_teachers_gives_all_spaces_as_torch_does(weights
     with pytest.raises(InputError, match="gives features of labels, colors, raw; name one of them"):
         runtime.encode(cloud, ALONE)
     # A wrong block of columns in the graph is not hidden by the larger numbers of another space.
-    encoder.outputs = OutputSpaces(by_teacher=outputs.by_teacher | {"colors": replace(second, scale=5.001)})
+    wrong = OutputSpaces(by_teacher=outputs.by_teacher | {"colors": replace(second, scale=5.001)})
+    encoder.network.header = replace(header, outputs=wrong)
     with pytest.raises(InputError, match="onnxruntime and torch differ"):
         check_parity(model, encoder, clouds[1:])
 
