@@ -58,11 +58,11 @@ def drawn_scene(scene: Scene, title: str, *, max_gaussians: int, advice: str = "
         factor = np.float32(np.sqrt(total / len(rows)))
         gaussians = gaussians.select(rows)
         gaussians = replace(gaussians, scales=gaussians.scales * factor)
-        features = replace(features, weights=features.weights[rows])
+        weights = features.weights[rows]
         if features.index is None:
-            features = replace(features, features=features.features[rows])
+            features = replace(features, features=features.features[rows], weights=weights)
         else:  # The table that Gaussians share stays whole.
-            features = replace(features, index=features.index[rows])
+            features = replace(features, index=features.index[rows], weights=weights)
         notes.append(
             f"{len(rows):,} of {total:,} Gaussians are drawn and searched: evenly chosen, and enlarged {factor:.2f} "
             f"times. {advice or f'max_gaussians={total} takes all, a smaller number draws faster'}."
