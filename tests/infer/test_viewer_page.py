@@ -207,7 +207,8 @@ def test_thinned_gaussians_cover_as_much_as_all_and_keep_their_weights(search: S
 
 def test_a_table_that_gaussians_share_stays_whole_where_they_are_thinned(search: SceneSearch) -> None:
     index = np.array([0, 1, 1, -1], np.int32)
-    features = replace(features_of(np.eye(2, 6), np.array([1, 2, 3, 0])), index=index)
+    weights = np.array([1, 2, 3, 0], np.float32)
+    features = replace(features_of(np.eye(2, 6), np.ones(2)), index=index, weights=weights)
     scene = replace(search.shown.scene, gaussians=search.shown.gaussians.select(np.arange(4)), features={"f": features})
     thin = drawn_scene(scene, "t", max_gaussians=2).features
     assert (thin.weights.tolist(), len(thin.features)) == ([1, 0], 2)
