@@ -24,7 +24,7 @@ from gsencoder.types import GaussianFeatures
 pytestmark = pytest.mark.slow
 
 WORDS = "mug,chair,table"
-EVERY_BOX = ("localize.min_probability=0", "localize.threshold.kind=quantile", "localize.threshold.quantile=0.9")
+EVERY_BOX = ("localize.min_probability=0", "localize.threshold.kind=relative")
 
 
 def features_of(folder: Path) -> GaussianFeatures:
