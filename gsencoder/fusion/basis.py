@@ -7,7 +7,6 @@ channels. Because rows of B sum to alpha and not to 1, a rendered map decodes as
 import numpy as np
 from jaxtyping import Float, Float32, Float64
 
-from gsencoder.core.archive import Archive
 from gsencoder.core.errors import InputError
 from gsencoder.types import FeatureBasis, FeatureMap, FeatureSpace
 
@@ -66,20 +65,6 @@ class Moments:
             self.outer += other.outer + mixed + mixed.T + other.count * np.outer(offset, offset)
         self.sum += other.sum + other.count * offset
         self.count += other.count
-
-    def state(self) -> dict[str, np.ndarray]:
-        """The arrays that represent the moments in a file."""
-        shift = np.zeros(len(self.sum), np.float32) if self._shift is None else self._shift
-        return {"count": np.array([self.count]), "sum": self.sum, "outer": self.outer, "shift": shift}
-
-    @classmethod
-    def read(cls, file: Archive, channels: int) -> "Moments":
-        """Moments from the arrays of a file."""
-        moments = cls(channels)
-        state = {name: file.array(name, each.dtype.name, each.shape) for name, each in moments.state().items()}
-        moments.count, moments.sum, moments.outer = float(state["count"][0]), state["sum"], state["outer"]
-        moments._shift = state["shift"] if moments.count else None
-        return moments
 
     @property
     def mean(self) -> Float64[np.ndarray, " D"]:
