@@ -89,16 +89,16 @@ def test_two_processes_on_the_cpu_of_a_machine_with_gpus_follow_the_losses_of_on
 
 
 def test_a_killed_process_leaves_what_the_next_one_needs(dataset: Prepared, tmp_path: Path, ranks: RankServer) -> None:
-    whole = script(dataset, tmp_path / "whole", steps=20, accumulate=1)
-    cut = script(dataset, tmp_path / "cut", steps=20, accumulate=1)
+    whole = script(dataset, tmp_path / "whole", steps=40, accumulate=1)
+    cut = script(dataset, tmp_path / "cut", steps=40, accumulate=1)
     ranks.started(whole, count=1).end_well()
     running = ranks.started(cut, count=1)
     log, deadline = tmp_path / "cut" / LOG_FILE, time.monotonic() + 120
     while time.monotonic() < deadline and not (log.is_file() and len(log.read_text().splitlines()) > 5):
         time.sleep(0.02)
     running.kill()
-    assert len(losses(tmp_path / "cut")) < 20
-    assert 0 < steps_in(tmp_path / "cut") < 20
+    assert len(losses(tmp_path / "cut")) < 40
+    assert 0 < steps_in(tmp_path / "cut") < 40
     ranks.started(cut, count=1).end_well()
     assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
     assert_same_weights(tmp_path / "cut", tmp_path / "whole")
