@@ -1,6 +1,6 @@
 """Views chosen of the objects of labeled scenes: held against instance masks, and against full-size renders.
 
-    python bench/views.py SCENE … [--candidates 16,32,64] [--weights 0.3,0.1,0.2] [--furniture]
+    python bench/views.py SCENE … [--candidates 16,32,64] [--furniture]
 
 Objects are found by their names in features of the labels teacher. Among the scene's own frames, 8 chosen ones are
 held against the 8 with most pixels of the object by its instance mask, and against 8 that are evenly spread. Views
@@ -101,14 +101,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--candidates", default="16,32,64")
-    parser.add_argument("--weights", default="")
     parser.add_argument("--furniture", action="store_true")
     add_json_option(parser)
     chosen = parser.parse_args()
-    settings = {}
-    if chosen.weights:
-        names = ("cover_weight", "context_weight", "spread_weight")
-        settings = dict(zip(names, map(float, chosen.weights.split(",")), strict=True))
     counts = [int(count) for count in chosen.candidates.split(",")]
     frames: dict[str, list[float]] = {"greedy": [], "uniform": []}
     shells: dict[int, list[dict[str, np.ndarray]]] = {count: [] for count in counts}
@@ -121,11 +116,11 @@ def main() -> None:
             pixels = pixels_of(scene, one)
             best = np.sort(pixels)[::-1][:COUNT].sum()
             for method in ("greedy", "uniform"):
-                config = ViewsConfig(source="frames", method=method, candidates=max(64, COUNT), **settings)
+                config = ViewsConfig(source="frames", method=method, candidates=max(64, COUNT))
                 views = choose_views(scene, [target], config)
                 frames[method].append(float(pixels[[each.frame for each in views.chosen]].sum() / best))
             for count in counts:
-                config = ViewsConfig(source="shells", candidates=count, **settings)
+                config = ViewsConfig(source="shells", candidates=count)
                 start = time.perf_counter()
                 try:
                     views = choose_views(scene, [target], config)

@@ -12,7 +12,6 @@ import argparse
 import csv
 import json
 import warnings
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,9 +23,8 @@ from gsencoder.fusion.folder import load_features
 from gsencoder.infer.localize import LocalizeConfig, localize
 from gsencoder.infer.views.budget import ViewsBudget, fewest_views, measured_errors
 from gsencoder.infer.views.candidates import FreeSpace
-from gsencoder.infer.views.choose import CoverageObjective, judge_candidates
+from gsencoder.infer.views.choose import CoverageObjective, score_candidates
 from gsencoder.infer.views.targets import ViewsConfig, targets_of
-from gsencoder.render import BlendConfig
 
 
 def main() -> None:
@@ -55,14 +53,14 @@ def main() -> None:
         targets = targets_of(gaussians, localize(queried, names, words, LocalizeConfig()))[: given.most]
         free = FreeSpace(gaussians)
         for target in targets:
-            judgment = judge_candidates(scene, gaussians, [target], free, config)
-            cameras = judgment.candidates.cameras
-            blend = replace(BlendConfig(), near=min(BlendConfig().near, judgment.blend.near))
-            usual, _ = CoverageObjective(cameras, [target], judgment.scores, config).greedy(config.count)
-            fewest = [fewest_views(judgment.scores, ViewsBudget(error=error)) for error in errors]
-            choices = [usual, *(picked.order for picked, _ in fewest)]
-            usual_error, *realised = measured_errors(gaussians, [target], cameras, choices, config=blend)
-            for error, (picked, choice), measured in zip(errors, fewest, realised, strict=True):
+            candidates = score_candidates(scene, [target], config, free)
+            cameras, scores = candidates.cameras, candidates.scores
+            usual, _ = CoverageObjective(cameras, [target], scores, config.count).greedy(config.count)
+            fewest = [fewest_views(scores, ViewsBudget(error=error))[0] for error in errors]
+            choices = [usual, *(choice.setting for choice in fewest)]
+            near = candidates.blend.near
+            usual_error, *realised = measured_errors(gaussians, [target], cameras, choices, near=near)
+            for error, choice, measured in zip(errors, fewest, realised, strict=True):
                 lines.append(
                     {
                         "scene": scene.name,
@@ -70,7 +68,7 @@ def main() -> None:
                         "gaussians": len(target.rows),
                         "candidates": len(cameras),
                         "limit": error,
-                        "views": len(picked.order),
+                        "views": len(choice.setting),
                         "predicted": choice.estimate.error,
                         "realised": measured,
                         "usual_views": len(usual),

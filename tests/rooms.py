@@ -33,6 +33,11 @@ def splat(means: np.ndarray, scale: float | np.ndarray = 0.6 * STEP) -> Gaussian
     )
 
 
+def merged(*parts: Gaussians) -> Gaussians:
+    names = ("means", "quats", "scales", "opacities", "sh")
+    return Gaussians(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
 def cube(center: tuple[float, float, float], half: float = CUBE, step: float = 0.03) -> np.ndarray:
     """Points of the surface of a cube."""
     faces = []

@@ -21,9 +21,7 @@ SIZE = {"width": 320, "height": 240}
 
 def photographed() -> tuple[Scene, Target]:
     """The room with small cameras and large photographs, whose red and green say where a pixel is."""
-    scene, rows = room()
-    assert scene.gaussians is not None
-    assert scene.views is not None
+    scene, rows = room(step=0.12)
     x, y = np.meshgrid((np.arange(WIDTH) + 0.5) / WIDTH, (np.arange(HEIGHT) + 0.5) / HEIGHT)
     pictures = [
         np.stack([255 * x, 255 * y, np.full_like(x, 20 * view)], axis=-1).round().astype(np.uint8)
@@ -40,8 +38,6 @@ def places(cameras: Cameras, view: int, points: np.ndarray) -> np.ndarray:
 
 def test_a_close_up_shows_each_point_where_the_photograph_has_it() -> None:
     scene, target = photographed()
-    assert scene.gaussians is not None
-    assert scene.views is not None
     large = photograph_cameras(scene.views)
     assert large.widths.tolist() == [WIDTH] * len(scene.views)
     cameras, rows = closeups(large, scene.gaussians, target, **SIZE)
@@ -62,10 +58,8 @@ def test_a_close_up_shows_each_point_where_the_photograph_has_it() -> None:
 
 def test_windows_keep_their_shape_stay_in_the_frame_and_leave_room_around_the_target() -> None:
     scene, target = photographed()
-    assert scene.gaussians is not None
-    assert scene.views is not None
     large = photograph_cameras(scene.views)
-    for shape in ((320, 240), (300, 300), (200, 400)):
+    for shape in ((320, 240), (200, 400)):
         cameras, rows = closeups(large, scene.gaussians, target, width=shape[0], height=shape[1])
         assert len(rows)
         zoom = large.Ks[rows][:, [0, 1], [0, 1]] / cameras.Ks[:, [0, 1], [0, 1]]
@@ -85,8 +79,6 @@ def test_windows_keep_their_shape_stay_in_the_frame_and_leave_room_around_the_ta
 
 def test_only_what_is_clearly_closer_is_cut() -> None:
     scene, target = photographed()
-    assert scene.gaussians is not None
-    assert scene.views is not None
     # So few pixels that any window would be most of the frame.
     small, none = closeups(scene.views.cameras, scene.gaussians, target, **SIZE)
     assert len(small) == len(none) == 0
@@ -99,11 +91,10 @@ def test_only_what_is_clearly_closer_is_cut() -> None:
 
 
 @pytest.mark.parametrize("source", ["frames", "both"])
-@pytest.mark.parametrize("candidates", [8, 16, 24])
+@pytest.mark.parametrize("candidates", [8, 24])
 def test_close_ups_are_chosen_where_there_are_photographs_and_nowhere_else(source: str, candidates: int) -> None:
     scene, target = photographed()
-    assert scene.views is not None
-    config = ViewsConfig(source=source, candidates=candidates, count=6, **SIZE)  # type: ignore[arg-type]
+    config = ViewsConfig(source=source, candidates=candidates, count=6, **SIZE)
     views = choose_views(scene, [target], config)
     assert views.judged <= candidates
     near = [number for number, each in enumerate(views.chosen) if each.name.endswith(" near cube")]
@@ -111,7 +102,6 @@ def test_close_ups_are_chosen_where_there_are_photographs_and_nowhere_else(sourc
     kinds, (pictures, _) = picture_kinds(scene, views), view_pictures(scene, views)
     for number in near:
         frame = views.chosen[number].frame
-        assert frame is not None
         assert views.chosen[number].name == f"{scene.views.names[frame]} near cube"
         assert kinds[number] == "photograph"
         assert (pictures[number][..., 2] == 20 * frame).all()
@@ -125,7 +115,6 @@ def test_close_ups_are_chosen_where_there_are_photographs_and_nowhere_else(sourc
 
 def test_several_targets_share_the_close_ups() -> None:
     scene, target = photographed()
-    assert scene.gaussians is not None
     wall = np.flatnonzero(np.abs(scene.gaussians.means - np.array([2, 0, 1.2], np.float32)).max(axis=1) < 0.2)
     both = [target, target_of("patch", scene.gaussians, wall)]
     views = choose_views(scene, both, ViewsConfig(source="frames", candidates=24, count=12, **SIZE))
@@ -140,9 +129,7 @@ def test_several_targets_share_the_close_ups() -> None:
 
 def test_whole_photographs_are_shown_as_before() -> None:
     scene, _ = photographed()
-    assert scene.views is not None
     assert isinstance(scene.views, Views)
-    assert scene.views.images is not None
     for frame in (0, 7):
         assert (photograph_of(scene.views, frame, scene.views.cameras, frame) == scene.views.images[frame]).all()
         large = photograph_cameras(scene.views)

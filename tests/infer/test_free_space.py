@@ -1,22 +1,18 @@
 """Where a camera can stand, in a room whose walls are known."""
 
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from rooms import HALF, HEIGHT, STEP, corner_cameras, room, sheet, splat
+from rooms import HALF, HEIGHT, STEP, corner_cameras, merged, room, sheet, splat
 
-from gsencoder.infer.views import candidates as free_space
 from gsencoder.infer.views.candidates import FreeSpace
 from gsencoder.infer.views.targets import CONSTANTS
-from gsencoder.render import BlendConfig, blend
-from gsencoder.types import Cameras, Gaussians
 
 
 @pytest.fixture(scope="module")
 def free() -> FreeSpace:
     scene, rows = room()
-    assert scene.gaussians is not None
     return FreeSpace(scene.gaussians).seen_by(corner_cameras()).without(rows)
 
 
@@ -30,56 +26,16 @@ def test_points_in_the_room_are_seen_empty_and_those_beyond_its_walls_are_not(
     outside = outside[(np.abs(outside[:, :2]) > HALF + 0.2).any(axis=1)]
     assert len(outside) > 100
     assert not free.seen_empty(outside).any()
-
-
-def test_the_inside_of_a_closed_thing_is_not_seen_empty(free: FreeSpace) -> None:
+    # Nor is the inside of a closed thing, and without cameras nobody knows.
     assert not free.seen_empty(np.array([[0.3, 0.2, 0.8]])).any()
-
-
-def test_nobody_knows_what_is_empty_without_cameras() -> None:
-    scene, _ = room()
-    assert scene.gaussians is not None
-    blind = FreeSpace(scene.gaussians)
+    blind = FreeSpace(room()[0].gaussians)
     assert blind.observers is None
-    assert not blind.seen_empty(np.zeros((3, 3))).any()
-
-
-def test_a_camera_that_was_asked_before_tells_the_same_and_is_not_rendered_again(
-    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
-) -> None:
-    scene, _ = room()
-    assert scene.gaussians is not None
-    cameras, points = corner_cameras(), rng.uniform((-1.5, -1.5, 0), (1.5, 1.5, 2), (500, 3))
-    rendered: list[int] = []
-
-    def counted(gaussians: Gaussians, small: Cameras, view: int, **rest: Any) -> Any:
-        rendered.append(view)
-        return blend(gaussians, small, view, **rest)
-
-    monkeypatch.setattr(free_space, "blend", counted)
-    space = FreeSpace(scene.gaussians)
-    first = space.seen_by(cameras.select([0]))
-    both = space.seen_by(cameras.select([1, 0]))
-    assert sorted(rendered) == [0, 0]
-    alone = FreeSpace(scene.gaussians)
-    np.testing.assert_array_equal(both.seen_empty(points), alone.seen_by(cameras.select([1, 0])).seen_empty(points))
-    np.testing.assert_array_equal(first.seen_empty(points), alone.seen_by(cameras.select([0])).seen_empty(points))
-    assert (first.seen_empty(points) != both.seen_empty(points)).any()
-    # More exact maps are others.
-    rendered.clear()
-    space.seen_by(cameras.select([0]), BlendConfig(stop_transmittance=1e-6))
-    assert rendered == [0]
+    assert not blind.seen_empty(inside).any()
 
 
 def test_clearance_from_a_wall_is_at_most_the_distance_less_two_standard_deviations() -> None:
     wall = splat(sheet((1.0, 0, 0), (1, 2), (1.0, 1.0)))
-    flat = Gaussians(
-        means=wall.means,
-        quats=wall.quats,
-        scales=wall.scales * np.array([0.1, 1, 1], np.float32),
-        opacities=wall.opacities,
-        sh=wall.sh,
-    )
+    flat = replace(wall, scales=wall.scales * np.array([0.1, 1, 1], np.float32))
     # Straight in front of one of the Gaussians.
     away = np.array([0.5, 0.2, 0.1])
     at = np.array([[1 - d, *wall.means[600, 1:]] for d in away])
@@ -102,7 +58,6 @@ def test_rays_end_at_walls_and_go_through_what_is_set_apart(free: FreeSpace) -> 
         assert abs(distance - abs(wall - start[0, axis])) < 2 * free.cell
     assert free.first_hit(start, np.array([[1.0, 0, 0]]), np.array([0.5]))[0] == np.inf
     scene, _ = room()
-    assert scene.gaussians is not None
     assert FreeSpace(scene.gaussians).first_hit(start, np.array([[1.0, 0, 0]]), np.array([0.5]))[0] < 0.25
 
 
@@ -128,19 +83,9 @@ def test_few_gaussians_and_many_in_one_place_have_a_free_space(count: int) -> No
 
 def test_faint_gaussians_are_no_obstacle_unless_there_are_no_others() -> None:
     wall = splat(sheet((1.0, 0, 0), (1, 2), (1.0, 1.0)))
-    faint = Gaussians(
-        means=wall.means - np.array([0.5, 0, 0], np.float32),
-        quats=wall.quats,
-        scales=wall.scales,
-        opacities=np.full(len(wall), 0.1, np.float32),
-        sh=wall.sh,
-    )
-    both = Gaussians(
-        **{
-            name: np.concatenate([getattr(wall, name), getattr(faint, name)])
-            for name in ("means", "quats", "scales", "opacities", "sh")
-        }
-    )
+    means = wall.means - np.array([0.5, 0, 0], np.float32)
+    faint = replace(wall, means=means, opacities=np.full(len(wall), 0.1, np.float32))
+    both = merged(wall, faint)
     ray = (np.zeros((1, 3)) + 0.01, np.array([[1.0, 0, 0]]), np.array([3.0]))
     assert FreeSpace(both).first_hit(*ray)[0] > 0.8
     assert FreeSpace(faint).first_hit(*ray)[0] < 0.6

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from rooms import UP, splat
+from rooms import UP, merged, splat
 
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.infer.draw import word_color
@@ -89,12 +89,7 @@ def test_no_mark_hides_another_or_leaves_the_picture(half: int) -> None:
 def test_things_that_are_hidden_or_too_small_carry_no_mark() -> None:
     gaussians, (front,), _ = scene((160.0, 120.0))
     behind = splat(gaussians.means + np.array([1.0, 0, 0], np.float32), 0.02)
-    both = Gaussians(
-        **{
-            name: np.concatenate([getattr(gaussians, name), getattr(behind, name)])
-            for name in ("means", "quats", "scales", "opacities", "sh")
-        }
-    )
+    both = merged(gaussians, behind)
     cameras = looking_cameras(np.zeros((1, 3)), np.array([[1.0, 0, 0]]), UP, FOCAL, WIDTH, HEIGHT)
     hidden = target_of("behind", both, np.arange(len(gaussians), len(both)))
     speck = target_of("speck", both, front.rows[:1])

@@ -48,9 +48,7 @@ def write_room(folder: Path, count: int = COUNT, *, larger: int = 1) -> Path:
 
 def kept_room(taken: Scene, order: list[int]) -> Scene:
     """The room as features keep it: some of the frames, without pictures."""
-    scene, _ = room()
-    assert scene.views is not None
-    assert taken.views is not None
+    scene, _ = room(step=0.12)
     names = tuple(taken.views.names[view] for view in order)
     views = replace(scene.views, cameras=scene.views.cameras.select(order), names=names)
     return replace(scene, origin=ORIGIN, views=views)
@@ -61,8 +59,6 @@ def test_each_frame_gets_its_own_photograph_in_the_size_of_its_camera(tmp_path: 
     room = load_scene(write_room(tmp_path, larger=larger))
     order = [5, 0, 11]
     scene = with_photographs(kept_room(room, order), room)
-    assert scene.views is not None
-    assert scene.views.images is not None
     for frame, view in enumerate(order):
         picture = scene.views.images[frame]
         assert picture.shape == (48, 64, 3)
@@ -73,8 +69,7 @@ def test_each_frame_gets_its_own_photograph_in_the_size_of_its_camera(tmp_path: 
 def test_frames_are_shown_as_photographs_and_placed_cameras_as_renders(tmp_path: Path) -> None:
     taken = load_scene(write_room(tmp_path))
     scene = with_photographs(kept_room(taken, list(range(COUNT))), taken)
-    assert scene.gaussians is not None
-    target = target_of("cube", scene.gaussians, room()[1])
+    target = target_of("cube", scene.gaussians, room(step=0.12)[1])
     views = choose_views(scene, [target], ViewsConfig(candidates=16, count=16, width=64, height=48))
     kinds = picture_kinds(scene, views)
     assert set(kinds) == {"photograph", "render"}
@@ -93,9 +88,7 @@ def test_frames_are_shown_as_photographs_and_placed_cameras_as_renders(tmp_path:
 
 
 def test_large_frames_are_shown_no_larger_than_asked() -> None:
-    scene, rows = room()
-    assert scene.gaussians is not None
-    assert scene.views is not None
+    scene, rows = room(step=0.12)
     target = target_of("cube", scene.gaussians, rows)
     large = replace(scene, views=replace(scene.views, cameras=scene.views.cameras.resized(400)))
     config = ViewsConfig(source="frames", candidates=12, count=3, frame_side=100)
@@ -110,7 +103,6 @@ def test_large_frames_are_shown_no_larger_than_asked() -> None:
 def test_photographs_of_other_cameras_are_refused(tmp_path: Path) -> None:
     room = load_scene(write_room(tmp_path / "all"))
     scene = kept_room(room, list(range(COUNT)))
-    assert room.views is not None
     cameras = room.views.cameras
     poses, focal = cameras.cam_from_world.copy(), cameras.Ks.copy()
     poses[2, :3, 3] += 0.05
@@ -132,8 +124,7 @@ def test_photographs_of_other_cameras_are_refused(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_commands_show_photographs_and_say_so(tmp_path: Path) -> None:
     scene = load_scene(write_room(tmp_path / "scene", larger=2))
-    assert scene.views is not None
-    save_room(tmp_path / "features", scene.views.names)
+    save_room(tmp_path / "features", scene.views.names, step=0.12)
     quick = ("choose.source=frames", "choose.candidates=12", "choose.count=3", "quiet=true")
     words = [str(tmp_path / "features"), f"photos={tmp_path / 'scene'}", "query=cube", *quick]
     assert cli.main(["views", *words, f"out={tmp_path / 'views'}"]) == 0
@@ -151,10 +142,9 @@ def test_commands_show_photographs_and_say_so(tmp_path: Path) -> None:
 def test_a_photograph_counts_as_sharp_and_solid_however_rough_the_splat_is(tmp_path: Path) -> None:
     scene = load_scene(write_room(tmp_path / "taken"))
     bare = kept_room(scene, list(range(COUNT)))
-    assert bare.gaussians is not None
     thin = replace(bare.gaussians, scales=2 * bare.gaussians.scales, opacities=0.3 * bare.gaussians.opacities)
     rough = replace(bare, gaussians=thin)
-    target = target_of("cube", thin, room()[1])
+    target = target_of("cube", thin, room(step=0.12)[1])
     config = ViewsConfig(source="frames", count=4, candidates=12)
     renders = choose_views(rough, [target], config)
     photographs = choose_views(with_photographs(rough, scene), [target], config)

@@ -85,30 +85,28 @@ def test_a_looser_error_never_takes_more_views_and_few_gaussians_take_more() -> 
     weights = rng.uniform(size=(12, 400))
     counts = []
     for error in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.9):
-        picked, choice = fewest_views(scores(weights), ViewsBudget(error=error))
+        choice, _ = fewest_views(scores(weights), ViewsBudget(error=error))
         assert choice.estimate.error <= error
-        counts.append(len(picked.order))
+        counts.append(len(choice.setting))
     assert counts == sorted(counts, reverse=True)
     # Fewer than the default, and more.
     assert counts[0] > ViewsConfig().count > counts[-1]
     # Of the same Gaussians, each a hundred times, nothing is surer; of four of them, less.
     many, _ = fewest_views(scores(np.tile(weights, 100)), ViewsBudget(error=0.2))
     few, _ = fewest_views(scores(weights[:, :4]), ViewsBudget(error=0.2))
-    assert len(many.order) <= counts[4]
-    assert errors_after(order_by_error(scores(weights[:, :4]))[1])[len(few.order) - 1] == 0
+    assert len(many.setting) <= counts[4]
+    assert errors_after(order_by_error(scores(weights[:, :4]))[1])[len(few.setting) - 1] == 0
 
 
 def test_candidates_that_show_nothing_leave_one_view() -> None:
-    picked, choice = fewest_views(scores(np.zeros((4, 6))), ViewsBudget(error=0.1))
-    assert picked.order.tolist() == [0]
-    assert choice.setting == 1
+    choice, _ = fewest_views(scores(np.zeros((4, 6))), ViewsBudget(error=0.1))
+    assert choice.setting.tolist() == [0]
 
 
 def test_what_is_measured_in_windows_is_what_whole_pictures_show() -> None:
     # A Gaussian of the target is high above the room, where no camera looks.
     scene, cube = cube_in_room(np.array([[0.3, 0.2, 9.0]]))
     gaussians = scene.gaussians
-    assert gaussians is not None
     target = replace(cube, rows=np.append(cube.rows, len(gaussians) - 1))
     cameras = corner_cameras(5, 96, 72)
     # One of another size, whose weights count as shares of the picture.
@@ -138,7 +136,7 @@ def test_a_half_that_is_hidden_takes_a_second_view_and_the_limit_is_kept() -> No
     counts, measured = [], []
     for error in (0.05, 0.2, 0.65):
         made = choose_views_within(scene, [plate], config, ViewsBudget(error=error))
-        realised = made.realised_error(scene, [plate], largest_side=1024)
+        realised = made.realised_error(scene.gaussians, [plate])
         assert realised <= error
         assert made.chosen == {"count": len(made.views)}
         counts.append(len(made.views))
@@ -157,7 +155,7 @@ def test_the_fewest_views_of_a_cube_keep_the_limit_at_the_size_of_their_pictures
     made = choose_views_within(scene, [target], replace(SHELLS, count=8), ViewsBudget(error=0.1))
     assert 1 < len(made.views) < made.views.judged == 16
     assert 0 < made.predicted["error"] <= 0.1
-    assert 0 < made.realised_error(scene, [target], largest_side=160) <= 0.1
+    assert 0 < made.realised_error(scene.gaussians, [target]) <= 0.1
 
 
 def test_an_error_comes_before_seconds() -> None:

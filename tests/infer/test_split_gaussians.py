@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from rooms import sheet, splat
+from rooms import merged, sheet, splat
 
 from gsencoder.geometry import rotmats_from_quats
 from gsencoder.infer.views.candidates import FreeSpace, patches
@@ -23,11 +23,6 @@ def one(
     )
 
 
-def together(*parts: Gaussians) -> Gaussians:
-    names = ("means", "quats", "scales", "opacities", "sh")
-    return Gaussians(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
-
-
 def test_small_gaussians_stay_as_they_are(rng: np.random.Generator) -> None:
     small = splat(rng.normal(size=(50, 3)), 0.4)
     parts = patches(small, 1.0)
@@ -36,7 +31,7 @@ def test_small_gaussians_stay_as_they_are(rng: np.random.Generator) -> None:
     assert parts.rows.tolist() == list(range(50))
 
 
-@pytest.mark.parametrize("scales", [(1.0, 1.0, 0.001), (1.0, 0.01, 0.01), (0.5, 0.5, 0.5), (1.0, 0.5, 0.25)])
+@pytest.mark.parametrize("scales", [(1.0, 1.0, 0.001), (1.0, 0.01, 0.01), (1.0, 0.5, 0.25)])
 def test_every_point_of_a_gaussian_is_near_a_patch_and_no_patch_leaves_it(
     scales: tuple[float, float, float], rng: np.random.Generator
 ) -> None:
@@ -58,7 +53,7 @@ def test_every_point_of_a_gaussian_is_near_a_patch_and_no_patch_leaves_it(
 def test_a_sky_is_cut_into_no_more_patches_than_are_allowed() -> None:
     sky = one((1e6, 1e6, 1e6), np.array([1.0, 0, 0, 0]))
     assert len(patches(sky, 1e-3).rows) <= CONSTANTS.max_patches_per_gaussian
-    many = together(*[sky] * 3000)
+    many = merged(*[sky] * 3000)
     assert len(patches(many, 1e-3).rows) <= 1 << 21
 
 
@@ -66,7 +61,7 @@ def test_a_wall_of_one_gaussian_stops_rays_and_is_near_all_along() -> None:
     # The nearest centers belong to small Gaussians; the surface of the large one is nearer.
     clutter = splat(sheet((0.6, 0.0, 0.0), (1, 2), (0.05, 0.05), 0.02), 0.005)
     wall = one((0.01, 1.0, 1.0), np.array([1.0, 0, 0, 0]), (0.0, 1.5, 0.0))
-    free = FreeSpace(together(clutter, wall))
+    free = FreeSpace(merged(clutter, wall))
     at = np.array([[0.1, 0.0, 0.0]])
     assert free.clearance(at)[0] < 0.1
     assert free.clearance(at)[0] == pytest.approx(0.1 - CONSTANTS.surface_sigmas * 0.01, abs=0.03)

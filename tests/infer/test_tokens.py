@@ -66,7 +66,6 @@ def test_where_nothing_is_the_mean_of_the_space_stands() -> None:
 
 def test_views_together_are_as_one_by_one() -> None:
     scene, _ = room()
-    assert scene.gaussians is not None
     n = len(scene.gaussians)
     features = make_features(n)
     blends = token_blends(scene.gaussians, corner_cameras(3), (6, 8))

@@ -17,7 +17,6 @@ pytestmark = pytest.mark.slow
 
 def test_frames_that_would_show_most_are_taken_first() -> None:
     scene, target = cube_in_room()
-    assert scene.gaussians is not None
     free = FreeSpace(scene.gaussians).without(target.rows)
     middle = corner_cameras(6)
     outward = middle.centers / np.linalg.norm(middle.centers, axis=1, keepdims=True)
@@ -29,23 +28,20 @@ def test_frames_that_would_show_most_are_taken_first() -> None:
 
 def test_frames_that_look_at_a_wall_are_taken_last_however_near_the_target_is_behind_it() -> None:
     scene, target = cube_in_room()
-    assert scene.gaussians is not None
     # Next door, nearer to the cube than the cameras of the room are, and pointed at it.
     next_door = around(np.array([0.3, 0.2, 0.8]), np.full(20, 2.4), np.linspace(-0.4, 0.4, 20))
     cameras = joined(next_door, corner_cameras())
     free = FreeSpace(scene.gaussians).without(target.rows)
     assert (frames_on(cameras, scene.gaussians, [target], 6, [free]) >= 20).all()
-    assert scene.views is not None
     names = tuple(f"{number:02d}" for number in range(len(cameras)))
     both = replace(scene, views=replace(scene.views, cameras=cameras, names=names))
     for source in ("frames", "both"):
-        chosen = choose_views(both, [target], replace(SHELLS, source=source))  # type: ignore[arg-type]
+        chosen = choose_views(both, [target], replace(SHELLS, source=source))
         assert all(each.target_scores[0].visible > 0.5 for each in chosen.chosen)
 
 
 def test_frames_of_a_film_are_taken_from_all_along_it() -> None:
     scene, target = cube_in_room()
-    assert scene.gaussians is not None
     turns = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     film = around(np.array([0.3, 0.2, 0.8]), 1.0 + 0.3 * np.abs(turns - np.pi) / np.pi, turns)
     free = FreeSpace(scene.gaussians).without(target.rows)
@@ -58,7 +54,6 @@ def test_frames_of_a_film_are_taken_from_all_along_it() -> None:
 
 def test_targets_take_turns_at_the_frames() -> None:
     scene, target = cube_in_room(cube((-1.2, -1.2, 0.5), half=0.5))
-    assert scene.gaussians is not None
     large = target_of("crate", scene.gaussians, np.arange(len(scene.gaussians) - 5000, len(scene.gaussians)))
     at = np.linspace(0, 6, 20)
     cameras = joined(around(large.center, np.full(20, 1.2), at), around(target.center, np.full(20, 1.2), at))

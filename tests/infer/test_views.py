@@ -54,7 +54,6 @@ def test_targets_are_the_best_boxes_of_each_word_with_the_ball_that_holds_them()
 
 def test_cameras_on_shells_look_at_the_target_from_free_places_that_were_seen() -> None:
     scene, target = cube_in_room()
-    assert scene.gaussians is not None
     free = FreeSpace(scene.gaussians).seen_by(corner_cameras()).without(target.rows)
     around = shell_cameras(scene.gaussians, target, 16, free, up=UP)
     assert len(around) == 16
@@ -88,8 +87,6 @@ def test_the_same_views_are_chosen_however_the_gaussians_are_ordered_and_whereve
     rng: np.random.Generator,
 ) -> None:
     scene, target = cube_in_room()
-    assert scene.gaussians is not None
-    assert scene.views is not None
     here = choose_views(scene, [target], replace(SHELLS, source="both"))
     order = rng.permutation(len(scene.gaussians))
     mixed = replace(scene, gaussians=scene.gaussians.select(order))
@@ -102,7 +99,6 @@ def test_the_same_views_are_chosen_however_the_gaussians_are_ordered_and_whereve
 
 def test_views_that_add_nothing_are_left_out_and_that_is_said() -> None:
     scene, target = cube_in_room()
-    assert scene.views is not None
     middle = corner_cameras(3)
     away = looking_cameras(
         middle.centers, middle.centers / np.linalg.norm(middle.centers, axis=1, keepdims=True), UP, 40.0, 64, 48
@@ -114,12 +110,10 @@ def test_views_that_add_nothing_are_left_out_and_that_is_said() -> None:
     assert sorted(each.name for each in chosen.chosen) == ["d", "e", "f"]
 
 
-@pytest.mark.parametrize("unit", [1e-4, 1e-2, 1e3])
+@pytest.mark.parametrize("unit", [1e-4, 1e3])
 def test_the_same_views_are_chosen_in_scenes_of_any_unit(unit: float) -> None:
     scene, target = cube_in_room()
     g = scene.gaussians
-    assert g is not None
-    assert scene.views is not None
     poses = scene.views.cameras.cam_from_world.copy()
     poses[:, :3, 3] *= unit
     other = replace(
@@ -127,7 +121,6 @@ def test_the_same_views_are_chosen_in_scenes_of_any_unit(unit: float) -> None:
         gaussians=replace(g, means=g.means * np.float32(unit), scales=g.scales * np.float32(unit)),
         views=replace(scene.views, cameras=replace(scene.views.cameras, cam_from_world=poses)),
     )
-    assert other.gaussians is not None
     here = choose_views(scene, [target], SHELLS)
     there = choose_views(other, [target_of("cube", other.gaussians, target.rows)], SHELLS)
     np.testing.assert_allclose(there.cameras.centers, here.cameras.centers * unit, rtol=1e-3, atol=1e-3 * unit)
@@ -143,7 +136,6 @@ def test_a_thing_on_a_wall_of_a_closed_room_is_looked_at_from_inside_though_no_c
     poster = sheet((HALF - gap, 0, 1.2), (1, 2), (0.4, 0.3), 0.03)
     means = np.concatenate([poster, walls()])
     scene = Scene(name="room", gaussians=splat(means), up=UP)
-    assert scene.gaussians is not None
     target = target_of("poster", scene.gaussians, np.arange(len(poster)))
     chosen = choose_views(scene, [target], replace(SHELLS, candidates=32, count=6))
     inside = (np.abs(chosen.cameras.centers[:, :2]) < HALF).all(axis=1)
@@ -156,7 +148,6 @@ def test_clearance_of_each_view_is_told() -> None:
     inner = np.array([HALF, HALF, HEIGHT])
     for center, each in zip(chosen.cameras.centers, chosen.chosen, strict=True):
         walls_ = np.minimum(inner - center, center + np.array([HALF, HALF, 0])).min()
-        assert each.clearance is not None
         assert 0 < each.clearance <= walls_
 
 
@@ -176,7 +167,6 @@ def test_uniform_frames_are_evenly_spread_and_need_no_target() -> None:
     assert [each.frame for each in blank.chosen] == [0, 4, 7, 11]
     assert [each.frame for each in judged.chosen] == [0, 4, 7, 11]
     assert all(each.target_scores == () and each.covered is None and each.gain is None for each in blank.chosen)
-    assert judged.chosen[-1].covered is not None
     # All that any of them sees, as well as any sees it: but for the cube's lower face.
     assert judged.chosen[-1].covered > 0.8
 
@@ -184,40 +174,36 @@ def test_uniform_frames_are_evenly_spread_and_need_no_target() -> None:
 def test_more_candidates_never_leave_less_to_choose_from_than_are_asked_for() -> None:
     scene, target = cube_in_room()
     for source in ("frames", "shells", "both"):
-        chosen = choose_views(scene, [target], replace(SHELLS, source=source))  # type: ignore[arg-type]
+        chosen = choose_views(scene, [target], replace(SHELLS, source=source))
         assert len(chosen) == 6
         assert chosen.judged <= 16
         names = [each.name for each in chosen.chosen]
         assert len(set(names)) == 6
         covered = [each.covered for each in chosen.chosen]
-        assert covered == sorted(covered)  # type: ignore[type-var]
+        assert covered == sorted(covered)
         assert all((each.frame is None) == each.name.startswith("around cube") for each in chosen.chosen)
-
-
-def test_up_is_the_scenes_or_what_its_cameras_agree_on() -> None:
-    scene, _ = cube_in_room()
-    assert up_of(scene) is scene.up
-    unknown = up_of(replace(scene, up=None))
-    assert unknown is not None
-    assert unknown @ UP > 0.99
-    assert up_of(replace(scene, up=None, views=None)) is None
 
 
 def test_a_splat_without_cameras_has_views_around_its_target() -> None:
     scene, target = cube_in_room()
+    # Up is the scene's, or what its cameras agree on.
+    assert up_of(scene) is scene.up
+    assert up_of(replace(scene, up=None)) @ UP > 0.99
     bare = replace(scene, views=None, up=None)
+    assert up_of(bare) is None
     assert len(choose_views(bare, [target], replace(SHELLS, source="both"))) == 6
 
 
 def test_what_cannot_be_looked_at_is_said(rng: np.random.Generator) -> None:
     scene, target = cube_in_room()
-    assert scene.gaussians is not None
     with pytest.raises(InputError, match="nothing to look at"):
         choose_views(scene, [], SHELLS)
     with pytest.raises(InputError, match="'cube' has Gaussians beyond the 200 of the splat"):
         choose_views(replace(scene, gaussians=scene.gaussians.select(np.arange(200))), [target], SHELLS)
     with pytest.raises(InputError, match="has no Gaussians to look at"):
         target_of("nothing", scene.gaussians, np.zeros(0, np.int64))
+    with pytest.raises(InputError, match="source: expected frames or both with method=uniform"):
+        ViewsConfig(method="uniform", source="shells")
     bare = replace(scene, views=None)
     with pytest.raises(InputError, match="has no cameras; use choose.source=shells"):
         choose_views(bare, [target], replace(SHELLS, source="frames"))
@@ -225,7 +211,6 @@ def test_what_cannot_be_looked_at_is_said(rng: np.random.Generator) -> None:
         choose_views(replace(scene, gaussians=None), [target], SHELLS)
     # A cube in a closed box that leaves no place to see it from.
     closed, rows = room(cube((0.3, 0.2, 0.8), half=CUBE + 0.3, step=0.06))
-    assert closed.gaussians is not None
     with (
         pytest.warns(SceneWarning, match="no room for a camera around cube"),
         pytest.raises(InputError, match="no room for a camera around cube"),
@@ -240,33 +225,8 @@ def test_what_cannot_be_looked_at_is_said(rng: np.random.Generator) -> None:
     assert all(each.frame is not None for each in frames.chosen)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"count": 0},
-        {"count": 4097},
-        {"candidates": 0},
-        {"width": 0},
-        {"fov": 0.5},
-        {"judged_side": 4},
-        {"judged_side": 2048},
-        {"fov": 170.0},
-        {"candidates": 5000},
-        {"cover_weight": 1e300},
-        {"method": "uniform", "source": "shells"},
-        {"least_share": 0.7},
-        {"cover_weight": -1.0},
-        {"spread_weight": float("inf")},
-    ],
-)
-def test_settings_that_make_no_sense_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(InputError, match="expected"):
-        ViewsConfig(**wrong)  # type: ignore[arg-type]
-
-
 def test_single_gaussians_and_unequal_pictures_can_be_looked_at() -> None:
     scene, _ = cube_in_room()
-    assert scene.gaussians is not None
     point = target_of("point", scene.gaussians, np.array([7]))
     chosen = choose_views(scene, [point], replace(SHELLS, candidates=8, count=1, width=31, height=77))
     assert (chosen.cameras.widths == 31).all()
@@ -285,10 +245,9 @@ def test_pictures_and_the_sheet_are_of_the_chosen_cameras() -> None:
 
 def test_opacity_zero_and_huge_gaussians_break_nothing() -> None:
     scene, target = cube_in_room()
-    assert scene.gaussians is not None
     g = scene.gaussians
     scales, opacities = g.scales.copy(), g.opacities.copy()
     scales[-3:], opacities[-50:] = 1e4, 0.0
     odd = Gaussians(means=g.means, quats=g.quats, scales=scales, opacities=opacities, sh=g.sh)
     chosen = choose_views(replace(scene, gaussians=odd), [target], SHELLS)
-    assert all(np.isfinite(each.gain) for each in chosen.chosen)  # type: ignore[arg-type]
+    assert all(np.isfinite(each.gain) for each in chosen.chosen)

@@ -24,14 +24,13 @@ SHELLS = ViewsConfig(source="shells", count=4, width=160, height=120)
 
 def test_seconds_are_kept_and_more_of_them_never_judge_fewer_candidates(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, rows = room(step=0.12)
-    assert scene.gaussians is not None
-    target, now, judge = target_of("cube", scene.gaussians, rows), [0.0], module.judge_candidates
+    target, now, score = target_of("cube", scene.gaussians, rows), [0.0], module.score_candidates
 
-    def judged(*arguments: Any) -> Any:
-        now[0] += arguments[-1].candidates
-        return judge(*arguments)
+    def scored(*arguments: Any) -> Any:
+        now[0] += arguments[2].candidates
+        return score(*arguments)
 
-    monkeypatch.setattr(module, "judge_candidates", judged)
+    monkeypatch.setattr(module, "score_candidates", scored)
     numbers = []
     for seconds in (4.0, 12.0, 30.0, 60.0):
         begun = now[0]
@@ -60,7 +59,7 @@ def test_what_a_budget_chooses_and_what_it_cannot_are_refused() -> None:
     for name in ("width", "height", "frame_side"):
         with pytest.raises(InputError, match=f"^choose.{name}=300: is chosen by budget.megabytes"):
             check_views_budget(ViewsBudget(megabytes=2.0), ViewsConfig(**{name: 300}))
-    # What a limit does not choose can be set beside it.
+    # Beside a limit that does not choose it an option can be set.
     check_views_budget(ViewsBudget(error=0.1, seconds=3.0), ViewsConfig(candidates=16, width=300))
     check_views_budget(ViewsBudget(megabytes=2.0), ViewsConfig(candidates=16, count=4))
     check_views_budget(ViewsBudget(), ViewsConfig(method="uniform", candidates=16))
@@ -68,7 +67,6 @@ def test_what_a_budget_chooses_and_what_it_cannot_are_refused() -> None:
 
 def test_as_many_candidates_are_judged_as_views_are_asked_for_with_a_budget_and_without() -> None:
     scene, rows = room(step=0.12)
-    assert scene.gaussians is not None
     target = target_of("cube", scene.gaussians, rows)
     config = ViewsConfig(source="shells", count=12, candidates=8, judged_side=40, width=160, height=120)
     assert choose_views(scene, [target], config).judged == 12
@@ -79,8 +77,6 @@ def test_as_many_candidates_are_judged_as_views_are_asked_for_with_a_budget_and_
 
 def test_frames_that_are_all_judged_are_the_candidates_that_are_reported() -> None:
     scene, rows = room(step=0.12)
-    assert scene.gaussians is not None
-    assert scene.views is not None
     target = target_of("cube", scene.gaussians, rows)
     few = replace(scene, views=scene.views.select([0, 3, 6]))
     config = ViewsConfig(source="frames", count=2, judged_side=40)

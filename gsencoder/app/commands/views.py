@@ -1,6 +1,5 @@
 """`gsencoder views FEATURES query=…`: renders of the views that show best what a word stands for, with their scores."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from gsencoder.core.settings import option
 from gsencoder.data.scenes import SceneConfig
 from gsencoder.fusion.folder import check_heads_space
 from gsencoder.fusion.measured_heads import find_head, head_space, head_tokens
-from gsencoder.infer.draw import Picture
 from gsencoder.infer.localize import (
     LocalizeConfig,
     box_to_json,
@@ -26,13 +24,7 @@ from gsencoder.infer.localize import (
     select_features,
     words_to_json,
 )
-from gsencoder.infer.views.budget import (
-    BudgetViews,
-    ViewsBudget,
-    check_views_budget,
-    choose_views_within,
-    pictures_within,
-)
+from gsencoder.infer.views.budget import ViewsBudget, check_views_budget, choose_views_within
 from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.pictures import (
     SHEET,
@@ -49,51 +41,6 @@ from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, best_box
 from gsencoder.render import BlendConfig
 from gsencoder.text.vocabulary import TableTextConfig, TextConfig
 from gsencoder.types import Box, Scene
-
-
-def choose_in_budget(
-    scene: Scene, targets: Sequence[Target], config: "ViewsCommandConfig", run: Run
-) -> tuple[BudgetViews, ViewSet, list[Picture]]:
-    """Chooses views and the sizes of their pictures; says which they are, and what is predicted of them.
-
-    Returns:
-        The choice, the views that are kept of it, and their pictures; none where megabytes are not limited.
-    """
-    budget = config.budget
-    with run.step("choose"):
-        choice = choose_views_within(scene, targets, config.choose, budget)
-    views, pictures = choice.views, list[Picture]()
-    chosen, predicted, notes = dict(choice.chosen), dict(choice.predicted), choice.notes
-    if budget.megabytes is not None:
-        with run.step("render"):
-            sized = pictures_within(scene, views, budget)
-        views, pictures = sized.views, sized.pictures
-        predicted["megabytes"] = sized.predicted
-        chosen |= {"count": len(views), "side": sized.side}
-        notes += sized.notes
-    report_choice(run, scene.name, chosen, predicted=predicted, notes=notes, quiet=config.quiet)
-    return choice, views, pictures
-
-
-def report_views(
-    choice: BudgetViews,
-    scene: Scene,
-    targets: Sequence[Target],
-    views: ViewSet,
-    files: Sequence[Path],
-    config: "ViewsCommandConfig",
-    run: Run,
-) -> list[str]:
-    """Measures what is limited, of views that were kept and their pictures; returns a line for each limit, and warns of
-    those that are broken."""
-    budget = config.budget
-    measured = {"seconds": choice.seconds, "megabytes": sum(file.stat().st_size for file in files) / MEGABYTE}
-    if budget.error is not None and budget.check:
-        with run.step("check"):
-            side = int(max(views.cameras.widths.max(), views.cameras.heights.max()))
-            measured["error"] = choice.realised_error(scene, targets, largest_side=side)
-    return report_budget(run, budget, measured)
-
 
 VIEWS, TOKENS = "views.json", "tokens.safetensors"
 
@@ -152,12 +99,17 @@ def run(config: ViewsCommandConfig, run: Run) -> None:
             raise InputError(f"views: none of the words has a box in scene {scene.name}: {listing}")
         boxes = best_boxes(localization, config.boxes)
         run.results.update(boxes=[box_to_json(box) for box in boxes], words=words_to_json(localization))
-    choice, pictures, lines = None, list[Picture](), list[str]()
-    if config.budget.limits:
-        choice, views, pictures = choose_in_budget(scene, targets, config, run)
-    else:
-        with run.step("choose"):
+    budget, choice, pictures, lines = config.budget, None, None, list[str]()
+    with run.step("choose"):
+        if budget.limits:
+            choice = choose_views_within(scene, targets, config.choose, budget)
+            views, pictures = choice.views, choice.pictures
+        else:
             views = choose_views(scene, targets, config.choose)
+    if choice is not None:
+        report_choice(
+            run, scene.name, choice.chosen, predicted=choice.predicted, notes=choice.notes, quiet=config.quiet
+        )
     out = run.out(scene.name, "views")
     rows = views_to_json(scene, views)
     run.results.update(views=rows, judged=views.judged)
@@ -169,8 +121,13 @@ def run(config: ViewsCommandConfig, run: Run) -> None:
             with run.step("tokens"):
                 write_tokens(target / TOKENS, scene, views, config)
         if choice is not None:
-            files = [target / row["picture"] for row in rows]
-            lines = report_views(choice, scene, targets, views, files, config, run)
+            size = sum((target / row["picture"]).stat().st_size for row in rows)
+            measured = {"seconds": choice.seconds, "megabytes": size / MEGABYTE}
+            if budget.error is not None and budget.check:
+                with run.step("check"):
+                    assert scene.gaussians is not None
+                    measured["error"] = choice.realised_error(scene.gaussians, targets)
+            lines = report_budget(run, budget, measured)
     run.print(*(f"{word}: {text}" for word, text in absent.items()))
     run.print(*(f"{number:2d}  {describe_view(each)}" for number, each in enumerate(views.chosen)))
     run.print(*(f"{out}: {line}" for line in lines))

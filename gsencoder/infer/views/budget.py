@@ -29,137 +29,12 @@ from gsencoder.core.files import picture_bytes
 from gsencoder.core.settings import option, shown_value
 from gsencoder.infer.draw import Picture
 from gsencoder.infer.views.candidates import FreeSpace
-from gsencoder.infer.views.choose import Judged, Picked, checked_gaussians, chosen_views, judge_candidates
+from gsencoder.infer.views.choose import Candidates, CoverageObjective, greedy_order, score_candidates, view_set
 from gsencoder.infer.views.pictures import SUFFIX, view_pictures
 from gsencoder.infer.views.scores import ViewScores, coverage
 from gsencoder.infer.views.targets import CONSTANTS, Target, ViewsConfig, ViewSet
 from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene
-
-Window = tuple[int, int, int, int]
-"""Left, upper, right and lower edge in pixels; the last two are not part of it."""
-
-
-def order_by_error(scores: Sequence[ViewScores]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Candidates in the order in which each leaves least unseen beside those before it, and by how much each lowers the
-    error. Ties go to the first candidate; those that show nothing more are left out, except the first.
-
-    Args:
-        scores: of each target.
-    """
-    shown = [coverage(each.target) for each in scores]
-    # Weights in the mean over the Gaussians of a target that any candidate shows, and over targets.
-    counts = [max(int(np.count_nonzero(each.any(axis=0))), 1) for each in shown]
-    parts = [each / (count * len(shown)) for each, count in zip(shown, counts, strict=True)]
-    best = [np.zeros(each.shape[1]) for each in parts]
-    order: list[int] = []
-    gains: list[float] = []
-    for _ in range(len(parts[0])):
-        gain = np.sum(
-            [np.maximum(part - level, 0).sum(axis=1) for part, level in zip(parts, best, strict=True)], axis=0
-        )
-        view = int(gain.argmax())
-        if order and gain[view] <= 0:
-            break
-        order.append(view)
-        gains.append(float(gain[view]))
-        best = [np.maximum(level, part[view]) for part, level in zip(parts, best, strict=True)]
-    return np.array(order, np.int64), np.array(gains)
-
-
-def errors_after(gains: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
-    """The errors of the first one, two, … candidates of an order by what each lowers it; the last is exactly 0."""
-    return np.append(np.cumsum(gains[:0:-1])[::-1], 0.0)
-
-
-def fewest_views(scores: Sequence[ViewScores], budget: Budget) -> tuple[Picked, Choice[int]]:
-    """The fewest candidates that keep a limit of error in all likelihood, and their number with its error by the small
-    renders. The order is that of any error, so that a looser one never takes more views.
-
-    Args:
-        scores: of each target.
-    """
-    order, gains = order_by_error(scores)
-    errors = errors_after(gains)
-    # Small renders err, and of targets of few Gaussians, which are few pixels, they err most.
-    seen = [max(int(np.count_nonzero(each.target.any(axis=0))), 1) for each in scores]
-    margin = CONSTANTS.unsure_gaussians * float(np.mean(1 / np.array(seen)))
-
-    def measure(count: int) -> Estimate:
-        error = float(errors[count - 1])
-        return Estimate(error=error, bound=CONSTANTS.error_safety * error + margin)
-
-    choice = choose(range(1, len(order) + 1), measure, budget)
-    return Picked(order[: choice.setting], gains[: choice.setting]), choice
-
-
-def measured_errors(
-    gaussians: Gaussians,
-    targets: Sequence[Target],
-    cameras: Cameras,
-    choices: Sequence[Int64[np.ndarray, " n"]],
-    *,
-    config: BlendConfig = BlendConfig(),
-) -> tuple[float, ...]:
-    """The errors of choices of views over all Gaussians of the targets, by renders at the cameras' sizes.
-
-    Args:
-        cameras: of all candidates, in the sizes of their pictures.
-        choices: which of them are chosen, once or several times.
-    """
-    most = [np.zeros(len(target.rows)) for target in targets]
-    most_chosen = [[np.zeros(len(target.rows)) for target in targets] for _ in choices]
-    together = gaussians.select(np.unique(np.concatenate([target.rows for target in targets])))
-    for view in range(len(cameras)):
-        window = _window_around(together, cameras, view, config.near)
-        if window is None:
-            continue
-        weights = _weights_in_window(gaussians, cameras, view, window, config)
-        for levels in (most, *(each for each, chosen in zip(most_chosen, choices, strict=True) if view in chosen)):
-            for target, level in zip(targets, levels, strict=True):
-                np.maximum(level, weights[target.rows], out=level)
-    return tuple(float(np.mean(list(map(_unseen, most, each)))) for each in most_chosen)
-
-
-def _unseen(most: Float64[np.ndarray, " n"], chosen: Float64[np.ndarray, " n"]) -> float:
-    """Mean share that is left unseen, over what any candidate shows; 0 where that is nothing."""
-    seen = most > 0
-    return float(1 - (chosen[seen] / most[seen]).mean()) if seen.any() else 0.0
-
-
-def _window_around(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> Window | None:
-    """The part of a picture that Gaussians may reach into; None where they do not."""
-    means = gaussians.means.astype(np.float64)
-    pixels, depths = cameras.project(means, view, min_depth=near)
-    reach = CONSTANTS.window_sigmas * gaussians.scales.max(axis=1).astype(np.float64)
-    front = depths + reach > near
-    if not front.any():
-        return None
-    size = np.array([cameras.widths[view], cameras.heights[view]])
-    radii = (reach * float(np.diag(cameras.Ks[view])[:2].max()) / np.maximum(depths, near) + 2)[front, None]
-    low = np.clip(np.floor((pixels[front] - radii).min(axis=0)), 0, size).astype(int)
-    high = np.clip(np.ceil((pixels[front] + radii).max(axis=0)), 0, size).astype(int)
-    if (high <= low).any():
-        return None
-    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
-
-
-def _weights_in_window(
-    gaussians: Gaussians, cameras: Cameras, view: int, window: Window, config: BlendConfig
-) -> Float64[np.ndarray, " N"]:
-    """The weight of each Gaussian in a window of a picture, as a share of a square of the picture's longer side."""
-    left, upper, right, lower = window
-    # A blend takes its rays from a map: one through the center of each pixel.
-    cells = np.zeros((lower - upper, right - left, 1), np.float32)
-    like = FeatureMap(
-        grid_from_image=np.array([[1.0, 0, -left], [0, 1, -upper]]),
-        space=FeatureSpace(name="pixels", channels=1),
-        features=cells,
-    )
-    b = blend(gaussians, cameras, view, like=like, config=replace(config, rays_per_patch=1))
-    weights = np.bincount(b.col.numpy(), b.weight.numpy(), minlength=len(gaussians))
-    return np.asarray(weights / float(max(cameras.widths[view], cameras.heights[view])) ** 2)
-
 
 OPTIONS_SET_BY_BUDGET: Mapping[str, tuple[str, ...]] = {
     "error": ("count",),
@@ -169,6 +44,10 @@ OPTIONS_SET_BY_BUDGET: Mapping[str, tuple[str, ...]] = {
 """Beside a limit of error, seconds set nothing: it is one about what `choose.candidates` show, which are all judged."""
 CANDIDATES = (8, 12, 16, 24, 32, 48, 64)
 """Numbers that are chosen among; the last is that of preset=exact. The first is judged in any case, and timed."""
+SAMPLED = 2
+"""Pictures that are rendered to predict the bytes of all, those that grow most."""
+RATIO = 1.05
+"""Of one side of pictures to the next smaller one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,49 +73,8 @@ class ViewsBudget(Budget):
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BudgetViews:
-    """Views that were chosen within a budget.
-
-    Attributes:
-        picked: which of the candidates they are, with a limit of error.
-        cameras: of all candidates, which may be fewer than there was time for where the scene has no more.
-        chosen: values that were chosen, by name.
-        predicted: by limit.
-        seconds: from the beginning to the choice.
-        notes: warnings about limits that are expected to be broken.
-    """
-
-    views: ViewSet
-    picked: Picked | None
-    cameras: Cameras
-    chosen: Mapping[str, int]
-    predicted: Mapping[str, float]
-    seconds: float
-    notes: tuple[str, ...]
-
-    def realised_error(self, scene: Scene, targets: Sequence[Target], *, largest_side: int) -> float:
-        """The error of the chosen views at the size of their pictures, over all Gaussians of the targets.
-
-        Args:
-            largest_side: of the pictures, pixels; candidates are compared in no larger ones.
-        """
-        assert scene.gaussians is not None
-        assert self.picked is not None
-        config = BlendConfig()
-        (error,) = measured_errors(
-            scene.gaussians,
-            targets,
-            self.cameras.resized(largest_side, enlarge=False),
-            [self.picked.order],
-            config=replace(config, near=min(config.near, self.views.near)),
-        )
-        return error
-
-
 def check_views_budget(budget: ViewsBudget, config: ViewsConfig) -> None:
-    """Refuses what a budget cannot be combined with: options that it chooses, and views that are not chosen from
-    candidates."""
+    """Refuses options that a budget chooses, and views that are not chosen from candidates."""
     for name in budget.limits:
         if name != "seconds" or budget.error is None:
             reject_options_set_by_budget(budget, config, ViewsConfig(), OPTIONS_SET_BY_BUDGET[name], "choose")
@@ -247,6 +85,37 @@ def check_views_budget(budget: ViewsBudget, config: ViewsConfig) -> None:
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class BudgetViews:
+    """Views that were chosen within a budget.
+
+    Attributes:
+        candidates: may be fewer than there was time for where the scene has no more.
+        pictures: of the views, with a limit of megabytes.
+        order: which candidates the views are, with a limit of error.
+        chosen: values that were chosen, by name.
+        predicted: by limit.
+        seconds: from the beginning to the choice, without the pictures.
+        notes: warnings about limits that are expected to be broken.
+    """
+
+    views: ViewSet
+    candidates: Candidates
+    pictures: list[Picture] | None = None
+    order: Int64[np.ndarray, " n"] | None = None
+    chosen: Mapping[str, int]
+    predicted: Mapping[str, float]
+    seconds: float
+    notes: tuple[str, ...]
+
+    def realised_error(self, gaussians: Gaussians, targets: Sequence[Target]) -> float:
+        """The error of the chosen views at the size of their pictures, over all Gaussians of the targets."""
+        assert self.order is not None
+        side = longest_side(self.views)
+        cameras = self.candidates.cameras.resized(side, enlarge=False)
+        return measured_errors(gaussians, targets, cameras, [self.order], near=self.views.near)[0]
+
+
 def choose_views_within(
     scene: Scene,
     targets: Sequence[Target],
@@ -255,84 +124,174 @@ def choose_views_within(
     *,
     clock: Callable[[], float] = time.perf_counter,
 ) -> BudgetViews:
-    """The views that show targets best, of as many candidates as can be judged in time; or the fewest that keep an
-    error. A limit of megabytes chooses nothing here.
+    """The views that show targets best, of as many candidates as can be judged in time, or the fewest that keep an
+    error; and their pictures, as large as megabytes allow.
 
     Args:
-        scene: see `choose_views`.
-        targets: see `choose_views`.
         config: options that the budget does not choose.
     """
     check_views_budget(budget, config)
     check_any_limit(budget)
     start = clock()
-    gaussians = checked_gaussians(scene, targets, config)
-    free = FreeSpace(gaussians)
-
-    def judged(number: int) -> Judged:
-        return judge_candidates(scene, gaussians, targets, free, replace(config, candidates=number))
-
-    picked, choice, chosen = None, Choice(setting=config.candidates, estimate=Estimate()), dict[str, int]()
-    if budget.error is not None:
-        judgment = judged(config.candidates)
-        picked, choice = fewest_views(judgment.scores, replace(budget, seconds=None, megabytes=None))
-        chosen["count"] = choice.setting
-    elif budget.seconds is not None:
+    free = FreeSpace(scene.gaussians) if scene.gaussians is not None else None
+    chosen: dict[str, int] = {}
+    predicted: dict[str, float] = {}
+    notes: tuple[str, ...] = ()
+    order, gains = None, None
+    if budget.error is None and budget.seconds is not None:
         numbers = sorted({max(number, config.count, len(targets)) for number in CANDIDATES})
         begun = clock()
-        judgment, least = judged(numbers[0]), numbers[0]
-        each, spent = (clock() - begun) / least, clock() - start
+        candidates = score_candidates(scene, targets, replace(config, candidates=numbers[0]), free)
+        each, spent = (clock() - begun) / numbers[0], clock() - start
 
         def measure(number: int) -> Estimate:
             # Placing candidates takes some of that time whatever their number, so that this is on the safe side.
-            return Estimate(seconds=spent + number * each if number > least else spent)
+            return Estimate(seconds=spent + number * each if number > numbers[0] else spent)
 
         choice = choose(numbers, measure, replace(budget, megabytes=None))
-        if choice.setting > least:
-            judgment = judged(choice.setting)
-        chosen["candidates"] = len(judgment.candidates.cameras)
+        if choice.setting > numbers[0]:
+            candidates = score_candidates(scene, targets, replace(config, candidates=choice.setting), free)
+        predicted["seconds"], notes = choice.estimate.seconds, choice.notes
+        chosen["candidates"] = len(candidates.cameras)
     else:
-        judgment = judged(config.candidates)
-    views = chosen_views(scene, targets, judgment, free, config, picked=picked)
-    seconds, notes = clock() - start, choice.notes
+        candidates = score_candidates(scene, targets, config, free)
+    objective = CoverageObjective(candidates.cameras, targets, candidates.scores, config.count)
+    if budget.error is not None:
+        fewest, gains = fewest_views(candidates.scores, budget)
+        order = fewest.setting
+        chosen["count"], predicted["error"] = len(order), fewest.estimate.error
+        views = view_set(targets, candidates, objective, order, gains)
+    else:
+        views = view_set(targets, candidates, objective, *objective.greedy(config.count))
+    seconds = clock() - start
     if budget.error is not None and budget.seconds is not None and seconds > budget.seconds:
         notes = (budget.conflict("seconds", seconds),)
+    pictures = None
+    if budget.megabytes is not None:
+        views, pictures, predicted["megabytes"], note = pictures_within(scene, views, budget)
+        chosen |= {"count": len(views), "side": longest_side(views)}
+        notes += note
     return BudgetViews(
         views=views,
-        picked=picked,
-        cameras=judgment.candidates.cameras,
+        candidates=candidates,
+        pictures=pictures,
+        order=order,
         chosen=chosen,
-        predicted={"error": choice.estimate.error, "seconds": choice.estimate.seconds},
+        predicted=predicted,
         seconds=seconds,
         notes=notes,
     )
 
 
-SAMPLED = 2
-"""Pictures that are rendered to predict the bytes of all, those that grow most."""
-RATIO = 1.05
-"""Of one side of pictures to the next smaller one."""
+def order_by_error(scores: Sequence[ViewScores]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    """Candidates in the order in which each leaves least unseen beside those before it, and by how much each lowers the
+    error; those that show nothing more are left out, except the first.
 
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SizedPictures:
-    """Views whose pictures fit into a budget of megabytes.
-
-    Attributes:
-        views: with cameras in the sizes of the pictures; fewer than there were where not all fit.
-        side: largest longer side, pixels.
-        predicted: megabytes.
-        notes: warnings about a limit that is broken, or views that are left out.
+    Args:
+        scores: of each target.
     """
+    parts = []
+    for each in scores:
+        # Only Gaussians that any candidate shows count.
+        shown = max(int(np.count_nonzero(each.target.any(axis=0))), 1)
+        parts.append((each.target.shape[1] / (shown * len(scores)), coverage(each.target)))
+    count = len(scores[0].target)
+    return greedy_order(parts, np.zeros(count), count)
 
-    views: ViewSet
-    pictures: list[Picture]
-    side: int
-    predicted: float
-    notes: tuple[str, ...]
+
+def errors_after(gains: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
+    """The errors of the first one, two, … candidates of an order by what each lowers it; the last is exactly 0."""
+    return np.append(np.cumsum(gains[:0:-1])[::-1], 0.0)
 
 
-def pictures_within(scene: Scene, views: ViewSet, budget: ViewsBudget) -> SizedPictures:
+def fewest_views(
+    scores: Sequence[ViewScores], budget: ViewsBudget
+) -> tuple[Choice[Int64[np.ndarray, " n"]], Float64[np.ndarray, " n"]]:
+    """The fewest candidates that keep a limit of error in all likelihood, and by how much each lowers the error. The
+    order is that of any error, so that a looser one never takes more views.
+
+    Args:
+        scores: of each target.
+    """
+    order, gains = order_by_error(scores)
+    errors = errors_after(gains)
+    # Small renders err, and of targets of few Gaussians, which are few pixels, they err most.
+    seen = [max(int(np.count_nonzero(each.target.any(axis=0))), 1) for each in scores]
+    margin = CONSTANTS.unsure_gaussians * float(np.mean(1 / np.array(seen)))
+
+    def measure(chosen: Int64[np.ndarray, " n"]) -> Estimate:
+        error = float(errors[len(chosen) - 1])
+        return Estimate(error=error, bound=CONSTANTS.error_safety * error + margin)
+
+    choice = choose([order[: n + 1] for n in range(len(order))], measure, ViewsBudget(error=budget.error))
+    return choice, gains[: len(choice.setting)]
+
+
+def measured_errors(
+    gaussians: Gaussians,
+    targets: Sequence[Target],
+    cameras: Cameras,
+    choices: Sequence[Int64[np.ndarray, " n"]],
+    *,
+    near: float = BlendConfig().near,
+) -> tuple[float, ...]:
+    """The errors of choices of views over all Gaussians of the targets, by renders at the cameras' sizes.
+
+    Args:
+        cameras: of all candidates, in the sizes of their pictures.
+        choices: which of them are chosen, once or several times.
+        near: near plane, world units.
+    """
+    config = BlendConfig(rays_per_patch=1, near=min(BlendConfig().near, near))
+    most = [np.zeros(len(target.rows)) for target in targets]
+    most_chosen = [[np.zeros(len(target.rows)) for target in targets] for _ in choices]
+    together = gaussians.select(np.unique(np.concatenate([target.rows for target in targets])))
+    for view in range(len(cameras)):
+        if (window := _window_around(together, cameras, view, config.near)) is None:
+            continue
+        # Only the rays of a window are blended: one through the center of each pixel.
+        left, upper, right, lower = window
+        like = FeatureMap(
+            grid_from_image=np.array([[1.0, 0, -left], [0, 1, -upper]]),
+            space=FeatureSpace(name="pixels", channels=1),
+            features=np.zeros((lower - upper, right - left, 1), np.float32),
+        )
+        b = blend(gaussians, cameras, view, like=like, config=config)
+        area = float(max(cameras.widths[view], cameras.heights[view])) ** 2
+        weights = np.bincount(b.col.numpy(), b.weight.numpy(), minlength=len(gaussians)) / area
+        for levels in (most, *(each for each, chosen in zip(most_chosen, choices, strict=True) if view in chosen)):
+            for target, level in zip(targets, levels, strict=True):
+                np.maximum(level, weights[target.rows], out=level)
+    return tuple(float(np.mean(list(map(_unseen, most, each)))) for each in most_chosen)
+
+
+def _unseen(most: Float64[np.ndarray, " n"], chosen: Float64[np.ndarray, " n"]) -> float:
+    """Mean share that is left unseen, over what any candidate shows; 0 where that is nothing."""
+    seen = most > 0
+    return float(1 - (chosen[seen] / most[seen]).mean()) if seen.any() else 0.0
+
+
+def _window_around(gaussians: Gaussians, cameras: Cameras, view: int, near: float) -> tuple[int, ...] | None:
+    """Left, upper, right and lower edge of the part of a picture that Gaussians may reach into, pixels, the last two
+    exclusive; None where they reach into none."""
+    means = gaussians.means.astype(np.float64)
+    pixels, depths = cameras.project(means, view, min_depth=near)
+    reach = CONSTANTS.window_sigmas * gaussians.scales.max(axis=1).astype(np.float64)
+    front = depths + reach > near
+    if not front.any():
+        return None
+    size = np.array([cameras.widths[view], cameras.heights[view]])
+    radii = (reach * float(np.diag(cameras.Ks[view])[:2].max()) / np.maximum(depths, near) + 2)[front, None]
+    low = np.clip(np.floor((pixels[front] - radii).min(axis=0)), 0, size).astype(int)
+    high = np.clip(np.ceil((pixels[front] + radii).max(axis=0)), 0, size).astype(int)
+    if (high <= low).any():
+        return None
+    return (*low.tolist(), *high.tolist())
+
+
+def pictures_within(
+    scene: Scene, views: ViewSet, budget: ViewsBudget
+) -> tuple[ViewSet, list[Picture], float, tuple[str, ...]]:
     """The largest pictures of views whose files keep a limit of megabytes.
 
     All are encoded at the least side; by how much the bytes of larger ones grow a few tell. A side that takes more than
@@ -342,66 +301,60 @@ def pictures_within(scene: Scene, views: ViewSet, budget: ViewsBudget) -> SizedP
     Args:
         views: as chosen, in the sizes that their pictures would have without a budget.
 
+    Returns:
+        The views that are kept, with cameras in the sizes of the pictures; the pictures; the megabytes that were
+        predicted; and warnings about a limit that is broken, or views that are left out.
+
     Raises:
         InputError: no error is limited, and not even the first view fits at the least side.
     """
-    limit, largest = budget.limit("megabytes"), _longest(views)
+    limit, largest = budget.limit("megabytes"), longest_side(views)
     least = min(CONSTANTS.least_picture_side, largest)
     smallest = _resized(views, least)
     pictures, _ = view_pictures(scene, smallest)
     sizes = _megabytes(pictures)
     if sizes.sum() > limit:
-        return _least(scene, smallest, pictures, sizes, budget)
+        count, total = len(views), np.cumsum(sizes)
+        if budget.error is not None:
+            note = budget.conflict("megabytes", total[-1])
+        elif sizes[0] > limit:
+            raise InputError(
+                f"{budget.option('megabytes')}: one picture of {least} pixels in scene {scene.name} takes "
+                f"{math.ceil(1e5 * sizes[0]) / 1e5:.6g} MB; give more"
+            )
+        else:
+            count = int((total <= limit).sum())
+            note = (
+                f"{budget.option('megabytes')}: {count} of {counted(len(views), 'view')} fit in pictures of {least} "
+                f"pixels, the least; all take {shown_value(math.ceil(1e4 * total[-1]) / 1e4)} MB"
+            )
+        return _selected(smallest, np.arange(count)), pictures[:count], float(total[count - 1]), (note,)
     sample = np.argsort(-_pixels(views) / _pixels(smallest), kind="stable")[:SAMPLED]
-    sampled = replace(views, cameras=views.cameras.select(sample), chosen=tuple(views.chosen[row] for row in sample))
     sides = [least]
     while sides[-1] < largest:
         sides.append(min(largest, max(sides[-1] + 1, round(RATIO * sides[-1]))))
-    predicted = {least: float(sizes.sum())}
 
     def measure(side: int) -> Estimate:
-        if side not in predicted:
-            growth = _pixels(_resized(views, side)) / _pixels(smallest)
-            larger = sizes * growth
-            larger *= np.where(growth > 1, _megabytes(view_pictures(scene, _resized(sampled, side))[0]).sum(), 1)
-            larger /= np.where(growth > 1, (sizes * growth)[sample].sum(), 1)
-            predicted[side] = float(larger.sum())
-        return Estimate(megabytes=predicted[side])
+        """Bytes grow with pixels, times what they grow more or less by in the sample."""
+        if side == least:
+            return Estimate(megabytes=float(sizes.sum()))
+        sampled = _megabytes(view_pictures(scene, _resized(_selected(views, sample), side))[0])
+        growth = _pixels(_resized(views, side)) / _pixels(smallest)
+        correction = sampled.sum() / (sizes * growth)[sample].sum()
+        return Estimate(megabytes=float((sizes * growth * np.where(growth > 1, correction, 1)).sum()))
 
-    of_bytes = ViewsBudget(megabytes=limit)
     while True:
-        side = choose(sides, measure, of_bytes).setting
-        sized = _resized(views, side)
-        if side > least:
+        choice = choose(sides, measure, ViewsBudget(megabytes=limit))
+        sized = _resized(views, choice.setting)
+        if choice.setting > least:
             pictures, _ = view_pictures(scene, sized)
-        if side == least or _megabytes(pictures).sum() <= limit:
-            return SizedPictures(views=sized, pictures=pictures, side=side, predicted=predicted[side], notes=())
-        sides = sides[: sides.index(side)]
+        if choice.setting == least or _megabytes(pictures).sum() <= limit:
+            return sized, pictures, choice.estimate.megabytes, ()
+        sides = sides[: sides.index(choice.setting)]
 
 
-def _least(
-    scene: Scene, views: ViewSet, pictures: list[Picture], sizes: Float64[np.ndarray, " n"], budget: ViewsBudget
-) -> SizedPictures:
-    """Views whose pictures take too much at the least side: as many as fit, or all where an error is limited."""
-    total = np.cumsum(sizes)
-    side, count = _longest(views), len(views)
-    if budget.error is not None:
-        note = budget.conflict("megabytes", total[-1])
-    else:
-        count = int((total <= budget.limit("megabytes")).sum())
-        if count == 0:
-            raise InputError(
-                f"{budget.option('megabytes')}: one picture of {side} pixels in scene {scene.name} takes "
-                f"{math.ceil(1e5 * sizes[0]) / 1e5:.6g} MB; give more"
-            )
-        note = (
-            f"{budget.option('megabytes')}: {count} of {counted(len(views), 'view')} fit in pictures of {side} pixels, "
-            f"the least; all take {shown_value(math.ceil(1e4 * total[-1]) / 1e4)} MB"
-        )
-    kept = replace(views, cameras=views.cameras.select(slice(count)), chosen=views.chosen[:count])
-    return SizedPictures(
-        views=kept, pictures=pictures[:count], side=side, predicted=float(total[count - 1]), notes=(note,)
-    )
+def _selected(views: ViewSet, rows: Int64[np.ndarray, " n"]) -> ViewSet:
+    return replace(views, cameras=views.cameras.select(rows), chosen=tuple(views.chosen[row] for row in rows))
 
 
 def _resized(views: ViewSet, side: int) -> ViewSet:
@@ -409,7 +362,7 @@ def _resized(views: ViewSet, side: int) -> ViewSet:
     return replace(views, cameras=views.cameras.resized(side, enlarge=False))
 
 
-def _longest(views: ViewSet) -> int:
+def longest_side(views: ViewSet) -> int:
     return int(max(views.cameras.widths.max(), views.cameras.heights.max()))
 
 

@@ -1,13 +1,8 @@
-"""Candidate views of a target: the scene's own, close-ups, and cameras on shells in free space.
-
-Close-ups: windows of the scene's own photographs around a target.
-
-A photograph has far more pixels than a model is shown of it. A window of it shows a small thing as large as a camera
-near it would, and sharper than any render.
-"""
+"""Candidate views of a target: the scene's own frames, close-ups cut from their photographs, which show a small thing
+as large as a camera near it would and sharper than any render, and cameras on shells in free space."""
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
 
@@ -162,14 +157,12 @@ class FreeSpace:
         self._occupied = np.unique(self._cell_of[self._cell_of >= 0])
         self.observers: Cameras | None = None
         self._depths: list[Float32[np.ndarray, "h w"]] = []
-        # Shared by copies of this space: the same cameras tell of it for one target after the other.
-        self._depth_maps: dict[Hashable, Float32[np.ndarray, "h w"]] = {}
 
     def seen_by(self, cameras: Cameras, config: BlendConfig = BlendConfig()) -> "FreeSpace":
         """The same space, of which cameras tell what they looked through.
 
         Args:
-            cameras: in the same world; a depth map is rendered for each, once. None of them: nobody tells.
+            cameras: in the same world; a depth map is rendered for each. None of them: nobody tells.
             config: accuracy of the depth maps.
         """
         if not len(cameras):
@@ -182,11 +175,7 @@ class FreeSpace:
             # Rays that end nowhere have looked through nothing that is known.
             return torch.where(b.alpha >= CONSTANTS.min_depth_alpha, b.depth, 0.0).reshape(b.shape).float().numpy()
 
-        arrays = small.cam_from_world, small.Ks, small.widths, small.heights
-        keys = [(config, *(array[view].tobytes() for array in arrays)) for view in range(len(small))]
-        new = {key: view for view, key in enumerate(keys) if key not in self._depth_maps}
-        self._depth_maps.update(zip(new, parallel(depth_map, new.values()), strict=True))
-        other._depths = [self._depth_maps[key] for key in keys]
+        other._depths = list(parallel(depth_map, range(len(small))))
         return other
 
     def _codes(self, points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
@@ -288,7 +277,6 @@ def _rank_frames(
     rows = target.rows[even_indices(len(target.rows), CONSTANTS.frame_rays)]
     points = gaussians.means[rows].astype(np.float64)
     shown = np.full(len(cameras), -1.0)
-
     blocked = CONSTANTS.blocked_frame_weight
 
     def judge(views: Int64[np.ndarray, " n"]) -> None:
@@ -353,8 +341,6 @@ def shell_cameras(
     up: Float64[np.ndarray, "3"] | None = None,
     width: int = 640,
     height: int = 480,
-    fov_degrees: float = 60.0,
-    between: tuple[float, float] = (0.0, 1.0),
 ) -> Cameras:
     """Cameras around a target from which nothing stands between: SplatDistill sec. 3.4, "viewpoints around".
 
@@ -366,14 +352,13 @@ def shell_cameras(
     Args:
         width: of the pictures, pixels.
         height: of the pictures, pixels.
-        between: shares of the picture that the target is to fill at least, and at most.
 
     Returns:
         Cameras relative to the scene's origin; none where there is no room.
     """
-    focal = width / (2 * math.tan(math.radians(fov_degrees) / 2))
+    focal = width / (2 * math.tan(math.radians(CONSTANTS.fov_degrees) / 2))
     outward, vertical = spiral_directions(max(CONSTANTS.tried_directions * count, CONSTANTS.min_tried_directions), up)
-    preferred, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height, between)
+    preferred, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height)
     # Up to the first surface beyond the target itself and the cells of what it lies on, with room to stand before it.
     begins = reach + 2 * free.cell
     starts = target.center + begins[:, None] * outward
@@ -422,14 +407,13 @@ def _distances(
     focal: float,
     width: int,
     height: int,
-    between: tuple[float, float],
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Along each direction how far a camera should be, how far at least, and how far the target itself reaches."""
     rows = target.rows[even_indices(len(target.rows), CONSTANTS.outline_sample)]
     offsets = gaussians.means[rows].astype(np.float64) - target.center
     # A Gaussian fills a cell of its own size.
     margin = CONSTANTS.fill_margin
-    shares = np.clip(CONSTANTS.fill_shares, between[0] * margin, between[1] / margin)
+    shares = np.clip(CONSTANTS.fill_shares, CONSTANTS.least_share * margin, CONSTANTS.most_share / margin)
     cell = max(target.radius / CONSTANTS.outline_cells, 2 * float(np.median(gaussians.scales[rows].max(axis=1))))
     preferred, least, reach = (np.empty(len(outward)) for _ in range(3))
     for index, (right, down, direction) in enumerate(look_rotation(outward, vertical)):

@@ -66,7 +66,11 @@ def score_views(
 
     # Small views are rendered faster with one thread for each view than with all threads for one.
     per_view = parallel(one, range(len(cameras)))
-    return tuple(_stack_scores([each[index] for each in per_view]) for index in range(len(targets)))
+    names, scores = _TargetInView._fields, []
+    for seen in zip(*per_view, strict=True):
+        columns = dict(zip(names, map(np.array, zip(*seen, strict=True)), strict=True))
+        scores.append(ViewScores(**columns))
+    return tuple(scores)
 
 
 def replace_with_photographs(scores: ViewScores, photograph_at: Bool[np.ndarray, " V"]) -> ViewScores:
@@ -86,13 +90,6 @@ class _TargetInView(NamedTuple):
     blur: float
     target: Float32[np.ndarray, " n"]
     context: Float32[np.ndarray, " m"]
-
-
-def _stack_scores(seen: Sequence[_TargetInView]) -> ViewScores:
-    """All cameras' sight of one target."""
-    values = {name: np.array([getattr(each, name) for each in seen], np.float64) for name in _TargetInView._fields[:5]}
-    target, context = (np.stack([getattr(each, name) for each in seen]) for name in ("target", "context"))
-    return ViewScores(**values, target=target, context=context)
 
 
 class _TargetProbe:

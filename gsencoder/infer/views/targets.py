@@ -1,6 +1,5 @@
 """Targets of a choice of views: the Gaussians of boxes."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -8,6 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Integer
 
 from gsencoder.core.errors import InputError
+from gsencoder.core.settings import check_limits, option
 from gsencoder.render import BlendConfig
 from gsencoder.types import Box, Cameras, Gaussians, Localization
 
@@ -22,6 +22,10 @@ class ViewConstants:
     """
 
     # Targets (targets.py)
+    least_share: float = 0.05
+    """A target should fill this much of the picture …"""
+    most_share: float = 0.6
+    """… and no more than this."""
     point_radius_scales: float = 2.0
     """Smallest radius of a target, in median scales of its Gaussians: a single Gaussian is as large as it is drawn."""
 
@@ -69,6 +73,8 @@ class ViewConstants:
     """Depth at which a target around the camera is taken to lie, world units."""
 
     # Cameras on shells around a target
+    fov_degrees: float = 60.0
+    """Their horizontal field of view."""
     tried_directions: int = 8
     """Directions tried for each camera: many are blocked, or look at holes where nobody has been …"""
     min_tried_directions: int = 64
@@ -76,7 +82,7 @@ class ViewConstants:
     fill_shares: tuple[float, ...] = (0.30, 0.18, 0.10)
     """Shares of the picture that the target fills, by turns from direction to direction …"""
     fill_margin: float = 1.5
-    """… kept by this factor above `ViewsConfig.least_share` and below `most_share`: outlines are counted in cells."""
+    """… kept by this factor above `least_share` and below `most_share`: outlines are counted in cells."""
     max_fill_share: float = 0.5
     """A camera comes no nearer than where the target fills this share."""
     thin_fill_share: float = 0.08
@@ -127,7 +133,13 @@ class ViewConstants:
     least_picture_side: int = 224
     """Pictures are made no smaller by a budget, longer side, pixels: the input of the smallest common vision towers."""
 
-    # Utility of a view and of a set of views (utility.py, choose.py)
+    # Utility of a view and of a set of views (choose.py)
+    cover_weight: float = 0.3
+    """What seeing all of a target is worth."""
+    context_weight: float = 0.1
+    """What seeing its surroundings is worth."""
+    spread_weight: float = 0.2
+    """What seeing it from many directions is worth."""
     half_blur: float = 0.04
     """Standard deviation of the target's Gaussians, as a share of the picture's longer side, that halves a view's
     utility."""
@@ -175,104 +187,54 @@ def target_of(name: str, gaussians: Gaussians, rows: Integer[np.ndarray, " n"]) 
 
 
 def best_boxes(localization: Localization, per_word: int) -> tuple[Box, ...]:
-    """So many boxes of each word, best first within it."""
+    """The first boxes of each word, best first."""
     return tuple(box for box in localization.boxes if box.rank < per_word)
 
 
 def targets_of(gaussians: Gaussians, localization: Localization, per_word: int = 1) -> tuple[Target, ...]:
-    """The best boxes of each word as targets; words without a box give none.
-
-    Args:
-        localization: relevancy and boxes of the words.
-        per_word: boxes taken of each word, best first.
-    """
+    """The best boxes of each word as targets; words without a box give none."""
     boxes = best_boxes(localization, per_word)
     names = [box.query if box.rank == 0 else f"{box.query} {box.rank + 1}" for box in boxes]
     return tuple(target_of(name, gaussians, box.rows) for name, box in zip(names, boxes, strict=True))
 
 
-def check_targets(targets: Sequence[Target], gaussians: Gaussians) -> None:
-    """Complains about targets of another splat."""
-    if not targets:
-        raise InputError("views: there is nothing to look at; give one target or more")
-    for target in targets:
-        if target.rows.min() < 0 or target.rows.max() >= len(gaussians):
-            raise InputError(f"views: {target.name!r} has Gaussians beyond the {len(gaussians):,} of the splat")
-
-
 MAX_CANDIDATES = 4096
 MAX_PIXELS = 8192
-MAX_WEIGHT = 1e6
-MAX_FOV = 120.0
-"""Gaussians are projected as if the picture were flat around each; degrees up to which that looks right."""
-JUDGED_SIDES = (40, 1024)
-"""Smaller pictures show small targets too large, because no Gaussian is drawn smaller than a pixel; larger ones cost
-gigabytes and tell no more."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ViewsConfig:
     """How views are found and chosen."""
 
-    source: Literal["both", "frames", "shells"] = field(
-        default="both", metadata={"help": "the scene's own cameras, cameras around the targets, or up to half of each"}
+    source: Literal["both", "frames", "shells"] = option(
+        "both", "the scene's own cameras, cameras around the targets, or up to half of each"
     )
-    method: Literal["greedy", "uniform"] = field(
-        default="greedy", metadata={"help": "the best by what they show, or evenly spread frames (the baseline)"}
+    method: Literal["greedy", "uniform"] = option(
+        "greedy", "the best by what they show, or evenly spread frames (the baseline)"
     )
-    count: int = field(default=8, metadata={"help": "views chosen"})
-    candidates: int = field(
-        default=32,
-        metadata={
-            "help": "views judged (at least count, and one for each target); the paper's table has 16, 32 and 64"
-        },
+    count: int = option(8, "views chosen", ge=1, le=MAX_CANDIDATES)
+    candidates: int = option(
+        32,
+        "views judged (at least count, and one for each target); the paper's table has 16, 32 and 64",
+        ge=1,
+        le=MAX_CANDIDATES,
     )
-    width: int = field(default=640, metadata={"help": "of the pictures around targets, pixels"})
-    height: int = field(default=480, metadata={"help": "of the pictures around targets, pixels"})
-    fov: float = field(default=60.0, metadata={"help": "their horizontal field of view, degrees"})
-    frame_side: int = field(
-        default=1024, metadata={"help": "frames are shown no larger than this, longer side, pixels"}
-    )
-    judged_side: int = field(default=160, metadata={"help": "longer side of the renders that candidates are judged by"})
-    least_share: float = field(default=0.05, metadata={"help": "a target should fill this much of the picture …"})
-    most_share: float = field(default=0.6, metadata={"help": "… and no more than this"})
-    cover_weight: float = field(default=0.3, metadata={"help": "what seeing all of a target is worth"})
-    context_weight: float = field(default=0.1, metadata={"help": "what seeing its surroundings is worth"})
-    spread_weight: float = field(default=0.2, metadata={"help": "what seeing it from many directions is worth"})
+    width: int = option(640, "of the pictures around targets, pixels", ge=1, le=MAX_PIXELS)
+    height: int = option(480, "of the pictures around targets, pixels", ge=1, le=MAX_PIXELS)
+    frame_side: int = option(1024, "frames are shown no larger than this, longer side, pixels", ge=1, le=MAX_PIXELS)
+    # Smaller renders show small targets too large, as no Gaussian is drawn smaller than a pixel.
+    judged_side: int = option(160, "longer side of the renders that candidates are judged by", ge=40, le=1024)
 
     def __post_init__(self) -> None:
-        for name in ("count", "candidates"):
-            if not 1 <= getattr(self, name) <= MAX_CANDIDATES:
-                raise InputError(f"{name}: expected 1 to {MAX_CANDIDATES}, got {getattr(self, name)}")
+        check_limits(self)
         if self.method == "uniform" and self.source == "shells":
             raise InputError("source: expected frames or both with method=uniform, which spreads frames evenly")
-        for name in ("width", "height", "frame_side"):
-            if not 1 <= getattr(self, name) <= MAX_PIXELS:
-                raise InputError(f"{name}: expected 1 to {MAX_PIXELS} pixels, got {getattr(self, name)}")
-        if not 1 <= self.fov <= MAX_FOV:
-            raise InputError(f"fov: expected 1 to {MAX_FOV:g} degrees, got {self.fov}")
-        if not JUDGED_SIDES[0] <= self.judged_side <= JUDGED_SIDES[1]:
-            raise InputError(
-                f"judged_side: expected {JUDGED_SIDES[0]} to {JUDGED_SIDES[1]} pixels, got {self.judged_side}"
-            )
-        if not 0 < self.least_share < self.most_share < 1:
-            raise InputError(
-                f"least_share, most_share: expected shares that rise between 0 and 1, got {self.least_share}, "
-                f"{self.most_share}"
-            )
-        for name in ("cover_weight", "context_weight", "spread_weight"):
-            if not 0 <= getattr(self, name) <= MAX_WEIGHT:
-                raise InputError(f"{name}: expected 0 to {MAX_WEIGHT:g}, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetScore:
-    """What one view shows of one target; see `ViewScores`.
-
-    Attributes:
-        visible, share, inside, alpha, blur: as in `ViewScores`; alpha 1 and blur 0 where a photograph is shown.
-        utility: of the view for this target alone, 0 to 1.
-    """
+    """What one view shows of one target: see `ViewScores`; alpha 1 and blur 0 where a photograph is shown; the utility
+    of the view for this target alone is 0 to 1."""
 
     target: str
     visible: float

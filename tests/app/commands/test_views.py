@@ -96,7 +96,7 @@ def test_uniform_frames_need_no_word(features: Path, tmp_path: Path) -> None:
         (("query=cube", "grid=[0,3]"), "grid: expected rows and columns of 1 or more"),
         (("query=zebra",), "not among the 4 words"),
         (("query=pen holder",), "'pen holder' is absent (probability"),
-        (("query=cube", "choose.count=4097"), "count: expected 1 to 4096, got 4097"),
+        (("query=cube", "choose.count=4097"), "count: expected 1 to 4,096, got 4097"),
         (("query=cube", "choose.source=nowhere"), "choose.source: expected one of both, frames, shells"),
         (("query=cube", "space=other"), "other"),
         (("choose.method=uniform", "grid=[3,4]", "space=other"), "none of 'other'"),
