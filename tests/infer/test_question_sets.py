@@ -4,14 +4,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.labels.files import box_corners
 from gsencoder.infer.ask.ask import Question
-from gsencoder.infer.ask.batch import predictions, short_answer
-from gsencoder.infer.ask.questions import QuestionSet, is_question_set, read_question_set
+from gsencoder.infer.ask.batch import predictions, short_answer, target_corners
+from gsencoder.infer.ask.questions import QuestionSet, caption_question, is_question_set, read_question_set
 
 LOW, HIGH = (0.0, 1.0, 2.0), (1.0, 3.0, 2.5)
 SCANQA = [
@@ -36,14 +35,9 @@ SCANREFER = [
 SCAN2CAP = {"a": [{"box": box_corners(LOW, HIGH), "caption": "old", "obj_prob": [0.25, 0.75], "sem_prob": [1.0]}]}
 
 
-def written(tmp_path: Path, content: Any) -> Path:
+def read(tmp_path: Path, content: Any, **settings: Any) -> QuestionSet:
     path = tmp_path / "set.json"
     path.write_text(json.dumps(content))
-    return path
-
-
-def read(tmp_path: Path, content: Any, **settings: Any) -> QuestionSet:
-    path = written(tmp_path, content)
     assert is_question_set(path)
     return read_question_set(path, **settings)
 
@@ -58,7 +52,7 @@ def test_questions_of_scanqa_are_answered(tmp_path: Path) -> None:
     assert question_set.benchmark == "scanqa"
     assert question_set.scenes() == {"a": 1, "b": 1}
     (first,) = question_set.of_scene("a")
-    assert first.question.question == Question(text="What is on the table?")
+    assert first.question == Question(text="What is on the table?")
     assert answers(question_set, answer="<think>Hm.</think> A red Mug. ")[0] == {
         "scene_id": "a",
         "question_id": "q1",
@@ -71,7 +65,7 @@ def test_questions_of_scanqa_are_answered(tmp_path: Path) -> None:
 def test_situations_of_sqa3d_are_said_before_the_question(tmp_path: Path) -> None:
     question_set = read(tmp_path, SQA3D)
     assert question_set.benchmark == "sqa3d"
-    assert question_set.questions[0].question.question.text == "I sit. What is left?"
+    assert question_set.questions[0].question.text == "I sit. What is left?"
     assert answers(question_set, answer="Chair") == [
         {"scene_id": "a", "question_id": "220602000002", "situation": "I sit.", "question": "What is left?"}
         | {"answer": "chair"}
@@ -81,7 +75,7 @@ def test_situations_of_sqa3d_are_said_before_the_question(tmp_path: Path) -> Non
 def test_descriptions_of_scanrefer_are_grounded(tmp_path: Path) -> None:
     question_set = read(tmp_path, SCANREFER)
     assert question_set.benchmark == "scanrefer"
-    assert question_set.questions[1].question.question == Question(text="the cabinet 1", task="ground")
+    assert question_set.questions[1].question == Question(text="the cabinet 1", task="ground")
     other = {"aabb_min": (5, 5, 5), "aabb_max": (6, 6, 6)}
     targets = [other, {"aabb_min": LOW, "aabb_max": HIGH}]
     keys = {"scene_id": "a", "object_id": "8", "ann_id": "1"}
@@ -95,18 +89,6 @@ def test_descriptions_of_scanrefer_are_grounded(tmp_path: Path) -> None:
     assert answers(question_set, answer="?", mark=None, targets=targets)[1] == nothing
     assert predictions("scanrefer", [], question_set.questions)[1] == nothing
     assert predictions("scanqa", [], question_set.questions) == []
-
-
-def test_objects_of_scanrefer_are_captioned_once_each_in_the_boxes_of_the_file(tmp_path: Path) -> None:
-    question_set = read(tmp_path, SCANREFER, task="caption")
-    assert question_set.benchmark == "scan2cap"
-    (question,) = question_set.questions
-    assert question.question.question == Question(task="caption", aabb=(*LOW, *HIGH))
-    (caption,) = answers(question_set, answer="A cabinet. It is gray.")["a"]
-    assert caption["caption"] == "sos a cabinet . it is gray . eos"
-    np.testing.assert_allclose(caption["box"], box_corners(LOW, HIGH))
-    assert caption["obj_prob"] == [0.0, 1.0]
-    assert sum(caption["sem_prob"]) == pytest.approx(1)
 
 
 def test_boxes_of_scan2cap_are_captioned_and_keep_their_probabilities(tmp_path: Path) -> None:
@@ -128,11 +110,8 @@ def test_boxes_of_another_file_stand_in_for_those_of_the_set(tmp_path: Path) -> 
     ]
     with pytest.raises(InputError, match="has boxes in a, c, and .* describes objects of d; expected the same scenes"):
         read(tmp_path, [{**bare[0], "scene_id": "d"}], task="caption", proposals=str(boxes))
-    assert [each.question.question.aabb for each in question_set.questions] == [(5.0, 5.0, 5.0, 6.0, 6.0, 6.0)] * 2
-    assert len({each.question.id for each in question_set.questions}) == 2
-    localized = read(tmp_path, bare, task="caption", proposals="localize")
-    assert localized.names == {"a": ("file cabinet",)}
-    assert localized.scenes() == {"a": 1}
+    assert [each.question.aabb for each in question_set.questions] == [(5.0, 5.0, 5.0, 6.0, 6.0, 6.0)] * 2
+    assert len({each.id for each in question_set.questions}) == 2
     with pytest.raises(InputError, match="2 of 2 descriptions have no bbox"):
         read(tmp_path, bare, task="caption")
 
@@ -163,16 +142,107 @@ def test_what_is_no_question_set_is_an_error(
         read(tmp_path, content, **settings)
 
 
-def test_lines_of_questions_are_no_set(tmp_path: Path) -> None:
-    path = tmp_path / "lines.jsonl"
-    for text in ('{"question": "a"}', '{"question": "a"}\n{"question": "b"}\n', "", "{", '{"query": "mug"}', "x"):
-        path.write_text(text)
-        assert not is_question_set(path)
-    assert not is_question_set(tmp_path / "none")
-    path.write_text("\n\ufeff[1")
-    assert is_question_set(path)
-
-
 def test_answers_lose_case_thoughts_and_the_last_full_stop() -> None:
     assert short_answer("<think>A? B.</think>\n The  Mug on\nthe table.") == "the mug on the table"
     assert short_answer("3.5") == "3.5"
+
+
+def target(low: float) -> dict[str, Any]:
+    return {"aabb_min": [low, 0, -1], "aabb_max": [low + 1, 2, 3]}
+
+
+def corners(low: float) -> list[list[float]]:
+    return box_corners((float(low), 0.0, -1.0), (low + 1.0, 2.0, 3.0))
+
+
+def described(number: int, scene: str = "a", name: str = "x", **changes: Any) -> dict[str, Any]:
+    keys = {"scene_id": scene, "object_id": number, "object_name": name, "ann_id": "0", "description": f"d {number}"}
+    return keys | {"token": ["d"]} | changes
+
+
+def test_the_meant_box_comes_first_and_the_others_in_their_order(tmp_path: Path) -> None:
+    (question,) = read(tmp_path, [described(4)]).questions
+    assert question.id == "a/4/0"
+    targets = [target(0), target(5), target(9)]
+    for mark, order in ((1, (0, 5, 9)), (2, (5, 0, 9)), (3, (9, 0, 5))):
+        (row,) = predictions("scanrefer", [(question, {"mark": mark, "targets": targets})])
+        assert (row["bbox"], row["bboxes"]) == (corners(order[0]), [corners(low) for low in order])
+        assert (row["scene_id"], row["object_id"], row["ann_id"]) == ("a", "4", "0")
+
+
+def test_answers_have_the_box_of_the_best_target_and_unanswered_descriptions_come_last(tmp_path: Path) -> None:
+    questions = read(tmp_path, [{"scene_id": "a", "question_id": "q", "question": "What?"}]).questions
+    (row,) = predictions("scanqa", [(questions[0], {"answer": "A.", "targets": [target(3), target(0)]})])
+    assert row == {"scene_id": "a", "question_id": "q", "answer_top10": ["a"], "bbox": corners(3)}
+    first, second = read(tmp_path, [described(1), described(2)]).questions
+    rows = predictions("scanrefer", [(second, {"mark": 1, "targets": [target(0)]})], [first])
+    assert [(each["object_id"], len(each["bboxes"])) for each in rows] == [("2", 1), ("1", 0)]
+
+
+def test_captions_of_scenes_keep_their_boxes_and_the_even_probabilities_of_eighteen_classes() -> None:
+    keyed = caption_question("b", "7", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {"obj_prob": [0.5, 0.5]})
+    bare = caption_question("a", "0", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {})
+    assert (keyed.scene, keyed.question.id, keyed.question.task) == ("b", "b/7", "caption")
+    rows = predictions(
+        "scan2cap",
+        [
+            (keyed, {"answer": "Two", "targets": [target(2)]}),
+            (bare, {"answer": "Five", "targets": [target(5)]}),
+            (bare, {"answer": "Six", "targets": [target(6), target(0)]}),
+        ],
+    )
+    assert {scene: [(row["caption"], row["box"]) for row in found] for scene, found in rows.items()} == {
+        "b": [("sos two eos", corners(2))],
+        "a": [("sos five eos", corners(5)), ("sos six eos", corners(6))],
+    }
+    assert rows["b"][0]["obj_prob"] == [0.5, 0.5]
+    assert rows["a"][0]["obj_prob"] == [0.0, 1.0]
+    # ScanNet's benchmark has eighteen classes with instances.
+    assert rows["a"][0]["sem_prob"] == [1 / 18] * 18
+    assert target_corners(target(2)) == corners(2)
+
+
+def test_each_object_is_captioned_once_in_its_own_box_and_only_in_scenes_that_are_asked_about(tmp_path: Path) -> None:
+    rows = [
+        described(4, bbox=corners(4)),
+        described(2, bbox=corners(2)),
+        described(4, ann_id="1", bbox=corners(4)),
+        described(4, "b", bbox=corners(9)),
+    ]
+    question_set = read(tmp_path, rows, task="caption")
+    assert [(each.scene, each.id, each.question.aabb) for each in question_set.questions] == [
+        ("a", "a/4", (4.0, 0.0, -1.0, 5.0, 2.0, 3.0)),
+        ("a", "a/2", (2.0, 0.0, -1.0, 3.0, 2.0, 3.0)),
+        ("b", "b/4", (9.0, 0.0, -1.0, 10.0, 2.0, 3.0)),
+    ]
+    assert question_set.scenes() == {"a": 2, "b": 1}
+    assert [each.id for each in question_set.of_scene("a")] == ["a/4", "a/2"]
+    with pytest.raises(InputError, match="1 of 5 descriptions have no bbox"):
+        read(tmp_path, [*rows, described(7)], task="caption")
+
+
+def test_names_that_are_localized_are_each_once_in_every_scene(tmp_path: Path) -> None:
+    rows = [described(1, name="office_chair"), described(2, name="lamp"), described(3, name="office_chair")]
+    question_set = read(tmp_path, [*rows, described(1, "b", name="lamp")], task="caption", proposals="localize")
+    assert question_set.names == {"a": ("office chair", "lamp"), "b": ("lamp",)}
+    assert (question_set.questions, question_set.scenes()) == ((), {"a": 2, "b": 1})
+
+
+@pytest.mark.parametrize(
+    ("text", "one"),
+    [
+        ('{"a": []}', True),
+        ('\ufeff\n {"questions": []}', True),
+        ("[", True),
+        ('{"query": "mug"}', False),
+        ('{"aabb": [0, 0, 0, 1, 1, 1]}', False),
+        ('{"a": 1}\n{"b": 2}', False),
+        (" " * 64 + "[]", False),
+        (" " * 63 + "[]", True),
+        ("{", False),
+        ("", False),
+    ],
+)
+def test_a_set_is_one_value_that_is_no_question(tmp_path: Path, text: str, one: bool) -> None:
+    (tmp_path / "s").write_text(text)
+    assert is_question_set(tmp_path / "s") is one

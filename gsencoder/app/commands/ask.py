@@ -29,7 +29,6 @@ from gsencoder.infer.ask.batch import (
 from gsencoder.infer.ask.questions import (
     BatchQuestion,
     QuestionSet,
-    SetQuestion,
     caption_question,
     is_question_set,
     read_question_set,
@@ -126,10 +125,17 @@ def run(config: AskCommandConfig, run: Run) -> None:
     with run.step("load"):
         asker = asker_of(config, config.vlm, shown_scene(folder, config.photos, config.data), folder)
     out = run.out(asker.scene.name, "answers" if questions else "answer")
-    if questions:
-        ask_file(out, questions, asker, server, config, run)
-        return
     clock = Clock()
+    if questions:
+        with run.resumable(out, "answers", resume=config.resume) as (target, work):
+            rows = ask_questions(
+                questions, asker, server, work, made_from=made_from(config), clock=clock, track=run.track
+            )
+            write_answers(target, work, rows)
+            run.add_seconds(clock.seconds)
+            run.results.update(questions=len(questions), answers=ANSWERS)
+        run.print(f"{out}: {counted(len(questions), 'question')}, {ANSWERS}")
+        return
     with run.folder(out) as target:
         row = ask_question(config.single_question(), asker, server, target, clock)
         run.add_seconds(clock.seconds)
@@ -147,42 +153,23 @@ def made_from(config: AskCommandConfig) -> dict[str, Any]:
     return {name: values[name] for name in ("space", "photos", "data")}
 
 
-def ask_file(
-    out: Path,
-    questions: Sequence[BatchQuestion],
-    asker: Asker,
-    server: VlmServer | None,
-    config: AskCommandConfig,
-    run: Run,
-) -> None:
-    """Asks the questions of a file; the answers of an interrupted run stay in a folder beside out=."""
-    clock = Clock()
-    with run.resumable(out, "answers", resume=config.resume) as (folder, work):
-        rows = ask_questions(questions, asker, server, work, made_from=made_from(config), clock=clock, track=run.track)
-        write_answers(folder, work, rows)
-        run.add_seconds(clock.seconds)
-        run.results.update(questions=len(questions), answers=ANSWERS)
-    run.print(f"{out}: {counted(len(questions), 'question')}, {ANSWERS}")
-
-
 def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServer | None, run: Run) -> None:
     """Asks the questions of a benchmark about each scene that there are features of, and writes predictions.
 
     The features of one scene are in memory at a time. Questions that have no answer are counted and named, and so are
     scenes without features.
     """
-    out = run.out(question_set.benchmark)
+    out, file = run.out(question_set.benchmark), config.questions
     question_counts = question_set.scenes()
+    asked = (
+        f"questions: {file} asks about {counted(len(question_counts), 'scene')} ({listed(sorted(question_counts), 3)})"
+    )
     folders = scene_folders(config.paths, question_counts)
     if not folders:
-        raise InputError(
-            f"questions: {config.questions} asks about {counted(len(question_counts), 'scene')} "
-            f"({listed(sorted(question_counts), 3)}), and none of "
-            f"them has features in {', '.join(config.paths)}"
-        )
+        raise InputError(f"{asked}, and none of them has features in {', '.join(config.paths)}")
     clock = Clock()
-    answered: list[tuple[SetQuestion, dict[str, Any]]] = []
-    silent: list[SetQuestion] = []
+    answered: list[tuple[BatchQuestion, dict[str, Any]]] = []
+    silent: list[BatchQuestion] = []
     unanswered: dict[str, str] = {}
     counts: dict[str, int] = {}
     with run.resumable(out, "answers", resume=config.resume) as (folder, work):
@@ -193,18 +180,15 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
             name = asker.scene.name
             if name in counts:
                 raise InputError(f"{path}: holds features of scene {name}, and so does another folder; give one")
+            counts[name] = 0
             if name not in question_counts:
-                counts[name] = 0
                 continue
-            questions = (
-                localized_captions(asker, question_set.names[name])
-                if question_set.names
-                else question_set.of_scene(name)
-            )
+            names = question_set.names.get(name)
+            questions = localized_captions(asker, names) if names else question_set.of_scene(name)
             state = work / name
             state.mkdir(exist_ok=True)
             rows = ask_questions(
-                [each.question for each in questions],
+                questions,
                 asker,
                 server,
                 state,
@@ -216,26 +200,17 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
             (folder / name).mkdir()
             write_answers(folder / name, state, rows)
             by_id = {row["id"]: row for row in rows}
-            answered += [(each, by_id[each.question.id]) for each in questions if each.question.id in by_id]
-            silent += [each for each in questions if each.question.id not in by_id]
+            answered += [(each, by_id[each.id]) for each in questions if each.id in by_id]
+            silent += [each for each in questions if each.id not in by_id]
             counts[name] = len(questions)
             run.print(f"{name}: {len(rows)} of {len(questions)} questions")
         run.add_seconds(clock.seconds)
         if not any(counts.values()):
-            raise InputError(
-                f"questions: {config.questions} asks about {counted(len(question_counts), 'scene')} "
-                f"({listed(sorted(question_counts), 3)}), and "
-                f"there are features of others ({listed(sorted(counts), 3) or 'none'})"
-            )
+            raise InputError(f"{asked}, and there are features of others ({listed(sorted(counts), 3)})")
         others = {name: count for name, count in question_counts.items() if name not in counts}
-        unasked = [name for name in counts if name not in question_counts]
-        if unasked:
-            warnings.warn(
-                f"{config.questions} asks nothing about {counted(len(unasked), 'scene')} with features: "
-                f"{listed(unasked)}",
-                SceneWarning,
-                stacklevel=2,
-            )
+        if unasked := [name for name in counts if name not in question_counts]:
+            message = f"{file} asks nothing about {counted(len(unasked), 'scene')} with features: {listed(unasked)}"
+            warnings.warn(message, SceneWarning, stacklevel=2)
         run.results.update(
             benchmark=question_set.benchmark,
             questions=sum(counts.values()),
@@ -252,25 +227,15 @@ def ask_set(config: AskCommandConfig, question_set: QuestionSet, server: VlmServ
             run.results.update(predictions=PREDICTIONS, predicted=predicted)
     if unanswered:
         first = next(iter(unanswered.values()))
-        warnings.warn(
-            f"{len(unanswered)} of {sum(counts.values())} questions have no answer: {first}",
-            SceneWarning,
-            stacklevel=2,
-        )
+        message = f"{len(unanswered)} of {sum(counts.values())} questions have no answer: {first}"
+        warnings.warn(message, SceneWarning, stacklevel=2)
     if others:
         run.print(
             f"not asked, for want of features: {counted(sum(others.values()), 'question')} about "
-            f"{counted(len(others), 'scene')}: "
-            f"{listed(sorted(others), 3)}"
+            f"{counted(len(others), 'scene')}: {listed(sorted(others), 3)}"
         )
-    run.print(
-        f"{out}: "
-        + (
-            f"{counted(len(answered), 'answer')}, {PREDICTIONS}"
-            if server
-            else f"{counted(len(answered), 'request')}, {REQUEST}"
-        )
-    )
+    kind, last = ("answer", PREDICTIONS) if server else ("request", REQUEST)
+    run.print(f"{out}: {counted(len(answered), kind)}, {last}")
 
 
 def asker_of(config: AskingConfig, vlm: VlmConfig, scene: Scene, folder: Path) -> Asker:
@@ -312,7 +277,7 @@ def scene_folders(paths: Sequence[str], scenes: Collection[str]) -> list[Path]:
     return list(distinct_paths(folders))
 
 
-def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[SetQuestion, ...]:
+def localized_captions(asker: Asker, names: Sequence[str]) -> tuple[BatchQuestion, ...]:
     """Questions for captions of the best boxes of names, `ask.boxes` for each; names that no table knows have none.
 
     Warns:

@@ -5,14 +5,15 @@ import io
 import re
 import warnings
 from collections.abc import Collection, Hashable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
-from jaxtyping import Float64
 from PIL import Image
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.core.settings import check_limits, option
 from gsencoder.infer.ask.server import VlmConfig
 from gsencoder.infer.draw import Picture
 from gsencoder.infer.localize import LocalizeConfig, describe_absent, localize, spacing_of
@@ -21,12 +22,12 @@ from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import resized_picture
 from gsencoder.infer.views.pictures import PictureKind, picture_kinds, view_pictures
 from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, best_boxes, target_of, targets_of
-from gsencoder.text.question_words import ENGLISH, WordRules, words_in
+from gsencoder.text.question_words import words_in
 from gsencoder.text.vocabulary import Words, closed_table
-from gsencoder.types import Box, Scene
+from gsencoder.types import Box, Gaussians, Scene
 
 Task = Literal["answer", "ground", "caption"]
-ImageFormat = Literal["jpeg", "png"]
+IMAGE_FORMAT = "jpeg"
 
 SETTING = "The pictures show one place from several viewpoints."
 SHOWN_BY = {
@@ -105,38 +106,27 @@ def check_question(task: Task, question: str) -> None:
         raise InputError(f"question: holds what is no character, at {error.start}") from None
 
 
-def messages(text: str, pictures: Sequence[Picture], *, side: int, kind: ImageFormat) -> list[dict[str, Any]]:
-    """One message of the user: pictures, then words.
+def prompt_messages(text: str, pictures: Sequence[Picture], *, side: int) -> list[dict[str, Any]]:
+    """A prompt as the chat protocol carries it: one message of the user with pictures, then words.
 
     Args:
-        pictures: what the model sees, in order.
         side: longer pictures are made smaller, pixels.
     """
-    parts: list[dict[str, Any]] = [
-        {"type": "image_url", "image_url": {"url": data_url(picture, side=side, kind=kind)}} for picture in pictures
-    ]
+    parts: list[dict[str, Any]] = []
+    for picture in pictures:
+        data = base64.b64encode(encoded_picture(picture, side=side)).decode()
+        parts.append({"type": "image_url", "image_url": {"url": f"data:image/{IMAGE_FORMAT};base64,{data}"}})
     return [{"role": "user", "content": [*parts, {"type": "text", "text": text}]}]
 
 
-def data_url(picture: Picture, *, side: int, kind: ImageFormat) -> str:
-    """A picture as the protocol carries it."""
-    data = encoded_picture(picture, side=side, kind=kind)
-    return f"data:image/{kind};base64,{base64.b64encode(data).decode()}"
-
-
-def encoded_picture(picture: Picture, *, side: int, kind: ImageFormat) -> bytes:
-    """A picture as the bytes of a JPEG or PNG file.
-
-    Args:
-        picture: uint8 [H, W, 3].
-        side: a longer picture is made smaller, pixels.
-    """
+def encoded_picture(picture: Picture, *, side: int) -> bytes:
+    """A picture as the bytes of a file; a longer one is made smaller, pixels."""
     height, width = picture.shape[:2]
     if max(width, height) > side:
         factor = side / max(width, height)
         picture = resized_picture(picture, (max(1, round(width * factor)), max(1, round(height * factor))))
     held = io.BytesIO()
-    Image.fromarray(picture).save(held, format=kind, **({"quality": 92} if kind == "jpeg" else {}))
+    Image.fromarray(picture).save(held, format=IMAGE_FORMAT, quality=92)
     return held.getvalue()
 
 
@@ -156,8 +146,8 @@ def number_in(text: str, count: int) -> int | None:
     return NUMBERS.index(word) if word in NUMBERS[: count + 1] else None
 
 
-MAX_CACHED_PICTURES = 8
-"""Sets of pictures that are kept for the next question; each is some megabytes."""
+MAX_KEPT = 16
+"""Sets of pictures that are kept for the next question, since many are about the same thing; each is some megabytes."""
 SAME_THING_IOU = 0.5
 """What shares more of its Gaussians with what was found before, as intersection over union, is the same thing."""
 
@@ -181,7 +171,7 @@ class Question:
         if self.task not in get_args(Task):
             raise InputError(f"task: expected one of {', '.join(get_args(Task))}, got {str(self.task)[:40]!r}")
         if self.aabb and (len(self.aabb) != 6 or not all(np.isfinite(self.aabb))):
-            raise InputError(f"aabb: expected six numbers, lower corner and upper corner, got {list(self.aabb)}")
+            raise InputError(f"aabb: expected six numbers, got {list(self.aabb)}")
         if self.aabb and not all(low < high for low, high in zip(self.aabb[:3], self.aabb[3:], strict=True)):
             raise InputError(f"aabb: the lower corner is not below the upper one: {list(self.aabb)}")
         if self.aabb and self.query:
@@ -192,15 +182,11 @@ class Question:
 class AskConfig:
     """How a question becomes a prompt."""
 
-    boxes: int = field(default=3, metadata={"help": "boxes of each word that are looked at, best first"})
-    marks: bool | None = field(
-        default=None,
-        metadata={"help": "numbered marks on what was found; left out: for ground and caption"},
-    )
+    boxes: int = option(3, "boxes of each word that are looked at, best first", ge=1)
+    marks: bool | None = option(None, "numbered marks on what was found; left out: for ground and caption")
 
     def __post_init__(self) -> None:
-        if self.boxes < 1:
-            raise InputError(f"boxes: expected 1 or more, got {self.boxes}")
+        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -208,9 +194,7 @@ class Prompt:
     """What a VLM is shown and told.
 
     Attributes:
-        pictures: as they are sent.
-        views: where they were taken, and why.
-        targets: what they are of, in the order of their marks.
+        targets: what the pictures are of, in the order of their marks.
         boxes: the boxes of the targets, where words found them.
         words: that were looked for.
         absent: those of them that are probably absent, and the probability that they are not.
@@ -227,20 +211,6 @@ class Prompt:
     marks: frozenset[int]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Lookup:
-    """What the words of a question, or its box, lead to.
-
-    Attributes:
-        views: chosen for the targets.
-    """
-
-    targets: tuple[Target, ...]
-    boxes: tuple[Box, ...]
-    absent: dict[str, float]
-    views: ViewSet
-
-
 class Asker:
     """Turns questions about one scene into prompts; what was found and chosen is kept for the next question."""
 
@@ -254,21 +224,15 @@ class Asker:
         localization: LocalizeConfig = LocalizeConfig(),
         views: ViewsConfig = ViewsConfig(),
         vlm: VlmConfig = VlmConfig(),
-        word_rules: WordRules = ENGLISH,
     ) -> None:
         """Args:
         scene: Gaussians, features and cameras; photographs where frames are to be shown as these.
         words: what leads into the features; None where nothing does.
-        vlm: how requests are made; pictures are made smaller than its `image_side`.
-        word_rules: which words of a question make a name a verb or a color."""
+        vlm: how requests are made; pictures are made smaller than its `image_side`."""
         self.scene, self.words, self.space = scene, words, space
         self.table = closed_table(words) if words is not None else None
         self.config, self.localization, self.views, self.vlm = config, localization, views, vlm
-        self.word_rules = word_rules
-        self._spacing: float | None = None
-        self._free: FreeSpace | None = None
-        self._lookups: dict[Hashable, Lookup] = {}
-        self._picture_cache: dict[Hashable, tuple[list[Picture], frozenset[int]]] = {}
+        self._kept: dict[Hashable, Prompt] = {}
 
     def prompt(self, question: Question) -> Prompt:
         """What to send for a question.
@@ -276,53 +240,29 @@ class Asker:
         Where no words are given and the question holds none that the table knows, evenly spread frames are shown."""
         words = question.query
         if not words and not question.aabb and self.table is not None:
-            words = words_in(question.text, self.table, self.word_rules)
-        key = (words, question.aabb, question.task == "caption")
-        if key not in self._lookups:
-            self._lookups[key] = self._look_up(words, question)
-        lookup = self._lookups[key]
-        targets, boxes, views = lookup.targets, lookup.boxes, lookup.views
-        if not targets and self.views.method == "greedy":
-            message = self._nothing(words, lookup.absent)
+            words = words_in(question.text, self.table)
+        marked = question.task in ("ground", "caption") if self.config.marks is None else self.config.marks
+        key = (words, question.aabb, question.task == "caption", marked)
+        shown = self._kept.pop(key) if key in self._kept else self._without_text(words, question, marked)
+        self._kept[key] = shown
+        if len(self._kept) > MAX_KEPT:
+            del self._kept[next(iter(self._kept))]
+        if not shown.targets and self.views.method == "greedy":
+            message = self._nothing(words, shown.absent)
             if question.task != "answer":
                 raise InputError(f"task={question.task}: {message}; give query= or aabb=")
             warnings.warn(f"{message}: evenly spread views are shown", SceneWarning, stacklevel=2)
-        marked = self.config.marks
-        if marked is None:
-            marked = question.task in ("ground", "caption")
-        pictures, marks = self._pictures_of((*key, marked), views, targets if marked else ())
-        # A thing in a box that was given has no name.
-        names = [box.query for box in boxes] or ["" for _ in targets]
-        kinds = picture_kinds(self.scene, views)
         text = prompt_text(
             question.task,
             question.text,
-            names,
-            marks=marks,
-            kinds=kinds,
-            probabilities=[box.probability for box in boxes],
-            absent=lookup.absent,
+            # A thing in a box that was given has no name.
+            [box.query for box in shown.boxes] or ["" for _ in shown.targets],
+            marks=shown.marks,
+            kinds=picture_kinds(self.scene, shown.views),
+            probabilities=[box.probability for box in shown.boxes],
+            absent=shown.absent,
         )
-        return Prompt(
-            text=text,
-            pictures=pictures,
-            views=views,
-            targets=targets,
-            boxes=boxes,
-            words=words,
-            absent=lookup.absent,
-            marks=marks,
-        )
-
-    def _pictures_of(
-        self, key: Hashable, views: ViewSet, marked: Sequence[Target]
-    ) -> tuple[list[Picture], frozenset[int]]:
-        """Pictures of what was asked about last are kept: many questions are about the same thing."""
-        localization = self._picture_cache.pop(key, None) or view_pictures(self.scene, views, marked)
-        self._picture_cache[key] = localization
-        if len(self._picture_cache) > MAX_CACHED_PICTURES:
-            del self._picture_cache[next(iter(self._picture_cache))]
-        return localization
+        return replace(shown, text=text)
 
     def _nothing(self, words: Sequence[str], absent: Mapping[str, float]) -> str:
         if not words:
@@ -330,26 +270,47 @@ class Asker:
         listing = (f"{word!r} is {describe_absent(absent[word])}" if word in absent else repr(word) for word in words)
         return f"none of the words has a box: {', '.join(listing)}"
 
-    def _look_up(self, words: Sequence[str], question: Question) -> Lookup:
+    def _without_text(self, words: tuple[str, ...], question: Question, marked: bool) -> Prompt:
+        """Looks for the words of a question, or in its box, and renders views of what was found."""
         targets, boxes, absent = self._targets(words, question)
         config = self.views
         if not targets:
             config = replace(config, method="uniform", source="both")
-        if self._free is None and self.scene.gaussians is not None:
-            self._free = FreeSpace(self.scene.gaussians)
         views = choose_views(self.scene, targets, config, free=self._free)
         # Marks are drawn on pictures of the size that is sent, or their numbers would shrink.
-        small = views.cameras.resized(self.vlm.image_side, enlarge=False)
-        return Lookup(targets=targets, boxes=boxes, absent=absent, views=replace(views, cameras=small))
+        views = replace(views, cameras=views.cameras.resized(self.vlm.image_side, enlarge=False))
+        pictures, marks = view_pictures(self.scene, views, targets if marked else ())
+        return Prompt(
+            text="",
+            pictures=pictures,
+            views=views,
+            targets=targets,
+            boxes=boxes,
+            words=words,
+            absent=absent,
+            marks=marks,
+        )
+
+    @cached_property
+    def _gaussians(self) -> Gaussians:
+        if self.scene.gaussians is None:
+            raise InputError(f"ask: scene {self.scene.name} has no Gaussians")
+        return self.scene.gaussians
+
+    @cached_property
+    def _spacing(self) -> float:
+        return spacing_of(self._gaussians)
+
+    @cached_property
+    def _free(self) -> FreeSpace:
+        return FreeSpace(self._gaussians)
 
     def _targets(
         self, words: Sequence[str], question: Question
     ) -> tuple[tuple[Target, ...], tuple[Box, ...], dict[str, float]]:
-        gaussians = self.scene.gaussians
-        if gaussians is None:
-            raise InputError(f"ask: scene {self.scene.name} has no Gaussians")
+        gaussians = self._gaussians
         if question.aabb:
-            low, high = _corners(question.aabb, self.scene.origin)
+            low, high = np.array(question.aabb).reshape(2, 3) - self.scene.origin
             rows = np.flatnonzero(((gaussians.means >= low) & (gaussians.means <= high)).all(axis=1))
             if not len(rows):
                 raise InputError(f"aabb: no Gaussian of scene {self.scene.name} is in the box {list(question.aabb)}")
@@ -358,8 +319,6 @@ class Asker:
             return (), (), {}
         if self.words is None:
             raise InputError(f"query: no words lead into the features of {self.scene.name}; give words= or aabb=")
-        # The spacing of the scene is computed once, for the first question that has words.
-        self._spacing = self._spacing or spacing_of(gaussians)
         localization = localize(
             self.scene, words, self.words, self.localization, space=self.space, spacing=self._spacing
         )
@@ -380,17 +339,6 @@ def _distinct(targets: Sequence[Target], boxes: Sequence[Box]) -> tuple[tuple[Ta
         if all(shared <= SAME_THING_IOU * (size - shared) for shared, size in zip(same, sizes, strict=True)):
             distinct.append(index)
     return tuple(targets[index] for index in distinct), tuple(boxes[index] for index in distinct)
-
-
-def _corners(
-    aabb: Sequence[float], origin: Float64[np.ndarray, "3"]
-) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-    return np.array(aabb[:3]) - origin, np.array(aabb[3:]) - origin
-
-
-def prompt_messages(prompt: Prompt, config: VlmConfig) -> list[dict[str, Any]]:
-    """The prompt as the chat protocol carries it."""
-    return messages(prompt.text, prompt.pictures, side=config.image_side, kind=config.image_format)
 
 
 def chosen_mark(prompt: Prompt, text: str) -> int | None:

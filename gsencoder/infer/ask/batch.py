@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float16
 
 from gsencoder.core.errors import InputError, SceneWarning, WriteError, about
 from gsencoder.core.files import plain, sealed, unsealed, write_bytes, write_json
@@ -21,13 +20,12 @@ from gsencoder.data.labels.files import box_corners
 from gsencoder.data.prompts import PromptStore, StoredPrompt
 from gsencoder.data.splats.files import fingerprint
 from gsencoder.infer.ask.ask import THOUGHT, Asker, Prompt, Question, chosen_mark, encoded_picture, prompt_messages
-from gsencoder.infer.ask.questions import BatchQuestion, Benchmark, SetQuestion, read_answers
+from gsencoder.infer.ask.questions import BatchQuestion, Benchmark, read_answers
 from gsencoder.infer.ask.server import MODEL_VARIABLE, URL_VARIABLE, Reply, ServerError, VlmServer, request_body
 from gsencoder.infer.localize import box_to_json
 from gsencoder.infer.views.pictures import Fit, feature_tokens, token_blends, views_to_json, write_pictures
-from gsencoder.infer.views.targets import ViewSet
 from gsencoder.render import BlendConfig
-from gsencoder.types import GaussianFeatures, Gaussians
+from gsencoder.types import GaussianFeatures
 
 ANSWER, ANSWERS, PROMPT, REQUEST = "answer.json", "answers.jsonl", "prompt.txt", "request.json"
 TRANSPORT = ("key", "timeout", "longest", "retries")
@@ -53,7 +51,8 @@ def ask_question(
     with clock("views"):
         prompt = asker.prompt(question)
     views = views_to_json(scene, prompt.views)
-    body = request_body(prompt_messages(prompt, vlm), vlm, named=server is not None)
+    messages = prompt_messages(prompt.text, prompt.pictures, side=vlm.image_side)
+    body = request_body(messages, vlm, named=server is not None)
     with clock("write"):
         write_pictures(folder, scene, prompt.views, views, prompt.pictures, prompt.boxes)
         write_bytes(folder / PROMPT, prompt.text.encode() + b"\n")
@@ -128,10 +127,7 @@ def ask_questions(
     done = _answered(work, digests)
     failures: dict[str, str] = {}
     # Rows of other settings, and one that was cut off, are removed before new ones are appended.
-    try:
-        write_bytes(file, b"".join(_line(sealed(row)) for row in done.values()))
-    except RecursionError as error:
-        raise InputError(f"{file}: an answer is nested too deep; give resume=false to ask anew") from error
+    write_bytes(file, b"".join(_line(sealed(row)) for row in done.values()))
     for each in track(questions, "asking"):
         if each.id in done:
             continue
@@ -190,7 +186,7 @@ def _answered(work: Path, digests: Mapping[str, str]) -> dict[str, dict[str, Any
             rows[name] = unsealed(row)
         except (ValueError, RecursionError) as error:
             message = f"{work / ANSWERS}: the answer to {name[:40]} is not as it was written"
-            raise InputError(f"{message}; give resume=false to ask anew") from error
+            raise InputError(f"{message}; give resume=false to ask again") from error
     return {
         name: rows[name]
         for name, digest in digests.items()
@@ -252,8 +248,8 @@ CLASSES = 18
 
 def predictions(
     benchmark: Benchmark,
-    answered: Sequence[tuple[SetQuestion, Mapping[str, Any]]],
-    unanswered: Sequence[SetQuestion] = (),
+    answered: Sequence[tuple[BatchQuestion, Mapping[str, Any]]],
+    unanswered: Sequence[BatchQuestion] = (),
 ) -> Any:
     """What a benchmark takes.
 
@@ -283,7 +279,7 @@ def predictions(
             captions.setdefault(question.scene, []).append(entry)
         return captions
     if benchmark == "scanrefer":
-        missing: list[tuple[SetQuestion, Mapping[str, Any]]] = [(question, {}) for question in unanswered]
+        missing: list[tuple[BatchQuestion, Mapping[str, Any]]] = [(question, {}) for question in unanswered]
         return [{**question.keys, **_referred(row)} for question, row in (*answered, *missing)]
     if benchmark == "sqa3d":
         return [{**question.keys, "answer": short_answer(row["answer"])} for question, row in answered]
@@ -339,20 +335,12 @@ def store_prompt(
         fit: how the tower's preprocessing makes pictures square.
     """
     prompt = asker.prompt(question)
-    side, kind = asker.vlm.image_side, asker.vlm.image_format
-    pictures = [encoded_picture(each, side=side, kind=kind) for each in prompt.pictures]
+    pictures = [encoded_picture(each, side=asker.vlm.image_side) for each in prompt.pictures]
     if features is None:
         return store.add(key, prompt.text, pictures)
     assert asker.scene.gaussians is not None
-    tokens = view_tokens(asker.scene.gaussians, prompt.views, features, grid, fit)
-    return store.add(key, prompt.text, pictures, tokens, features.space.describe())
-
-
-def view_tokens(
-    gaussians: Gaussians, views: ViewSet, features: GaussianFeatures, grid: tuple[int, int], fit: Fit
-) -> Float16[np.ndarray, "V P D"]:
-    """Rendered features of chosen views on the grid of a tower."""
-    config = BlendConfig(near=min(BlendConfig().near, views.near))
-    tokens = feature_tokens(token_blends(gaussians, views.cameras, grid, fit=fit, config=config), features)
+    config = BlendConfig(near=min(BlendConfig().near, prompt.views.near))
+    blends = token_blends(asker.scene.gaussians, prompt.views.cameras, grid, fit=fit, config=config)
     limit = float(np.finfo(np.float16).max)
-    return tokens.clamp(-limit, limit).numpy().astype(np.float16)
+    tokens = feature_tokens(blends, features).clamp(-limit, limit).numpy().astype(np.float16)
+    return store.add(key, prompt.text, pictures, tokens, features.space.describe())

@@ -31,19 +31,24 @@ FIELDS = ("id", "question", "task", "query", "aabb")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchQuestion:
-    """One line of a file of questions.
+    """A question of a file.
 
     Attributes:
-        id: of the question; the number of its line where it has none.
+        id: unique in the file; the number of its line where it has none.
+        scene: that it is about; empty for lines about one scene.
+        keys: by which a benchmark's predictions name it, such as question_id.
     """
 
     id: str
     question: Question
+    scene: str = ""
+    keys: Mapping[str, Any] = field(default_factory=dict)
 
     def digest(self, settings: Mapping[str, Any]) -> str:
         """Of the question and all that its answer depends on."""
-        question_row = [self.question.text, self.question.task, list(self.question.query), list(self.question.aabb)]
-        return sha256(json.dumps([question_row, settings], sort_keys=True).encode()).hexdigest()[:16]
+        asked = self.question
+        row = [asked.text, asked.task, list(asked.query), list(asked.aabb)]
+        return sha256(json.dumps([row, settings], sort_keys=True).encode()).hexdigest()[:16]
 
 
 def read_questions(path: Path, task: Task = "answer") -> tuple[BatchQuestion, ...]:
@@ -55,10 +60,10 @@ def read_questions(path: Path, task: Task = "answer") -> tuple[BatchQuestion, ..
     for number, line in enumerate(lines, start=1):
         if line.strip():
             with about(f"{path}: line {number}"):
-                question_row = _parse_line(line, str(number), task)
-                if question_row.id in questions:
-                    raise InputError(f"id {question_row.id[:40]!r} comes twice")
-                questions[question_row.id] = question_row
+                question = _parse_line(line, str(number), task)
+                if question.id in questions:
+                    raise InputError(f"id {question.id[:40]!r} comes twice")
+                questions[question.id] = question
     if not questions:
         raise InputError(f"questions: {path} holds none")
     return tuple(questions.values())
@@ -84,25 +89,16 @@ def _parse_line(line: str, number: str, task: Task) -> BatchQuestion:
     if not isinstance(words, list) or not all(isinstance(word, str) and word.strip() for word in words):
         raise InputError(f"query: expected a word or a list of words, got {str(query)[:40]!r}")
     corners = row.get("aabb", [])
-    numbers = isinstance(corners, list) and all(
-        isinstance(value, (int, float)) and not isinstance(value, bool) for value in corners
-    )
-    if not numbers:
-        raise InputError(f"aabb: expected six numbers, got {str(corners)[:40]!r}")
-    check_question(row.get("task", task), text)
     try:
-        aabb = tuple(float(value) for value in corners)
-    except OverflowError as error:
+        if not isinstance(corners, list) or any(type(value) not in (int, float) for value in corners):
+            raise ValueError
+        aabb = tuple(map(float, corners))
+    except (OverflowError, ValueError) as error:
         raise InputError(f"aabb: expected six numbers, got {str(corners)[:40]!r}") from error
-    return BatchQuestion(
-        id=str(name),
-        question=Question(
-            text=text,
-            task=row.get("task", task),
-            query=tuple(word.strip() for word in words),
-            aabb=aabb,
-        ),
-    )
+    task = row.get("task", task)
+    check_question(task, text)
+    query = tuple(word.strip() for word in words)
+    return BatchQuestion(id=str(name), question=Question(text=text, task=task, query=query, aabb=aabb))
 
 
 def read_answers(path: Path) -> dict[str, dict[str, Any]]:
@@ -112,32 +108,17 @@ def read_answers(path: Path) -> dict[str, dict[str, Any]]:
     check_written(path)
     with readable(path):
         lines = read_foreign(path, MODEL_BYTES).split(b"\n")
-    questions = {}
+    rows = {}
     for number, line in enumerate(lines[:-1], start=1):
         try:
             row = json.loads(line)
-            questions[str(row["id"])] = row
+            rows[str(row["id"])] = row
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise InputError(f"{path}: line {number} is no answer; give resume=false to ask anew") from error
-    return questions
+            raise InputError(f"{path}: line {number} is no answer; give resume=false to ask again") from error
+    return rows
 
 
 Benchmark = Literal["scanqa", "sqa3d", "scanrefer", "scan2cap"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SetQuestion:
-    """A question of a set.
-
-    Attributes:
-        scene: that it is about.
-        question: with an id that is unique in the set.
-        keys: by which the benchmark's predictions name it, such as question_id.
-    """
-
-    scene: str
-    question: BatchQuestion
-    keys: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,11 +132,10 @@ class QuestionSet:
     """
 
     benchmark: Benchmark
-    questions: tuple[SetQuestion, ...]
+    questions: tuple[BatchQuestion, ...]
     names: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def of_scene(self, scene: str) -> tuple[SetQuestion, ...]:
-        """The questions about a scene."""
+    def of_scene(self, scene: str) -> tuple[BatchQuestion, ...]:
         return tuple(each for each in self.questions if each.scene == scene)
 
     def scenes(self) -> dict[str, int]:
@@ -215,7 +195,7 @@ def read_question_set(path: Path, task: Task = "answer", proposals: str = "") ->
     return QuestionSet(benchmark=benchmark, questions=tuple(map(_answered, questions)))
 
 
-def caption_question(scene: str, name: str, aabb: tuple[Corner, Corner], keys: Mapping[str, Any]) -> SetQuestion:
+def caption_question(scene: str, name: str, aabb: tuple[Corner, Corner], keys: Mapping[str, Any]) -> BatchQuestion:
     """The question for a caption of what is in a box.
 
     Args:
@@ -223,7 +203,7 @@ def caption_question(scene: str, name: str, aabb: tuple[Corner, Corner], keys: M
         keys: what the prediction says besides caption and box, such as probabilities.
     """
     question = Question(task="caption", aabb=(*aabb[0], *aabb[1]))
-    return SetQuestion(scene=scene, question=BatchQuestion(id=f"{scene}/{name}", question=question), keys=keys)
+    return BatchQuestion(id=f"{scene}/{name}", question=question, scene=scene, keys=keys)
 
 
 def _refuse_other_object(content: Mapping[str, Any], path: Path) -> None:
@@ -247,27 +227,22 @@ def _check_task(path: Path, subject: str, task: Task, allowed: Sequence[str]) ->
         raise InputError(f"task={task}: {path} holds {subject}; expected task={' or '.join(allowed)}")
 
 
-def _answered(question: TruthQuestion) -> SetQuestion:
+def _answered(question: TruthQuestion) -> BatchQuestion:
     keys = {"scene_id": question.scene, "question_id": question.id}
     if question.situation:
         keys |= {"situation": question.situation, "question": question.text}
-    return SetQuestion(
-        scene=question.scene,
-        question=BatchQuestion(id=question.id, question=Question(text=question.situated_text)),
-        keys=keys,
-    )
+    asked = Question(text=question.situated_text)
+    return BatchQuestion(id=question.id, question=asked, scene=question.scene, keys=keys)
 
 
 def _grounded(expressions: Sequence[Expression]) -> QuestionSet:
     return QuestionSet(
         benchmark="scanrefer",
         questions=tuple(
-            SetQuestion(
+            BatchQuestion(
+                id=f"{each.scene}/{each.object_id}/{each.annotation}",
+                question=Question(text=each.text, task="ground"),
                 scene=each.scene,
-                question=BatchQuestion(
-                    id=f"{each.scene}/{each.object_id}/{each.annotation}",
-                    question=Question(text=each.text, task="ground"),
-                ),
                 keys={"scene_id": each.scene, "object_id": str(each.object_id), "ann_id": each.annotation},
             )
             for each in expressions
@@ -339,7 +314,7 @@ def _read_boxes(
 
 def _captions(
     boxes: Mapping[str, Sequence[tuple[tuple[Corner, Corner], Mapping[str, Any]]]],
-) -> tuple[SetQuestion, ...]:
+) -> tuple[BatchQuestion, ...]:
     return tuple(
         caption_question(scene, str(number), aabb, keys)
         for scene, rows in boxes.items()

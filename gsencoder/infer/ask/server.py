@@ -179,7 +179,6 @@ class VlmConfig:
         0.0, "0 = the likeliest answer; empty = the server's, where it takes no other", ge=0, le=2
     )
     image_side: int = option(768, "longer side of the pictures that are sent, pixels", ge=16, le=8192)
-    image_format: Literal["jpeg", "png"] = option("jpeg", "of the pictures that are sent; png is exact and larger")
 
     def __post_init__(self) -> None:
         check_limits(self)

@@ -13,7 +13,8 @@ from chat_server import answer, serving
 from PIL import Image
 
 from gsencoder.app import main as cli
-from gsencoder.core.errors import printable
+from gsencoder.core.errors import InputError, printable
+from gsencoder.infer.ask.ask import Question
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("vlm_environment")]
 
@@ -130,10 +131,7 @@ def test_a_question_that_names_nothing_is_shown_even_frames_and_says_so(features
         (("dry_run=true",), "question= is missing"),
         (("question=x", "task=ground", "dry_run=true"), "names nothing to look for; give query= or aabb="),
         (("question=x", "query=zebra", "dry_run=true"), "not among the 4 words"),
-        (("question=x", "aabb=[0,0,0,1,1]", "dry_run=true"), "aabb: expected six numbers"),
-        (("question=x", "aabb=[1,0,0,0,1,1]", "dry_run=true"), "not below the upper one"),
         (("question=x", "aabb=[0,0,0,1,1,1]", "dry_run=true"), "no Gaussian of scene room is in the box"),
-        (("question=x", "aabb=[0,0,0,1,1,1]", "query=cube", "dry_run=true"), "give one of them"),
         (("question=x", "questions=q.jsonl", "dry_run=true"), "the file contains the questions"),
         (("question=the cube", "task=ground", "ask.marks=false", "dry_run=true"), "needs marks"),
     ],
@@ -146,6 +144,16 @@ def test_what_cannot_be_asked_ends_in_one_line(
     assert len(lines) == 1
     assert problem in lines[0]
     assert not (tmp_path / "out").exists()
+
+
+def test_boxes_that_are_none_are_refused() -> None:
+    for aabb, query, problem in (
+        ((0.0, 0.0, 0.0, 1.0, 1.0), (), "aabb: expected six numbers"),
+        ((1.0, 0.0, 0.0, 0.0, 1.0, 1.0), (), "not below the upper one"),
+        ((0.0, 0.0, 0.0, 1.0, 1.0, 1.0), ("cube",), "give one of them"),
+    ):
+        with pytest.raises(InputError, match=problem):
+            Question(text="x", aabb=aabb, query=query)
 
 
 def test_a_word_that_is_absent_stands_in_the_prompt_and_in_the_answer(features: Path, tmp_path: Path) -> None:
