@@ -25,13 +25,13 @@ from gsencoder.data.seeding.seed import SeedConfig, with_gaussians
 from gsencoder.evaluate.benchmarks.naming import compare_names, naming_scores
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.encode import load_encoder
-from gsencoder.memory.bank import MapStream, build_bank, memory_of_features
+from gsencoder.memory.bank import MapStream, build_bank, principal_queries
 from gsencoder.memory.index import index_features
 from gsencoder.teachers.base import Teacher
 from gsencoder.teachers.build import build_teacher, words_of
 from gsencoder.teachers.labels import LabelsConfig, LabelsTeacher
 from gsencoder.train.memory import MemoryConfig, memory_training, prepare_memory, train_memory
-from gsencoder.types import FeatureMap, Scene
+from gsencoder.types import FeatureMap, QueryMemory, Scene
 
 WIDTHS = (16, 32)
 
@@ -86,7 +86,17 @@ def main() -> None:
             bank_seconds = time.perf_counter() - start
             for width in WIDTHS:
                 start = time.perf_counter()
-                features = memory_of_features(dense, bank, channels=width).features()
+                queries, projection = principal_queries(dense, bank, width)
+                features = QueryMemory(
+                    queries=queries,
+                    weights=dense.weights,
+                    projection=projection,
+                    bank=bank,
+                    scoring="centered",
+                    temperature=0.05,
+                    mean=dense.mean,
+                    basis=dense.basis,
+                ).features()
                 key = f"encoded queries of {width}, {name}"
                 seconds[key].append(time.perf_counter() - start + bank_seconds)
                 made[key] = (features, 2 * width)

@@ -26,10 +26,7 @@ from gsencoder.data.scenes import load_scene
 from gsencoder.fusion.checkpoint import CachedTeacher
 from gsencoder.memory.reduction import (
     CoverReduction,
-    Reduction,
     reduce_as_published,
-    reduce_to_cover,
-    reduce_units_as_published,
     unit_rows,
 )
 from gsencoder.teachers.build import build_teacher, words_of
@@ -51,7 +48,17 @@ def raw_features(scene_path: Path, teacher_words: list[str], maps: Path | None) 
     return np.concatenate([each[np.isfinite(each[:, 0])] for each in rows])
 
 
-def transcription(features: np.ndarray, threshold: float) -> tuple[np.ndarray, np.ndarray]:
+def reduce_to_published(features: np.ndarray, threshold: float) -> np.ndarray:
+    return reduce_as_published(unit_rows(features), threshold)[0]
+
+
+def reduce_to_cover(features: np.ndarray, threshold: float) -> np.ndarray:
+    cover = CoverReduction(features.shape[1], threshold)
+    cover.add(features)
+    return cover.rows
+
+
+def transcription(features: np.ndarray, threshold: float) -> np.ndarray:
     """Algorithm 1, line by line, with the last chunk."""
     unit = features / np.linalg.norm(features, axis=1, keepdims=True)
     components, used = [], np.zeros(len(unit), bool)
@@ -63,7 +70,7 @@ def transcription(features: np.ndarray, threshold: float) -> tuple[np.ndarray, n
                 if not used[neighbors].any():
                     components.append(j)
                     used[neighbors] = True
-    return np.array(components, np.int64), used
+    return np.array(components, np.int64)
 
 
 def nearest_cosines(features: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -96,10 +103,10 @@ def main() -> None:
     figures: dict[str, dict[str, float]] = {}
     for threshold in arguments.thresholds:
         start = time.perf_counter()
-        published, used = transcription(features, threshold)
+        published = transcription(features, threshold)
         reference = time.perf_counter() - start
-        rows: list[tuple[str, float, Reduction]] = [("transcription", reference, Reduction(rows=published, used=used))]
-        for name, reduce in (("paper", reduce_as_published), ("cover", reduce_to_cover)):
+        rows = [("transcription", reference, published)]
+        for name, reduce in (("paper", reduce_to_published), ("cover", reduce_to_cover)):
             seconds = []
             for _ in range(arguments.repeats):
                 start = time.perf_counter()
@@ -107,17 +114,17 @@ def main() -> None:
                 seconds.append(time.perf_counter() - start)
             rows.append((name, min(seconds), made))
         for name, each, made in rows:
-            best = nearest_cosines(features, made.rows)
+            best = nearest_cosines(features, made)
             figures[f"{name}, {threshold}"] = {
                 "faster": reference / each,
-                "components": len(made.rows),
+                "components": len(made),
                 "coverage": (best >= threshold - 1e-6).mean(),
                 "cosine": best.mean(),
             }
             print(
-                f"| {threshold} | {name} | {each:.2f} | {reference / each:.1f} | {len(made.rows):,} | "
+                f"| {threshold} | {name} | {each:.2f} | {reference / each:.1f} | {len(made):,} | "
                 f"{(best >= threshold - 1e-6).mean():.3f} | {best.mean():.3f} | "
-                f"{'yes' if np.array_equal(made.rows, published) else 'no'} |",
+                f"{'yes' if np.array_equal(made, published) else 'no'} |",
                 flush=True,
             )
     write_figures(arguments.json, figures)
@@ -152,9 +159,9 @@ def of_many_as_published(features: np.ndarray, thresholds: list[float], replicas
             before = own_memory()
             watch = MemoryWatch()
             with watch:
-                made = reduce_units_as_published(file.array(), threshold)
+                made, _ = reduce_as_published(file.array(), threshold)
         print(
-            f"θ = {threshold}, paper: {replicas * len(features):,} features to {len(made.rows):,} components in "
+            f"θ = {threshold}, paper: {replicas * len(features):,} features to {len(made):,} components in "
             f"{time.perf_counter() - start:.1f} s; own memory at most {watch.highest:.0f} MB, {before:.0f} MB before",
             flush=True,
         )

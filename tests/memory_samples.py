@@ -2,7 +2,10 @@
 
 import numpy as np
 
-from gsencoder.types import FeatureSpace, MemoryBank, QueryMemory
+from gsencoder.memory.attention import render_queries
+from gsencoder.memory.bank import principal_queries
+from gsencoder.render import Blend
+from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory
 from gsencoder.types.features import Scoring
 
 TEMPERATURE = {"centered": 0.05, "cosine": 0.05, "dot": 1.0}
@@ -38,3 +41,30 @@ def make_memory(
         temperature=TEMPERATURE[scoring],
         mean=mean,
     )
+
+
+def memory_of_features(
+    features: GaussianFeatures,
+    bank: MemoryBank,
+    *,
+    channels: int = 16,
+    scoring: Scoring = "centered",
+    temperature: float = 0.05,
+) -> QueryMemory:
+    """The memory of features without any training."""
+    queries, projection = principal_queries(features, bank, channels, scoring)
+    return QueryMemory(
+        queries=queries,
+        weights=features.weights,
+        projection=projection,
+        bank=bank,
+        scoring=scoring,
+        temperature=temperature,
+        mean=features.mean,
+        basis=features.basis,
+    )
+
+
+def render_features(memory: QueryMemory, b: Blend) -> tuple[np.ndarray, np.ndarray]:
+    """The features of the rows of B, and how opaque these rows are."""
+    return memory.attend(render_queries(memory, b)[0]), b.alpha.numpy()

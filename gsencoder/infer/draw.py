@@ -1,8 +1,6 @@
 """Drawing: relevancy over views, boxes in views and as .ply, features as colors, depth, contact sheets.
 
-Pictures of results: relevancy over views, boxes in views, features as colors, depth, contact sheets.
-
-Pictures are uint8 [H, W, 3], RGB. What is shown arrives as arrays that were rendered elsewhere.
+Pictures are uint8 [H, W, 3], RGB, of arrays that were rendered elsewhere.
 """
 
 from collections.abc import Sequence
@@ -50,14 +48,10 @@ def write_boxes_ply(
     *,
     oriented: bool = False,
 ) -> None:
-    """Writes the Gaussians of all boxes as points in their word's color, and the boxes' edges.
+    """Writes the Gaussians of all boxes as points in their word's color, and the edges of the boxes.
 
-    Edges are drawn as rows of points (every viewer shows those) and listed as `edge` elements between the corners (for
-    those that draw lines). Boxes after a word's first are darker. Positions are doubles in world coordinates.
-
-    Args:
-        localization: what was found in it.
-        oriented: draw the oriented boxes, not the axis-aligned ones.
+    Edges are rows of points, which every viewer shows, and `edge` elements between the corners. Boxes after a word's
+    first are darker. Positions are doubles in world coordinates.
     """
     means = np.zeros((0, 3), np.float32) if scene.gaussians is None else scene.gaussians.means
     points: list[np.ndarray] = []
@@ -105,6 +99,7 @@ Picture = UInt8[np.ndarray, "_h _w 3"]
 LEGIBLE_WIDTH = 640
 """Smaller pictures are enlarged by a whole factor before anything is written on them."""
 NEAR = 0.05
+RING = 11
 PAPER, INK, FAINT = (255, 255, 255), (32, 33, 36), (120, 124, 130)
 
 
@@ -217,7 +212,7 @@ def draw_boxes(
                 draw.line(segment.ravel().tolist(), fill=back, width=width)
         ends = np.concatenate(segments)
         labels.append((ends[ends[:, 1].argmin()], f"{_printable(box.query)} {box.score:.2f}", color))
-    _draw_labels(draw, image.size, labels[::-1])
+    draw_labels(draw, image.size, labels[::-1])
     return np.asarray(image)
 
 
@@ -263,18 +258,28 @@ def ink_on(color: tuple[int, int, int]) -> tuple[int, int, int]:
     return (0, 0, 0) if bright else (255, 255, 255)
 
 
+def draw_ring(draw: ImageDraw.ImageDraw, at: Float64[np.ndarray, "2"], color: tuple[int, int, int]) -> None:
+    """A ring around a point and lines that point at it; the point itself stays as it is."""
+    for ink, width, rim in (((0, 0, 0), 7, 2), (color, 3, 0)):
+        outer = RING + width / 2
+        draw.ellipse([*(at - outer), *(at + outer)], outline=ink, width=width)
+        for way in np.array([(1, 0), (-1, 0), (0, 1), (0, -1)]):
+            draw.line([*(at + RING * way), *(at + (2 * RING + rim) * way)], fill=ink, width=width)
+
+
 def _printable(text: str, longest: int = 28) -> str:
     clean = "".join(character if character.isprintable() else " " for character in text)
     return clean if len(clean) <= longest else clean[: longest - 1] + "…"
 
 
-def _draw_labels(
+def draw_labels(
     draw: ImageDraw.ImageDraw, size: tuple[int, int], labels: Sequence[tuple[np.ndarray, str, tuple[int, int, int]]]
 ) -> None:
     """Labels above their boxes, inside the picture, each moved down until it covers no earlier one."""
     font = label_font(18)
     occupied: list[tuple[float, float, float, float]] = []
-    for at, text, color in labels:
+    for at, label, color in labels:
+        text = _printable(label, 200)
         wide, high = draw.textlength(text, font) + 10, 26
         x = float(np.clip(at[0] - wide / 2, 0, max(size[0] - wide, 0)))
         y = float(np.clip(at[1] - high - 4, 0, max(size[1] - high, 0)))

@@ -19,11 +19,12 @@ from jaxtyping import Float32, Float64, UInt8
 from PIL import Image, ImageDraw
 
 from gsencoder.core.errors import InputError
-from gsencoder.infer.draw import contact_sheet, enlarge, ink_on, label_font, legible_factor, relevancy_overlay
+from gsencoder.core.settings import check_limits, option
+from gsencoder.infer.draw import contact_sheet, draw_labels, draw_ring, enlarge, legible_factor, relevancy_overlay
 from gsencoder.infer.localize import select_features
 from gsencoder.infer.pictures import pixel_features
 from gsencoder.infer.relevancy import GaussianProducts, Mode, ThresholdConfig, threshold, word_directions
-from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.render import Blend, blend
 from gsencoder.render.images import render_image
 from gsencoder.render.rays import strided_lattice
 from gsencoder.text.table import TextEncoder, check_space
@@ -32,38 +33,28 @@ from gsencoder.types import Cameras, QueryMemory, Scene
 MEMORY_STRIDE = 4
 MAX_RAYS = 1 << 21
 """Pixels that are looked at in a view, at most, unless a stride is asked for; their blend takes about a gigabyte."""
+MIN_ALPHA = 0.5
+"""Opacity, of the Gaussians that have features, from which a pixel counts: what is fainter is haze, and no surface."""
 BLOCK_WORDS = 16
 """Words that are answered at once."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FromPoseConfig:
-    """How words are found in a view.
+    """How words are found in a view."""
 
-    Attributes:
-        mode: cosines after removing each side's mean ("centered"), or as they are ("raw").
-        threshold: relevancy from which on something relevant is visible; it is taken over all Gaussians of the scene,
-            so that a word whose best Gaussians are elsewhere is not visible here.
-        min_alpha: a pixel counts where the Gaussians that have features are at least so opaque: what is fainter is
-            haze, and no surface.
-        stride: every so many pixels are looked at, in both directions; None = all for features, and every fourth for a
-            memory, whose attention takes longer, or fewer in large views, so that there are no more than `MAX_RAYS`.
-        blend: accuracy of the rendering.
-    """
-
-    mode: Mode = "centered"
+    mode: Mode = option("centered", "cosines after removing each side's mean (centered), or as they are (raw)")
     threshold: ThresholdConfig = field(default_factory=ThresholdConfig)
-    min_alpha: float = 0.5
-    stride: int | None = None
-    blend: BlendConfig = field(default_factory=BlendConfig)
+    """Over all Gaussians of the scene, so that a word whose best Gaussians are elsewhere is not visible."""
+    stride: int | None = option(
+        None,
+        "every so many pixels are looked at, in both directions; None = all for features, and every fourth for a "
+        "memory, whose attention takes longer, or fewer in large views",
+        ge=1,
+    )
 
     def __post_init__(self) -> None:
-        if self.mode not in ("centered", "raw"):
-            raise InputError(f"mode: expected centered or raw, got {self.mode!r}")
-        if not 0 < self.min_alpha <= 1:
-            raise InputError(f"min_alpha: expected a number in (0, 1], got {self.min_alpha}")
-        if self.stride is not None and self.stride < 1:
-            raise InputError(f"stride: expected at least 1 pixel, got {self.stride}")
+        check_limits(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,10 +122,8 @@ class FeatureField:
         """Every so many pixels of a view are looked at."""
         if self.config.stride is not None:
             return self.config.stride
-        stride, (width, height) = (
-            1 if self.memory is None else MEMORY_STRIDE,
-            (cameras.widths[view], cameras.heights[view]),
-        )
+        stride = 1 if self.memory is None else MEMORY_STRIDE
+        width, height = cameras.widths[view], cameras.heights[view]
         while math.ceil(width / stride) * math.ceil(height / stride) > MAX_RAYS:
             stride += 1
         return stride
@@ -150,7 +139,7 @@ class FeatureField:
             raise InputError(f"view: expected 0 to {len(cameras) - 1}, got {view}")
         stride = self.stride_in(cameras, view)
         if b is None:
-            b = blend(self.gaussians, cameras, view, stride=stride, config=self.config.blend)
+            b = blend(self.gaussians, cameras, view, stride=stride)
         expected = strided_lattice(int(cameras.widths[view]), int(cameras.heights[view]), stride)
         if b.lattice != expected:
             raise InputError(
@@ -172,17 +161,10 @@ class SeenField:
     def __init__(self, field: FeatureField, cameras: Cameras, view: int, b: Blend) -> None:
         self.field, self.cameras, self.view, self.b = field, cameras, view, b
         self._pixels = pixel_features(field.products, b, memory=field.memory, mode=field.config.mode)
-        self._opaque = self._pixels.alpha >= field.config.min_alpha
+        self._opaque = self._pixels.alpha >= MIN_ALPHA
 
     def find(self, queries: Sequence[str], text: TextEncoder) -> tuple[PosePoint, ...]:
-        """Where the camera sees each word.
-
-        Args:
-            text: turns words into the features' space.
-
-        Returns:
-            One point for each word, in the order asked.
-        """
+        """Where the camera sees each word, in their order."""
         points: list[PosePoint] = []
         for start in range(0, len(directions := self._directions(queries, text)), BLOCK_WORDS):
             block = directions[start : start + BLOCK_WORDS]
@@ -193,10 +175,7 @@ class SeenField:
         return tuple(points)
 
     def relevancy(self, queries: Sequence[str], text: TextEncoder) -> Float32[np.ndarray, "Q h w"]:
-        """Relevancy of each word at the pixels that are looked at; NaN where there is no surface with features.
-
-        Arguments and errors are those of `find`.
-        """
+        """Relevancy of each word at the pixels that are looked at; NaN where there is no surface with features."""
         cosines = np.clip(self._pixels.cosines(self._directions(queries, text)), -1, 1)
         cosines[:, ~self._opaque] = np.nan
         return cosines.reshape(len(queries), *self.b.shape)
@@ -258,8 +237,7 @@ def from_pose(
     """Where each camera sees each word: `FeatureField` for those who ask once.
 
     Args:
-        cameras: one or several, relative to the scene's origin.
-        text: turns words into the features' space.
+        cameras: relative to the scene's origin.
         space: name of the feature set; None where the scene has only one.
         memory: queries of the same Gaussians; see `FeatureField`.
 
@@ -271,6 +249,8 @@ def from_pose(
 
 
 VISIBLE, HIDDEN = (255, 255, 255), (150, 150, 150)
+LABEL_AWAY = 24
+"""Pixels from a ring's middle to its label."""
 MAX_SIDE = 2000
 """Longer side of a picture, at most."""
 
@@ -281,7 +261,7 @@ def view_picture(seen: SeenField) -> UInt8[np.ndarray, "H W 3"]:
     small = cameras.resized(MAX_SIDE, enlarge=False)
     same = np.array_equal([small.widths, small.heights], [cameras.widths, cameras.heights])
     blended = seen.b if same and seen.b.lattice.dx == 1 else None
-    return render_image(seen.field.gaussians, small, 0, blended=blended, config=seen.field.config.blend)
+    return render_image(seen.field.gaussians, small, 0, blended=blended)
 
 
 def pose_picture(
@@ -316,29 +296,13 @@ def _marked(
     """A picture, enlarged, with the pixel of a word in a ring, and the word's relevancy and depth."""
     image = Image.fromarray(enlarge(picture, factor))
     draw = ImageDraw.Draw(image)
-    if not np.isfinite(point.pixel).all():
-        _write(draw, image.size, f"{point.query}: nothing with features in view", HIDDEN, None)
-        return np.asarray(image)
-    at = pixel * factor
-    color = VISIBLE if point.visible else HIDDEN
-    for radius, ink, line in ((15, (0, 0, 0), 6), (14, color, 3)):
-        draw.ellipse([*(at - radius), *(at + radius)], outline=ink, width=line)
-    for ink, line in (((0, 0, 0), 4), (color, 2)):
-        for step in ((1, 0), (0, 1)):
-            draw.line([*(at - np.multiply(step, 5)), *(at + np.multiply(step, 5))], fill=ink, width=line)
-    verdict = f"depth {point.depth:.3g}" if point.visible else f"not visible (needs {point.threshold:.2f})"
-    _write(draw, image.size, f"{point.query} {point.relevancy:.2f}, {verdict}", color, at)
+    at, color, text = np.zeros(2), HIDDEN, f"{point.query}: nothing with features in view"
+    if np.isfinite(point.pixel).all():
+        at, color = pixel * factor, VISIBLE if point.visible else HIDDEN
+        draw_ring(draw, at, color)
+        verdict = f"depth {point.depth:.3g}" if point.visible else f"not visible (needs {point.threshold:.2f})"
+        text = f"{point.query} {point.relevancy:.2f}, {verdict}"
+    # Above the ring, or below it where it would be covered.
+    label_at = at + np.array([0, -LABEL_AWAY if at[1] > LABEL_AWAY + 30 else LABEL_AWAY + 30])
+    draw_labels(draw, image.size, [(label_at, text, color)])
     return np.asarray(image)
-
-
-def _write(
-    draw: ImageDraw.ImageDraw, size: tuple[int, int], text: str, color: tuple[int, int, int], at: np.ndarray | None
-) -> None:
-    """A label in the upper left corner, or in the lower one where the upper one would cover what is marked."""
-    text = "".join(character if character.isprintable() else " " for character in text)
-    font = label_font(18)
-    wide, high = draw.textlength(text, font) + 10, 26
-    covers = at is not None and at[0] < wide + 20 and at[1] < high + 20
-    top = max(size[1] - high, 0) if covers else 0
-    draw.rectangle([0, top, wide, top + high], fill=color)
-    draw.text((5, top + high / 2), text, fill=ink_on(color), font=font, anchor="lm")

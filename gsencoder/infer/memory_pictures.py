@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +11,12 @@ from PIL import Image, ImageDraw
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.infer.draw import FAINT, INK, PAPER, fit_text, label_font
+from gsencoder.infer.draw import FAINT, PAPER, contact_sheet, draw_ring
 from gsencoder.memory.attention import render_queries
 from gsencoder.memory.bank import RawSample
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import RenderedImages, render_image
-from gsencoder.types import Cameras, Gaussians, MemoryBank, QueryMemory, Scene
+from gsencoder.types import MemoryBank, QueryMemory, Scene
 from gsencoder.types.features import attention_keys
 
 MIN_ALPHA = 0.5
@@ -26,56 +25,29 @@ GRID = 64
 """Pixels of the longer side among which one is chosen."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PixelAttention:
-    """The strongest components of a pixel, strongest first.
-
-    Attributes:
-        pixel: column and row of the pixel.
-        components: rows of the bank.
-        weights: of these in the attention, in which those of all components sum to 1.
-    """
-
-    pixel: tuple[int, int]
-    components: Int64[np.ndarray, " k"]
-    weights: Float32[np.ndarray, " k"]
-
-
 def strongest_components(
-    memory: QueryMemory,
-    gaussians: Gaussians,
-    cameras: Cameras,
-    view: int,
-    pixel: tuple[int, int],
-    count: int,
-    *,
-    config: BlendConfig = BlendConfig(),
-    blended: Blend | None = None,
-) -> PixelAttention:
-    """The components that a pixel's rendered query gives the largest weights; of equal ones the first.
+    memory: QueryMemory, b: Blend, pixel: tuple[int, int], count: int
+) -> tuple[Int64[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
+    """The components that a pixel's rendered query gives the largest weights, rows of the bank, and these weights; of
+    equal ones the first.
 
     Args:
+        b: of all pixels of the view.
         count: at most so many components.
-        config: accuracy of the rendering, where the blend must be made.
-        blended: the view's pixel blend, where it has been made already.
     """
-    x, y = pixel
-    width, height = int(cameras.widths[view]), int(cameras.heights[view])
+    (x, y), (height, width) = pixel, b.shape
     if not (0 <= x < width and 0 <= y < height):
         raise InputError(f"pixel ({x}, {y}): expected a column from 0 to {width - 1} and a row from 0 to {height - 1}")
-    if count < 1:
-        raise InputError(f"count: expected 1 component or more, got {count}")
     # A camera of this pixel alone would see Gaussians at its rim linearized elsewhere.
-    b = blend(gaussians, cameras, view, config=config) if blended is None else blended
     queries, alpha = (rows[[y * width + x]] for rows in render_queries(memory, b))
     if not alpha[0] > 0:
         raise InputError(
-            f"pixel ({x}, {y}): no Gaussian with a query is seen in this pixel of view {view}; choose a pixel in which "
-            "the rendered view shows something"
+            f"pixel ({x}, {y}): no Gaussian with a query is seen in this pixel; choose one in which the rendered view "
+            "shows something"
         )
     weights = memory.attention(queries)[0]
     order = np.argsort(-weights, kind="stable")[:count]
-    return PixelAttention(pixel=(x, y), components=order, weights=weights[order])
+    return order, weights[order]
 
 
 def salient_pixel(memory: QueryMemory, b: Blend) -> tuple[int, int] | None:
@@ -108,52 +80,43 @@ def attention_entropy(weights: Float32[np.ndarray, "n M"]) -> Float32[np.ndarray
 
 MARK, HALO = (255, 214, 0), (0, 0, 0)
 """The pixel and the cells are marked in one color, with a dark rim."""
-VIEW_SIDE, TILE_SIDE, CLOSE_SIDE = 660, 300, 96
-"""Longer sides of the view and of the tiles, and the side of the close-up in a tile's corner, in pixels."""
+SIDE, CLOSE_SIDE = 480, 150
+"""Longer side of the view and of photographs, and the side of the close-up in a photograph's corner, in pixels."""
 CLOSE_CELLS = 3.0
 """Cells along the side of a close-up."""
 LEAST_OUTLINE = 7.0
 """Cells smaller than this many pixels of the picture are outlined as if they were this large."""
-GAP, HEAD, CAPTION, BAR = 18, 74, 54, 8
-LEAST_LEFT, LEAST_RIGHT = 520, 620
-"""Smallest widths of the two parts, which hold their headings."""
-EMPTY_BAR, FULL_BAR = (226, 228, 232), (230, 160, 0)
 
 
 def attention_pictures(
-    memory: QueryMemory, scene: Scene, *, views: int, count: int = 6, config: BlendConfig = BlendConfig()
+    memory: QueryMemory, scene: Scene, *, views: int, config: BlendConfig = BlendConfig()
 ) -> Iterator[tuple[int, Image.Image]]:
-    """For evenly spaced views a picture of what their most salient pixel attends to: the pixel whose attention has the
-    lowest entropy.
+    """For evenly spaced views a picture of what their most salient pixel attends to.
 
     Args:
         scene: Gaussians, and the views that the memory was made from.
         views: so many, or all if there are fewer.
-        count: components that are shown, at most.
     """
     if scene.gaussians is None or scene.views is None:
         raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")
     for view in even_indices(len(scene.views), views).tolist():
-        b = blend(scene.gaussians, scene.views.cameras, view, config=config)
-        pixel = salient_pixel(memory, b)
-        if pixel is None:
+        picture = attention_picture(memory, scene, view, config=config)
+        if picture is None:
             name = scene.views.names[view]
             warnings.warn(f"pictures: view {name} shows no Gaussian with a query and is not drawn", SceneWarning, 2)
-            continue
-        picture = attention_picture(memory, scene, view, pixel, count=count, config=config, blended=b)
-        yield view, Image.fromarray(picture)
+        else:
+            yield view, Image.fromarray(picture)
 
 
 def attention_picture(
     memory: QueryMemory,
     scene: Scene,
     view: int,
-    pixel: tuple[int, int],
+    pixel: tuple[int, int] | None = None,
     *,
     count: int = 6,
     config: BlendConfig = BlendConfig(),
-    blended: Blend | None = None,
-) -> UInt8[np.ndarray, "H W 3"]:
+) -> UInt8[np.ndarray, "H W 3"] | None:
     """A rendered view with a pixel marked, and for each of the pixel's strongest components the photograph that it
     comes from, with its cell outlined and enlarged in a corner, its rank, and its weight in the attention.
 
@@ -161,8 +124,9 @@ def attention_picture(
 
     Args:
         scene: Gaussians, and the views that the memory was made from.
-        count: components that are shown, at most.
-        blended: the view's pixel blend, where it has been made already.
+        pixel: column and row; None = the pixel whose attention has the lowest entropy, and no picture where no pixel
+            is opaque.
+        count: components that are drawn, at most.
     """
     gaussians, views, bank = scene.gaussians, scene.views, memory.bank
     if gaussians is None or views is None:
@@ -173,16 +137,19 @@ def attention_picture(
             f"pictures: scene {scene.name} has {len(views)} views, and view {view} is asked for and components come "
             f"from view {last}; expected the views that the memory was made from"
         )
-    b = blended if blended is not None else blend(gaussians, views.cameras, view, config=config)
-    strongest = strongest_components(memory, gaussians, views.cameras, view, pixel, count, config=config, blended=b)
-    shown = render_image(gaussians, views.cameras, view, blended=b)
+    b = blend(gaussians, views.cameras, view, config=config)
+    if pixel is None and (pixel := salient_pixel(memory, b)) is None:
+        return None
+    strongest, weights = strongest_components(memory, b, pixel, count)
     images = RenderedImages(gaussians, views.cameras, config) if views.images is None else views.images
-    cells, tiles = bank.cells, []
-    for component in strongest.components.tolist():
+    pictures = [mark_pixel(render_image(gaussians, views.cameras, view, blended=b), pixel)]
+    titles = [f"{views.names[view]}, column {pixel[0]}, row {pixel[1]}, attends to …"]
+    for rank, (component, weight) in enumerate(zip(strongest.tolist(), weights, strict=True), start=1):
         source, row, column = bank.sources[component].tolist()
-        where = f"{views.names[source]}{', rendered' if views.images is None else ''}"
-        tiles.append((cell_tile(images[source], cells[component]), where, f"row {row}, column {column} of its map"))
-    return _sheet(mark_pixel(shown, pixel), views.names[view], strongest, tiles, bank)
+        pictures.append(cell_tile(images[source], bank.cells[component]))
+        rendered = ", rendered" if views.images is None else ""
+        titles.append(f"{rank}.  {100 * weight:.1f} %  row {row}, column {column} of {views.names[source]}{rendered}")
+    return contact_sheet(pictures, titles, columns=4, width=SIDE)
 
 
 def fit_in(rgb: UInt8[np.ndarray, "h w 3"], side: int) -> tuple[Image.Image, float]:
@@ -193,23 +160,14 @@ def fit_in(rgb: UInt8[np.ndarray, "h w 3"], side: int) -> tuple[Image.Image, flo
 
 
 def mark_pixel(rgb: UInt8[np.ndarray, "h w 3"], pixel: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
-    """A view, its longer side `VIEW_SIDE` pixels, with a ring around a pixel and lines that point at it."""
-    image, factor = fit_in(rgb, VIEW_SIDE)
-    draw = ImageDraw.Draw(image)
-    x, y = ((coordinate + 0.5) * factor for coordinate in pixel)
-    radius, reach = 11, 22
-    for color, width in ((HALO, 7), (MARK, 3)):
-        outer = radius + width / 2
-        draw.ellipse([x - outer, y - outer, x + outer, y + outer], outline=color, width=width)
-        rim = 2 if color == HALO else 0
-        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            start, end = radius, reach + rim
-            draw.line([x + dx * start, y + dy * start, x + dx * end, y + dy * end], fill=color, width=width)
+    """A view, its longer side `SIDE` pixels, with a ring around a pixel and lines that point at it."""
+    image, factor = fit_in(rgb, SIDE)
+    draw_ring(ImageDraw.Draw(image), (np.array(pixel) + 0.5) * factor, MARK)
     return np.asarray(image)
 
 
 def cell_tile(rgb: UInt8[np.ndarray, "h w 3"], cell: Float64[np.ndarray, "4"]) -> UInt8[np.ndarray, "H W 3"]:
-    """A photograph, its longer side `TILE_SIDE` pixels, with a cell outlined; in the corner that is farthest from the
+    """A photograph, its longer side `SIDE` pixels, with a cell outlined; in the corner that is farthest from the
     cell the cell and what is around it, enlarged.
 
     Args:
@@ -218,7 +176,7 @@ def cell_tile(rgb: UInt8[np.ndarray, "h w 3"], cell: Float64[np.ndarray, "4"]) -
     height, width = rgb.shape[:2]
     left, right = np.clip(cell[[0, 2]], 0, width)
     top, bottom = np.clip(cell[[1, 3]], 0, height)
-    image, factor = fit_in(rgb, TILE_SIDE)
+    image, factor = fit_in(rgb, SIDE)
     _outline(image, [left * factor, top * factor, right * factor, bottom * factor])
     middle_x, middle_y = (left + right) / 2, (top + bottom) / 2
     reach = max(CLOSE_CELLS * max(right - left, bottom - top), 12.0) / 2
@@ -259,54 +217,6 @@ def _outline(image: Image.Image, edges: Sequence[float]) -> None:
         draw.rectangle([int(corner) for corner in corners], outline=color, width=width)
 
 
-def _sheet(
-    view: UInt8[np.ndarray, "h w 3"],
-    view_name: str,
-    strongest: PixelAttention,
-    tiles: Sequence[tuple[UInt8[np.ndarray, "_h _w 3"], str, str]],
-    bank: MemoryBank,
-) -> UInt8[np.ndarray, "H W 3"]:
-    """The view on the left and the tiles on the right, up to three in a row, with what they are above and below."""
-    columns = min(3, len(tiles))
-    block = max(tile.shape[0] for tile, _, _ in tiles) + BAR + CAPTION
-    rows = -(-len(tiles) // columns)
-    view_width = max(view.shape[1], LEAST_LEFT)
-    left = 3 * GAP + view_width
-    width = left + max(columns * (TILE_SIDE + GAP), LEAST_RIGHT)
-    height = HEAD + max(view.shape[0] + CAPTION, rows * block)
-    sheet = Image.new("RGB", (width, height), PAPER)
-    draw = ImageDraw.Draw(sheet)
-
-    def write(at: tuple[int, int], text: str, room: int, size: int, color: tuple[int, int, int] = INK) -> None:
-        draw.text(at, fit_text(draw, text, room, size), fill=color, font=label_font(size))
-
-    (x, y), total = strongest.pixel, 100 * float(strongest.weights.sum())
-    write((GAP, GAP), "The query that is rendered in the marked pixel …", view_width, 19)
-    write((GAP, GAP + 28), f"memory of {bank.space.name}", view_width, 15, FAINT)
-    sheet.paste(Image.fromarray(view), (GAP, HEAD))
-    write((GAP, HEAD + view.shape[0] + 6), f"column {x}, row {y} of {view_name}", view_width, 15, FAINT)
-    room = width - left - GAP
-    kinds = "component" if len(bank) == 1 else "components"
-    write(
-        (left, GAP), f"… attends most to these {len(tiles)} of {len(bank):,} {kinds}: {total:.1f} % together", room, 19
-    )
-    legend = "outlined: the cell whose feature the component is; enlarged in the corner"
-    write((left, GAP + 28), legend, room, 15, FAINT)
-    for number, (tile, where, cell) in enumerate(tiles):
-        row, column = divmod(number, columns)
-        at_x, at_y = left + column * (TILE_SIDE + GAP), HEAD + row * block
-        sheet.paste(Image.fromarray(tile), (at_x, at_y))
-        below = at_y + tile.shape[0] + 4
-        weight = float(strongest.weights[number])
-        draw.rectangle([at_x, below, at_x + TILE_SIDE - 1, below + BAR - 3], fill=EMPTY_BAR)
-        if (filled := round(weight * TILE_SIDE)) > 0:
-            draw.rectangle([at_x, below, at_x + filled - 1, below + BAR - 3], fill=FULL_BAR)
-        write((at_x, below + BAR), f"{number + 1}.  {100 * weight:.1f} %", TILE_SIDE, 17)
-        draw.text((at_x + TILE_SIDE, below + BAR + 3), cell, fill=FAINT, font=label_font(13), anchor="ra")
-        write((at_x, below + BAR + 24), where, TILE_SIDE, 13, FAINT)
-    return np.asarray(sheet)
-
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -315,6 +225,8 @@ UMAP_LEAST = 10
 """Fewer features have no neighborhoods that UMAP could keep."""
 UMAP_NEIGHBORS = 15
 LONGEST_NAME = 60
+MIN_SHARE = 1e-13
+"""Smaller shares of the variance are rounding of float32."""
 
 
 def check_umap() -> None:
@@ -360,32 +272,21 @@ def principal_plane(
     features: Float32[np.ndarray, "n D"],
 ) -> tuple[Float64[np.ndarray, " D"], Float64[np.ndarray, "D 2"], Float64[np.ndarray, "2"]]:
     """The mean of features, the two orthonormal directions along which they vary most, and the shares of the variance
-    along these.
+    along these. Where features have no variance along a direction, it is zero and its share is 0."""
+    from sklearn.decomposition import PCA
 
-    The largest entry of a direction is positive. Where features have no variance along a second direction, or none at
-    all, the direction is zero and its share is 0.
-    """
     channels = features.shape[1]
     axes, shares = np.zeros((channels, 2)), np.zeros(2)
-    if not len(features):
-        return np.zeros(channels), axes, shares
-    mean = features.mean(axis=0, dtype=np.float64)
-    centered = features - mean
-    # Of features and channels the fewer are compared with each other.
-    wide = len(features) < channels
-    products = centered @ centered.T if wide else centered.T @ centered
-    values, vectors = np.linalg.eigh(products)
-    total = float(np.maximum(values, 0).sum())
-    floor = np.finfo(np.float32).eps ** 2 * max(total, float(np.square(mean).sum()) * len(features))
-    for number in range(min(2, len(values))):
-        value, vector = float(values[-1 - number]), vectors[:, -1 - number]
-        if value <= floor:
-            break
-        axis = centered.T @ vector if wide else vector
-        axis = axis / np.linalg.norm(axis)
-        axes[:, number] = axis * (-1 if axis[np.abs(axis).argmax()] < 0 else 1)
-        shares[number] = value / total
-    return mean, axes, shares
+    if not len(features) or not np.ptp(features, axis=0).any():
+        return features[:1].sum(axis=0, dtype=np.float64), axes, shares
+    pca = PCA(min(2, *features.shape), random_state=0).fit(features.astype(np.float64))
+    for number, share in enumerate(pca.explained_variance_ratio_):
+        if share > MIN_SHARE:
+            axis = pca.components_[number]
+            # The largest entry is positive.
+            axes[:, number] = axis * np.sign(axis[np.abs(axis).argmax()])
+            shares[number] = share
+    return pca.mean_, axes, shares
 
 
 def umap_plane(vectors: Float32[np.ndarray, "n D"], seed: int = 0) -> Float32[np.ndarray, "n 2"]:

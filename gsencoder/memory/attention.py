@@ -1,9 +1,6 @@
-"""Gaussian memory attention in torch, for training and rendering (M3 Eq. 2), and the decoders it is compared with.
-
-What M3 compares Gaussian memory attention with: low-dimensional features and a decoder, at the same width.
-
-A linear decoder is that of Feature-3DGS (Zhou et al. 2024), a perceptron that of Feature-Splatting (Qiu et al. 2024).
-"""
+"""Gaussian memory attention in torch, for training and rendering (M3 Eq. 2), and what M3 compares it with: features of
+as few channels and a decoder, linear as in Feature-3DGS (Zhou et al. 2024) or a perceptron as in Feature-Splatting (Qiu
+et al. 2024)."""
 
 import json
 import logging
@@ -93,16 +90,6 @@ def unit_queries(queries: Float[Tensor, "n s"], gram: Float[Tensor, "s s"]) -> F
 def random_projection(query_channels: int, channels: int, generator: torch.Generator) -> Float[Tensor, "s D"]:
     """A random W_m of queries with s channels and components with D, with rows of length 1 on average."""
     return torch.randn(query_channels, channels, generator=generator) / math.sqrt(channels)
-
-
-def render_features(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, "P D"], Float32[np.ndarray, " P"]]:
-    """The features of the rows of B, and how opaque these rows are. Where nothing is hit a feature means nothing.
-
-    Args:
-        b: of pixels or patches.
-    """
-    queries, _ = render_queries(memory, b)
-    return memory.attend(queries), b.alpha.numpy()
 
 
 def render_queries(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, "P s"], Float32[np.ndarray, " P"]]:

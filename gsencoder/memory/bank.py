@@ -1,32 +1,26 @@
-"""Building a memory bank: the principal scene components of a scene's feature maps (M3 sec. 3.3, Algorithm 1).
-
-Queries without training: the coordinates of features in the principal directions of a bank.
-
-The features may be fused, which gives queries to start an optimization from, or predicted by an encoder, which gives
-the memory of a scene that nothing was optimized for.
-"""
+"""Memory banks, the principal scene components of a scene's feature maps (M3 sec. 3.3, Algorithm 1), and queries
+without training: the coordinates of fused or predicted features in the principal directions of a bank."""
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, Int64
+from jaxtyping import Bool, Float32, Float64, Int32
 
 from gsencoder.core.archive import RowFile
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, about
-from gsencoder.core.process import free_memory
+from gsencoder.core.settings import check_limits, option
 from gsencoder.memory.reduction import (
     ROUNDING,
     CoverReduction,
-    check_threshold,
     largest_threshold,
-    reduce_units_as_published,
+    reduce_as_published,
     unit_rows,
 )
-from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank, QueryMemory
+from gsencoder.types import FeatureMap, FeatureSpace, GaussianFeatures, MemoryBank
 from gsencoder.types.features import Scoring, attention_keys
 
 MapStream = Callable[[], Iterator[tuple[int, FeatureMap]]]
@@ -66,8 +60,6 @@ def draw_sample(maps: MapStream, space: FeatureSpace, limit: int, *, seed: int =
 
     Every feature gets a random number, and those with the smallest numbers are the sample. Every n-th feature would
     come from the same few columns of maps whose width divides n."""
-    if limit < 1:
-        raise InputError(f"limit: expected 1 or more, got {limit}")
     features = np.zeros((0, space.channels), np.float32)
     numbers, total = np.zeros(0), 0
     for view, feature_map in maps():
@@ -97,66 +89,39 @@ MAX_NAMES = 1000
 """Up to so many vectors of coded maps are all components, unless another number or threshold is asked for."""
 SAME_KIND_COSINE = 0.95
 """Features within this of another one are of its kind."""
-COPIES = 6
-"""How many times a bank is in memory while it is made."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BankConfig:
     """How raw features are reduced to principal scene components."""
 
-    method: Literal["cover", "paper"] = field(
-        default="cover",
-        metadata={
-            "help": "cover = every feature is within the threshold of a component; paper = M3's Algorithm 1, which "
-            "skips features near one that is in use, though no component may be near them"
-        },
+    method: Literal["cover", "paper"] = option(
+        "cover",
+        "cover = every feature is within the threshold of a component; paper = M3's Algorithm 1, which skips features "
+        "near one that is in use, though no component may be near them",
     )
-    center: bool = field(
-        default=True,
-        metadata={"help": "compare features by the cosine after their mean has been subtracted; false = as the paper"},
+    center: bool = option(
+        True, "compare features by the cosine after their mean has been subtracted; false = as the paper"
     )
-    cosine: float = field(
-        default=0.9,
-        metadata={
-            "help": "mean cosine with the nearest component that the threshold is chosen for, over features and over "
-            "kinds of features, unless threshold= or components= is given; names and captions are all components"
-        },
+    cosine: float = option(
+        0.9,
+        "mean cosine with the nearest component that the threshold is chosen for, over features and over kinds of "
+        "features, unless threshold= or components= is given; names and captions are all components",
+        gt=0,
+        le=1,
     )
-    threshold: float = field(
-        default=0.0, metadata={"help": "cosine θ within which a component stands for a feature; 0 = chosen"}
-    )
-    components: int = field(
-        default=0, metadata={"help": "largest number of components, for which the threshold is chosen; 0 = any"}
-    )
-    coverage: float = field(
-        default=1.0,
-        metadata={
-            "help": "share of the features that must be within the threshold of a component; the components that stand "
-            "for the fewest features are left out"
-        },
-    )
-    drop_last: int = field(
-        default=0,
-        metadata={"help": "method=paper: a chunk size whose last, incomplete chunk gives no components, as printed"},
+    threshold: float = option(0.0, "cosine θ within which a component stands for a feature; 0 = chosen", ge=0, le=1)
+    components: int = option(0, "largest number of components, for which the threshold is chosen; 0 = any", ge=0)
+    drop_last: int = option(
+        0, "method=paper: a chunk size whose last, incomplete chunk gives no components, as printed", ge=0
     )
 
     def __post_init__(self) -> None:
+        check_limits(self)
         if self.threshold and self.components:
             raise InputError(
                 f"threshold, components: expected one of the two, got {self.threshold} and {self.components}"
             )
-        if self.threshold:
-            check_threshold(self.threshold)
-        if not 0 < self.cosine <= 1:
-            raise InputError(f"cosine: expected a cosine above 0 and up to 1, got {self.cosine}")
-        if not 0 < self.coverage <= 1:
-            raise InputError(f"coverage: expected a share above 0 and up to 1, got {self.coverage}")
-        for name in ("components", "drop_last"):
-            if getattr(self, name) < 0:
-                raise InputError(f"{name}: expected 0 or more, got {getattr(self, name)}")
-        if self.method == "paper" and self.coverage < 1:
-            raise InputError("coverage: expected 1 with method=paper, whose components need not cover all features")
         if self.method == "cover" and self.drop_last:
             raise InputError("drop_last: expected 0 with method=cover, which has no chunks")
 
@@ -172,8 +137,7 @@ def build_bank(
     Args:
         mean: of the space, which is subtracted where the configuration asks for centered cosines.
     """
-    builder = _Builder(maps, space, mean if config.center else np.zeros_like(mean), config)
-    return builder.build()
+    return _Builder(maps, space, mean if config.center else np.zeros_like(mean), config).build()
 
 
 class _Builder:
@@ -186,7 +150,6 @@ class _Builder:
         self._grids: dict[int, Float64[np.ndarray, "2 3"]] = {}
         self._coded: dict[int, bool] = {}
         self._floor = MIN_RELATIVE_NORM * float(np.linalg.norm(mean.astype(np.float64)))
-        self._limit = free_memory() // 2 // (COPIES * 4 * space.channels)
 
     def build(self) -> MemoryBank:
         threshold = self._threshold()
@@ -194,11 +157,7 @@ class _Builder:
             components, sources = self._cover_all(threshold)
         else:
             components, sources = self._published(threshold)
-        counts, coverage, cosine = self._score(components, threshold)
-        if self._config.coverage < coverage:
-            chosen = _most_used(counts, self._config.coverage)
-            components, sources = components[chosen], sources[chosen]
-            _, coverage, cosine = self._score(components, threshold)
+        coverage, cosine = self._score(components, threshold)
         return MemoryBank(
             components=components,
             sources=sources,
@@ -231,10 +190,6 @@ class _Builder:
         if config.components:
             counts = np.array([(len(rows), directed.sum()) for rows, _, directed in self._rows()]).reshape(-1, 2)
             features, directed = counts.sum(axis=0).tolist()
-            if min(config.components, features) > self._limit:
-                raise InputError(
-                    f"bank.components={config.components:,}: {self._too_large()}; give at most {self._limit:,}"
-                )
             # One component is for features without a direction.
             most = min(config.components, features) - (directed < features)
             if most < 1 and directed:
@@ -289,12 +244,7 @@ class _Builder:
         without_direction: list[tuple[np.ndarray, np.ndarray]] = []
         before = 0
         for rows, cells, directed in self._rows():
-            cover.add(rows[directed], limit=self._limit)
-            if len(cover) > self._limit:
-                raise InputError(
-                    f"bank.threshold={threshold:.4g}: {self._too_large()}; {self._limit:,} fit: give bank.components="
-                    f"{self._limit} or less, or a smaller threshold"
-                )
+            cover.add(rows[directed])
             new = cover.rows[len(sources) :] - before
             sources.extend(cells[directed][new])
             before += int(directed.sum())
@@ -314,7 +264,7 @@ class _Builder:
                 file.append(unit_rows(rows[directed]))
             unit = file.array()
             count = len(unit)
-            chosen = reduce_units_as_published(unit, threshold, drop_last=self._config.drop_last).rows
+            chosen, _ = reduce_as_published(unit, threshold, drop_last=self._config.drop_last)
             del unit
         if not count:
             raise self._no_features()
@@ -330,39 +280,25 @@ class _Builder:
             start += int(directed.sum())
         return np.concatenate(components), np.concatenate(sources)
 
-    def _score(
-        self, components: Float32[np.ndarray, "M D"], threshold: float
-    ) -> tuple[Int64[np.ndarray, " M"], float, float]:
-        """For each component the number of features that it is nearest to; the share of features with a component
-        within the threshold; and the mean cosine with the nearest one. Features without a direction count as covered
-        where the bank has a component without one."""
+    def _score(self, components: Float32[np.ndarray, "M D"], threshold: float) -> tuple[float, float]:
+        """The share of features with a component within the threshold, and the mean cosine with the nearest one.
+        Features without a direction count as covered where the bank has a component without one."""
         keys = components - self._mean
         directed_keys = np.abs(keys).max(axis=1) * np.sqrt(keys.shape[1]) > self._floor
-        unit, numbers = unit_rows(keys[directed_keys]), np.flatnonzero(directed_keys)
-        counts, covered, total, count = np.zeros(len(keys), np.int64), 0, 0.0, 0
+        unit = unit_rows(keys[directed_keys])
+        covered, total, count = 0, 0.0, 0
         for rows, _, directed in self._rows():
             count += len(rows)
             undirected = int((~directed).sum())
             if undirected and not directed_keys.all():
-                counts[~directed_keys] += undirected
                 covered, total = covered + undirected, total + undirected
             chosen = rows[directed] if len(unit) else rows[:0]
             for start in range(0, len(chosen), BLOCK):
-                cosines = unit_rows(chosen[start : start + BLOCK]) @ unit.T
-                nearest = cosines.argmax(axis=1)
-                best = cosines[np.arange(len(nearest)), nearest]
-                counts += np.bincount(numbers[nearest], minlength=len(keys))
+                best = (unit_rows(chosen[start : start + BLOCK]) @ unit.T).max(axis=1)
                 # A feature is its own component at a threshold of 1, whatever its product with itself rounds to.
                 covered += int((best >= min(threshold, 1 - ROUNDING)).sum())
                 total += float(best.sum(dtype=np.float64))
-        return counts, covered / count, total / count
-
-    def _too_large(self) -> str:
-        gigabytes = self._limit * COPIES * 4 * self._space.channels / 1e9
-        return (
-            f"the bank would have more than {self._limit:,} components of {self._space.channels} channels, which "
-            f"take the {gigabytes:.1f} GB that may be used of this machine's free memory"
-        )
+        return covered / count, total / count
 
     def _no_features(self) -> InputError:
         return InputError(f"memory: no view has a cell with a feature of {self._space.name}")
@@ -382,13 +318,6 @@ def _mean_cosine(sample: Float32[np.ndarray, "n D"], cover: CoverReduction, kind
         return float(np.concatenate([(block @ cover.unit.T).max(axis=1) for block in blocks]).mean(dtype=np.float64))
 
     return min(mean(sample), mean(kinds))
-
-
-def _most_used(counts: Int64[np.ndarray, " M"], share: float) -> Int64[np.ndarray, " m"]:
-    """The fewest components that stand for a share of the features, ascending."""
-    order = np.argsort(-counts, kind="stable")
-    enough = int(np.searchsorted(counts[order].cumsum(), share * counts.sum() - 0.5)) + 1
-    return np.sort(order[:enough])
 
 
 QUERY_BLOCK = 1 << 14
@@ -441,31 +370,3 @@ def principal_queries(
         return queries, projection
     spread = np.float32(float(queries[seen].std()) or 1.0)
     return queries / spread, projection * np.float32(math.sqrt(space.channels))
-
-
-def memory_of_features(
-    features: GaussianFeatures,
-    bank: MemoryBank,
-    *,
-    channels: int = 16,
-    scoring: Scoring = "centered",
-    temperature: float = 0.05,
-) -> QueryMemory:
-    """The memory of features without any training.
-
-    Args:
-        features: of the Gaussians, fused or predicted by an encoder.
-        bank: of the scene's own views, or of other scenes.
-        scoring: how queries are compared with components.
-    """
-    queries, projection = principal_queries(features, bank, channels, scoring)
-    return QueryMemory(
-        queries=queries,
-        weights=features.weights,
-        projection=projection,
-        bank=bank,
-        scoring=scoring,
-        temperature=temperature,
-        mean=features.mean,
-        basis=features.basis,
-    )

@@ -2,13 +2,12 @@
 
 The table is made from fused or encoded features, without training: a cover of their centered directions (see
 `gsencoder.memory.reduction`), whose rows are then moved to the means of the Gaussians that are nearest to them.
-LightSplat (CVPR 2026) and LangSplatV2 (2025) have per-scene codebooks that are learned; here a row costs what the scene
-requires, and the cosine with what it stands for is measured.
+LightSplat (CVPR 2026) and LangSplatV2 (2025) learn a codebook for each scene.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, Int64
@@ -16,10 +15,11 @@ from jaxtyping import Float32, Float64, Int32, Int64
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.budget import MEGABYTE, Estimate, choose
 from gsencoder.core.errors import InputError
+from gsencoder.core.settings import check_limits, option
 from gsencoder.fusion.errors import row_cosines
 from gsencoder.fusion.package import PackBudget
 from gsencoder.fusion.quantize import FIT_SAMPLE, rarity_of
-from gsencoder.memory.reduction import BLOCK, CoverReduction, check_threshold, largest_threshold
+from gsencoder.memory.reduction import BLOCK, CoverReduction, largest_threshold
 from gsencoder.types import GaussianFeatures
 
 MAX_ROWS = 65_535
@@ -32,24 +32,23 @@ MIN_RELATIVE_NORM = 1e-3
 class IndexConfig:
     """How features become rows of a table."""
 
-    threshold: float = field(
-        default=0.9,
-        metadata={"help": "centered cosine within which every Gaussian has a row when the table is made; 0 = by rows="},
+    threshold: float = option(
+        0.9,
+        "centered cosine within which every Gaussian has a row when the table is made; 0 = by rows=",
+        ge=0,
+        le=1,
     )
-    rows: int = field(default=0, metadata={"help": "largest number of rows of the table, with threshold=0"})
+    rows: int = option(0, "largest number of rows of the table, with threshold=0", ge=0, le=MAX_ROWS)
 
     def __post_init__(self) -> None:
+        check_limits(self)
         if self.threshold and self.rows:
             raise InputError(
                 f"rows: {self.rows} rows need threshold=0 as well, got {self.threshold}; beside a budget, which "
                 "chooses both, leave both out"
             )
-        if not self.threshold and not self.rows:
-            raise InputError("threshold: 0 needs rows= as well")
-        if self.threshold:
-            check_threshold(self.threshold)
-        elif not 2 <= self.rows <= MAX_ROWS:
-            raise InputError(f"rows: expected 2 to {MAX_ROWS:,}, got {self.rows:,}")
+        if not self.threshold and self.rows < 2:
+            raise InputError(f"threshold: 0 needs rows=2 or more as well, got {self.rows}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -126,7 +125,7 @@ def _leaders(
 
     def cover(threshold: float, limit: int) -> CoverReduction:
         reduction = CoverReduction(centered.shape[1], threshold)
-        reduction.add(centered, "features", limit=limit)
+        reduction.add(centered, limit=limit)
         return reduction
 
     threshold = config.threshold or largest_threshold(lambda each: len(cover(each, limit)) <= limit)

@@ -5,7 +5,6 @@ Products are made block by block, so that memory is that of the features, the co
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
@@ -13,7 +12,7 @@ from jaxtyping import Bool, Float32, Int64
 from gsencoder.core.errors import InputError
 
 ROUNDING = 2e-6
-"""What a cosine of float32 products may be off; see `cover_threshold`."""
+"""What a cosine of float32 products may be off."""
 BLOCK = 1024
 """Rows that are compared at once."""
 PRODUCT_VALUES = 1 << 25
@@ -24,72 +23,42 @@ WITNESSES = 4096
 """Rows in use that a row is compared with before it is compared with all."""
 
 
-def unit_rows(rows: Float32[np.ndarray, "n D"], where: str = "features") -> Float32[np.ndarray, "n D"]:
+def unit_rows(rows: Float32[np.ndarray, "n D"]) -> Float32[np.ndarray, "n D"]:
     """Rows of unit length, without overflow or underflow of their squares."""
     largest = np.abs(rows).max(axis=1, initial=0.0, keepdims=True)
     bad = ~np.isfinite(largest[:, 0]) | (largest[:, 0] == 0)
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
         fault = "zero" if largest[row, 0] == 0 else "not finite"
-        raise InputError(f"{where}: {int(bad.sum()):,} of {len(rows):,} rows have no direction: row {row} is {fault}")
+        raise InputError(f"features: {int(bad.sum()):,} of {len(rows):,} rows have no direction: row {row} is {fault}")
     scaled = rows / largest
     return np.asarray(scaled / np.sqrt(np.einsum("nd,nd->n", scaled, scaled))[:, None], np.float32)
 
 
-def check_threshold(threshold: float) -> None:
-    """Raises:
-    InputError: the threshold is no cosine above 0."""
-    if not 0 < threshold <= 1:
-        raise InputError(f"threshold: expected a cosine above 0 and up to 1, got {threshold}")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Reduction:
-    """Which rows are principal scene components.
-
-    Attributes:
-        rows: indices of the components, ascending.
-        used: which rows are represented: within the threshold of a component.
-    """
-
-    rows: Int64[np.ndarray, " M"]
-    used: Bool[np.ndarray, " n"]
-
-    @property
-    def coverage(self) -> float:
-        """Share of rows that are within the threshold of a component."""
-        return float(self.used.mean()) if len(self.used) else 1.0
-
-
 def reduce_as_published(
-    features: Float32[np.ndarray, "n D"], threshold: float, *, drop_last: int = 0, seed: int = 0
-) -> Reduction:
+    unit: Float32[np.ndarray, "n D"], threshold: float, *, drop_last: int = 0
+) -> tuple[Int64[np.ndarray, " M"], Bool[np.ndarray, " n"]]:
     """M3's Algorithm 1: a row becomes a component if no row within the threshold of it is in use; then all rows within
     the threshold of it are in use.
 
     A row near one in use is skipped even where no component is within the threshold of it, so the components need not
-    represent every row; see `Reduction.coverage`. The printed algorithm computes the cosines of each row with all
-    others. Here most rows are settled before that: those in use are skipped, and for others a row in use that is near
-    (a witness) is searched among neighbors in order and in a sample. Only rows without one are compared with all.
+    represent every row. The printed algorithm computes the cosines of each row with all others. Here most rows are
+    settled before that: those in use are skipped, and for others a row in use that is near (a witness) is searched
+    among neighbors in order and in a sample. Only rows without one are compared with all.
 
     Args:
-        features: raw features of all views, in order.
+        unit: directions of the raw features of all views, in order; they may be those of a file that is mapped into
+            memory.
         drop_last: a chunk size c: the last n mod c rows become no components, as the printed loop has it; 0 = they may.
-        seed: of the order in which witnesses are searched, which changes nothing of the result.
+
+    Returns:
+        The components, ascending; and which rows are in use.
     """
-    check_threshold(threshold)
-    return reduce_units_as_published(unit_rows(features), threshold, drop_last=drop_last, seed=seed)
-
-
-def reduce_units_as_published(
-    unit: Float32[np.ndarray, "n D"], threshold: float, *, drop_last: int = 0, seed: int = 0
-) -> Reduction:
-    """`reduce_as_published` of rows of unit length, such as those of a file that is mapped into memory."""
     count = len(unit)
     candidates = count - count % drop_last if drop_last else count
     used = np.zeros(count, bool)
     rows: list[int] = []
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     start, size = 0, 64
     while start < candidates:
         stop = min(start + size, candidates)
@@ -106,7 +75,7 @@ def reduce_units_as_published(
                     used |= neighbors
                     used[row] = True
         start, size = stop, min(2 * size, BLOCK)
-    return Reduction(rows=np.array(rows, np.int64), used=used)
+    return np.array(rows, np.int64), used
 
 
 def _without_witness(
@@ -138,7 +107,6 @@ class CoverReduction:
     """
 
     def __init__(self, channels: int, threshold: float) -> None:
-        check_threshold(threshold)
         # Rounding of float32 products depends on their block. The smallest cosine that counts is a little above the
         # threshold, so that a row that counts is within the threshold in exact arithmetic, and a little below 1, so
         # that equal rows are one component.
@@ -165,18 +133,13 @@ class CoverReduction:
         """The directions of the components."""
         return self._unit[: len(self)]
 
-    def add(self, features: Float32[np.ndarray, "n D"], where: str = "features", *, limit: int | None = None) -> None:
-        """Takes more rows.
-
-        Args:
-            where: what they are, for the error.
-            limit: rows are no longer taken once there are more components than this, which is for the caller to see.
-        """
+    def add(self, features: Float32[np.ndarray, "n D"], *, limit: int | None = None) -> None:
+        """Takes more rows, but none once there are more components than a limit, which is for the caller to see."""
         for start in range(0, len(features), BLOCK):
             if limit is not None and len(self) > limit:
                 return
             raw = features[start : start + BLOCK]
-            unit = unit_rows(raw, where)
+            unit = unit_rows(raw)
             far = self._far_from_components(unit, np.arange(len(unit)))
             leaders = self._leaders(unit, far)
             self._append(unit[leaders], raw[leaders])
@@ -224,10 +187,3 @@ def largest_threshold(fits: Callable[[float], bool]) -> float:
         middle = (low + high) / 2
         low, high = (middle, high) if fits(middle) else (low, middle)
     return low or high
-
-
-def reduce_to_cover(features: Float32[np.ndarray, "n D"], threshold: float) -> Reduction:
-    """`CoverReduction` of rows that are all at hand."""
-    cover = CoverReduction(features.shape[1], threshold)
-    cover.add(features)
-    return Reduction(rows=cover.rows, used=np.ones(len(features), bool))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from memory_samples import memory_of_features
 from named_rooms import write_words
 from rooms import room
 
@@ -22,7 +23,6 @@ from gsencoder.evaluate.benchmarks.grounding import (
     masks_of,
 )
 from gsencoder.evaluate.benchmarks.protocol import Evaluation, predict_scenes
-from gsencoder.memory.bank import memory_of_features
 from gsencoder.render import blend
 from gsencoder.text.table import make_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, Scene, SceneObject, Views

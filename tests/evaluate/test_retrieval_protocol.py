@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from command_runs import refusal, results_of
+from memory_samples import memory_of_features
 from named_rooms import write_words
 from rooms import room
 
@@ -17,7 +18,6 @@ from gsencoder.data.synthetic import make_room, write_room
 from gsencoder.evaluate.benchmarks.retrieval import RetrievalProtocol, score_views
 from gsencoder.infer.relevancy import word_directions
 from gsencoder.memory.attention import render_queries
-from gsencoder.memory.bank import memory_of_features
 from gsencoder.render import blend
 from gsencoder.text.table import load_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank, Scene

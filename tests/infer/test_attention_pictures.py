@@ -1,7 +1,6 @@
 """What a pixel attends to, and pictures of it: the components are the strongest, and their cells are outlined."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,15 +10,11 @@ from memory_scenes import prepared_wall
 from training_scenes import scene as wall
 
 from gsencoder.core.errors import InputError, SceneWarning
+from gsencoder.infer import memory_pictures as module
 from gsencoder.infer.memory_pictures import (
-    EMPTY_BAR,
-    FULL_BAR,
-    GAP,
     HALO,
-    HEAD,
     MARK,
-    TILE_SIDE,
-    VIEW_SIDE,
+    SIDE,
     attention_entropy,
     attention_picture,
     attention_pictures,
@@ -28,7 +23,7 @@ from gsencoder.infer.memory_pictures import (
     salient_pixel,
     strongest_components,
 )
-from gsencoder.memory.attention import render_features, render_queries
+from gsencoder.memory.attention import render_queries
 from gsencoder.memory.bank import BankConfig
 from gsencoder.render import blend
 from gsencoder.render.images import render_image
@@ -52,7 +47,6 @@ def scene() -> Scene:
 
 def with_photographs(scene: Scene) -> Scene:
     rng = np.random.default_rng(0)
-    assert scene.views is not None
     photographs = [rng.integers(0, 256, (40, 48, 3), dtype=np.uint8) for _ in range(len(scene.views))]
     return replace(scene, views=replace(scene.views, images=photographs))
 
@@ -74,79 +68,48 @@ def in_color(picture: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
     return np.asarray((picture == np.array(color)).all(axis=2))
 
 
-@pytest.mark.parametrize("pixel", [(24, 20), (18, 11), (30, 27)])
-@pytest.mark.parametrize("view", [0, 1])
+def strongest(
+    memory: QueryMemory, scene: Scene, view: int = 0, pixel: tuple[int, int] = (24, 20), count: int = 3
+) -> tuple[np.ndarray, np.ndarray]:
+    return strongest_components(memory, blend(scene.gaussians, scene.views.cameras, view), pixel, count)
+
+
+@pytest.mark.parametrize(("view", "pixel"), [(0, (24, 20)), (1, (18, 11))])
 def test_the_components_are_the_first_of_the_attention_of_the_pixels_query(
     memory: QueryMemory, scene: Scene, view: int, pixel: tuple[int, int]
 ) -> None:
-    assert scene.gaussians is not None
-    assert scene.views is not None
     b = blend(scene.gaussians, scene.views.cameras, view)
     seen = torch.from_numpy((memory.weights > 0).astype(np.float32))
     row = pixel[1] * b.shape[1] + pixel[0]
     query = (b.render(torch.from_numpy(memory.queries)) / b.render(seen)[:, None])[row].numpy()
     attention = memory.attention(query[None])[0]
-    components = strongest_components(memory, scene.gaussians, scene.views.cameras, view, pixel, 4, blended=b)
-    assert components.pixel == pixel
-    np.testing.assert_allclose(components.weights, np.sort(attention)[::-1][:4], rtol=1e-5)
-    np.testing.assert_allclose(attention[components.components], components.weights, rtol=1e-5)
-    again = strongest_components(memory, scene.gaussians, scene.views.cameras, view, pixel, 4)
-    np.testing.assert_array_equal(again.components, components.components)
-    np.testing.assert_array_equal(again.weights, components.weights)
+    components, weights = strongest_components(memory, b, pixel, 4)
+    np.testing.assert_allclose(weights, np.sort(attention)[::-1][:4], rtol=1e-5)
+    np.testing.assert_allclose(attention[components], weights, rtol=1e-5)
 
 
 def test_weights_of_all_components_sum_to_one_and_a_bank_may_have_fewer(memory: QueryMemory, scene: Scene) -> None:
-    assert scene.gaussians is not None
-    assert scene.views is not None
-    components = strongest_components(memory, scene.gaussians, scene.views.cameras, 0, (24, 20), 10_000)
-    assert sorted(components.components.tolist()) == list(range(len(memory.bank)))
-    assert components.weights.sum() == pytest.approx(1, abs=1e-5)
-    assert (np.diff(components.weights) <= 0).all()
-    single = strongest_components(first_components(memory, 1), scene.gaussians, scene.views.cameras, 0, (24, 20), 6)
-    assert single.components.tolist() == [0]
-    assert single.weights.tolist() == [1.0]
+    components, weights = strongest(memory, scene, count=10_000)
+    assert sorted(components.tolist()) == list(range(len(memory.bank)))
+    assert weights.sum() == pytest.approx(1, abs=1e-5)
+    assert (np.diff(weights) <= 0).all()
+    single, whole = strongest(first_components(memory, 1), scene)
+    assert (single.tolist(), whole.tolist()) == ([0], [1.0])
+    # Of equal components the first come first: of eight, which a matrix product computes alike.
+    eight = first_components(memory, 8)
+    tied = replace(eight, bank=replace(eight.bank, components=np.repeat(eight.bank.components[:1], 8, axis=0)))
+    assert strongest(tied, scene)[0].tolist() == [0, 1, 2]
 
 
-def test_of_equal_components_the_first_come_first(memory: QueryMemory, scene: Scene) -> None:
-    assert scene.gaussians is not None
-    assert scene.views is not None
-    """Of eight, which a matrix product computes alike: columns of a remainder are rounded otherwise."""
-    memory = first_components(memory, 8)
-    tied = replace(memory, bank=replace(memory.bank, components=np.repeat(memory.bank.components[:1], 8, axis=0)))
-    components = strongest_components(tied, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
-    assert components.components.tolist() == [0, 1, 2]
-
-
-def test_rendered_features_are_what_rendered_queries_attend_to(memory: QueryMemory, scene: Scene) -> None:
-    assert scene.gaussians is not None
-    assert scene.views is not None
-    b = blend(scene.gaussians, scene.views.cameras, 0)
-    queries, alpha = render_queries(memory, b)
-    features, opacity = render_features(memory, b)
-    np.testing.assert_array_equal(features, memory.attend(queries))
-    assert (alpha <= opacity + 1e-6).all()
-    np.testing.assert_array_equal(queries[alpha == 0], 0)
-
-
-@pytest.mark.parametrize("pixel", [(-1, 5), (48, 5), (5, -1), (5, 40)])
-def test_a_pixel_outside_of_the_view_is_refused(memory: QueryMemory, scene: Scene, pixel: tuple[int, int]) -> None:
-    with pytest.raises(InputError, match="expected a column from 0 to 47 and a row from 0 to 39"):
-        attention_picture(memory, scene, 0, pixel)
-
-
-def test_a_pixel_that_hits_nothing_is_refused(memory: QueryMemory, scene: Scene) -> None:
-    with pytest.raises(InputError, match=r"pixel \(0, 0\): no Gaussian with a query is seen in this pixel of view 1"):
+def test_a_pixel_outside_of_the_view_or_that_hits_nothing_is_refused(memory: QueryMemory, scene: Scene) -> None:
+    for pixel in ((-1, 5), (48, 5), (5, 40)):
+        with pytest.raises(InputError, match="expected a column from 0 to 47 and a row from 0 to 39"):
+            attention_picture(memory, scene, 0, pixel)
+    with pytest.raises(InputError, match=r"pixel \(0, 0\): no Gaussian with a query is seen in this pixel"):
         attention_picture(memory, scene, 1, (0, 0))
-    unseen = replace(memory, queries=np.zeros_like(memory.queries), weights=np.zeros_like(memory.weights))
-    with pytest.raises(InputError, match=r"pixel \(24, 20\): no Gaussian with a query"):
-        attention_picture(unseen, scene, 0, (24, 20))
 
 
 def test_memories_views_and_counts_that_do_not_fit_are_refused(memory: QueryMemory, scene: Scene) -> None:
-    assert scene.gaussians is not None
-    assert scene.views is not None
-    with pytest.raises(InputError, match="count: expected 1 component or more, got 0"):
-        attention_picture(memory, scene, 0, (24, 20), count=0)
     for view in (-1, 2):
         with pytest.raises(InputError, match=f"has 2 views, and view {view} is asked for"):
             attention_picture(memory, scene, view, (24, 20))
@@ -164,9 +127,9 @@ def test_memories_views_and_counts_that_do_not_fit_are_refused(memory: QueryMemo
 def test_the_outline_lies_around_the_cell_and_the_cell_stays_as_it_is(cell: tuple[float, ...]) -> None:
     rng = np.random.default_rng(0)
     photograph = rng.integers(0, 200, (60, 80, 3), dtype=np.uint8)
-    factor = TILE_SIDE / 80
+    factor = SIDE / 80
     tile = cell_tile(photograph, np.array(cell, np.float64))
-    assert tile.shape == (225, 300, 3)
+    assert tile.shape == (360, 480, 3)
     left, top, right, bottom = (edge * factor for edge in cell)
     rows, columns = np.nonzero(in_color(tile, MARK))
     near = (abs(columns - (left + right) / 2) < (right - left) / 2 + 4) & (
@@ -174,9 +137,9 @@ def test_the_outline_lies_around_the_cell_and_the_cell_stays_as_it_is(cell: tupl
     )
     rows, columns = rows[near], columns[near]
     assert abs(columns.min() - max(left - 2, 1)) <= 1.5
-    assert abs(columns.max() - min(right + 2, 298)) <= 1.5
+    assert abs(columns.max() - min(right + 2, 478)) <= 1.5
     assert abs(rows.min() - max(top - 2, 1)) <= 1.5
-    assert abs(rows.max() - min(bottom + 2, 223)) <= 1.5
+    assert abs(rows.max() - min(bottom + 2, 358)) <= 1.5
     inside = np.s_[int(top) + 5 : int(bottom) - 4, int(left) + 5 : int(right) - 4]
     plain = cell_tile(photograph, np.array([0.0, 0, 80, 60]))
     np.testing.assert_array_equal(tile[inside], plain[inside])
@@ -184,16 +147,16 @@ def test_the_outline_lies_around_the_cell_and_the_cell_stays_as_it_is(cell: tupl
 
 def test_a_small_cell_is_enlarged_in_the_corner_that_is_farthest_from_it() -> None:
     """A white pixel on grey: in its place, and as a bright square in the middle of the close-up."""
-    for row, column, corner in ((5, 5, (-98, -98)), (5, 74, (-98, 2)), (54, 5, (2, -98)), (54, 74, (2, 2))):
+    for row, column, corner in ((5, 5, (-152, -152)), (5, 74, (-152, 2)), (54, 5, (2, -152)), (54, 74, (2, 2))):
         photograph = GREY.copy()
         photograph[row, column] = 255
         cell = np.array([column, row, column + 1, row + 1], np.float64)
         tile = cell_tile(photograph, cell)
         top, left = (start if start >= 0 else side + start for start, side in zip(corner, tile.shape, strict=False))
-        close = tile[top : top + 96, left : left + 96]
+        close = tile[top : top + 150, left : left + 150]
         assert in_color(close, MARK).any()
-        assert (close[46:50, 46:50] > 220).all()
-        assert (close[46:50, 16:24] == 90).all()
+        assert (close[73:77, 73:77] > 220).all()
+        assert (close[73:77, 25:40] == 90).all()
     large = cell_tile(GREY, np.array([10.0, 10, 60, 50]))
     assert (in_color(large, (90, 90, 90)) | in_color(large, MARK) | in_color(large, HALO)).all()
 
@@ -207,8 +170,8 @@ def test_cells_beyond_the_photograph_are_outlined_at_its_edge() -> None:
 @pytest.mark.parametrize("pixel", [(0, 0), (40, 30), (79, 59)])
 def test_the_mark_surrounds_the_pixel_and_does_not_hide_it(pixel: tuple[int, int]) -> None:
     picture = mark_pixel(GREY, pixel)
-    assert picture.shape == (495, VIEW_SIDE, 3)
-    x, y = ((each + 0.5) * VIEW_SIDE / 80 for each in pixel)
+    assert picture.shape == (360, SIDE, 3)
+    x, y = ((each + 0.5) * SIDE / 80 for each in pixel)
     rows, columns = np.nonzero(in_color(picture, MARK))
     distance = np.hypot(rows - y, columns - x)
     assert 8 <= distance.min() <= 12
@@ -216,45 +179,39 @@ def test_the_mark_surrounds_the_pixel_and_does_not_hide_it(pixel: tuple[int, int
     np.testing.assert_array_equal(picture[int(y), int(x)], 90)
 
 
-@pytest.mark.parametrize("view", [0, 1])
-def test_a_picture_holds_the_view_and_the_tiles_of_the_components_and_comes_again_the_same(
-    memory: QueryMemory, scene: Scene, view: int
+@pytest.mark.parametrize("photographs", [True, False])
+def test_a_picture_holds_the_view_and_the_photographs_of_the_components_with_their_titles(
+    memory: QueryMemory, scene: Scene, photographs: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene = with_photographs(scene)
-    assert scene.gaussians is not None
-    assert scene.views is not None
-    assert scene.views.images is not None
-    picture = attention_picture(memory, scene, view, (24, 20), count=3)
-    np.testing.assert_array_equal(picture, attention_picture(memory, scene, view, (24, 20), count=3))
-    components = strongest_components(memory, scene.gaussians, scene.views.cameras, view, (24, 20), 3)
-    tiles = []
-    for number, component in enumerate(components.components.tolist()):
-        photograph = scene.views.images[int(memory.bank.sources[component, 0])]
-        tile = cell_tile(photograph, memory.bank.cells[component])
-        left = 3 * GAP + VIEW_SIDE + number * (TILE_SIDE + GAP)
-        np.testing.assert_array_equal(picture[HEAD : HEAD + tile.shape[0], left : left + TILE_SIDE], tile)
-        tiles.append(tile)
-    assert not np.array_equal(tiles[0], tiles[1])
-    assert not np.array_equal(tiles[1], tiles[2])
-    shown = picture[HEAD : HEAD + 550, GAP : GAP + VIEW_SIDE]
-    plain = render_image(scene.gaussians, scene.views.cameras, view)
-    np.testing.assert_array_equal(shown, mark_pixel(plain, (24, 20)))
+    scene = with_photographs(scene) if photographs else scene
+    # Components of both views are among those that are found.
+    components, weights = strongest(memory, scene, 1)
+    sources = memory.bank.sources.copy()
+    sources[components, 0] = [0, 1, 0]
+    memory = replace(memory, bank=replace(memory.bank, sources=sources))
+    titles: list[str] = []
+    sheet = module.contact_sheet
+    monkeypatch.setattr(
+        module, "contact_sheet", lambda shown, named, **rest: titles.extend(named) or sheet(shown, named, **rest)
+    )
+    picture = attention_picture(memory, scene, 1, (24, 20), count=3)
+    cameras = scene.views.cameras
+    shown = [mark_pixel(render_image(scene.gaussians, cameras, 1), (24, 20))]
+    for component in components.tolist():
+        source = int(sources[component, 0])
+        image = scene.views.images[source] if photographs else render_image(scene.gaussians, cameras, source)
+        shown.append(cell_tile(image, memory.bank.cells[component]))
+    for number, each in enumerate(shown):
+        left = 12 + 492 * number
+        np.testing.assert_array_equal(picture[40 : 40 + each.shape[0], left : left + SIDE], each)
+    names, ending = scene.views.names, "" if photographs else ", rendered"
+    assert titles[0] == f"{names[1]}, column 24, row 20, attends to …"
+    for number, (title, weight, source) in enumerate(zip(titles[1:], weights, (0, 1, 0), strict=True), start=1):
+        assert title.startswith(f"{number}.  {100 * weight:.1f} %  row ")
+        assert title.endswith(f" of {names[source]}{ending}")
 
 
-def test_the_bar_under_a_tile_is_as_long_as_its_weight(memory: QueryMemory, scene: Scene) -> None:
-    assert scene.gaussians is not None
-    assert scene.views is not None
-    components = strongest_components(memory, scene.gaussians, scene.views.cameras, 0, (24, 20), 3)
-    picture = attention_picture(memory, scene, 0, (24, 20), count=3)
-    for number, weight in enumerate(components.weights.tolist()):
-        left = 3 * GAP + VIEW_SIDE + number * (TILE_SIDE + GAP)
-        row = picture[HEAD + 250 + 6, left : left + TILE_SIDE]
-        full = (row == np.array(FULL_BAR)).all(axis=1)
-        assert full.sum() == round(weight * TILE_SIDE)
-        assert (row[~full] == np.array(EMPTY_BAR)).all()
-
-
-def test_scenes_without_photographs_and_banks_of_one_component_are_drawn(memory: QueryMemory, scene: Scene) -> None:
+def test_banks_of_one_component_are_drawn(memory: QueryMemory, scene: Scene) -> None:
     rendered = attention_picture(memory, scene, 0, (24, 20))
     assert in_color(rendered, MARK).any()
     single = attention_picture(first_components(memory, 1), scene, 0, (24, 20))
@@ -270,11 +227,8 @@ def test_entropy_is_none_for_one_component_and_largest_for_equal_ones() -> None:
 def test_the_salient_pixel_is_opaque_and_has_the_lowest_entropy_of_the_middle(
     memory: QueryMemory, scene: Scene
 ) -> None:
-    assert scene.gaussians is not None
-    assert scene.views is not None
     b = blend(scene.gaussians, scene.views.cameras, 0)
     pixel = salient_pixel(memory, b)
-    assert pixel is not None
     x, y = pixel
     assert 12 <= x < 36
     assert 10 <= y < 30
@@ -290,19 +244,15 @@ def test_the_salient_pixel_is_opaque_and_has_the_lowest_entropy_of_the_middle(
 def test_where_only_the_rim_of_a_view_shows_something_the_salient_pixel_is_there(
     memory: QueryMemory, scene: Scene
 ) -> None:
-    assert scene.gaussians is not None
-    assert scene.views is not None
     corner = (scene.gaussians.means[:, 0] < -0.75) & (memory.weights > 0)
     weights = np.where(corner, memory.weights, 0).astype(np.float32)
     rim = replace(memory, weights=weights, queries=np.where(corner[:, None], memory.queries, 0).astype(np.float32))
     b = blend(scene.gaussians, scene.views.cameras, 0)
     pixel = salient_pixel(rim, b)
-    assert pixel is not None
     assert pixel[0] < 24
 
 
 def test_evenly_spaced_views_are_drawn_and_those_that_show_nothing_are_named(memory: QueryMemory, scene: Scene) -> None:
-    assert scene.views is not None
     drawn = dict(attention_pictures(memory, scene, views=5))
     assert sorted(drawn) == [0, 1]
     assert [view for view, _ in attention_pictures(memory, scene, views=1)] == [0]
@@ -315,18 +265,9 @@ def test_evenly_spaced_views_are_drawn_and_those_that_show_nothing_are_named(mem
 
 
 def test_features_of_one_channel_are_drawn(scene: Scene) -> None:
-    assert scene.gaussians is not None
     one = make_memory("dot", components=2, channels=1, width=1, gaussians=len(scene.gaussians))
     picture = attention_picture(one, scene, 0, (24, 20))
     assert in_color(picture, MARK).any()
-
-
-def test_the_picture_is_a_file_that_is_the_same_again(memory: QueryMemory, scene: Scene, tmp_path: Path) -> None:
-    for name in ("one", "other"):
-        for view, picture in attention_pictures(memory, with_photographs(scene), views=2):
-            picture.save(tmp_path / f"{name}{view}.png")
-    for view in (0, 1):
-        assert (tmp_path / f"one{view}.png").read_bytes() == (tmp_path / f"other{view}.png").read_bytes()
 
 
 def test_sources_of_the_walls_bank_are_cells_of_two_pixels(memory: QueryMemory) -> None:
@@ -335,3 +276,29 @@ def test_sources_of_the_walls_bank_are_cells_of_two_pixels(memory: QueryMemory) 
         [bank.sources[:, 2], bank.sources[:, 1], bank.sources[:, 2] + 1, bank.sources[:, 1] + 1], axis=1
     )
     np.testing.assert_allclose(bank.cells, 2 * expected)
+
+
+@pytest.mark.parametrize("case", ["haze", "below the middle", "beside the middle"])
+def test_the_salient_pixel_is_opaque_and_in_the_middle_though_others_attend_to_less(
+    memory: QueryMemory, case: str
+) -> None:
+    """One Gaussian in the middle attends to all components, and another one to a single component."""
+    scene = wall(0)
+    positions = {"haze": (0.4, 0.0, 3.0), "below the middle": (0.0, 0.95, 3.0), "beside the middle": (1.1, 0.0, 3.0)}[
+        case
+    ]
+    gaussians = replace(
+        scene.gaussians.select(np.zeros(2, int)),
+        means=np.array([(0, 0, 3), positions], np.float32),
+        scales=np.full((2, 3), 0.1, np.float32),
+        opacities=np.array([0.95, 0.4 if case == "haze" else 0.95], np.float32),
+    )
+    toward = np.linalg.lstsq(memory.projection.T, memory.bank.components[0] - memory.mean, rcond=None)[0]
+    queries = np.stack([np.zeros(5), toward]).astype(np.float32)
+    two = replace(memory, queries=queries, weights=np.ones(2, np.float32))
+    both, one = attention_entropy(two.attention(queries))
+    assert one < both - 0.1
+    b = blend(gaussians, scene.views.cameras, 0)
+    pixel = salient_pixel(two, b)
+    assert abs(pixel[0] - 24) <= 4
+    assert abs(pixel[1] - 20) <= 4

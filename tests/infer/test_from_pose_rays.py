@@ -1,19 +1,18 @@
-"""Words to points from a pose by rays at a stride, in views of any size."""
-
-from dataclasses import replace
+"""Words to points from a pose by rays at a stride, in views of any size, of features and of memories."""
 
 import numpy as np
 import pytest
 import torch
-from posed_words import NAMES, opaque_ball, plain_relevancy, scene_of, some_features, two_kinds, words
+from posed_words import CHANNELS, NAMES, SPACE, opaque_ball, plain_relevancy, scene_of, some_features, two_kinds, words
 from splats import front_camera, one_gaussian
 
-from gsencoder.infer.from_pose import MAX_RAYS, FeatureField, FromPoseConfig, from_pose, pose_picture, view_picture
+from gsencoder.infer.from_pose import FeatureField, FromPoseConfig, from_pose, pose_picture, view_picture
 from gsencoder.render import blend
+from gsencoder.types import MemoryBank, QueryMemory
 
 
-@pytest.mark.parametrize(("width", "height"), [(61, 43), (2, 1), (8, 5), (1, 9)])
-@pytest.mark.parametrize("stride", [1, 3, 4])
+@pytest.mark.parametrize(("width", "height"), [(61, 43), (2, 1), (1, 9)])
+@pytest.mark.parametrize("stride", [1, 4])
 def test_rays_at_a_stride_are_those_of_their_pixels(width: int, height: int, stride: int) -> None:
     gaussians, cameras = opaque_ball(), front_camera(width, height)
     full, strided = blend(gaussians, cameras), blend(gaussians, cameras, stride=stride)
@@ -61,10 +60,38 @@ def test_large_views_are_looked_at_in_fewer_pixels_and_drawn_small(monkeypatch: 
     assert abs(small.shape[0] / small.shape[1] - large.shape[0] / large.shape[1]) < 0.1
 
 
-def test_a_stride_that_is_asked_for_holds_in_views_of_any_size() -> None:
+def test_a_memory_answers_as_features_where_its_attention_is_exact() -> None:
+    """Queries that fit one component each, and no pixel that blends two kinds."""
     gaussians, features = two_kinds(one_gaussian((-0.7, 0, 2)), one_gaussian((0.7, 0, 2)))
-    field = FeatureField(scene_of(gaussians, features), config=FromPoseConfig(stride=3))
-    huge = replace(front_camera(), widths=np.array([1 << 24], np.int32), heights=np.array([1], np.int32))
-    assert field.stride_in(huge, 0) == 3
-    free = FeatureField(scene_of(gaussians, features)).stride_in(huge, 0)
-    assert -(-(1 << 24) // free) <= MAX_RAYS
+    local = features.features - features.mean
+    bank = MemoryBank(
+        components=features.features,
+        sources=np.zeros((2, 3), np.int32),
+        grid_from_image=np.tile(np.eye(2, 3), (2, 1, 1)),
+        mean=features.mean,
+        threshold=0.9,
+        coverage=1.0,
+        cosine=1.0,
+        space=SPACE,
+    )
+    memory = QueryMemory(
+        queries=local, weights=features.weights, projection=np.eye(CHANNELS, dtype=np.float32), bank=bank,
+        scoring="centered", temperature=0.01, mean=features.mean,
+    )  # fmt: skip
+    scene, config = scene_of(gaussians, features), FromPoseConfig(stride=1)
+    plain, remembered = (
+        FeatureField(scene, memory=each, config=config).at(front_camera()).relevancy(NAMES[:2], words())
+        for each in (None, memory)
+    )
+    assert np.isfinite(plain).any()
+    np.testing.assert_allclose(remembered, plain, atol=1e-5)
+    for a, b in zip(
+        from_pose(scene, front_camera(), NAMES[:2], words(), config),
+        from_pose(scene, front_camera(), NAMES[:2], words(), config, memory=memory),
+        strict=True,
+    ):
+        assert a.visible
+        assert b.visible
+        assert a.threshold == pytest.approx(b.threshold, abs=1e-5)
+        np.testing.assert_allclose(b.position, a.position, atol=0.3)
+    assert FeatureField(scene, memory=memory).stride_in(front_camera(), 0) == 4

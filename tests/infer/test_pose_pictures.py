@@ -1,5 +1,7 @@
 """Pictures of what was found from a pose: where the ring, the label and the relevancy of each ray are drawn."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from splats import front_camera, one_gaussian, random_gaussians
@@ -18,7 +20,13 @@ from gsencoder.infer.from_pose import (
 from gsencoder.render.images import render_image
 from gsencoder.types import FeatureSpace, GaussianFeatures, Gaussians, Scene
 
-LABEL_HEIGHT = 27
+
+@pytest.fixture(autouse=True)
+def labels(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Labels are listed in place of being drawn."""
+    listed: list[Any] = []
+    monkeypatch.setattr("gsencoder.infer.from_pose.draw_labels", lambda *arguments: listed.extend(arguments[2]))
+    return listed
 
 
 def seen_from(width: int, height: int, stride: int = 1, gaussians: Gaussians | None = None) -> SeenField:
@@ -55,9 +63,9 @@ def drawn(seen: SeenField, point: PosePoint, relevancy: np.ndarray | None = None
 
 
 def middle_of(picture: np.ndarray, color: tuple[int, int, int]) -> tuple[float, float]:
-    """The middle, x and y, of the pixels of a color below the label."""
-    rows, columns = np.nonzero((picture[LABEL_HEIGHT:] == color).all(axis=2))
-    return (columns.min() + columns.max()) / 2, (rows.min() + rows.max()) / 2 + LABEL_HEIGHT
+    """The middle, x and y, of the pixels of a color."""
+    rows, columns = np.nonzero((picture == color).all(axis=2))
+    return (columns.min() + columns.max()) / 2, (rows.min() + rows.max()) / 2
 
 
 @pytest.mark.parametrize(
@@ -70,7 +78,7 @@ def test_the_ring_lies_around_the_pixel_of_the_enlarged_view(width: int, height:
         assert picture.shape == (factor * height, factor * width, 3)
         np.testing.assert_allclose(middle_of(picture, color), (factor * x, factor * y), atol=1)
         other = HIDDEN if visible else VISIBLE
-        assert not (picture[LABEL_HEIGHT:] == other).all(axis=2).any()
+        assert not (picture == other).all(axis=2).any()
 
 
 @pytest.mark.parametrize(("width", "height", "stride"), [(640, 90, 1), (646, 93, 4), (650, 90, 3)])
@@ -94,42 +102,21 @@ def test_the_relevancy_of_a_ray_is_shown_over_the_block_of_pixels_around_it(
         assert rows.max() == (height - 1 if row == lattice.height - 1 else (row + 1) * stride - 1)
 
 
-def test_the_label_never_covers_what_is_marked() -> None:
+def test_a_label_beside_the_ring_says_where_the_word_is_or_why_it_is_nowhere(labels: list[Any]) -> None:
     seen = seen_from(64, 48)
-
-    def has_label(strip: np.ndarray) -> bool:
-        return bool((strip[:, :60] == VISIBLE).all(axis=2).mean() > 0.3)
-
-    above = drawn(seen, point_at(40.5, 30.5))
-    below = drawn(seen, point_at(3.5, 1.5))
-    assert has_label(above[:LABEL_HEIGHT])
-    assert not has_label(above[-LABEL_HEIGHT:])
-    assert has_label(below[-LABEL_HEIGHT:])
-    np.testing.assert_array_equal(below[:LABEL_HEIGHT, 80:], 0)
-
-
-def test_where_nothing_with_features_is_in_view_the_picture_says_so_and_marks_nothing() -> None:
-    seen = seen_from(64, 48, gaussians=one_gaussian((0, 0, -2)))
-    picture = drawn(seen, point_at(np.nan, np.nan, visible=False))
-    assert (picture[:LABEL_HEIGHT, :100] == HIDDEN).all(axis=2).any()
-    assert not picture[LABEL_HEIGHT:].any()
-
-
-def test_a_label_says_where_the_word_is_or_why_it_is_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    written = []
-    monkeypatch.setattr("gsencoder.infer.from_pose._write", lambda *arguments: written.append(arguments[2]))
-    seen = seen_from(64, 48)
-    for point in (point_at(40.5, 20.5), point_at(40.5, 20.5, visible=False), point_at(np.nan, np.nan, visible=False)):
+    nowhere = point_at(np.nan, np.nan, visible=False)
+    for point in (point_at(40.5, 30.5), point_at(3.5, 1.5, visible=False), nowhere):
         drawn(seen, point)
-    assert written == [
-        label
-        for label in (
-            "mug 0.70, depth 2",
-            "mug 0.70, not visible (needs 0.50)",
-            "mug: nothing with features in view",
-        )
-        for _ in ("the view", "its relevancy")
+    # One for the view, and one for its relevancy.
+    assert [text for _, text, _ in labels] == [
+        text
+        for text in ("mug 0.70, depth 2", "mug 0.70, not visible (needs 0.50)", "mug: nothing with features in view")
+        for _ in range(2)
     ]
+    assert labels[0][0][1] < 305 - 20
+    assert labels[2][0][1] - 30 > 15 + 20
+    assert [color for *_, color in labels] == [VISIBLE] * 2 + [HIDDEN] * 4
+    assert not drawn(seen_from(64, 48, gaussians=one_gaussian((0, 0, -2))), nowhere).any()
 
 
 @pytest.mark.parametrize("stride", [1, 4])

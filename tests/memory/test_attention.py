@@ -104,7 +104,6 @@ def test_queries_of_any_length_give_finite_features_and_gradients(scoring: Scori
     features = module(queries)
     features.square().sum().backward()
     for values in (features, queries.grad, module.projection.grad):
-        assert values is not None
         assert torch.isfinite(values).all()
     assert np.isfinite(memory.attend(queries.detach().numpy())).all()
 
@@ -219,7 +218,7 @@ def test_a_memory_whose_parts_do_not_fit_is_refused(no_jaxtyping: None) -> None:
         {"basis": basis},
     ):
         with pytest.raises(InputError, match=r"QueryMemory\."):
-            replace(memory, **changes)  # type: ignore[arg-type]
+            replace(memory, **changes)
     changed: list[dict[str, Any]] = [
         {"components": memory.bank.components[:0], "sources": memory.bank.sources[:0]},
         {"components": memory.bank.components * np.float32(np.inf)},

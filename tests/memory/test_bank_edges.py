@@ -120,23 +120,6 @@ def test_a_threshold_is_searched_among_features_of_all_views(monkeypatch: pytest
     assert bank.cosine > 0.75
 
 
-def test_a_bank_of_less_coverage_has_the_fewest_components_and_states_its_own_figures() -> None:
-    rng = np.random.default_rng(6)
-    number = np.concatenate([np.repeat(np.arange(12), 2 ** np.arange(12) // 2 + 1), [11] * 12])
-    rows = MEAN + kinds(12, seed=9)[rng.permutation(number)]
-    maps = [map_of(rows[: len(rows) // 4 * 4], len(rows) // 4, 4)]
-    rows = rows[: len(rows) // 4 * 4].astype(np.float32)
-    full = build_bank(stream(maps), SPACE, MEAN, BankConfig(threshold=0.99))
-    part = build_bank(stream(maps), SPACE, MEAN, BankConfig(threshold=0.99, coverage=0.9))
-    assert len(full) == 12
-    best = best_cosines(rows, part)
-    assert part.coverage == pytest.approx((best >= 0.99).mean())
-    assert part.cosine == pytest.approx(best.mean(), abs=1e-6)
-    assert part.coverage >= 0.9
-    counts = [int((rows == component).all(axis=1).sum()) for component in part.components]
-    assert (sum(counts) - min(counts)) / len(rows) < 0.9
-
-
 def test_one_component_is_refused_where_cells_at_the_mean_need_one_of_their_own() -> None:
     row = MEAN + kinds(1)[0]
     two = np.stack([row, MEAN, row, row]).astype(np.float32)

@@ -17,7 +17,7 @@ from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_packag
 from gsencoder.infer.relevancy import relevancy
 from gsencoder.memory import index as index_module
 from gsencoder.memory.index import IndexConfig, index_features
-from gsencoder.memory.reduction import reduce_to_cover
+from gsencoder.memory.reduction import CoverReduction
 from gsencoder.text.table import make_text_table, save_text_table
 from gsencoder.types import FeatureSpace, GaussianFeatures, Scene
 
@@ -91,7 +91,6 @@ def test_features_at_the_mean_but_for_rounding_have_its_row() -> None:
 def test_every_gaussian_has_the_row_that_is_nearest_to_it_and_every_row_is_used(basis: bool) -> None:
     features = make_features(basis=basis)
     made = index_features(features, IndexConfig(threshold=0.8)).features
-    assert made.index is not None
     table, seen = made.features.astype(np.float64), features.seen
     distances = np.linalg.norm(features.features[seen][:, None] - table, axis=2)
     own = distances[np.arange(seen.sum()), made.index[seen]]
@@ -105,7 +104,6 @@ def test_a_row_is_the_mean_of_the_gaussians_that_have_it() -> None:
     noise = 0.01 * np.random.default_rng(0).normal(size=features.features.shape)
     values = (features.features + noise).astype(np.float32) * features.seen[:, None]
     made = index_features(replace(features, features=values), IndexConfig(threshold=0.97)).features
-    assert made.index is not None
     assert len(made.features) == 7
     for row, vector in enumerate(made.features):
         np.testing.assert_allclose(vector, values[made.index == row].mean(axis=0, dtype=np.float64), atol=1e-5)
@@ -115,8 +113,10 @@ def test_the_threshold_that_is_stated_is_the_largest_one_whose_table_has_so_few_
     features = make_features(n=1000)
     made = index_features(features, IndexConfig(threshold=0.0, rows=60))
     centered = features.features[features.seen]
-    assert len(reduce_to_cover(centered, made.threshold).rows) <= 60
-    assert len(reduce_to_cover(centered, made.threshold + 2 / 4096).rows) > 60
+    for threshold, few in ((made.threshold, True), (made.threshold + 2 / 4096, False)):
+        cover = CoverReduction(centered.shape[1], threshold)
+        cover.add(centered)
+        assert (len(cover) <= 60) == few
 
 
 def test_rows_that_are_asked_for_have_room_for_features_at_the_mean() -> None:
@@ -144,7 +144,7 @@ def test_the_number_of_rows_is_a_limit_and_more_than_two_bytes_number_are_refuse
         index_features(replace(features, weights=np.zeros_like(features.weights)))
     for config in ({"threshold": 0.0}, {"rows": 9}, {"threshold": 1.5}, {"threshold": 0.0, "rows": 1}):
         with pytest.raises(InputError, match="threshold|rows"):
-            IndexConfig(**config)  # type: ignore[arg-type]
+            IndexConfig(**config)
 
 
 def test_words_score_an_index_as_they_score_what_it_stands_for(rng: np.random.Generator) -> None:
@@ -211,8 +211,8 @@ def test_settings_of_an_index_and_another_splat_are_refused(
 ) -> None:
     out = tmp_path / "out"
     for words, message in (
-        (["index.threshold=1.2"], "index.threshold: expected a cosine above 0 and up to 1, got 1.2"),
-        (["index.threshold=0"], "index.threshold: 0 needs rows= as well"),
+        (["index.threshold=1.2"], "index.threshold: expected 0 to 1, got 1.2"),
+        (["index.threshold=0"], "index.threshold: 0 needs rows=2 or more as well"),
         (["index.rows=8", "budget.error=0.1"], "index.rows: 8 rows need threshold=0 as well, got 0.9; beside a budget"),
         (["decoded=true"], "form=index holds codes"),
     ):

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from feature_fields import SPACE, make_features
+from memory_samples import memory_of_features
 
 from gsencoder.core.errors import InputError
-from gsencoder.memory.bank import memory_of_features, principal_queries
+from gsencoder.memory.bank import principal_queries
 from gsencoder.types import FeatureSpace, GaussianFeatures, MemoryBank
 from gsencoder.types.features import Scoring
 
@@ -42,14 +43,9 @@ def test_queries_of_all_directions_stand_for_the_features(basis: bool, scoring: 
         np.testing.assert_allclose(products, expected, rtol=1e-3, atol=1e-4)
     else:
         assert queries[seen].std() == pytest.approx(1, abs=1e-5)
-
-
-@pytest.mark.parametrize("scoring", ["centered", "cosine"])
-def test_with_cosines_rows_of_the_projection_are_as_long_as_the_root_of_the_channels(scoring: Scoring) -> None:
-    features = make_features(basis=False)
-    _, projection = principal_queries(features, bank_of(features, scoring), 5, scoring)
-    directions = projection[int(scoring == "cosine") :]
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), np.sqrt(12), rtol=1e-5)
+        directions = projection[int(scoring == "cosine") :]
+        lengths = np.linalg.norm(directions, axis=1)
+        np.testing.assert_allclose(lengths[lengths > 1e-3], np.sqrt(12), rtol=1e-5)
 
 
 def test_fewer_channels_keep_the_directions_in_which_the_components_differ_most() -> None:
@@ -79,17 +75,6 @@ def test_with_cosines_the_directions_are_those_about_the_mean_of_the_features_wh
     assert projection[0] @ features.mean == pytest.approx(
         np.linalg.norm(projection[0]) * np.linalg.norm(features.mean), rel=1e-5
     )
-
-
-@pytest.mark.parametrize("basis", [True, False])
-def test_a_memory_without_training_has_the_settings_basis_and_weights_that_it_was_given(basis: bool) -> None:
-    features = make_features(basis=basis)
-    memory = memory_of_features(features, bank_of(features), channels=3, scoring="dot", temperature=0.7)
-    assert (memory.channels, memory.scoring, memory.temperature) == (3, "dot", 0.7)
-    assert memory.basis is features.basis
-    np.testing.assert_array_equal(memory.weights, features.weights)
-    np.testing.assert_array_equal(memory.mean, features.mean)
-    assert memory.features().features.shape == features.features.shape
 
 
 def test_rare_kinds_are_told_apart_where_most_gaussians_are_of_one_kind() -> None:
@@ -138,7 +123,7 @@ def test_equal_features_have_finite_queries() -> None:
     features = make_features(basis=False)
     equal = replace(features, features=np.repeat(features.mean[None], len(features), axis=0))
     for scoring in ("centered", "cosine", "dot"):
-        queries, projection = principal_queries(equal, bank_of(features), 4, scoring)  # type: ignore[arg-type]
+        queries, projection = principal_queries(equal, bank_of(features), 4, scoring)
         assert np.isfinite(queries).all()
         assert np.isfinite(projection).all()
 
@@ -147,7 +132,7 @@ def test_features_and_banks_of_different_spaces_are_refused() -> None:
     features = make_features()
     bank = replace(bank_of(features), space=FeatureSpace(name="other", channels=SPACE.channels))
     with pytest.raises(InputError, match=r"the features are of \(s .*, and the bank is of \(other"):
-        memory_of_features(features, bank)
+        principal_queries(features, bank, 4)
     nothing = replace(features, weights=np.zeros_like(features.weights))
     with pytest.raises(InputError, match="no Gaussian has features"):
-        memory_of_features(nothing, bank_of(features))
+        principal_queries(nothing, bank_of(features), 4)

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from gsencoder.core.errors import InputError
 from gsencoder.memory.bank import MapStream, build_bank, draw_sample, raw_features
 from gsencoder.types import FeatureMap, FeatureSpace
 
@@ -31,7 +30,7 @@ def stream(maps: list[FeatureMap]) -> MapStream:
     return give
 
 
-@pytest.mark.parametrize("limit", [1, 7, 59, 60, 61, 10_000])
+@pytest.mark.parametrize("limit", [1, 59, 60, 61])
 def test_a_sample_has_so_many_different_features_of_the_maps_in_their_order(limit: int) -> None:
     maps = numbered_maps((4, 5), (3, 10), (2, 5))
     sample = draw_sample(stream(maps), SPACE, limit)
@@ -48,12 +47,14 @@ def test_cells_without_a_feature_are_in_no_sample_and_not_counted() -> None:
     rows = np.concatenate([raw_features(view, each)[0] for view, each in enumerate(maps)])
     np.testing.assert_array_equal(sample.features, rows)
     assert sample.total == len(rows) < 500
+    empty = draw_sample(stream(numbered_maps((3, 3), missing=1.1)), SPACE, 5)
+    assert (empty.features.shape, empty.total) == ((0, 2), 0)
 
 
 def test_every_feature_is_drawn_equally_often() -> None:
     """Views of any size and columns of any map: counts over seeds are those of independent draws."""
     maps = numbered_maps((2, 32), (1, 4), (4, 8))
-    seeds, limit = 600, 25
+    seeds, limit = 300, 25
     counts = {}
     for seed in range(seeds):
         for key in map(tuple, draw_sample(stream(maps), SPACE, limit, seed=seed).features.tolist()):
@@ -77,17 +78,6 @@ def test_a_seed_gives_the_same_sample_again_and_another_seed_another_one() -> No
     first, again, other = (draw_sample(maps, SPACE, 20, seed=seed).features for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
-
-
-def test_maps_without_features_give_an_empty_sample() -> None:
-    sample = draw_sample(stream(numbered_maps((3, 3), missing=1.1)), SPACE, 5)
-    assert sample.features.shape == (0, 2)
-    assert sample.total == 0
-
-
-def test_a_limit_below_one_is_refused() -> None:
-    with pytest.raises(InputError, match="limit: expected 1 or more, got 0"):
-        draw_sample(stream(numbered_maps((2, 2))), SPACE, 0)
 
 
 def test_the_cell_of_a_component_is_where_the_affine_of_its_map_puts_its_source() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from memory_samples import render_features
 from memory_scenes import PREPARE, BlendedTeacher, prepared_wall
 from training_scenes import scene as wall
 
@@ -13,7 +14,7 @@ from gsencoder.app.commands.memory import fit_errors, in_space
 from gsencoder.core.errors import InputError
 from gsencoder.core.logs import LOG_FILE, read_log
 from gsencoder.evaluate.sources import RenderedTally
-from gsencoder.memory.attention import render_features, render_queries
+from gsencoder.memory.attention import render_queries
 from gsencoder.memory.bank import BankConfig, raw_features
 from gsencoder.render import BlendConfig, blend
 from gsencoder.train import loop

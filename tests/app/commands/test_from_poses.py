@@ -65,7 +65,6 @@ def test_the_memory_that_is_asked_is_that_of_the_features_of_the_scene(tmp_path:
     loaded = load_features(tmp_path / "several")
     for teacher, name in (("a", "first"), ("b", "second")):
         memory = memory_of(tmp_path / "several", replace(loaded, features={teacher: loaded.features[teacher]}))
-        assert memory is not None
         assert memory.space.name == name
     save_features(tmp_path / "features", scene, memory_in("first").features())
     assert memory_of(tmp_path / "features", load_features(tmp_path / "features")) is None

@@ -66,7 +66,6 @@ def test_without_pictures_no_raw_features_are_kept_and_nothing_is_drawn(
 
 def test_a_bare_splat_is_drawn_by_its_renders(tmp_path: Path) -> None:
     gaussians = make_room(0, objects=2, views=1, width=8, height=6, spacing=0.15).gaussians
-    assert gaussians is not None
     save_splat(tmp_path / "room.ply", gaussians)
     out = f"out={tmp_path / 'of_splat'}"
     splat = [str(tmp_path / "room.ply"), "teacher=palette", "orbits=3", "pictures=2", "data.up=[0,0,1]"]
