@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float64
+from memory_samples import make_memory
+from rooms import merged
 from splats import random_gaussians
 
 from gsencoder.render import blend
@@ -14,10 +16,10 @@ from gsencoder.types import (
     FeatureSpace,
     GaussianFeatures,
     Gaussians,
-    MemoryBank,
     QueryMemory,
     Scene,
 )
+from gsencoder.types.features import Scoring
 
 CHANNELS = 40
 SPACE = FeatureSpace(name="toy", channels=CHANNELS, text_encoder="toy")
@@ -87,12 +89,7 @@ def plain_relevancy(
 
 def two_kinds(first: Gaussians, second: Gaussians) -> tuple[Gaussians, GaussianFeatures]:
     """Gaussians of two kinds whose features are the words a and b themselves."""
-    joined = Gaussians(
-        **{
-            name: np.concatenate([getattr(first, name), getattr(second, name)])
-            for name in ("means", "quats", "scales", "opacities", "sh")
-        }
-    )
+    joined = merged(first, second)
     kinds = np.repeat([0, 1], [len(first), len(second)])
     # The means of features and words are far from both, so that neither is the mean's opposite of the other.
     features = GaussianFeatures(
@@ -104,30 +101,6 @@ def two_kinds(first: Gaussians, second: Gaussians) -> tuple[Gaussians, GaussianF
     return joined, features
 
 
-def memory_of(n: int, *, components: int, temperature: float = 0.05) -> QueryMemory:
-    rng = np.random.default_rng(2)
-    weights = rng.uniform(0.5, 2, n).astype(np.float32)
-    weights[::7] = 0
-    mean = rng.normal(size=CHANNELS).astype(np.float32)
-    queries = rng.normal(size=(n, 6)).astype(np.float32)
-    queries[weights == 0] = 0
-    bank = MemoryBank(
-        components=(rng.normal(size=(components, CHANNELS)) + mean).astype(np.float32),
-        sources=np.zeros((components, 3), np.int32),
-        grid_from_image=np.tile(np.eye(2, 3), (components, 1, 1)),
-        mean=mean,
-        threshold=0.9,
-        coverage=1.0,
-        cosine=0.95,
-        space=SPACE,
-    )
-    projection = rng.normal(size=(6, CHANNELS)).astype(np.float32)
-    return QueryMemory(
-        queries=queries,
-        weights=weights,
-        projection=projection,
-        bank=bank,
-        scoring="centered",
-        temperature=temperature,
-        mean=mean,
-    )
+def memory_of(n: int, *, components: int = 9, scoring: Scoring = "centered") -> QueryMemory:
+    made = make_memory(scoring, components=components, channels=CHANNELS, gaussians=n)
+    return replace(made, bank=replace(made.bank, space=SPACE))

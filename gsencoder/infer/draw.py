@@ -45,8 +45,6 @@ def write_boxes_ply(
     path: str | Path,
     scene: Scene,
     localization: Localization,
-    *,
-    oriented: bool = False,
 ) -> None:
     """Writes the Gaussians of all boxes as points in their word's color, and the edges of the boxes.
 
@@ -64,7 +62,7 @@ def write_boxes_ply(
             raise InputError(
                 f"write_boxes_ply: box of {box.query!r} has row {box.rows.max()} of {len(means)} Gaussians"
             )
-        corners = box_corners(box, oriented=oriented)
+        corners = box_corners(box, oriented=False)
         lines = [corners[a] + steps * (corners[b] - corners[a]) for a, b in EDGES]
         inside = means[box.rows].astype(np.float64) + scene.origin
         part = np.concatenate([corners, *lines, inside])
@@ -74,24 +72,16 @@ def write_boxes_ply(
         colors.append(np.broadcast_to(color.astype(np.uint8), part.shape))
         edges.append(EDGES + count)
         count += len(part)
-    with atomic_file(path) as stream:
-        stream.write(
-            _ply_bytes(
-                np.concatenate(points) if points else np.zeros((0, 3)),
-                np.concatenate(colors) if colors else np.zeros((0, 3), np.uint8),
-                np.concatenate(edges) if edges else np.zeros((0, 2), np.int32),
-            )
-        )
-
-
-def _ply_bytes(points: Float64[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"], edges: np.ndarray) -> bytes:
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     header += [f"property double {axis}" for axis in "xyz"]
     header += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    header += [f"element edge {len(edges)}", "property int vertex1", "property int vertex2", "end_header\n"]
-    vertices = np.empty(len(points), [("position", "<f8", 3), ("color", "u1", 3)])
-    vertices["position"], vertices["color"] = points, colors
-    return "\n".join(header).encode() + vertices.tobytes() + edges.astype("<i4").tobytes()
+    header += [f"element edge {12 * len(edges)}", "property int vertex1", "property int vertex2", "end_header\n"]
+    vertices = np.empty(count, [("position", "<f8", 3), ("color", "u1", 3)])
+    if points:
+        vertices["position"], vertices["color"] = np.concatenate(points), np.concatenate(colors)
+    with atomic_file(path) as stream:
+        stream.write("\n".join(header).encode() + vertices.tobytes())
+        stream.write(b"".join(each.astype("<i4").tobytes() for each in edges))
 
 
 Picture = UInt8[np.ndarray, "_h _w 3"]
@@ -100,6 +90,8 @@ LEGIBLE_WIDTH = 640
 """Smaller pictures are enlarged by a whole factor before anything is written on them."""
 NEAR = 0.05
 RING = 11
+OPACITY = 0.6
+"""Of relevancy over a view."""
 PAPER, INK, FAINT = (255, 255, 255), (32, 33, 36), (120, 124, 130)
 
 
@@ -138,20 +130,13 @@ def legible_factor(width: int) -> int:
 
 
 def relevancy_overlay(
-    rgb: UInt8[np.ndarray, "H W 3"],
-    relevancy: Float32[np.ndarray, "H W"],
-    *,
-    low: float = 0.0,
-    high: float = 1.0,
-    opacity: float = 0.6,
+    rgb: UInt8[np.ndarray, "H W 3"], relevancy: Float32[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Relevancy as color (turbo: blue low, red high) over the grey view; NaN shows the grey view alone.
-
-    The ends are given, not found, so that pictures of different views and words can be compared."""
+    """Relevancy as color (turbo: 0 blue, 1 red) over the grey view; NaN shows the grey view alone."""
     if rgb.shape[:2] != relevancy.shape:
         raise InputError(f"relevancy_overlay: relevancy {relevancy.shape} over a picture of {rgb.shape[:2]}")
     grey = (rgb @ np.array([0.299, 0.587, 0.114]))[..., None]
-    mixed = (1 - opacity) * grey + opacity * _colors(relevancy, low, high, "turbo")
+    mixed = (1 - OPACITY) * grey + OPACITY * _colors(relevancy, 0.0, 1.0, "turbo")
     shown = np.where(np.isfinite(relevancy)[..., None], mixed, grey)
     return shown.round().clip(0, 255).astype(np.uint8)
 
@@ -180,17 +165,13 @@ def draw_boxes(
     K: Float32[np.ndarray, "3 3"],
     *,
     origin: Float64[np.ndarray, "3"] | None = None,
-    oriented: bool = True,
 ) -> UInt8[np.ndarray, "H2 W2 3"]:
-    """Draws the 12 edges of boxes, and word and score of each; edges end at the near plane.
+    """Draws the edges of oriented boxes, also behind surfaces, and word and score of each; edges end at the near plane.
 
     Small pictures are enlarged by a whole factor first (`legible_factor`). Words take colors in order of appearance.
-    Edges behind surfaces are drawn too.
 
     Args:
         boxes: in world coordinates, origin included.
-        K: its intrinsics in pixels of `rgb`.
-        oriented: draw the oriented boxes, not the axis-aligned ones.
     """
     factor = legible_factor(rgb.shape[1])
     image = Image.fromarray(enlarge(rgb, factor))
@@ -200,7 +181,7 @@ def draw_boxes(
     labels: list[tuple[np.ndarray, str, tuple[int, int, int]]] = []
     # The best box of a word is drawn last, over the others.
     for box in sorted(boxes, key=lambda each: -each.rank):
-        corners = box_corners(box, oriented=oriented)
+        corners = box_corners(box)
         if origin is not None:
             corners = corners - origin
         segments = _project_edges(transform(pose, corners), intrinsics, image.width, image.height)
@@ -344,21 +325,12 @@ def pca_picture(
     return ((share * cover[..., None] + (1 - cover[..., None])) * 255).round().astype(np.uint8)
 
 
-def depth_picture(
-    depth: Float32[np.ndarray, "H W"], *, low: float | None = None, high: float | None = None
-) -> UInt8[np.ndarray, "H W 3"]:
-    """Depth as color (viridis, near is bright); 0, NaN and Inf, which mean none, are dark grey.
-
-    Args:
-        depth: z, in world units.
-        low: depth shown brightest; the 2nd percentile if left out.
-        high: depth shown darkest; the 98th percentile if left out.
-    """
+def depth_picture(depth: Float32[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Depth as color (viridis, near is bright, from the 2nd percentile to the 98th); 0, NaN and Inf, which mean none,
+    are dark grey."""
     valid: Bool[np.ndarray, "H W"] = np.isfinite(depth) & (depth > 0)
-    if valid.any():
-        ends = np.percentile(depth[valid], [2, 98])
-        low, high = (float(ends[0]) if low is None else low), (float(ends[1]) if high is None else high)
-    shown = _colors(-np.where(valid, depth, 0), -(high or 1.0), -(low or 0.0), "viridis")
+    low, high = np.percentile(depth[valid], [2, 98]) if valid.any() else (0.0, 1.0)
+    shown = _colors(-np.where(valid, depth, 0), -float(high), -float(low), "viridis")
     return np.where(valid[..., None], shown, np.uint8(48)).astype(np.uint8)
 
 

@@ -26,7 +26,6 @@ from gsencoder.infer.pictures import pixel_features
 from gsencoder.infer.relevancy import GaussianProducts, Mode, ThresholdConfig, threshold, word_directions
 from gsencoder.render import Blend, blend
 from gsencoder.render.images import render_image
-from gsencoder.render.rays import strided_lattice
 from gsencoder.text.table import TextEncoder, check_space
 from gsencoder.types import Cameras, QueryMemory, Scene
 
@@ -128,35 +127,17 @@ class FeatureField:
             stride += 1
         return stride
 
-    def at(self, cameras: Cameras, view: int = 0, *, b: Blend | None = None) -> "SeenField":
-        """What one camera sees of the field, kept for many words.
-
-        Args:
-            cameras: relative to the scene's origin.
-            b: its blend at the stride of this field, where it has been made already.
-        """
+    def at(self, cameras: Cameras, view: int = 0) -> "SeenField":
+        """What one camera, relative to the scene's origin, sees of the field, kept for many words."""
         if not -len(cameras) <= view < len(cameras):
             raise InputError(f"view: expected 0 to {len(cameras) - 1}, got {view}")
-        stride = self.stride_in(cameras, view)
-        if b is None:
-            b = blend(self.gaussians, cameras, view, stride=stride)
-        expected = strided_lattice(int(cameras.widths[view]), int(cameras.heights[view]), stride)
-        if b.lattice != expected:
-            raise InputError(
-                f"from_pose: expected a blend of {expected.width}×{expected.height} rays, every {stride} pixels, "
-                f"got {b.lattice.width}×{b.lattice.height} with {b.lattice.side**2} rays each"
-            )
+        b = blend(self.gaussians, cameras, view, stride=self.stride_in(cameras, view))
         return SeenField(self, cameras, view % len(cameras), b)
 
 
 class SeenField:
-    """A feature field as one camera sees it; its geometry is kept and answers any number of words.
-
-    Attributes:
-        cameras: relative to the scene's origin.
-        view: number of the camera.
-        b: its blend, a row for each pixel that is looked at.
-    """
+    """A feature field as one camera sees it; its blend `b`, a row for each pixel that is looked at, answers any number
+    of words."""
 
     def __init__(self, field: FeatureField, cameras: Cameras, view: int, b: Blend) -> None:
         self.field, self.cameras, self.view, self.b = field, cameras, view, b

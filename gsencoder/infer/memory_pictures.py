@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, UInt8
@@ -236,16 +236,10 @@ def check_umap() -> None:
         raise InputError("umap=true needs the package umap-learn: pip install 'gsencoder[umap]', or give umap=false")
 
 
-def component_scatter(
-    bank: MemoryBank, sample: RawSample, *, umap: bool = False, seed: int = 0
-) -> UInt8[np.ndarray, "H W 3"]:
+def component_scatter(bank: MemoryBank, sample: RawSample, *, umap: bool = False) -> UInt8[np.ndarray, "H W 3"]:
     """Draws raw features as small blue dots and components as red ones, in the plane of the two directions along which
-    the raw features vary most, and with `umap` beside it by UMAP (McInnes et al. 2018), as the paper does.
-
-    Args:
-        sample: raw features of the same maps.
-        umap: whether to draw a second panel, by the cosines that the bank compares features by.
-    """
+    the raw features vary most, and with `umap` beside it by UMAP (McInnes et al. 2018) of the cosines that the bank
+    compares features by, as the paper does."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -259,10 +253,24 @@ def component_scatter(
     figure = Figure(figsize=(15 if umap else 8.4, 7.6), dpi=100, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     panels = figure.subplots(1, 2 if umap else 1, squeeze=False)[0]
-    shares = _draw_pca(panels[0], bank, sample.features)
+    raw = sample.features
+    mean, directions, shares = principal_plane(raw)
+    _dots(panels[0], (raw - mean) @ directions, (bank.components - mean) @ directions)
+    first, second = (f"{100 * share:.1f} % of their variance" for share in shares)
+    panels[0].set_xlabel(f"first principal direction of the raw features, {first}", fontsize=12)
+    panels[0].set_ylabel(f"second principal direction, {second}", fontsize=12)
     if umap:
-        _draw_umap(panels[1], bank, sample.features, seed)
         panels[0].set_title(f"PCA: {100 * shares.sum():.1f} % of the variance", fontsize=13)
+        panels[1].set_title("UMAP: close dots have features of a high cosine", fontsize=13)
+        panels[1].set_xticks([])
+        panels[1].set_yticks([])
+        both = attention_keys(np.concatenate([raw, bank.components]), bank.mean, "centered")
+        if len(both) < UMAP_LEAST:
+            text = f"UMAP needs {UMAP_LEAST} features or more;\nthere are {len(both)}."
+            panels[1].text(0.5, 0.5, text, ha="center", va="center", fontsize=12, transform=panels[1].transAxes)
+        else:
+            plane = umap_plane(both)
+            _dots(panels[1], plane[: len(raw)], plane[len(raw) :])
     figure.suptitle("\n".join(_title(bank, sample)), fontsize=13)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
@@ -289,13 +297,8 @@ def principal_plane(
     return pca.mean_, axes, shares
 
 
-def umap_plane(vectors: Float32[np.ndarray, "n D"], seed: int = 0) -> Float32[np.ndarray, "n 2"]:
-    """UMAP's coordinates of vectors; the same for the same seed.
-
-    Args:
-        vectors: `UMAP_LEAST` or more, compared by their distances.
-        seed: of its optimization, which then runs in one thread.
-    """
+def umap_plane(vectors: Float32[np.ndarray, "n D"]) -> Float32[np.ndarray, "n 2"]:
+    """UMAP's coordinates of `UMAP_LEAST` vectors or more, which are compared by their distances; its seed is fixed."""
     check_umap()
     if len(vectors) < UMAP_LEAST:
         raise InputError(f"umap: expected {UMAP_LEAST} features or more, got {len(vectors)}")
@@ -308,44 +311,20 @@ def umap_plane(vectors: Float32[np.ndarray, "n D"], seed: int = 0) -> Float32[np
         # Its own start needs a solver that fails where vectors are few or equal.
         mean, axes, shares = principal_plane(vectors)
         start = (vectors - mean) @ axes if shares.all() else "random"
-        reducer = UMAP(n_neighbors=neighbors, init=start, random_state=seed, n_jobs=1)
+        reducer = UMAP(n_neighbors=neighbors, init=start, random_state=0, n_jobs=1)
         return np.asarray(reducer.fit_transform(vectors), np.float32)
-
-
-def _draw_pca(axes: "Axes", bank: MemoryBank, raw: Float32[np.ndarray, "n D"]) -> Float64[np.ndarray, "2"]:
-    mean, directions, shares = principal_plane(raw)
-    _dots(axes, (raw - mean) @ directions, (bank.components - mean) @ directions)
-    axes.set_xlabel(
-        f"first principal direction of the raw features, {100 * shares[0]:.1f} % of their variance", fontsize=12
-    )
-    axes.set_ylabel(f"second principal direction, {100 * shares[1]:.1f} % of their variance", fontsize=12)
-    return shares
-
-
-def _draw_umap(axes: "Axes", bank: MemoryBank, raw: Float32[np.ndarray, "n D"], seed: int) -> None:
-    axes.set_title("UMAP: close dots have features of a high cosine", fontsize=13)
-    axes.set_xticks([])
-    axes.set_yticks([])
-    both = attention_keys(np.concatenate([raw, bank.components]), bank.mean, "centered")
-    if len(both) < UMAP_LEAST:
-        text = f"UMAP needs {UMAP_LEAST} features or more;\nthere are {len(both)}."
-        axes.text(0.5, 0.5, text, ha="center", va="center", fontsize=12, transform=axes.transAxes)
-        return
-    plane = umap_plane(both, seed)
-    _dots(axes, plane[: len(raw)], plane[len(raw) :])
 
 
 def _dots(axes: "Axes", raw: Float[np.ndarray, "n 2"], components: Float[np.ndarray, "M 2"]) -> None:
     from matplotlib.collections import PathCollection
 
     few = len(components) <= 100
-    style: dict[str, Any] = {"linewidths": 0.6 if few else 0.3, "edgecolors": "white"}
+    size, rim = (60, 0.6) if few else (16, 0.3)
     axes.scatter(
         raw[:, 0], raw[:, 1], s=5, color=RAW_COLOR, alpha=0.35, linewidths=0, label="raw feature", rasterized=True
     )
-    axes.scatter(
-        components[:, 0], components[:, 1], s=60 if few else 16, color=COMPONENT_COLOR, label="component", **style
-    )
+    x, y = components.T
+    axes.scatter(x, y, s=size, color=COMPONENT_COLOR, label="component", linewidths=rim, edgecolors="white")
     axes.grid(alpha=0.25)
     axes.set_axisbelow(True)
     legend = axes.legend(loc="best", fontsize=12, framealpha=0.9)

@@ -1,6 +1,4 @@
-"""Relevancy at pixels: cosines of words with blended features, and the views that show it.
-
-Relevancy of words at the pixels of a view: cosines with blended features.
+"""Relevancy of words at the pixels of a view, cosines with blended features, and the views that show it.
 
 The feature of a pixel is f[p] = Σ w[p, i] f[i] / Σ w[p, i], over the Gaussians that have one, and its relevancy for a
 word t is the cosine cos(f[p] − mean, t). A cosine of blended features is no blend of cosines, but its parts are simple:
@@ -21,7 +19,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.infer.draw import contact_sheet, draw_boxes, relevancy_overlay
 from gsencoder.infer.relevancy import EPS, MIN_RELATIVE_NORM, GaussianProducts, Mode
 from gsencoder.memory.attention import render_queries
-from gsencoder.render import Blend, BlendConfig, blend
+from gsencoder.render import Blend, blend
 from gsencoder.render.images import render_image, visible_shares
 from gsencoder.types import Cameras, Gaussians, Localization, QueryMemory, Scene
 from gsencoder.types.orientation import upright_views
@@ -132,21 +130,9 @@ def best_views(
     return [views[:count].tolist() for views in np.argsort(-worth, axis=0, kind="stable").T]
 
 
-def relevancy_pictures(
-    scene: Scene,
-    localization: Localization,
-    *,
-    per_word: int,
-    config: BlendConfig = BlendConfig(),
-) -> Iterator[tuple[str, Image.Image]]:
+def relevancy_pictures(scene: Scene, localization: Localization, *, per_word: int) -> Iterator[tuple[str, Image.Image]]:
     """For each word its best views: on the left the photograph, or where there is none the rendered view, on the right
-    the relevancy of the word over the rendered view; the word's boxes are in both.
-
-    Args:
-        scene: Gaussians, and cameras with photographs or without.
-        localization: relevancy and boxes of the words.
-        per_word: views drawn for each word.
-    """
+    the relevancy of the word over the rendered view; the word's boxes are in both."""
     if scene.gaussians is None or scene.views is None:
         raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")
     views = upright_views(scene.views)
@@ -161,7 +147,7 @@ def relevancy_pictures(
     chosen = best_views(scene.gaussians, cameras, groups, per_word)
     # Each view is looked at once, for all words that want it.
     for view in sorted({view for views in chosen for view in views}):
-        b = blend(scene.gaussians, cameras, view, config=config)
+        b = blend(scene.gaussians, cameras, view)
         rgb = render_image(scene.gaussians, cameras, view, blended=b)
         seen = rgb if images is None else images[view]
         kind = "rendered" if images is None else "photograph"

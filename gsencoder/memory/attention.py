@@ -94,11 +94,7 @@ def random_projection(query_channels: int, channels: int, generator: torch.Gener
 
 def render_queries(memory: QueryMemory, b: Blend) -> tuple[Float32[np.ndarray, "P s"], Float32[np.ndarray, " P"]]:
     """The queries of the rows of B, and the share of each row that is hit with a query; Gaussians without one take no
-    part in the mean. Where that share is 0 a query is zero and means nothing.
-
-    Args:
-        b: of pixels or patches.
-    """
+    part in the mean. Where that share is 0 a query is zero and means nothing."""
     if b.gaussians != len(memory):
         raise InputError(f"memory: queries of {len(memory):,} Gaussians, and a view of {b.gaussians:,}")
     seen = torch.from_numpy((memory.weights > 0).astype(np.float32))
@@ -112,13 +108,7 @@ Decoder = Literal["linear", "mlp"]
 def make_decoder(
     kind: Decoder, projection: Float[Tensor, "s C"], *, hidden: int = 64, generator: torch.Generator | None = None
 ) -> nn.Module:
-    """A decoder from s channels to C.
-
-    Args:
-        kind: linear, or a perceptron of one hidden layer.
-        projection: initial weights of the linear decoder.
-        hidden: units of the perceptron.
-    """
+    """A decoder from s channels to C: linear, which begins with a projection, or a perceptron of one hidden layer."""
     channels, width = projection.shape
     if kind == "linear":
         linear = nn.Linear(channels, width)

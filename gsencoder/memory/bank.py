@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32
+from jaxtyping import Bool, Float32, Float64, Int32, Int64
 
 from gsencoder.core.archive import RowFile
 from gsencoder.core.arrays import even_indices
@@ -44,12 +44,7 @@ def raw_features(view: int, feature_map: FeatureMap) -> tuple[Float32[np.ndarray
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RawSample:
-    """Raw features of one teacher in one scene.
-
-    Attributes:
-        features: the sample, in the order of the maps.
-        total: number of raw features that it was drawn from.
-    """
+    """Raw features of one teacher in one scene, in the order of the maps, and how many they were drawn from."""
 
     features: Float32[np.ndarray, "n D"]
     total: int
@@ -132,11 +127,7 @@ def build_bank(
     """Reduces the raw features of all maps to a bank.
 
     A cover reads the maps view by view and holds nothing but the bank. The published algorithm compares each feature
-    with all others, and keeps all of them in a temporary file.
-
-    Args:
-        mean: of the space, which is subtracted where the configuration asks for centered cosines.
-    """
+    with all others, and keeps all of them in a temporary file. The mean is that of the space."""
     return _Builder(maps, space, mean if config.center else np.zeros_like(mean), config).build()
 
 
@@ -152,11 +143,16 @@ class _Builder:
         self._floor = MIN_RELATIVE_NORM * float(np.linalg.norm(mean.astype(np.float64)))
 
     def build(self) -> MemoryBank:
-        threshold = self._threshold()
-        if self._config.method == "cover":
-            components, sources = self._cover_all(threshold)
-        else:
-            components, sources = self._published(threshold)
+        threshold, cover = self._threshold(), self._config.method == "cover"
+        components, sources = self._at(self._cover(threshold).rows if cover else self._published(threshold))
+        for rows, cells, directed in self._rows() if cover else ():
+            if not directed.all():
+                components = np.concatenate([components, rows[~directed][:1]])
+                sources = np.concatenate([sources, cells[~directed][:1]])
+                break
+        if not len(components):
+            raise InputError(f"memory: no view has a cell with a feature of {self._space.name}")
+        components += self._mean
         coverage, cosine = self._score(components, threshold)
         return MemoryBank(
             components=components,
@@ -205,7 +201,8 @@ class _Builder:
                     f"threshold of {threshold:.4f}; give more"
                 )
             return threshold
-        sample = self._sample()
+        count = sum(int(directed.sum()) for _, _, directed in self._rows())
+        sample, _ = self._at(even_indices(count, SAMPLE))
         if not len(sample):
             return 1.0
         if all(self._coded.values()) and len(np.unique(sample, axis=0)) <= MAX_NAMES:
@@ -217,47 +214,28 @@ class _Builder:
             lambda each: _mean_cosine(sample, _cover_of(sample, 1 - each), kinds) >= config.cosine
         )
 
-    def _sample(self) -> Float32[np.ndarray, "n D"]:
-        """Features with a direction, evenly from all views."""
-        counts = [int(directed.sum()) for _, _, directed in self._rows()]
-        sampled = even_indices(sum(counts), SAMPLE)
-        parts, start = [np.zeros((0, self._space.channels), np.float32)], 0
-        for rows, _, directed in self._rows():
-            count = int(directed.sum())
-            chosen = sampled[(sampled >= start) & (sampled < start + count)] - start
-            parts.append(rows[directed][chosen])
-            start += count
-        return np.concatenate(parts)
+    def _at(self, chosen: Int64[np.ndarray, " k"]) -> tuple[Float32[np.ndarray, "k D"], Int32[np.ndarray, "k 3"]]:
+        """Features with a direction, by their numbers among those of all views, ascending; and their cells."""
+        parts = [np.zeros((0, self._space.channels), np.float32)]
+        sources = [np.zeros((0, 3), np.int32)]
+        start = 0
+        for rows, cells, directed in self._rows():
+            stop = start + int(directed.sum())
+            within = chosen[(chosen >= start) & (chosen < stop)] - start
+            parts.append(rows[directed][within])
+            sources.append(cells[directed][within])
+            start = stop
+        return np.concatenate(parts), np.concatenate(sources)
 
-    def _cover(self, threshold: float, limit: int) -> CoverReduction:
+    def _cover(self, threshold: float, limit: int | None = None) -> CoverReduction:
         cover = CoverReduction(self._space.channels, threshold)
         for rows, _, directed in self._rows():
             cover.add(rows[directed], limit=limit)
-            if len(cover) > limit:
+            if limit is not None and len(cover) > limit:
                 break
         return cover
 
-    def _cover_all(self, threshold: float) -> tuple[Float32[np.ndarray, "M D"], Int32[np.ndarray, "M 3"]]:
-        """The cover of all features, and where its components come from."""
-        cover = CoverReduction(self._space.channels, threshold)
-        sources: list[np.ndarray] = []
-        without_direction: list[tuple[np.ndarray, np.ndarray]] = []
-        before = 0
-        for rows, cells, directed in self._rows():
-            cover.add(rows[directed])
-            new = cover.rows[len(sources) :] - before
-            sources.extend(cells[directed][new])
-            before += int(directed.sum())
-            if not directed.all() and not without_direction:
-                without_direction = [(rows[~directed][:1], cells[~directed][0])]
-        components = cover.components
-        for rows, cell in without_direction:
-            components, sources = np.concatenate([components, rows]), [*sources, cell]
-        if not len(components):
-            raise self._no_features()
-        return components + self._mean, np.stack(sources).astype(np.int32)
-
-    def _published(self, threshold: float) -> tuple[Float32[np.ndarray, "M D"], Int32[np.ndarray, "M 3"]]:
+    def _published(self, threshold: float) -> Int64[np.ndarray, " M"]:
         # Each feature is compared with all others: they are in a file, so that no more than a block is held.
         with RowFile(self._space.channels) as file:
             for rows, _, directed in self._rows():
@@ -266,19 +244,11 @@ class _Builder:
             count = len(unit)
             chosen, _ = reduce_as_published(unit, threshold, drop_last=self._config.drop_last)
             del unit
-        if not count:
-            raise self._no_features()
-        if not len(chosen):
+        if count and not len(chosen):
             raise InputError(
                 f"bank.drop_last={self._config.drop_last}: all {count:,} features are in the last, incomplete chunk"
             )
-        components, sources, start = [], [], 0
-        for rows, cells, directed in self._rows():
-            within = chosen[(chosen >= start) & (chosen < start + int(directed.sum()))] - start
-            components.append(rows[directed][within] + self._mean)
-            sources.append(cells[directed][within])
-            start += int(directed.sum())
-        return np.concatenate(components), np.concatenate(sources)
+        return chosen
 
     def _score(self, components: Float32[np.ndarray, "M D"], threshold: float) -> tuple[float, float]:
         """The share of features with a component within the threshold, and the mean cosine with the nearest one.
@@ -299,9 +269,6 @@ class _Builder:
                 covered += int((best >= min(threshold, 1 - ROUNDING)).sum())
                 total += float(best.sum(dtype=np.float64))
         return covered / count, total / count
-
-    def _no_features(self) -> InputError:
-        return InputError(f"memory: no view has a cell with a feature of {self._space.name}")
 
 
 def _cover_of(rows: Float32[np.ndarray, "n D"], threshold: float) -> CoverReduction:
@@ -335,14 +302,8 @@ def principal_queries(
 
     A cosine that is not centered depends on the mean as well, whose coordinate, the first one, is 1 for every Gaussian.
     With cosines queries have unit variance and rows of the projection the length √D, so that one learning rate serves
-    both; with products they are in the units of the space.
-
-    Args:
-        features: of the Gaussians; those never seen have queries of zero.
-        bank: that the queries will attend to.
-        channels: s. Where the components have fewer directions, further channels are zero.
-        scoring: how queries will be compared with components.
-    """
+    both; with products they are in the units of the space. Gaussians that were never seen have queries of zero, and
+    where the components have fewer directions, further channels are zero."""
     if features.space != bank.space:
         raise InputError(
             f"memory: the features are of ({features.space.describe()}), and the bank is of ({bank.space.describe()})"

@@ -76,11 +76,7 @@ class TooManyRowsError(InputError):
 def index_features(
     features: GaussianFeatures, config: IndexConfig = IndexConfig(), *, most: int | None = None
 ) -> IndexMemory:
-    """Makes a table of rows that features share.
-
-    Args:
-        most: a table of more rows is given up; None = one of more than two bytes can number.
-    """
+    """Makes a table of rows that features share, at most so many, or as many as two bytes can number."""
     seen = np.flatnonzero(features.seen)
     if not len(seen):
         raise InputError("index: no Gaussian has features")
@@ -175,14 +171,9 @@ def _cosines(
     centered: Float32[np.ndarray, "n C"], table: Float32[np.ndarray, "M C"], number: Int64[np.ndarray, " n"]
 ) -> Float64[np.ndarray, " n"]:
     """The cosine of each feature with its row."""
-    lengths = np.linalg.norm(table.astype(np.float64), axis=1)
-    cosines = np.empty(len(centered))
-    for start in range(0, len(centered), BLOCK):
-        part, rows = centered[start : start + BLOCK].astype(np.float64), number[start : start + BLOCK]
-        products = np.einsum("nc,nc->n", part, table[rows])
-        norms = np.sqrt(np.einsum("nc,nc->n", part, part)) * lengths[rows]
-        cosines[start : start + BLOCK] = products / np.where(norms > 0, norms, 1)
-    return cosines
+    parts = [slice(start, start + BLOCK) for start in range(0, len(centered), BLOCK)]
+    blocks = [row_cosines(centered[part].astype(np.float64), table[number[part]].astype(np.float64)) for part in parts]
+    return np.concatenate([np.zeros(0), *blocks])
 
 
 THRESHOLDS = tuple(1 - 0.8 * 2 ** (-step / 4) for step in range(48))
@@ -204,9 +195,6 @@ def index_within(
 
     Returns:
         The table, and its error: 1 − mean centered cosine over Gaussians, or over their kinds where that is larger.
-
-    Raises:
-        InputError: no features, or no table keeps the budget; the message says how near one comes.
     """
     seen = features.seen.nonzero()[0]
     if not len(seen):

@@ -11,7 +11,7 @@ from gsencoder.infer.views.choose import choose_views
 from gsencoder.infer.views.photographs import photograph_cameras, photograph_of, with_photographs
 from gsencoder.infer.views.pictures import picture_kinds, view_pictures
 from gsencoder.infer.views.targets import CONSTANTS, Target, ViewsConfig, target_of
-from gsencoder.types import Cameras, Scene, Views
+from gsencoder.types import Cameras, Scene
 
 pytestmark = pytest.mark.slow
 
@@ -40,6 +40,9 @@ def test_a_close_up_shows_each_point_where_the_photograph_has_it() -> None:
     scene, target = photographed()
     large = photograph_cameras(scene.views)
     assert large.widths.tolist() == [WIDTH] * len(scene.views)
+    raw = photograph_of(scene.views, 7, large, 7)
+    assert raw.shape == (HEIGHT, WIDTH, 3)
+    assert raw[5, 600, 0] == round(255 * 600.5 / WIDTH)
     cameras, rows = closeups(large, scene.gaussians, target, **SIZE)
     assert len(cameras) == len(rows) > 6
     points = scene.gaussians.means[target.rows].astype(np.float64)
@@ -90,8 +93,7 @@ def test_only_what_is_clearly_closer_is_cut() -> None:
     assert not len(closeups(away, scene.gaussians, target, **SIZE)[0])
 
 
-@pytest.mark.parametrize("source", ["frames", "both"])
-@pytest.mark.parametrize("candidates", [8, 24])
+@pytest.mark.parametrize(("source", "candidates"), [("frames", 8), ("both", 24)])
 def test_close_ups_are_chosen_where_there_are_photographs_and_nowhere_else(source: str, candidates: int) -> None:
     scene, target = photographed()
     config = ViewsConfig(source=source, candidates=candidates, count=6, **SIZE)
@@ -125,14 +127,3 @@ def test_several_targets_share_the_close_ups() -> None:
     # With hardly any candidates whole frames come first.
     few = choose_views(scene, both, ViewsConfig(source="frames", candidates=3, count=3, **SIZE))
     assert not any("near" in each.name for each in few.chosen)
-
-
-def test_whole_photographs_are_shown_as_before() -> None:
-    scene, _ = photographed()
-    assert isinstance(scene.views, Views)
-    for frame in (0, 7):
-        assert (photograph_of(scene.views, frame, scene.views.cameras, frame) == scene.views.images[frame]).all()
-        large = photograph_cameras(scene.views)
-        raw = photograph_of(scene.views, frame, large, frame)
-        assert raw.shape == (HEIGHT, WIDTH, 3)
-        assert raw[5, 600, 0] == round(255 * 600.5 / WIDTH)

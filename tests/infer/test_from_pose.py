@@ -22,7 +22,6 @@ from splats import front_camera, one_gaussian, random_rotation
 from gsencoder.core.errors import InputError
 from gsencoder.infer.from_pose import FeatureField, FromPoseConfig, PosePoint, from_pose
 from gsencoder.infer.relevancy import ThresholdConfig, relevancy
-from gsencoder.render import blend
 from gsencoder.text.table import make_text_table
 from gsencoder.types import Cameras, GaussianFeatures, Gaussians
 
@@ -125,18 +124,6 @@ def test_an_origin_a_thousand_kilometres_away_loses_nothing() -> None:
         np.testing.assert_allclose(b.position - origin, a.position, atol=1e-9)
 
 
-def test_one_gaussian_is_found_at_its_depth() -> None:
-    gaussians = one_gaussian((0.3, -0.2, 2.0), scale=0.1, opacity=0.8)
-    features = some_features(2, "vectors")
-    features = replace(features, features=features.features[1:], weights=features.weights[1:])
-    (point,) = from_pose(scene_of(gaussians, features), front_camera(), NAMES[:1], words(), EVERYTHING)
-    assert point.visible
-    assert point.depth == 2.0
-    assert np.linalg.norm(point.position - (0.3, -0.2, 2.0)) < 0.15
-    expected = relevancy(features, words().encode(NAMES[:1]), words().mean)[0, 0]
-    assert point.relevancy == pytest.approx(expected, abs=1e-5)
-
-
 def assert_nothing(point: PosePoint) -> None:
     assert not point.visible
     values = [point.relevancy, point.alpha, point.depth, *point.pixel, *point.position]
@@ -205,10 +192,10 @@ def test_a_small_share_before_a_background_of_the_mean_feature_has_its_own_depth
     assert point.depth == 2.0
 
 
-def test_words_together_are_as_one_by_one_and_a_kept_blend_answers_as_a_new_one() -> None:
+def test_words_together_are_as_one_by_one() -> None:
     gaussians, cameras, text = opaque_ball(), front_camera(), words()
     field = FeatureField(scene_of(gaussians, some_features(len(gaussians), "basis")))
-    frame = field.at(cameras, b=blend(gaussians, cameras))
+    frame = field.at(cameras)
     assert len(NAMES) > 16
     for together, name in zip(frame.find(NAMES, text), NAMES, strict=True):
         (alone,) = field.at(cameras).find([name], text)
@@ -245,10 +232,6 @@ def test_wrong_input_is_refused() -> None:
         field.at(cameras).find(["unheard of"], text)
     with pytest.raises(InputError):
         field.at(cameras).find(["a"], make_text_table(("a",), np.eye(1, CHANNELS, dtype=np.float32), "other"))
-    with pytest.raises(InputError, match="expected a blend of 61×43 rays"):
-        field.at(cameras, b=blend(gaussians, cameras, stride=2))
-    with pytest.raises(InputError, match="400 Gaussians, and a view of 1"):
-        field.at(cameras, b=blend(one_gaussian(), cameras))
     with pytest.raises(InputError, match="queries of 3 Gaussians"):
         FeatureField(scene, memory=memory_of(3, components=4))
     with pytest.raises(InputError, match="view: expected 0 to 0"):

@@ -182,7 +182,7 @@ def test_answers_have_the_box_of_the_best_target_and_unanswered_descriptions_com
 def test_captions_of_scenes_keep_their_boxes_and_the_even_probabilities_of_eighteen_classes() -> None:
     keyed = caption_question("b", "7", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {"obj_prob": [0.5, 0.5]})
     bare = caption_question("a", "0", ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), {})
-    assert (keyed.scene, keyed.question.id, keyed.question.task) == ("b", "b/7", "caption")
+    assert (keyed.scene, keyed.id, keyed.question.task) == ("b", "b/7", "caption")
     rows = predictions(
         "scan2cap",
         [

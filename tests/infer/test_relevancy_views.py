@@ -51,14 +51,6 @@ def test_a_wall_is_best_seen_from_its_own_side() -> None:
     assert best_views(splat, facing(1.0, -1.0), groups, 2) == [[1, 0], [0, 1]]
 
 
-def test_many_groups_at_once_are_as_one_by_one(rng: np.random.Generator) -> None:
-    splat = random_gaussians(60)
-    cameras = facing(1.0, -1.0, 0.7, -1.3)
-    groups = [rng.choice(60, size, replace=False) for size in (1, 7, 30)]
-    together = best_views(splat, cameras, groups, 3)
-    assert together == [best_views(splat, cameras, [group], 3)[0] for group in groups]
-
-
 def test_the_best_views_are_those_of_all_views(monkeypatch: pytest.MonkeyPatch) -> None:
     """A depth buffer spares most blends; the oracle blends every view."""
     splat = random_gaussians(400)

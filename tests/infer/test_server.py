@@ -90,16 +90,14 @@ def test_where_no_server_is_the_error_says_so() -> None:
     ("behave", "problem", "of_server"),
     [
         (status(500, "out of memory"), "failed 1 times .500: out of memory", True),
-        (status(429, "slow down"), "failed 1 times .429: slow down", True),
         (status(400, "too many images"), "refuses the request .400: too many images", False),
         (status(401, "bad key"), "refuses the key .401: bad key.; give vlm.key= or OPENAI_API_KEY", True),
-        (status(404, "no model x"), "has no model of that name, .*no model x.; it has tiny", True),
+        (status(404, "no model x"), "has no model of that name, .*no model x", True),
         (lambda handler, _: handler.reply(422, {"detail": "pinned"}), "refuses the request .422: pinned", False),
         (lambda handler, _: handler.raw(200, b"", "application/json"), "nothing that is a chat completion", True),
         (lambda handler, _: handler.reply(200, completion("a mug")), "nothing that is a chat completion", True),
         (silent(3.0), "was silent for 0.5 s .vlm.timeout", True),
         (stream(events("a red ", "mu", finish=None, done=False)), "cut off after 8 characters", True),
-        (stream(events("a red ", "mu", finish=None)), "cut off after 8 characters", True),
         (stream(b"data: {not json}\n\n"), "broke off .*or is no chat completion", True),
         (stream(b'data: {"hello": 1}\n\n'), "is no chat completion", True),
         (stream(events("a re", done=False, finish=None) + b'data: {"error": {"message": "GPU"}}\n\n'), "GPU", True),
@@ -118,11 +116,6 @@ def test_each_fault_is_an_error_in_one_line_of_the_server_or_of_the_question(
     assert "\n" not in str(caught.value)
 
 
-def test_what_follows_the_end_of_an_answer_is_not_waited_for() -> None:
-    with serving(stream(events("fine") + b'data: {"error": {"message": "GPU fell over"}}\n\n')) as server:
-        assert ask(server.url).text == "fine"
-
-
 def test_a_connection_that_breaks_within_a_stream_is_an_error() -> None:
     def behave(handler: Handler, _: Any) -> None:
         data = events("a red ", finish=None, done=False)
@@ -133,14 +126,13 @@ def test_a_connection_that_breaks_within_a_stream_is_an_error() -> None:
         ask(server.url)
 
 
-@pytest.mark.parametrize("part", [events("a", finish=None, done=False), b": ping\n\n"])
-def test_an_answer_that_drips_for_ever_ends(part: bytes) -> None:
+def test_an_answer_that_drips_for_ever_ends() -> None:
     def behave(handler: Handler, _: Any) -> None:
         handler.send_response(200)
         handler.send_header("Content-Type", "text/event-stream")
         handler.end_headers()
         for _ in range(40):
-            handler.wfile.write(part)
+            handler.wfile.write(b": ping\n\n")
             handler.wfile.flush()
             time.sleep(0.1)
 
@@ -148,17 +140,6 @@ def test_an_answer_that_drips_for_ever_ends(part: bytes) -> None:
     with serving(behave) as server, pytest.raises(ServerError, match="took more than 0.5 s .vlm.longest"):
         ask(server.url, longest=0.5, timeout=0.4)
     assert time.monotonic() - begun < 3
-
-
-def test_patience_holds_for_all_tries_together() -> None:
-    def behave(handler: Handler, _: Any) -> None:
-        handler.send_response(503)
-        handler.send_header("Retry-After", "20")
-        handler.send_header("Content-Length", "0")
-        handler.end_headers()
-
-    with serving(behave) as server, pytest.raises(ServerError, match="took more than 0.5 s"):
-        ask(server.url, longest=0.5, retries=3)
 
 
 @pytest.mark.slow
@@ -226,8 +207,6 @@ def test_what_is_left_out_comes_from_the_environment(monkeypatch: pytest.MonkeyP
         {"longest": float("nan")},
         {"base_url": "localhost:8000"},
         {"base_url": "ftp://x/v1"},
-        {"base_url": "http:///v1"},
-        {"base_url": "http://x:abc/v1"},
         {"base_url": "http://[::1"},
         {"base_url": "http://x /v1"},
     ],
@@ -289,7 +268,7 @@ def test_text_without_the_key_stays_as_it_is_and_is_cut_after_the_key_is_gone() 
 
 def test_long_text_of_escapes_and_long_keys_take_no_longer_than_others() -> None:
     begun = time.monotonic()
-    for text in ("\\" * 2_000_000, "%25" * 700_000, "&amp;" * 400_000, "&#000000" * 250_000):
+    for text in ("\\" * 500_000, "%25" * 200_000, "&amp;" * 100_000, "&#000000" * 60_000):
         assert KeyFilter(KEY).clean(text) == text
     for long in (KEY * 3300, KEY * 20):
         text = f"a {quote(long, safe='')} b {long} c {long[:600]} d"
@@ -297,7 +276,7 @@ def test_long_text_of_escapes_and_long_keys_take_no_longer_than_others() -> None
         assert KeyFilter(long).clean("no key") == "no key"
     strange = KEY * 10 + "\\\\%25" * 3000
     assert KeyFilter(strange).clean(f"a {strange} b") == "a (key) b"
-    assert time.monotonic() - begun < 15
+    assert time.monotonic() - begun < 10
 
 
 def test_every_field_of_an_answer_is_without_the_key_and_no_longer_than_names_are() -> None:
@@ -337,15 +316,6 @@ def test_no_error_repeats_the_key(within_stream: bool) -> None:
                 with pytest.raises(InputError) as caught:
                     client.ask(request_body([], config(server.url)))
                 assert spelling[:8] not in "".join(traceback.format_exception(caught.value)), name
-
-
-@pytest.mark.parametrize("models", [[{"id": KEY}], [{"id": None}], [{}], [5], None])
-def test_a_list_of_models_is_only_a_hint_and_never_shows_the_key(models: Any) -> None:
-    with serving(status(404, "no")) as server:
-        server.listing = lambda handler: handler.reply(200, {"object": "list", "data": models})
-        with pytest.raises(InputError, match="has no model of that name") as caught:
-            ask(server.url)
-    assert KEY[:8] not in str(caught.value)
 
 
 def test_a_key_is_in_no_setting_and_one_from_a_file_may_end_with_a_line_break() -> None:

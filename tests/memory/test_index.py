@@ -14,7 +14,6 @@ from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.splats.files import load_splat, save_splat
 from gsencoder.fusion.folder import WORDS_FILE, load_features, save_features
 from gsencoder.fusion.package import PACKAGE_FILE, SPLAT_FILE, save_index_package
-from gsencoder.infer.relevancy import relevancy
 from gsencoder.memory import index as index_module
 from gsencoder.memory.index import IndexConfig, index_features
 from gsencoder.memory.reduction import CoverReduction
@@ -42,14 +41,6 @@ def test_the_stated_error_is_that_of_the_rows_that_gaussians_have(basis: bool) -
         assert made.error == pytest.approx(1 - cosines.mean(), abs=1e-6)
         assert made.lowest == pytest.approx(np.quantile(cosines, 0.001), abs=1e-6)
     assert fine.lowest > coarse.lowest
-
-
-def test_a_few_kinds_of_features_have_a_row_each() -> None:
-    features = make_features(kinds=7)
-    made = index_features(features, IndexConfig(threshold=0.99))
-    assert len(made.features.features) == 7
-    assert made.error < 1e-6
-    np.testing.assert_allclose(made.features.stored(), features.features, atol=1e-6)
 
 
 def test_a_rare_kind_among_many_gaussians_keeps_its_row() -> None:
@@ -119,15 +110,6 @@ def test_the_threshold_that_is_stated_is_the_largest_one_whose_table_has_so_few_
         assert (len(cover) <= 60) == few
 
 
-def test_rows_that_are_asked_for_have_room_for_features_at_the_mean() -> None:
-    features = make_features(kinds=8)
-    values = features.features.copy()
-    values[np.flatnonzero(features.seen)[:50]] = 0
-    made = index_features(replace(features, features=values), IndexConfig(threshold=0.0, rows=8))
-    assert len(made.features.features) <= 8
-    np.testing.assert_array_equal(made.features.stored(np.flatnonzero(features.seen)[:50]), 0)
-
-
 def test_the_number_of_rows_is_a_limit_and_more_than_two_bytes_number_are_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -147,19 +129,7 @@ def test_the_number_of_rows_is_a_limit_and_more_than_two_bytes_number_are_refuse
             IndexConfig(**config)
 
 
-def test_words_score_an_index_as_they_score_what_it_stands_for(rng: np.random.Generator) -> None:
-    made = index_features(make_features()).features
-    expanded = replace(made, features=made.stored(), index=None)
-    words = rng.normal(size=(3, 12)).astype(np.float32)
-    negatives = rng.normal(size=(2, 12)).astype(np.float32)
-    mean = rng.normal(size=12).astype(np.float32)
-    for further in (None, negatives):
-        scores, expected = (relevancy(each, words, mean, negatives=further) for each in (made, expanded))
-        np.testing.assert_allclose(scores, expected, atol=1e-6)
-        assert np.isnan(scores[:, ~made.seen]).all()
-
-
-@pytest.mark.parametrize(("rows", "row_bytes"), [(40, 1), (255, 1), (256, 2), (900, 2)])
+@pytest.mark.parametrize(("rows", "row_bytes"), [(255, 1), (256, 2)])
 def test_a_package_of_an_index_is_read_back(tmp_path: Path, rows: int, row_bytes: int) -> None:
     source = make_features()
     table = make_features(n=rows).features

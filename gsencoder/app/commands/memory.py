@@ -22,7 +22,7 @@ from gsencoder.data.seeding.points import unit_of
 from gsencoder.evaluate.sources import RenderedErrors, RenderedTally
 from gsencoder.fusion.folder import MEMORY_FILE, file_of_teacher, save_memories, save_tables
 from gsencoder.infer.encode import EncodeConfig, load_encoder
-from gsencoder.memory.bank import BankConfig, RawSample
+from gsencoder.memory.bank import BankConfig
 from gsencoder.models.output_space import check_distinct, name_of_space
 from gsencoder.teachers.build import build_teacher, stored_words, words_by_teacher
 from gsencoder.text.table import TextTable
@@ -40,7 +40,7 @@ from gsencoder.train.memory import (
 )
 from gsencoder.train.prepare_scenes import SourceConfig
 from gsencoder.train.samples import sample_rows
-from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
+from gsencoder.types import GaussianFeatures, QueryMemory, Scene
 
 DRAWN_FEATURES = 20_000
 """Raw features in a scatter plot, at most."""
@@ -105,7 +105,17 @@ def run(config: MemoryCommandConfig, run: Run) -> None:
                         f"optimize=false: {unfinished[0]} holds an optimization that is not finished and would be "
                         "lost; leave optimize=false out to continue it, or give resume=false to start again"
                     )
-                scene = _load(path, config, run)
+                scene = load_fusable(
+                    path,
+                    run,
+                    splat=config.splat,
+                    data=config.data,
+                    seeds=config.seeds,
+                    orbits=config.orbits,
+                    cameras=config.cameras,
+                    blend=config.prepare.fusion.blend,
+                    labels=any(each.needs_labels for each in config.teachers_by_name.values()),
+                )
                 tables = _prepare(scene, words, config, work, device, run)
         scenes = {name: open_memory_scene(work / name) for name in config.teachers_by_name}
         with run.step("train"):
@@ -138,29 +148,20 @@ def run(config: MemoryCommandConfig, run: Run) -> None:
             save_memories(folder, scene, memories, settings(config))
             save_tables(folder, tables, memories)
         if config.pictures:
-            advice = "give pictures=0 to write the memory without pictures"
-            with run.step("pictures"), advised(advice):
+            from gsencoder.infer.memory_pictures import attention_pictures, component_scatter
+
+            blend = config.prepare.fusion.blend
+            with run.step("pictures"), advised("give pictures=0 to write the memory without pictures"):
                 for name, memory in memories.items():
-                    _draw(folder, scene, name, memory, open_raw_sample(work / name), config)
+                    scatter = component_scatter(memory.bank, open_raw_sample(work / name), umap=config.umap)
+                    write_picture(folder / f"components.{name}.png", scatter)
+                    for view, picture in attention_pictures(memory, scene, views=config.pictures, config=blend):
+                        write_picture(folder / f"attention.{name}.view{view:03d}.png", picture)
         files = {name: file_of_teacher(MEMORY_FILE, name if len(memories) > 1 else None) for name in memories}
         figures = {name: _figures(folder / files[name], each, errors[name]) for name, each in memories.items()}
         run.results.update(gaussians=len(next(iter(memories.values()))), teachers=figures)
     for name, each in memories.items():
         run.print(f"{out}: {name}: {_describe(each, errors[name], figures[name]['bytes'])}")
-
-
-def _load(path: Path, config: MemoryCommandConfig, run: Run) -> Scene:
-    return load_fusable(
-        path,
-        run,
-        splat=config.splat,
-        data=config.data,
-        seeds=config.seeds,
-        orbits=config.orbits,
-        cameras=config.cameras,
-        blend=config.prepare.fusion.blend,
-        labels=any(each.needs_labels for each in config.teachers_by_name.values()),
-    )
 
 
 def _prepare(
@@ -211,19 +212,6 @@ def in_space(predicted: Mapping[str, GaussianFeatures], space: FeatureSpace, wei
     """The predicted features of a teacher's space."""
     name = name_of_space({each: features.space for each, features in predicted.items()}, space, f"weights={weights}")
     return predicted[name]
-
-
-def _draw(
-    folder: Path, scene: Scene, name: str, memory: QueryMemory, sample: RawSample, config: MemoryCommandConfig
-) -> None:
-    """Writes the pictures of one teacher's memory."""
-    from gsencoder.infer.memory_pictures import attention_pictures, component_scatter
-
-    scatter = component_scatter(memory.bank, sample, umap=config.umap)
-    write_picture(folder / f"components.{name}.png", scatter)
-    blend = config.prepare.fusion.blend
-    for view, picture in attention_pictures(memory, scene, views=config.pictures, config=blend):
-        write_picture(folder / f"attention.{name}.view{view:03d}.png", picture)
 
 
 def fit_errors(memory: QueryMemory, scene: MemoryScene, min_alpha: float) -> RenderedErrors:

@@ -62,14 +62,9 @@ def prompt_text(
     probabilities: Sequence[float] = (),
     absent: Mapping[str, float] = {},
 ) -> str:
-    """What is asked, in words.
-
-    Args:
-        names: of what was looked for and found, in the order of their marks; empty where a thing has no name.
-        marks: the numbers, from 1, that the pictures carry.
-        probabilities: that each of the names is right, in their order; empty where nothing says.
-        absent: words that were looked for and not found, and the probability that they are there after all.
-    """
+    """What is asked, in words: names are those of what was found, in the order of their marks and with the
+    probabilities that they are right; absent are words that were not found, with the probability that they are there
+    after all."""
     question = question.strip()
     check_question(task, question)
     if task != "answer" and not names:
@@ -154,13 +149,8 @@ SAME_THING_IOU = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Question:
-    """What is asked.
-
-    Attributes:
-        text: the question; may be empty for a caption.
-        query: words to look for; empty = the words of the table that the text holds.
-        aabb: a box in world coordinates to look at in place of words: lower corner, upper corner.
-    """
+    """What is asked: a text, which may be empty for a caption, the words to look for, if not those of the table that it
+    holds, or in place of words a box in world coordinates, lower corner and upper corner."""
 
     text: str = ""
     task: Task = "answer"

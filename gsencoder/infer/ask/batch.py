@@ -35,16 +35,11 @@ TRANSPORT = ("key", "timeout", "longest", "retries")
 def ask_question(
     question: Question, asker: Asker, server: VlmServer | None, folder: Path, clock: Clock | None = None
 ) -> dict[str, Any]:
-    """Asks one question, and writes what was sent and what came back.
+    """Asks one question, and writes what was sent and what came back; the row of the answer as JSON values.
 
     Args:
-        asker: of the scene that the question is about.
         server: None = a dry run, which writes prompt, request and pictures, and asks nobody.
         clock: counts the seconds of the steps "views", "write" and "ask".
-
-    Returns:
-        The row of the answer as JSON values: question, task, words, absent, targets, views and, from a server, answer,
-        model, finish, tokens, seconds, and for task=ground the mark and its box.
     """
     clock = clock or Clock()
     scene, vlm = asker.scene, asker.vlm
@@ -117,9 +112,6 @@ def ask_questions(
         work: an existing folder for the rows so far, `answers.jsonl`, and one folder a question, named by its digest.
         made_from: what else answers depend on, as JSON values, such as the folders that the scene was read from.
         unanswered: collects the ids of questions that have no answer, and why; None = these are an error.
-
-    Returns:
-        One row a question, in their order, each with its digest; none for those in `unanswered`.
     """
     depends_on = _depends_on(asker, server is None, made_from)
     digests = {each.id: each.digest(depends_on) for each in questions}
@@ -165,11 +157,7 @@ def ask_questions(
 
 
 def write_answers(folder: Path, work: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes the rows of `ask_questions` as `answers.jsonl`, and the folder of each question as `00001`, `00002`, …
-
-    Args:
-        folder: an existing one to write into.
-    """
+    """Writes the rows of `ask_questions` as `answers.jsonl` into a folder, and that of each question as `00001`, …"""
     lines = []
     for number, row in enumerate(rows, start=1):
         target = folder / f"{number:05d}"
@@ -261,11 +249,8 @@ def predictions(
     - Scan2Cap: for each scene a list of {caption, box, obj_prob, sem_prob}, captions in lower case,
       between "sos" and "eos".
 
-    Boxes are eight corners. Of an answer the case and a full stop at its end are left out (`short_answer`).
-
-    Args:
-        answered: questions with the rows of `gsencoder.infer.ask.batch.ask_questions`.
-        unanswered: questions without one; besides ScanRefer's they have no entry.
+    Boxes are eight corners. Of an answer the case and a full stop at its end are left out (`short_answer`). Questions
+    come with the rows of `ask_questions`; those without, besides ScanRefer's, have no entry.
     """
     if benchmark == "scan2cap":
         captions: dict[str, list[dict[str, Any]]] = {}
@@ -325,15 +310,8 @@ def store_prompt(
     grid: tuple[int, int] = (1, 1),
     fit: Fit = "stretch",
 ) -> StoredPrompt:
-    """Writes the prompt that `ask` would send for a question.
-
-    Args:
-        key: states all that the prompt is made from.
-        features: of the scene's Gaussians; they are rendered in each view as tokens of a vision tower; None = no
-            tokens.
-        grid: rows and columns of the tower's patches.
-        fit: how the tower's preprocessing makes pictures square.
-    """
+    """Writes the prompt that `ask` would send for a question, under a key that states all that it is made from;
+    features of the scene's Gaussians are rendered in each view as tokens of a vision tower."""
     prompt = asker.prompt(question)
     pictures = [encoded_picture(each, side=asker.vlm.image_side) for each in prompt.pictures]
     if features is None:

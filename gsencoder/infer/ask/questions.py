@@ -53,7 +53,7 @@ class BatchQuestion:
 
 def read_questions(path: Path, task: Task = "answer") -> tuple[BatchQuestion, ...]:
     """Reads lines such as {"id": "7", "question": "What is on the table?", "query": "table"}; id, task, query and aabb
-    may be left out, empty lines are skipped."""
+    may be left out."""
     with about("questions"):
         lines = read_checked_text(path, max_bytes=MAX_FILE_BYTES).split("\n")
     questions: dict[str, BatchQuestion] = {}
@@ -178,7 +178,14 @@ def read_question_set(path: Path, task: Task = "answer", proposals: str = "") ->
     content = read_benchmark_json(path)
     first = content[0] if isinstance(content, list) and content and isinstance(content[0], dict) else {}
     if isinstance(content, dict) and "questions" not in content and "annotations" not in content:
-        _refuse_other_object(content, path)
+        keys = listed([name[:40] for name in content], 4)
+        for key, rows in content.items():
+            if not isinstance(rows, list) or not all(isinstance(row, dict) and "box" in row for row in rows):
+                raise InputError(
+                    f"{path}: expected a list of ScanQA's or ScanRefer's entries, SQA3D's object with questions, or "
+                    f"Scan2Cap's {{scene: [{{box}}, …]}}; got an object with {keys}, and no list of boxes "
+                    f"as {key[:40]}"
+                )
         _check_task(path, "Scan2Cap's boxes", task, ("answer", "caption"))
         return QuestionSet(benchmark="scan2cap", questions=_captions(_read_boxes(content, path)))
     if isinstance(content, list) and not content:
@@ -196,30 +203,10 @@ def read_question_set(path: Path, task: Task = "answer", proposals: str = "") ->
 
 
 def caption_question(scene: str, name: str, aabb: tuple[Corner, Corner], keys: Mapping[str, Any]) -> BatchQuestion:
-    """The question for a caption of what is in a box.
-
-    Args:
-        aabb: lower and upper corner in world coordinates.
-        keys: what the prediction says besides caption and box, such as probabilities.
-    """
+    """The question for a caption of what is in a box, lower and upper corner in world coordinates; keys are what the
+    prediction says besides caption and box, such as probabilities."""
     question = Question(task="caption", aabb=(*aabb[0], *aabb[1]))
     return BatchQuestion(id=f"{scene}/{name}", question=question, scene=scene, keys=keys)
-
-
-def _refuse_other_object(content: Mapping[str, Any], path: Path) -> None:
-    """Raises an error about an object that cannot be Scan2Cap's boxes by scene."""
-    wrong = next((key for key, rows in content.items() if not _are_boxes(rows)), None)
-    if wrong is not None:
-        raise InputError(
-            f"{path}: expected a list of ScanQA's or ScanRefer's entries, SQA3D's object with questions, or "
-            f"Scan2Cap's {{scene: [{{box}}, …]}}; got an object with {listed([key[:40] for key in content], 4)}, and "
-            f"no "
-            f"list of boxes as {wrong[:40]}"
-        )
-
-
-def _are_boxes(rows: Any) -> bool:
-    return isinstance(rows, list) and all(isinstance(row, dict) and "box" in row for row in rows)
 
 
 def _check_task(path: Path, subject: str, task: Task, allowed: Sequence[str]) -> None:
@@ -236,18 +223,16 @@ def _answered(question: TruthQuestion) -> BatchQuestion:
 
 
 def _grounded(expressions: Sequence[Expression]) -> QuestionSet:
-    return QuestionSet(
-        benchmark="scanrefer",
-        questions=tuple(
-            BatchQuestion(
-                id=f"{each.scene}/{each.object_id}/{each.annotation}",
-                question=Question(text=each.text, task="ground"),
-                scene=each.scene,
-                keys={"scene_id": each.scene, "object_id": str(each.object_id), "ann_id": each.annotation},
-            )
-            for each in expressions
-        ),
+    questions = tuple(
+        BatchQuestion(
+            id=f"{each.scene}/{each.object_id}/{each.annotation}",
+            question=Question(text=each.text, task="ground"),
+            scene=each.scene,
+            keys={"scene_id": each.scene, "object_id": str(each.object_id), "ann_id": each.annotation},
+        )
+        for each in expressions
     )
+    return QuestionSet(benchmark="scanrefer", questions=questions)
 
 
 def _captioned(expressions: Sequence[Expression], path: Path, proposals: str) -> QuestionSet:
@@ -277,14 +262,8 @@ def _captioned(expressions: Sequence[Expression], path: Path, proposals: str) ->
             "(a file of boxes, or localize)"
         )
     objects = {(each.scene, each.object_id): each.aabb for each in expressions}
-    return QuestionSet(
-        benchmark="scan2cap",
-        questions=tuple(
-            caption_question(scene, str(number), aabb, {})
-            for (scene, number), aabb in objects.items()
-            if aabb is not None
-        ),
-    )
+    questions = (caption_question(name, str(number), aabb, {}) for (name, number), aabb in objects.items() if aabb)
+    return QuestionSet(benchmark="scan2cap", questions=tuple(questions))
 
 
 def _warn_of_others(scenes: Sequence[str], why: str) -> None:

@@ -1,7 +1,6 @@
 """A vision-language model behind a server that speaks OpenAI's chat protocol: vLLM, transformers serve, llama.cpp's
 server, a cloud. The key is never written: what a server sends passes `KeyFilter` before anybody sees it."""
 
-import itertools
 import os
 import re
 import threading
@@ -84,14 +83,8 @@ class ServerError(InputError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply:
-    """What a model said.
-
-    Attributes:
-        model: as the server names it.
-        finish: why it ended: "stop", "length" (max_tokens), …
-        tokens: of prompt and answer, where the server counts them.
-        seconds: from the request to the end of the answer.
-    """
+    """What a model said, in how many seconds, and why it ended ("stop", "length", …); tokens are those that the server
+    counts, of prompt and answer."""
 
     text: str
     model: str
@@ -158,7 +151,6 @@ MAX_MESSAGE = 300
 """Characters of a server's message that an error repeats."""
 MAX_NAME = 200
 """Characters of a server's name for its model, or for why an answer ended, that are written down."""
-MAX_MODELS_LISTED = 8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -306,33 +298,16 @@ class VlmServer:
 
     def _status(self, code: int, message: str, location: str) -> InputError:
         if 300 <= code < 400:
-            return self._fault(
-                f"redirects to {location[:120]} ({code}), where nothing is sent; give that address as vlm.base_url if "
-                "you trust it",
-                ServerError,
-            )
+            hint = "give that address as vlm.base_url if you trust it"
+            message = f"redirects to {location[:120]} ({code}), where nothing is sent; {hint}"
+            return self._fault(message, ServerError)
         if code in (401, 403):
             return self._fault(f"refuses the key ({code}: {message}); give vlm.key= or {KEY_VARIABLE}", ServerError)
         if code == 404:
-            return self._fault(
-                f"has no model of that name, or no chat at this address ({message}){self._models()}", ServerError
-            )
+            return self._fault(f"has no model of that name, or no chat at this address ({message})", ServerError)
         if code == 429 or code >= 500:
             return self._fault(f"failed {self._config.retries + 1} times ({code}: {message})", ServerError)
         return self._fault(f"refuses the request ({code}: {message})", InputError)
-
-    def _models(self) -> str:
-        """The names that the server has, where it tells."""
-        names: list[str] = []
-
-        def listen() -> None:
-            try:
-                models = self._client.with_options(max_retries=0).models.list()
-                names.extend(str(model.id) for model in itertools.islice(models, MAX_MODELS_LISTED))
-            except Exception:  # it is only a hint
-                return
-
-        return f"; it has {', '.join(names)}" if _ends_within(self._config.timeout, listen) and names else ""
 
     def _fault(self, message: str, kind: type[InputError]) -> InputError:
         return kind(self._key.clean(f"the server at {self.url}: ") + self._key.clean(message, MAX_MESSAGE))

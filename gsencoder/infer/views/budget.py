@@ -185,11 +185,7 @@ def choose_views_within(
 
 def order_by_error(scores: Sequence[ViewScores]) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
     """Candidates in the order in which each leaves least unseen beside those before it, and by how much each lowers the
-    error; those that show nothing more are left out, except the first.
-
-    Args:
-        scores: of each target.
-    """
+    error; those that show nothing more are left out, except the first."""
     parts = []
     for each in scores:
         # Only Gaussians that any candidate shows count.
@@ -208,11 +204,7 @@ def fewest_views(
     scores: Sequence[ViewScores], budget: ViewsBudget
 ) -> tuple[Choice[Int64[np.ndarray, " n"]], Float64[np.ndarray, " n"]]:
     """The fewest candidates that keep a limit of error in all likelihood, and by how much each lowers the error. The
-    order is that of any error, so that a looser one never takes more views.
-
-    Args:
-        scores: of each target.
-    """
+    order is that of any error, so that a looser one never takes more views."""
     order, gains = order_by_error(scores)
     errors = errors_after(gains)
     # Small renders err, and of targets of few Gaussians, which are few pixels, they err most.
@@ -235,13 +227,8 @@ def measured_errors(
     *,
     near: float = BlendConfig().near,
 ) -> tuple[float, ...]:
-    """The errors of choices of views over all Gaussians of the targets, by renders at the cameras' sizes.
-
-    Args:
-        cameras: of all candidates, in the sizes of their pictures.
-        choices: which of them are chosen, once or several times.
-        near: near plane, world units.
-    """
+    """The errors of choices of views over all Gaussians of the targets, by renders of all candidates' cameras in the
+    sizes of their pictures."""
     config = BlendConfig(rays_per_patch=1, near=min(BlendConfig().near, near))
     most = [np.zeros(len(target.rows)) for target in targets]
     most_chosen = [[np.zeros(len(target.rows)) for target in targets] for _ in choices]
@@ -298,15 +285,9 @@ def pictures_within(
     was predicted is made smaller. Where the least side takes too much, the views that were chosen last are left out,
     or, beside a limit of error, none.
 
-    Args:
-        views: as chosen, in the sizes that their pictures would have without a budget.
-
     Returns:
         The views that are kept, with cameras in the sizes of the pictures; the pictures; the megabytes that were
         predicted; and warnings about a limit that is broken, or views that are left out.
-
-    Raises:
-        InputError: no error is limited, and not even the first view fits at the least side.
     """
     limit, largest = budget.limit("megabytes"), longest_side(views)
     least = min(CONSTANTS.least_picture_side, largest)

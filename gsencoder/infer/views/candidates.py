@@ -24,16 +24,8 @@ from gsencoder.types.checks import look_rotation
 def closeups(
     frames: Cameras, gaussians: Gaussians, target: Target, *, width: int, height: int
 ) -> tuple[Cameras, Int64[np.ndarray, " n"]]:
-    """The frames' cameras with windows around a target, where these are clearly smaller than the frame.
-
-    Args:
-        target: what is looked at; half of its size is left on every side.
-        width: of the pictures to be shown, pixels.
-        height: of the pictures to be shown, pixels; windows have the same shape.
-
-    Returns:
-        n cameras at places of frames, and which frames these are, ascending.
-    """
+    """The frames' cameras with windows around a target, where these are clearly smaller than the frame, in the size and
+    shape of the pictures; and which frames these are, ascending. Half of the target's size is left on every side."""
     points = gaussians.means[target.rows[even_indices(len(target.rows), CONSTANTS.closeup_sample)]].astype(np.float64)
     rows: list[int] = []
     Ks: list[Float64[np.ndarray, "3 3"]] = []
@@ -68,12 +60,7 @@ def closeups(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Patches:
-    """Parts of Gaussians, each an ellipsoid of the same turn.
-
-    Attributes:
-        centers: of the patches, world units.
-        scales: standard deviations along the axes of the Gaussian.
-    """
+    """Parts of Gaussians, each an ellipsoid of the same turn; scales are standard deviations along its axes."""
 
     centers: Float64[np.ndarray, "P 3"]
     rows: Int64[np.ndarray, " P"]
@@ -82,12 +69,7 @@ class Patches:
 
 def patches(gaussians: Gaussians, edge: float) -> Patches:
     """A splat as patches. Where a Gaussian, up to its surface, is longer than `ViewConstants.max_uncut_edges` edges, it
-    is cut along that axis into equal parts of an edge at most; those are kept whose middles lie in its ellipsoid.
-
-    Args:
-        gaussians: whole ones that are small enough stay as they are.
-        edge: world units, > 0.
-    """
+    is cut along that axis into equal parts of an edge at most; those are kept whose middles lie in its ellipsoid."""
     most = CONSTANTS.max_patches_per_gaussian
     parts = _parts(gaussians, edge, most)
     while parts.prod(axis=1).sum() > max(CONSTANTS.max_patches, len(gaussians)) and most > 1:
@@ -159,12 +141,7 @@ class FreeSpace:
         self._depths: list[Float32[np.ndarray, "h w"]] = []
 
     def seen_by(self, cameras: Cameras, config: BlendConfig = BlendConfig()) -> "FreeSpace":
-        """The same space, of which cameras tell what they looked through.
-
-        Args:
-            cameras: in the same world; a depth map is rendered for each. None of them: nobody tells.
-            config: accuracy of the depth maps.
-        """
+        """The same space, of which cameras tell what they looked through, by a depth map of each."""
         if not len(cameras):
             return self
         other = copy(self)
@@ -206,12 +183,8 @@ class FreeSpace:
         directions: Float64[np.ndarray, "n 3"],
         lengths: Float64[np.ndarray, " n"],
     ) -> Float64[np.ndarray, " n"]:
-        """How far each ray goes before the first cell that holds a Gaussian; +inf where it meets none.
-
-        Args:
-            directions: unit vectors.
-            lengths: rays are followed so far, world units, or for `ViewConstants.max_ray_cells` cells.
-        """
+        """How far each ray goes before the first cell that holds a Gaussian; +inf where it meets none within its
+        length, or within `ViewConstants.max_ray_cells` cells."""
         steps = int(np.clip(np.ceil(2 * lengths.max(initial=0) / self.cell), 1, 2 * CONSTANTS.max_ray_cells))
         along = self.cell / 2 * np.arange(steps + 1)
         points = starts[:, None] + along[:, None] * directions[:, None]
@@ -253,12 +226,8 @@ def frames_on(
     """The frames that show most of the targets as far as a few rays tell, ascending; at most so many.
 
     Targets take turns. Each takes its best frames for half of the places, and for the others some from all along the
-    recording, so that the frames of a film are not all neighbors.
-
-    Args:
-        count: frames.
-        spaces: what rays meet, one for each target, which is itself left out.
-    """
+    recording, so that the frames of a film are not all neighbors. Spaces are what rays meet, one for each target, which
+    is itself left out."""
     ranked = [
         _rank_frames(cameras, gaussians, target, count, free) for target, free in zip(targets, spaces, strict=True)
     ]
@@ -345,17 +314,10 @@ def shell_cameras(
     """Cameras around a target from which nothing stands between: SplatDistill sec. 3.4, "viewpoints around".
 
     Directions lie on a spiral. Along each the distance is the one at which the target's outline fills a share of the
-    picture, its frame permitting, or nearer where a surface would stand between. Directions are left out from which
-    the camera would be too near to a surface, where no known camera has looked, or so near that little else is seen.
-    Of those that remain the ones are kept with most of the scene behind and around the target, evenly spread.
-
-    Args:
-        width: of the pictures, pixels.
-        height: of the pictures, pixels.
-
-    Returns:
-        Cameras relative to the scene's origin; none where there is no room.
-    """
+    picture, its frame permitting, or nearer where a surface would stand between. Directions are left out from which the
+    camera would be too near to a surface, where no known camera has looked, or so near that little else is seen. Of
+    those that remain the ones are kept with most of the scene behind and around the target, evenly spread; none where
+    there is no room."""
     focal = width / (2 * math.tan(math.radians(CONSTANTS.fov_degrees) / 2))
     outward, vertical = spiral_directions(max(CONSTANTS.tried_directions * count, CONSTANTS.min_tried_directions), up)
     preferred, least, reach = _distances(gaussians, target, outward, vertical, focal, width, height)

@@ -189,7 +189,7 @@ def view_set(
         return tuple(
             TargetScore(
                 target=target.name,
-                utility=float(utility[view]),
+                worth=float(utility[view]),
                 **{name: float(getattr(each, name)[view]) for name in ("visible", "share", "inside", "alpha", "blur")},
             )
             for target, each, utility in zip(targets, candidates.scores, objective.utilities, strict=True)

@@ -68,11 +68,7 @@ def resized_picture(picture: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]) 
 
 
 def photograph_of(views: Views, frame: int, cameras: Cameras, view: int) -> UInt8[np.ndarray, "H W 3"]:
-    """What a camera in a frame's place shows of its photograph: all or a window, by its K, in the camera's size.
-
-    Args:
-        cameras: with one of the same pose that sees no more than the frame.
-    """
+    """What a camera in a frame's place shows of its photograph: all or a window, by its K, in the camera's size."""
     assert views.images is not None
     picture = views.images.photograph_at(frame) if isinstance(views.images, FramePhotographs) else views.images[frame]
     size = int(cameras.widths[view]), int(cameras.heights[view])
@@ -85,15 +81,8 @@ def photograph_of(views: Views, frame: int, cameras: Cameras, view: int) -> UInt
 def photograph_window(
     views: Views, frame: int, cameras: Cameras, view: int, size: tuple[int, int]
 ) -> tuple[float, float, float, float] | None:
-    """Which part of a frame's photograph a camera in its place shows.
-
-    Args:
-        views: of the frame.
-        size: width and height of the photograph, pixels.
-
-    Returns:
-        Left, upper, right and lower edge in pixels of the photograph; None for all of it.
-    """
+    """Which part of a frame's photograph, of a width and height, a camera in its place shows: left, upper, right and
+    lower edge in pixels of the photograph; None for all of it."""
     frame_K, view_K = views.cameras.Ks[frame].astype(np.float64), cameras.Ks[view].astype(np.float64)
     shown = np.array([cameras.widths[view], cameras.heights[view]])
     # Pixels of the frame's camera: where the window begins, and how large it is; then pixels as they were taken.
@@ -107,12 +96,7 @@ def photograph_window(
 
 
 def with_photographs(scene: Scene, photographed: Scene) -> Scene:
-    """A scene whose frames have the photographs that another reading of it has.
-
-    Args:
-        scene: with cameras; their names say which photograph is whose.
-        photographed: the same scene with its photographs, and perhaps more of them, in whatever size.
-    """
+    """A scene whose frames have the photographs of the same names that another reading of it has, in whatever size."""
     if scene.views is None or not len(scene.views):
         raise InputError(f"photos: the features of {scene.name} have no cameras that photographs could belong to")
     if photographed.views is None or photographed.views.images is None:

@@ -1,14 +1,9 @@
-"""Selected views as pictures: plain ones for a VLM, and an annotated sheet for people.
-
-Rendered features in the layout of a vision tower's output: what a VLM can take in place of its own.
-
-SplatDistill sec. 3.4 feeds maps that were rendered from the features of the tower's kind to VILA; M3 decodes such maps
-at any pose.
-"""
+"""Selected views as pictures for a VLM, an annotated sheet for people, and features rendered in the layout of a vision
+tower's output, which a VLM can take in place of its own (SplatDistill sec. 3.4)."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +17,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.files import write_picture
 from gsencoder.infer.draw import Picture, contact_sheet, draw_boxes, ink_on, label_font, word_color
 from gsencoder.infer.views.photographs import photograph_of, with_upright_frames
-from gsencoder.infer.views.targets import SelectedView, Target, TargetScore, ViewSet
+from gsencoder.infer.views.targets import SelectedView, Target, ViewSet
 from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.render.images import render_image
 from gsencoder.types import Box, Cameras, FeatureMap, FeatureSpace, GaussianFeatures, Gaussians, Scene
@@ -45,9 +40,6 @@ def draw_marks(
 
     A disc stands on the pixel of the target that is nearest to the middle of what is visible of it; where it would
     hide a small target, another disc, or leave the picture, it stands beside it, and a line leads to that pixel.
-
-    Args:
-        blended: the blending weights of its pixels.
 
     Returns:
         The picture, and the numbers that it carries.
@@ -125,8 +117,10 @@ def view_pictures(
     config = replace(config, near=min(config.near, views.near))
     pictures: list[Picture] = []
     numbers: frozenset[int] = frozenset()
-    for view, kind in enumerate(picture_kinds(scene, views)):
-        photograph = _photograph(scene, views, view) if kind == "photograph" else None
+    for view, chosen in enumerate(views.chosen):
+        photograph = None
+        if chosen.frame is not None and scene.views is not None and scene.views.images is not None:
+            photograph = photograph_of(scene.views, chosen.frame, views.cameras, view)
         if photograph is not None and not marked:
             pictures.append(photograph)
             continue
@@ -138,23 +132,14 @@ def view_pictures(
     return pictures, numbers
 
 
-def _photograph(scene: Scene, views: ViewSet, view: int) -> Picture:
-    frame = views.chosen[view].frame
-    assert scene.views is not None
-    assert frame is not None
-    return photograph_of(scene.views, frame, views.cameras, view)
-
-
-def view_sheet(
-    scene: Scene, views: ViewSet, pictures: Sequence[Picture], boxes: Sequence[Box], *, columns: int = 4
-) -> Picture:
+def view_sheet(scene: Scene, views: ViewSet, pictures: Sequence[Picture], boxes: Sequence[Box]) -> Picture:
     """All chosen views with the boxes drawn, and what each shows above it."""
     drawn = [
         draw_boxes(picture, boxes, pose, K, origin=scene.origin)
         for picture, pose, K in zip(pictures, views.cameras.cam_from_world, views.cameras.Ks, strict=True)
     ]
     titles = [f"{number}  {describe_view(each)}" for number, each in enumerate(views.chosen)]
-    return contact_sheet(drawn, titles, columns=columns)
+    return contact_sheet(drawn, titles, columns=4)
 
 
 def describe_view(chosen: SelectedView) -> str:
@@ -173,19 +158,6 @@ SUFFIX = ".png"
 """Of the pictures of views."""
 
 
-def score_to_json(score: TargetScore) -> dict[str, Any]:
-    """What a view shows of a target, under the keys of views.json."""
-    return {
-        "target": score.target,
-        "visible": score.visible,
-        "share": score.share,
-        "inside": score.inside,
-        "alpha": score.alpha,
-        "blur": score.blur,
-        "worth": score.utility,
-    }
-
-
 def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
     """The chosen views as JSON values, best first: names, pictures, scores, gains, and cameras in world coordinates
     with the origin added (cam_from_world and K in OpenCV's conventions)."""
@@ -201,7 +173,7 @@ def views_to_json(scene: Scene, views: ViewSet) -> list[dict[str, Any]]:
                 "clearance": each.clearance,
                 "gain": each.gain,
                 "covered": each.covered,
-                "sights": [score_to_json(score) for score in each.target_scores],
+                "sights": [asdict(score) for score in each.target_scores],
                 "cam_from_world": pose.tolist(),
                 "K": views.cameras.Ks[number].tolist(),
                 "width": int(views.cameras.widths[number]),
@@ -258,11 +230,7 @@ def token_blends(
     fit: Fit = "stretch",
     config: BlendConfig = BlendConfig(),
 ) -> tuple[Blend, ...]:
-    """The blending weights of each view, pooled to a tower's grid: keep them to render several features.
-
-    Args:
-        grid: rows and columns of the tower's patches.
-    """
+    """The blending weights of each view, pooled to a tower's grid of rows and columns."""
     # A blend takes its grid from a map.
     space, cells = FeatureSpace(name="grid", channels=1), np.zeros((*grid, 1), np.float32)
     sizes = list(zip(cameras.widths.tolist(), cameras.heights.tolist(), strict=True))
@@ -281,19 +249,12 @@ def token_blends(
 def feature_tokens(blends: Sequence[Blend], features: GaussianFeatures) -> Float[Tensor, "V tokens D"]:
     """Rendered features of views as a vision tower would give them: patches in lines from the top left, D channels.
 
-    A token is mean + Σᵢ B[p, i] (fᵢ − mean): where rays meet nothing, or Gaussians that no teacher saw, the mean of the
-    space stands.
+    A token is mean + Σᵢ B[p, i] (fᵢ − mean): where rays meet nothing, or Gaussians that no teacher saw, it is the mean.
 
     In a model of transformers these replace what the vision tower gives to the model's connector, by a forward hook on
     the tower. Where that is depends on the model: `last_hidden_state` for Idefics3 and SmolVLM, `hidden_states[-2]` for
     LLaVA, so that features must be of that layer; towers that begin with a summary token need theirs put first, and
-    those that merge patches before they give them (Qwen2-VL) need tokens on the merged grid.
-
-    Args:
-        blends: of `token_blends`, one for each view, all on one grid.
-
-    Returns:
-        float32.
+    towers that merge patches before they give them (Qwen2-VL) need tokens on the merged grid.
     """
     if not blends or len({each.shape for each in blends}) > 1:
         raise InputError(f"tokens: expected blends on one grid, got {sorted({each.shape for each in blends})}")

@@ -16,143 +16,105 @@ from gsencoder.types import Box, Cameras, Gaussians, Localization
 class ViewConstants:
     """Constants of how candidates are placed, scored and chosen.
 
-    The distances of shell cameras were chosen on the rooms train_000 and train_001 of the house scenes. The other
-    values were set by hand for a reason that stands beside them, and were not varied one by one. What the choice
-    reaches with all of them is measured on eight other rooms (docs/measurements.md, "Views").
+    The distances of shell cameras were chosen on the rooms train_000 and train_001 of the house scenes, the others by
+    hand. What the choice reaches with them is measured on eight other rooms (docs/results/views.md).
     """
 
     # Targets (targets.py)
-    least_share: float = 0.05
-    """A target should fill this much of the picture …"""
-    most_share: float = 0.6
-    """… and no more than this."""
+    least_share: float = 0.05  # A target should fill this much of the picture …
+    most_share: float = 0.6  # … and no more than this
+    # Smallest radius of a target, in median scales of its Gaussians: a single Gaussian is as large as it is drawn.
     point_radius_scales: float = 2.0
-    """Smallest radius of a target, in median scales of its Gaussians: a single Gaussian is as large as it is drawn."""
 
     # Free space
-    min_obstacle_opacity: float = 0.3
-    """Gaussians of less opacity are no obstacle."""
+    min_obstacle_opacity: float = 0.3  # Gaussians of less opacity are no obstacle
+    # Cameras of the scene whose depth maps tell what is empty; at least one for each target.
     free_space_cameras: int = 12
-    """Cameras of the scene whose depth maps tell what is empty; at least one for each target."""
-    free_space_side: int = 96
-    """Longer side of these depth maps, pixels."""
-    min_depth_alpha: float = 0.5
-    """Rays of less opacity have met nothing that they could have looked up to."""
+    free_space_side: int = 96  # Longer side of these depth maps, pixels
+    min_depth_alpha: float = 0.5  # Rays of less opacity have met nothing that they could have looked up to
+    # Edge of the cells in which rays are followed, in spacings of the splat: surfaces have no holes in such cells.
     cell_spacings: float = 2.0
-    """Edge of the cells in which rays are followed, in spacings of the splat: surfaces have no holes in such cells."""
-    spacing_sample: int = 5000
-    """Gaussians by whose neighbors the spacing is estimated."""
-    grid_cells: int = 1 << 20
-    """Cells along each side of the grid: three coordinates fit into 60 bits of an int64."""
-    max_ray_cells: int = 512
-    """Cells through which a ray is followed at most."""
-    clearance_neighbors: int = 8
-    """Patches whose surfaces are compared for the distance to the nearest one."""
-    surface_sigmas: float = 2.0
-    """A Gaussian's surface is so many standard deviations from its center."""
-    max_uncut_edges: float = 2.0
-    """Gaussians of at most so many edges are not cut into patches."""
+    spacing_sample: int = 5000  # Gaussians by whose neighbors the spacing is estimated
+    grid_cells: int = 1 << 20  # Cells along each side of the grid: three coordinates fit into 60 bits of an int64
+    max_ray_cells: int = 512  # Cells through which a ray is followed at most
+    clearance_neighbors: int = 8  # Patches whose surfaces are compared for the distance to the nearest one
+    surface_sigmas: float = 2.0  # A Gaussian's surface is so many standard deviations from its center
+    max_uncut_edges: float = 2.0  # Gaussians of at most so many edges are not cut into patches
+    # Patches that one Gaussian is cut into at most; a larger one gets larger patches.
     max_patches_per_gaussian: int = 4096
-    """Patches that one Gaussian is cut into at most; a larger one gets larger patches."""
+    # Patches that a splat is cut into at most, as far as one for each Gaussian allows (memory).
     max_patches: int = 1 << 21
-    """Patches that a splat is cut into at most, as far as one for each Gaussian allows (memory)."""
 
     # The scene's own frames, ranked by rays before any render
-    frame_rays: int = 12
-    """Rays from a target to each frame."""
-    frame_batch: int = 32
-    """Frames whose rays are followed together (memory)."""
-    blocked_frame_weight: float = 0.02
-    """Weight of a frame all of whose rays are blocked: rays may err."""
+    frame_rays: int = 12  # Rays from a target to each frame
+    frame_batch: int = 32  # Frames whose rays are followed together (memory)
+    blocked_frame_weight: float = 0.02  # Weight of a frame all of whose rays are blocked: rays may err
+    # Half of the frames are spread over the recording; they are taken from so many times as many …
     spread_frames: int = 4
-    """Half of the frames are spread over the recording; they are taken from so many times as many …"""
+    # … that show at least this share of what the best frame shows: the best of a film are neighbors.
     min_spread_share: float = 0.25
-    """… that show at least this share of what the best frame shows: the best of a film are neighbors."""
-
-    min_frame_depth: float = 1e-9
-    """Depth at which a target around the camera is taken to lie, world units."""
+    min_frame_depth: float = 1e-9  # Depth at which a target around the camera is taken to lie, world units
 
     # Cameras on shells around a target
-    fov_degrees: float = 60.0
-    """Their horizontal field of view."""
+    fov_degrees: float = 60.0  # Their horizontal field of view
+    # Directions tried for each camera: many are blocked, or look at holes where nobody has been …
     tried_directions: int = 8
-    """Directions tried for each camera: many are blocked, or look at holes where nobody has been …"""
-    min_tried_directions: int = 64
-    """… but never fewer than this."""
+    min_tried_directions: int = 64  # … but never fewer than this
+    # Shares of the picture that the target fills, by turns from direction to direction …
     fill_shares: tuple[float, ...] = (0.30, 0.18, 0.10)
-    """Shares of the picture that the target fills, by turns from direction to direction …"""
+    # … kept by this factor above `least_share` and below `most_share`: outlines are counted in cells.
     fill_margin: float = 1.5
-    """… kept by this factor above `least_share` and below `most_share`: outlines are counted in cells."""
-    max_fill_share: float = 0.5
-    """A camera comes no nearer than where the target fills this share."""
-    thin_fill_share: float = 0.08
-    """A long and thin target may leave the picture until it fills this share."""
-    framed_share: float = 0.9
-    """A target that fits into the picture stays within this share of its width and height."""
+    max_fill_share: float = 0.5  # A camera comes no nearer than where the target fills this share
+    thin_fill_share: float = 0.08  # A long and thin target may leave the picture until it fills this share
+    framed_share: float = 0.9  # A target that fits into the picture stays within this share of its width and height
+    # Distance to surfaces, as a share of the distance to the target, or of the target's radius where that is less.
     clearance_share: float = 0.2
-    """Distance to surfaces, as a share of the distance to the target, or of the target's radius where that is less."""
-    outline_cells: int = 16
-    """Cells along a target's radius in which its outline is counted."""
-    outline_sample: int = 1000
-    """Gaussians of a target that make its outline."""
-    background_radii: float = 1.5
-    """Rays that test what is behind a target pass so many radii beside its center."""
+    outline_cells: int = 16  # Cells along a target's radius in which its outline is counted
+    outline_sample: int = 1000  # Gaussians of a target that make its outline
+    background_radii: float = 1.5  # Rays that test what is behind a target pass so many radii beside its center
 
     # Close-ups from photographs
-    closeup_sample: int = 1000
-    """Gaussians of a target that tell where it is in a frame."""
-    min_closeup_inside: float = 0.5
-    """Share of these that must be in the frame."""
+    closeup_sample: int = 1000  # Gaussians of a target that tell where it is in a frame
+    min_closeup_inside: float = 0.5  # Share of these that must be in the frame
+    # Narrowest window in pixels of the photograph: a smaller one would be enlarged to a blur.
     min_closeup_width: int = 160
-    """Narrowest window in pixels of the photograph: a smaller one would be enlarged to a blur."""
+    # Windows of more than this share of a frame's width or height are left out: the frame itself shows as much.
     max_closeup_share: float = 0.75
-    """Windows of more than this share of a frame's width or height are left out: the frame itself shows as much."""
 
     # Scores by small renders (scores.py)
+    # Accuracy of the small renders: rays end where a fiftieth of their light is left.
     score_blend: BlendConfig = field(default_factory=lambda: BlendConfig(stop_transmittance=0.02, min_weight=1e-3))
-    """Accuracy of the small renders: rays end where a fiftieth of their light is left."""
-    context_radii: float = 2.0
-    """A target's context is what lies in the ball of so many times its radius."""
-    coverage_sample: int = 2000
-    """Gaussians of a target, and of its context, on which coverage is computed."""
-    min_weight: float = 0.05
-    """Blending weight from which on a pixel shows a target."""
+    context_radii: float = 2.0  # A target's context is what lies in the ball of so many times its radius
+    coverage_sample: int = 2000  # Gaussians of a target, and of its context, on which coverage is computed
+    min_weight: float = 0.05  # Blending weight from which on a pixel shows a target
     solid_share: float = 0.5
     """Visibility is counted over pixels at least this opaque by the target alone, as a share of the most opaque one:
     a thin rim is shared with what is behind it."""
+    # Margin around a target on every side, as a share of its size: for its opacity score, and in close-ups.
     frame_margin: float = 0.5
-    """Margin around a target on every side, as a share of its size: for its opacity score, and in close-ups."""
 
     # Budgets of error and of megabytes
+    # A Gaussian reaches no farther than so many standard deviations in a picture, and is left out of none by it.
     window_sigmas: float = 6.0
-    """A Gaussian reaches no farther than so many standard deviations in a picture, and is left out of none by it."""
-    error_safety: float = 1.2
-    """What small renders leave unseen counts so many times …"""
-    unsure_gaussians: float = 2.0
-    """… and so many Gaussians of each target count as unseen on top of it."""
+    error_safety: float = 1.2  # What small renders leave unseen counts so many times …
+    unsure_gaussians: float = 2.0  # … and so many Gaussians of each target count as unseen on top of it
+    # Pictures are made no smaller by a budget, longer side, pixels: the input of the smallest common vision towers.
     least_picture_side: int = 224
-    """Pictures are made no smaller by a budget, longer side, pixels: the input of the smallest common vision towers."""
 
     # Utility of a view and of a set of views (choose.py)
-    cover_weight: float = 0.3
-    """What seeing all of a target is worth."""
-    context_weight: float = 0.1
-    """What seeing its surroundings is worth."""
-    spread_weight: float = 0.2
-    """What seeing it from many directions is worth."""
+    cover_weight: float = 0.3  # What seeing all of a target is worth
+    context_weight: float = 0.1  # What seeing its surroundings is worth
+    spread_weight: float = 0.2  # What seeing it from many directions is worth
     half_blur: float = 0.04
     """Standard deviation of the target's Gaussians, as a share of the picture's longer side, that halves a view's
     utility."""
-    full_alpha: float = 0.9
-    """Mean opacity around a target from which on it does not lower the utility."""
+    full_alpha: float = 0.9  # Mean opacity around a target from which on it does not lower the utility
+    # Views are compared with the best one of a target, or with this where the best one is worse.
     min_best_utility: float = 0.1
-    """Views are compared with the best one of a target, or with this where the best one is worse."""
+    # The choice ends when the next view adds less than this share of what the first one added …
     min_relative_gain: float = 0.004
-    """The choice ends when the next view adds less than this share of what the first one added …"""
-    min_gain: float = 1e-4
-    """… or less than a view of this utility by itself: not a pixel of the target."""
-    min_visible: float = 0.1
-    """A warning says which targets no chosen view shows to this share."""
+    min_gain: float = 1e-4  # … or less than a view of this utility by itself: not a pixel of the target
+    min_visible: float = 0.1  # A warning says which targets no chosen view shows to this share
 
 
 CONSTANTS = ViewConstants()
@@ -233,8 +195,8 @@ class ViewsConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TargetScore:
-    """What one view shows of one target: see `ViewScores`; alpha 1 and blur 0 where a photograph is shown; the utility
-    of the view for this target alone is 0 to 1."""
+    """What one view shows of one target: see `ViewScores`; alpha 1 and blur 0 where a photograph is shown. Its worth is
+    its utility for this target alone, 0 to 1."""
 
     target: str
     visible: float
@@ -242,7 +204,7 @@ class TargetScore:
     inside: float
     alpha: float
     blur: float
-    utility: float
+    worth: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

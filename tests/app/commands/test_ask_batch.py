@@ -74,24 +74,6 @@ def test_a_batch_that_a_fault_ends_keeps_its_answers_and_goes_on(
     assert not (tmp_path / "answers.answers").exists()
 
 
-def test_an_answer_that_is_nested_too_deep_is_an_error_in_one_line(
-    features: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = batch(tmp_path / "q.jsonl", {"id": "a", "question": "the cube"}, {"id": "b", "question": "the crate"})
-    answers = tmp_path / "out.answers" / "answers.jsonl"
-    with serving(crate_refused) as server:
-        words = (f"questions={file}", f"vlm.base_url={server.url}")
-        assert ask(features, tmp_path / "out", *words) == 2
-        row = answers.read_text().rstrip()
-        for depth in (500, 200_000):
-            answers.write_text(row[:-1] + ', "x": ' + "[" * depth + "]" * depth + "}\n")
-            capsys.readouterr()
-            assert ask(features, tmp_path / "out", *words) == 2
-            output = capsys.readouterr().err
-            assert "Traceback" not in output
-            assert "give resume=false to ask again" in output
-
-
 def crate_refused(handler: Handler, body: Any) -> None:
     text = body["messages"][0]["content"][-1]["text"]
     if "crate" in text:

@@ -69,10 +69,6 @@ def echo(status: int, spelling: str, form: str) -> Any:
     return behave
 
 
-def listing(spelling: str) -> Any:
-    return lambda handler: handler.reply(200, {"object": "list", "data": [{"id": f"{spelling}{ESCAPE}"}]})
-
-
 @pytest.mark.parametrize(("many", "debug"), [(False, ("--debug",)), (True, ())])
 def test_a_key_that_a_server_repeats_reaches_neither_disk_nor_screen(
     features: Path,
@@ -92,7 +88,6 @@ def test_a_key_that_a_server_repeats_reaches_neither_disk_nor_screen(
     codes = set()
     for number, (status, form, spelling) in enumerate(cases):
         with serving(echo(status, spelling, form)) as server:
-            server.listing = listing(spelling)
             where = [f"vlm.base_url={server.url}", f"out={tmp_path / f'out{number}'}"]
             codes.add(cli.main(["ask", str(features), question, *where, *words, *debug]))
             assert server.requests[0][0]["authorization"] == f"Bearer {KEY}"

@@ -1,22 +1,42 @@
-"""`gsencoder memory`: what it writes is what localize, views and pack read; settings and scenes that cannot be."""
+"""`gsencoder memory`: what it writes is what localize, views and pack read; pictures; what is continued or refused."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from command_runs import refusal, results_of
+from memory_samples import make_memory
 from named_rooms import write_words
+from PIL import Image
+from splats import random_gaussians
+from training_scenes import SMALL
 
 from gsencoder.app import main as cli
+from gsencoder.app.commands.memory import MemoryCommandConfig
+from gsencoder.app.options import options_by_key
+from gsencoder.core.errors import InputError
 from gsencoder.core.logs import read_log
+from gsencoder.data.splats.files import save_splat
 from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.folder import load_features, load_memories
+from gsencoder.fusion.folder import load_features, load_memories, save_memories
+from gsencoder.models.encoder import GaussianEncoder
+from gsencoder.models.output_space import OutputSpace, OutputSpaces
+from gsencoder.models.weights import save_weights
+from gsencoder.teachers.labels import PaletteConfig, PaletteTeacher
 from gsencoder.train import memory as training
+from gsencoder.train.memory import fingerprint_of, memory_training
+from gsencoder.types import Scene
 
 pytestmark = pytest.mark.slow
 
 QUICK = ("quiet=true", "train.steps=30", "train.warmup=5", "memory.channels=8", "pictures=0")
+
+
+def unused(*arguments: object, **settings: object) -> None:
+    raise AssertionError
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +57,14 @@ def teachers(room: Path) -> list[str]:
 @pytest.fixture(scope="module")
 def made(room: Path, teachers: list[str]) -> Path:
     out = room.parent / "memory"
-    assert cli.main(["memory", str(room), *teachers, f"out={out}", *QUICK]) == 0
+    assert cli.main(["memory", str(room), *teachers, f"out={out}", *QUICK, "pictures=2"]) == 0
     return out
 
 
 def test_a_memory_of_two_teachers_is_written_with_its_words_and_figures(made: Path) -> None:
-    assert {path.name for path in made.iterdir()} == {
+    pictures = {"attention.{}.view000.png", "attention.{}.view002.png", "components.{}.png"}
+    drawn = {name.format(teacher) for name in pictures for teacher in ("labels", "palette")}
+    assert {path.name for path in made.iterdir()} - drawn == {
         "log.csv",
         "memory.labels.safetensors",
         "memory.palette.safetensors",
@@ -51,6 +73,9 @@ def test_a_memory_of_two_teachers_is_written_with_its_words_and_figures(made: Pa
         "words.labels.safetensors",
         "words.palette.safetensors",
     }
+    for name in drawn:
+        with Image.open(made / name) as picture:
+            picture.load()
     results = results_of(made)
     assert results["steps"] == 30
     memories = load_memories(made)
@@ -98,7 +123,11 @@ def test_objects_are_boxed_from_a_memory_as_from_fused_features(
 
 
 def test_an_interrupted_run_goes_on_where_it_stopped(
-    room: Path, teachers: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    room: Path,
+    teachers: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     run = training.Trainer.run
 
@@ -118,12 +147,10 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
     state = tmp_path / "memory.training"
     assert len(read_log(state / "queries" / "log.csv")) == 1
     assert not (tmp_path / "memory").exists()
-
-    def prepared_again(*arguments: object, **settings: object) -> None:
-        raise AssertionError
-
+    assert "a run with the same out= and settings continues it" in capsys.readouterr().err
+    assert "an optimization that is not finished and would be lost" in refusal(capsys, *words, "optimize=false")
     with monkeypatch.context() as patch:
-        patch.setattr("gsencoder.train.memory.fuse", prepared_again)
+        patch.setattr("gsencoder.train.memory.fuse", unused)
         assert cli.main(words) == 0
     whole = ["memory", str(room), *teachers, f"out={tmp_path / 'whole'}", *QUICK]
     assert cli.main(whole) == 0
@@ -132,14 +159,69 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
         np.testing.assert_array_equal(one.queries, other.queries)
 
 
-def test_teachers_can_be_optimized_one_by_one_or_not_at_all(room: Path, teachers: list[str], tmp_path: Path) -> None:
+def test_teachers_can_be_optimized_one_by_one_or_not_at_all(
+    room: Path, teachers: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Without pictures no raw features are kept.
+    monkeypatch.setattr("gsencoder.train.memory.draw_sample", unused)
     fits = {}
-    for name, words in (("turns", ["joint=false"]), ("none", ["optimize=false"])):
+    for name, words in (("turns", ["joint=false"]), ("none", ["optimize=false", f"bank.components={10**12}"])):
         assert cli.main(["memory", str(room), *teachers, f"out={tmp_path / name}", *QUICK, *words]) == 0
         results = results_of(tmp_path / name)
         fits[name] = results["teachers"]["labels"]["fit"]["centered"]
+        assert not list((tmp_path / name).glob("*.png"))
         assert ("steps" in results) == (name == "turns")
     assert 0.5 < fits["none"] < fits["turns"]
+
+
+def test_a_memory_of_predictions_has_their_mean_and_all_gaussians_without_any_fusion(
+    room: Path, teachers: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights = tmp_path / "encoder.safetensors"
+    mean = np.linspace(0.05, 0.15, 11, dtype=np.float32)
+    outputs = OutputSpace(space=PaletteTeacher(PaletteConfig()).space, mean=mean, scale=0.3)
+    torch.manual_seed(0)
+    save_weights(weights, GaussianEncoder(SMALL, 11), OutputSpaces(by_teacher={"palette": outputs}), {"steps": 1})
+    monkeypatch.setattr("gsencoder.train.memory.fuse", unused)
+    words = ["memory", str(room), f"weights={weights}", "optimize=false", "pictures=0", "device=cpu"]
+    assert cli.main([*words, "teacher=palette", "quiet=true", f"out={tmp_path / 'memory'}"]) == 0
+    (memory,) = load_memories(tmp_path / "memory").values()
+    # An encoder gives every Gaussian a feature, also those that no view sees.
+    assert len(memory) > 100
+    assert (memory.weights > 0).all()
+    np.testing.assert_allclose(memory.mean, mean, atol=1e-6)
+    message = refusal(capsys, *words, *teachers, f"out={tmp_path / 'other'}")
+    assert "gives features of (palette" in message
+    assert "give an encoder that was trained with this teacher" in message
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_bare_splat_is_drawn_by_its_renders(tmp_path: Path) -> None:
+    gaussians = make_room(0, objects=2, views=1, width=8, height=6, spacing=0.15).gaussians
+    save_splat(tmp_path / "room.ply", gaussians)
+    out = f"out={tmp_path / 'of_splat'}"
+    splat = [str(tmp_path / "room.ply"), "teacher=palette", "orbits=3", "pictures=2", "data.up=[0,0,1]"]
+    assert cli.main(["memory", *splat, out, *QUICK[:-1]]) == 0
+    assert sorted(path.name for path in (tmp_path / "of_splat").glob("*.png")) == [
+        "attention.palette.view000.png",
+        "attention.palette.view002.png",
+        "components.palette.png",
+    ]
+
+
+def test_a_run_whose_pictures_cannot_be_drawn_says_how_to_go_on(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(*arguments: object, **settings: object) -> None:
+        raise InputError("000.png: cannot be decoded")
+
+    words = ["memory", str(room), "teacher=palette", f"out={tmp_path / 'out'}", *QUICK[1:-1]]
+    monkeypatch.setattr("gsencoder.infer.memory_pictures.attention_picture", damaged)
+    line = refusal(capsys, *words)
+    assert line == "error: 000.png: cannot be decoded; give pictures=0 to write the memory without pictures"
+    monkeypatch.setattr("gsencoder.train.memory.fuse", damaged)
+    assert cli.main([*words, "pictures=0", "quiet=true"]) == 0
+    assert (tmp_path / "out" / "memory.safetensors").is_file()
 
 
 def test_settings_and_scenes_that_cannot_be_are_refused_in_one_line(
@@ -148,17 +230,43 @@ def test_settings_and_scenes_that_cannot_be_are_refused_in_one_line(
     out = f"out={tmp_path / 'out'}"
     palette = ["memory", str(room), "teacher=palette", out]
     for words, message in (
-        (["bank.threshold=1.5"], "bank.threshold: expected a cosine above 0 and up to 1, got 1.5"),
-        (["bank.threshold=-0.1"], "bank.threshold: expected a cosine above 0 and up to 1, got -0.1"),
         (["bank.threshold=0.9", "bank.components=4"], "bank.threshold, bank.components: expected one of the two"),
         (["memory.channels=0"], "memory.channels: expected 1 to 1,024, got 0"),
-        (["memory.temperature=0"], "memory.temperature: expected above 0, got 0.0"),
         (["optimize=false", "memory.init=random"], "optimize=false: random queries mean nothing without training"),
         (["prepare.scale=false"], "prepare.center, prepare.scale: expected true"),
-        (["memory.scoring=magic"], "memory.scoring"),
+        (["memory.min_alpha=1"], "memory.min_alpha: no cell of 3 views of teacher palette is covered to 1"),
+        (["umap=true", "pictures=0"], "umap: expected pictures=1 or more"),
     ):
         assert message in refusal(capsys, *palette, *words)
     assert "expected one scene, got 2" in refusal(capsys, "memory", str(room), str(room), "teacher=palette", out)
-    monkeypatch.setattr("gsencoder.memory.bank.free_memory", lambda: 1000)
-    assert "components of 11 channels, which take the" in refusal(capsys, *palette, "bank.threshold=0.9999")
+    monkeypatch.setattr("gsencoder.infer.memory_pictures.find_spec", lambda name: None)
+    assert "pip install 'gsencoder[umap]'" in refusal(capsys, *palette, "umap=true")
     assert not (tmp_path / "out").exists()
+
+
+def test_the_defaults_that_help_shows_are_those_of_the_command() -> None:
+    options, training = options_by_key(MemoryCommandConfig), memory_training()
+    for name in ("steps", "learning_rate", "warmup", "validate_every"):
+        assert options[f"train.{name}"].default == getattr(training, name)
+
+
+def test_banks_of_as_many_components_have_fingerprints_of_their_own() -> None:
+    bank = make_memory().bank
+    other = replace(bank, components=bank.components + np.float32(1e-3))
+    assert fingerprint_of(bank) == fingerprint_of(replace(bank)) != fingerprint_of(other)
+
+
+def test_settings_that_a_form_or_a_memory_does_not_take_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    memory = make_memory(gaussians=20)
+    scene = Scene(name="s", gaussians=random_gaussians(20), origin=np.zeros(3))
+    save_memories(tmp_path, scene, {"a": memory})
+    folder, out = str(tmp_path), f"out={tmp_path / 'm.onnx'}"
+    export = ["export", f"memory={folder}", out]
+    assert "expected one of them, got 'foo'" in refusal(capsys, *export, "space=foo")
+    assert "splats are compared with encoders alone" in refusal(capsys, "export", "/nowhere", *export[1:])
+    assert "space: names a teacher of memory=" in refusal(capsys, "export", "space=foo", out)
+    packed = ["pack", folder, f"out={tmp_path / 'p'}"]
+    assert "budget.error: form=npz writes features as they are" in refusal(capsys, *packed, "form=npz", "error=0.5")
+    assert "form=compact takes none" in refusal(capsys, *packed, "index.threshold=0.4")
