@@ -25,8 +25,7 @@ from gsencoder.evaluate.benchmarks.localization import queryable_objects
 from gsencoder.fusion.fuse import fuse
 from gsencoder.infer.localize import localize
 from gsencoder.infer.views.candidates import FreeSpace
-from gsencoder.infer.views.choose import choose_views
-from gsencoder.infer.views.scores import score_views
+from gsencoder.infer.views.choose import choose_views, score_views
 from gsencoder.infer.views.targets import Target, ViewsConfig, ViewSet, targets_of
 from gsencoder.render import BlendConfig
 from gsencoder.teachers.build import build_teacher

@@ -17,7 +17,7 @@ from gsencoder.infer.views.budget import (
     measured_errors,
     order_by_error,
 )
-from gsencoder.infer.views.scores import ViewScores
+from gsencoder.infer.views.choose import ViewScores
 from gsencoder.infer.views.targets import Target, ViewsConfig, target_of
 from gsencoder.render import blend
 from gsencoder.types import Scene, Views

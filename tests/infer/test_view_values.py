@@ -10,8 +10,7 @@ from viewed_targets import cube_in_room
 
 from gsencoder.data.orbits import looking_cameras
 from gsencoder.infer.views import choose
-from gsencoder.infer.views.choose import CoverageObjective, view_utility
-from gsencoder.infer.views.scores import coverage, score_views
+from gsencoder.infer.views.choose import CoverageObjective, coverage, score_views, view_utility
 from gsencoder.infer.views.targets import CONSTANTS, target_of
 
 pytestmark = pytest.mark.slow

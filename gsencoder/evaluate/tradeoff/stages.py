@@ -45,9 +45,8 @@ from gsencoder.infer.draw import Picture
 from gsencoder.infer.encode import EncodeConfig, Encoder
 from gsencoder.infer.localize import LocalizeConfig, localize, select_features
 from gsencoder.infer.torch_network import TorchNetwork
-from gsencoder.infer.views.choose import choose_views
+from gsencoder.infer.views.choose import choose_views, score_views
 from gsencoder.infer.views.pictures import view_pictures
-from gsencoder.infer.views.scores import score_views
 from gsencoder.infer.views.targets import ViewsConfig, ViewSet, target_of, targets_of
 from gsencoder.memory.index import IndexConfig, index_features
 from gsencoder.reconstruct.parameters import apply_colors

@@ -29,9 +29,16 @@ from gsencoder.core.files import picture_bytes
 from gsencoder.core.settings import option, shown_value
 from gsencoder.infer.draw import Picture
 from gsencoder.infer.views.candidates import FreeSpace
-from gsencoder.infer.views.choose import Candidates, CoverageObjective, greedy_order, score_candidates, view_set
+from gsencoder.infer.views.choose import (
+    Candidates,
+    CoverageObjective,
+    ViewScores,
+    coverage,
+    greedy_order,
+    score_candidates,
+    view_set,
+)
 from gsencoder.infer.views.pictures import SUFFIX, view_pictures
-from gsencoder.infer.views.scores import ViewScores, coverage
 from gsencoder.infer.views.targets import CONSTANTS, Target, ViewsConfig, ViewSet
 from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Cameras, FeatureMap, FeatureSpace, Gaussians, Scene

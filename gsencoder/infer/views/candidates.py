@@ -2,6 +2,7 @@
 as large as a camera near it would and sharper than any render, and cameras on shells in free space."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -11,11 +12,13 @@ import torch
 from jaxtyping import Bool, Float32, Float64, Int64, Integer
 
 from gsencoder.core.arrays import even_indices
+from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.core.threads import parallel
-from gsencoder.data.orbits import looking_cameras, spiral_directions
+from gsencoder.data.orbits import looking_cameras, orbit_cameras, spiral_directions
 from gsencoder.data.seeding.points import NEIGHBOR
 from gsencoder.geometry import covariances, rotmats_from_quats
-from gsencoder.infer.views.targets import CONSTANTS, Target
+from gsencoder.infer.views.photographs import photograph_cameras
+from gsencoder.infer.views.targets import CONSTANTS, Target, ViewsConfig
 from gsencoder.render import BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians, Scene
 from gsencoder.types.checks import look_rotation
@@ -401,3 +404,90 @@ def up_of(scene: Scene) -> Float64[np.ndarray, "3"] | None:
     mean = -scene.views.cameras.cam_from_world[:, 1, :3].astype(np.float64).mean(axis=0)
     length = float(np.linalg.norm(mean))
     return mean / length if length > 0.5 else None
+
+
+Placed = tuple[Cameras, list[str], list[int | None]]
+"""Cameras, their names, and which frames they are."""
+
+
+def uniform_candidates(scene: Scene, gaussians: Gaussians, config: ViewsConfig) -> Placed:
+    """Evenly spread frames, or cameras around a splat that has none."""
+    if scene.views is None or not len(scene.views):
+        around = orbit_cameras(
+            gaussians,
+            count=config.count,
+            width=config.width,
+            height=config.height,
+            fov_degrees=CONSTANTS.fov_degrees,
+            up=scene.up,
+        )
+        return around, [f"orbit {number:02d}" for number in range(len(around))], [None] * len(around)
+    chosen = even_indices(len(scene.views), config.count)
+    cameras = _downscaled(scene.views.cameras.select(chosen), config)
+    return cameras, [scene.views.names[view] for view in chosen], chosen.tolist()
+
+
+def target_candidates(
+    scene: Scene,
+    gaussians: Gaussians,
+    targets: Sequence[Target],
+    free: FreeSpace,
+    config: ViewsConfig,
+    blend: BlendConfig,
+) -> Placed:
+    """Frames that show the targets, close-ups cut from them, and cameras on shells around the targets."""
+    total = max(config.candidates, config.count)
+    views = scene.views if scene.views is not None and len(scene.views) else None
+    if config.source == "frames" and views is None:
+        raise InputError(f"views: scene {scene.name} has no cameras; use choose.source=shells")
+    names: list[str] = []
+    frames: list[int | None] = []
+    parts: list[Cameras] = []
+    spaces = [free.without(target.rows) for target in targets]
+    if config.source != "shells" and views is not None:
+        room = total if config.source == "frames" else total // 2
+        if views.images is not None and room >= 2 * len(targets):
+            large = photograph_cameras(views)
+            for target, space, part in zip(targets, spaces, _split_evenly(room // 2, len(targets)), strict=True):
+                best = frames_on(views.cameras, gaussians, [target], part, [space])
+                near, rows = closeups(large.select(best), gaussians, target, width=config.width, height=config.height)
+                parts.append(near)
+                names += [f"{views.names[view]} near {target.name}" for view in best[rows]]
+                frames += best[rows].tolist()
+        whole = frames_on(views.cameras, gaussians, targets, room - len(frames), spaces)
+        parts.append(_downscaled(views.cameras.select(whole), config))
+        names += [views.names[view] for view in whole]
+        frames += whole.tolist()
+    if config.source != "frames":
+        if views is not None:
+            count = max(CONSTANTS.free_space_cameras, len(targets))
+            observers = frames_on(views.cameras, gaussians, targets, count, spaces)
+            free = free.seen_by(views.cameras.select(observers), blend)
+        up = up_of(scene)
+        for target, room in zip(targets, _split_evenly(total - len(frames), len(targets)), strict=True):
+            space = free.without(target.rows)
+            around = shell_cameras(gaussians, target, room, space, up=up, width=config.width, height=config.height)
+            if not len(around):
+                warnings.warn(f"views: there is no room for a camera around {target.name}", SceneWarning, stacklevel=4)
+            parts.append(around)
+            names += [f"around {target.name} {number:02d}" for number in range(len(around))]
+            frames += [None] * len(around)
+    if not names:
+        remedy = "choose.method=uniform looks at all of the splat" if views is None else "take choose.source=frames"
+        raise InputError(
+            f"views: there is no room for a camera around {', '.join(target.name for target in targets)} "
+            f"(pictures of {config.width} x {config.height} pixels); {remedy}"
+        )
+    fields = ("cam_from_world", "Ks", "widths", "heights")
+    cameras = Cameras(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields})
+    return cameras, names, frames
+
+
+def _downscaled(frames: Cameras, config: ViewsConfig) -> Cameras:
+    """Frames at the size of their pictures: photographs have far more pixels than anyone looks at."""
+    return frames.resized(config.frame_side, enlarge=False)
+
+
+def _split_evenly(total: int, parts: int) -> list[int]:
+    """Whole numbers of one or more that come to a total, as equal as can be."""
+    return [max(1, total // parts + (part < total % parts)) for part in range(parts)]

@@ -9,19 +9,163 @@ directions are. The greedy choice is then within 1 − 1/e of the best one (Nemh
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+import torch
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.orbits import orbit_cameras
-from gsencoder.infer.views.candidates import FreeSpace, closeups, frames_on, shell_cameras, up_of
-from gsencoder.infer.views.photographs import photograph_cameras, with_upright_frames
-from gsencoder.infer.views.scores import ViewScores, coverage, directions, replace_with_photographs, score_views
+from gsencoder.core.threads import parallel
+from gsencoder.infer.views.candidates import FreeSpace, target_candidates, uniform_candidates
+from gsencoder.infer.views.photographs import with_upright_frames
 from gsencoder.infer.views.targets import CONSTANTS, SelectedView, Target, TargetScore, ViewsConfig, ViewSet
-from gsencoder.render import BlendConfig
+from gsencoder.render import Blend, BlendConfig, blend
 from gsencoder.types import Cameras, Gaussians, Scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ViewScores:
+    """What each of V cameras sees of one target.
+
+    Attributes:
+        visible: blending weight of the target as a share of what it has when rendered alone, over the pixels where
+            it is at least half as opaque then as anywhere; 0 where it is outside.
+        share: of the picture that the target fills, by weight.
+        inside: share of the target's Gaussians whose means lie in the picture.
+        alpha: mean opacity of the render over the target and around it.
+        blur: standard deviation of the Gaussians that make up the target in the picture, on average, as a share of
+            the picture's longer side.
+        target: the weight of each Gaussian of the target (a sample) in small pixels.
+        context: the same of Gaussians around it.
+    """
+
+    visible: Float64[np.ndarray, " V"]
+    share: Float64[np.ndarray, " V"]
+    inside: Float64[np.ndarray, " V"]
+    alpha: Float64[np.ndarray, " V"]
+    blur: Float64[np.ndarray, " V"]
+    target: Float32[np.ndarray, "V n"]
+    context: Float32[np.ndarray, "V m"]
+
+
+def score_views(
+    gaussians: Gaussians,
+    cameras: Cameras,
+    targets: Sequence[Target],
+    *,
+    side: int = 160,
+    config: BlendConfig = CONSTANTS.score_blend,
+) -> tuple[ViewScores, ...]:
+    """Judges cameras by small renders, one for each, in which every Gaussian hides what is behind it.
+
+    Args:
+        side: longer side of the renders, pixels.
+    """
+    if not targets:
+        return ()
+    small = cameras.resized(side)
+    probes = [_TargetProbe(gaussians, target) for target in targets]
+
+    def one(view: int) -> list[_TargetInView]:
+        b = blend(gaussians, small, view, config=config)
+        # Pixels that each Gaussian fills.
+        weights = np.bincount(b.col.numpy(), b.weight.numpy(), minlength=len(gaussians))
+        return [each.seen(b, weights, small, view, config) for each in probes]
+
+    # Small views are rendered faster with one thread for each view than with all threads for one.
+    per_view = parallel(one, range(len(cameras)))
+    names, scores = _TargetInView._fields, []
+    for seen in zip(*per_view, strict=True):
+        columns = dict(zip(names, map(np.array, zip(*seen, strict=True)), strict=True))
+        scores.append(ViewScores(**columns))
+    return tuple(scores)
+
+
+def replace_with_photographs(scores: ViewScores, photograph_at: Bool[np.ndarray, " V"]) -> ViewScores:
+    """Scores of cameras of which some are shown as photographs, which count as sharp and solid."""
+    return replace(
+        scores, alpha=np.where(photograph_at, 1.0, scores.alpha), blur=np.where(photograph_at, 0.0, scores.blur)
+    )
+
+
+class _TargetInView(NamedTuple):
+    """What one camera sees of one target; see `ViewScores`."""
+
+    visible: float
+    share: float
+    inside: float
+    alpha: float
+    blur: float
+    target: Float32[np.ndarray, " n"]
+    context: Float32[np.ndarray, " m"]
+
+
+class _TargetProbe:
+    """A target, with the arrays that scoring needs for every camera."""
+
+    def __init__(self, gaussians: Gaussians, target: Target) -> None:
+        self._rows = target.rows
+        self._alone = gaussians.select(target.rows)
+        member = np.zeros(len(gaussians), np.float32)
+        member[target.rows] = 1
+        self._member = torch.from_numpy(member)
+        near = np.linalg.norm(gaussians.means - target.center, axis=1) <= CONSTANTS.context_radii * target.radius
+        around = np.flatnonzero(near & (member == 0))
+        self._samples = tuple(
+            rows[even_indices(len(rows), CONSTANTS.coverage_sample)] for rows in (target.rows, around)
+        )
+        # The size of a flat Gaussian is that of its disc.
+        self._sizes = np.sqrt(np.sort(self._alone.scales, axis=1)[:, 1:].prod(axis=1, dtype=np.float64))
+
+    def seen(
+        self, b: Blend, weights: Float64[np.ndarray, " N"], small: Cameras, view: int, config: BlendConfig
+    ) -> _TargetInView:
+        """What a camera sees of it."""
+        alone = blend(self._alone, small, view, config=config).alpha
+        shown = b.render(self._member)
+        # What is half transparent at a target's rim belongs to what is behind it, too.
+        solid = alone >= CONSTANTS.solid_share * float(alone.max())
+        total = float(alone[solid].sum())
+        blended = weights[self._rows]
+        depths = b.depths.numpy()[self._rows].astype(np.float64)
+        pixels = float(small.Ks[view, 0, 0]) * self._sizes / np.maximum(depths, config.near)
+        target, context = (weights[rows].astype(np.float32) for rows in self._samples)
+        inside = small.in_image(*small.project(self._alone.means.astype(np.float64), view), view)
+        return _TargetInView(
+            visible=min(float(shown[solid].sum()) / total, 1.0) if total > CONSTANTS.min_weight else 0.0,
+            share=float(shown.mean()),
+            inside=float(inside.mean()),
+            alpha=_around(alone.reshape(b.shape), b.alpha.reshape(b.shape)),
+            blur=float(blended @ pixels / blended.sum()) / max(b.shape) if blended.sum() > 0 else 0.0,
+            target=target,
+            context=context,
+        )
+
+
+def _around(alone: torch.Tensor, alpha: torch.Tensor) -> float:
+    """Mean alpha in the rectangle around what shows the target, with a frame; 0 where nothing shows it."""
+    spans = []
+    for axis in (1, 0):
+        covered = np.flatnonzero((alone > CONSTANTS.min_weight).any(dim=axis).numpy())
+        if not len(covered):
+            return 0.0
+        margin = int(np.ceil(CONSTANTS.frame_margin * (covered[-1] - covered[0] + 1)))
+        spans.append(slice(max(int(covered[0]) - margin, 0), int(covered[-1]) + 1 + margin))
+    return float(alpha[spans[0], spans[1]].mean())
+
+
+def coverage(seen: Float32[np.ndarray, "V n"]) -> Float64[np.ndarray, "V n"]:
+    """How well each camera sees each Gaussian: its weight as a share of the largest that any camera gives it."""
+    best = seen.max(axis=0, initial=0)
+    return np.asarray(seen / np.where(best > 0, best, 1), np.float64)
+
+
+def directions(cameras: Cameras, target: Target) -> Float64[np.ndarray, "V 3"]:
+    """Unit vectors from a target to each camera."""
+    offsets = cameras.centers - target.center
+    return np.asarray(offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12))
 
 
 def view_utility(scores: ViewScores) -> Float64[np.ndarray, " V"]:
@@ -162,9 +306,9 @@ def score_candidates(
     scene = with_upright_frames(scene)
     blend = replace(CONSTANTS.score_blend, near=min(CONSTANTS.score_blend.near, free.cell / 2))
     if config.method == "uniform":
-        cameras, names, frames = _uniform(scene, gaussians, config)
+        cameras, names, frames = uniform_candidates(scene, gaussians, config)
     else:
-        cameras, names, frames = _around_targets(scene, gaussians, targets, free, config, blend)
+        cameras, names, frames = target_candidates(scene, gaussians, targets, free, config, blend)
     scores = score_views(gaussians, cameras, targets, side=config.judged_side, config=blend)
     if scene.views is not None and scene.views.images is not None:
         is_photograph = np.array([frame is not None for frame in frames])
@@ -213,90 +357,3 @@ def view_set(
         judged=len(candidates.cameras),
         near=candidates.blend.near,
     )
-
-
-Placed = tuple[Cameras, list[str], list[int | None]]
-"""Cameras, their names, and which frames they are."""
-
-
-def _uniform(scene: Scene, gaussians: Gaussians, config: ViewsConfig) -> Placed:
-    """Evenly spread frames, or cameras around a splat that has none."""
-    if scene.views is None or not len(scene.views):
-        around = orbit_cameras(
-            gaussians,
-            count=config.count,
-            width=config.width,
-            height=config.height,
-            fov_degrees=CONSTANTS.fov_degrees,
-            up=scene.up,
-        )
-        return around, [f"orbit {number:02d}" for number in range(len(around))], [None] * len(around)
-    chosen = even_indices(len(scene.views), config.count)
-    cameras = _downscaled(scene.views.cameras.select(chosen), config)
-    return cameras, [scene.views.names[view] for view in chosen], chosen.tolist()
-
-
-def _around_targets(
-    scene: Scene,
-    gaussians: Gaussians,
-    targets: Sequence[Target],
-    free: FreeSpace,
-    config: ViewsConfig,
-    blend: BlendConfig,
-) -> Placed:
-    """Frames that show the targets, close-ups cut from them, and cameras on shells around the targets."""
-    total = max(config.candidates, config.count)
-    views = scene.views if scene.views is not None and len(scene.views) else None
-    if config.source == "frames" and views is None:
-        raise InputError(f"views: scene {scene.name} has no cameras; use choose.source=shells")
-    names: list[str] = []
-    frames: list[int | None] = []
-    parts: list[Cameras] = []
-    spaces = [free.without(target.rows) for target in targets]
-    if config.source != "shells" and views is not None:
-        room = total if config.source == "frames" else total // 2
-        if views.images is not None and room >= 2 * len(targets):
-            large = photograph_cameras(views)
-            for target, space, part in zip(targets, spaces, _split_evenly(room // 2, len(targets)), strict=True):
-                best = frames_on(views.cameras, gaussians, [target], part, [space])
-                near, rows = closeups(large.select(best), gaussians, target, width=config.width, height=config.height)
-                parts.append(near)
-                names += [f"{views.names[view]} near {target.name}" for view in best[rows]]
-                frames += best[rows].tolist()
-        whole = frames_on(views.cameras, gaussians, targets, room - len(frames), spaces)
-        parts.append(_downscaled(views.cameras.select(whole), config))
-        names += [views.names[view] for view in whole]
-        frames += whole.tolist()
-    if config.source != "frames":
-        if views is not None:
-            count = max(CONSTANTS.free_space_cameras, len(targets))
-            observers = frames_on(views.cameras, gaussians, targets, count, spaces)
-            free = free.seen_by(views.cameras.select(observers), blend)
-        up = up_of(scene)
-        for target, room in zip(targets, _split_evenly(total - len(frames), len(targets)), strict=True):
-            space = free.without(target.rows)
-            around = shell_cameras(gaussians, target, room, space, up=up, width=config.width, height=config.height)
-            if not len(around):
-                warnings.warn(f"views: there is no room for a camera around {target.name}", SceneWarning, stacklevel=4)
-            parts.append(around)
-            names += [f"around {target.name} {number:02d}" for number in range(len(around))]
-            frames += [None] * len(around)
-    if not names:
-        remedy = "choose.method=uniform looks at all of the splat" if views is None else "take choose.source=frames"
-        raise InputError(
-            f"views: there is no room for a camera around {', '.join(target.name for target in targets)} "
-            f"(pictures of {config.width} x {config.height} pixels); {remedy}"
-        )
-    fields = ("cam_from_world", "Ks", "widths", "heights")
-    cameras = Cameras(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields})
-    return cameras, names, frames
-
-
-def _downscaled(frames: Cameras, config: ViewsConfig) -> Cameras:
-    """Frames at the size of their pictures: photographs have far more pixels than anyone looks at."""
-    return frames.resized(config.frame_side, enlarge=False)
-
-
-def _split_evenly(total: int, parts: int) -> list[int]:
-    """Whole numbers of one or more that come to a total, as equal as can be."""
-    return [max(1, total // parts + (part < total % parts)) for part in range(parts)]

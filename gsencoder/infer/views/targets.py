@@ -20,7 +20,7 @@ class ViewConstants:
     hand. What the choice reaches with them is measured on eight other rooms (docs/results/views.md).
     """
 
-    # Targets (targets.py)
+    # Targets
     least_share: float = 0.05  # A target should fill this much of the picture …
     most_share: float = 0.6  # … and no more than this
     # Smallest radius of a target, in median scales of its Gaussians: a single Gaussian is as large as it is drawn.
@@ -81,7 +81,7 @@ class ViewConstants:
     # Windows of more than this share of a frame's width or height are left out: the frame itself shows as much.
     max_closeup_share: float = 0.75
 
-    # Scores by small renders (scores.py)
+    # Scores by small renders
     # Accuracy of the small renders: rays end where a fiftieth of their light is left.
     score_blend: BlendConfig = field(default_factory=lambda: BlendConfig(stop_transmittance=0.02, min_weight=1e-3))
     context_radii: float = 2.0  # A target's context is what lies in the ball of so many times its radius
@@ -101,7 +101,7 @@ class ViewConstants:
     # Pictures are made no smaller by a budget, longer side, pixels: the input of the smallest common vision towers.
     least_picture_side: int = 224
 
-    # Utility of a view and of a set of views (choose.py)
+    # Utility of a view and of a set of views
     cover_weight: float = 0.3  # What seeing all of a target is worth
     context_weight: float = 0.1  # What seeing its surroundings is worth
     spread_weight: float = 0.2  # What seeing it from many directions is worth
