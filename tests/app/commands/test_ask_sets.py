@@ -50,7 +50,7 @@ def environment(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def ask(home: Path, out: Path, file: str, *words: str) -> int:
-    photos, sent = f"photos={home / 'rooms'}", ("vlm.image_format=png", "quiet=true", f"out={out}")
+    photos, sent = f"photos={home / 'rooms'}", ("quiet=true", f"out={out}")
     return cli.main(["ask", str(home / "features"), f"questions={home / 'set' / file}", photos, *sent, *QUICK, *words])
 
 
