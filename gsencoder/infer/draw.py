@@ -276,13 +276,8 @@ def draw_labels(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PcaColors:
-    """One map from features to colors for all views of a scene.
-
-    Attributes:
-        mean: of the features that it was fitted to.
-        axes: the three principal directions, as columns; red, green, blue.
-        low, high: 1st and 99th percentile along each, which become 0 and 255.
-    """
+    """One map from features to colors for all views of a scene: about a mean, along the three principal directions for
+    red, green and blue, from the 1st percentile along each, which becomes 0, to the 99th."""
 
     mean: Float64[np.ndarray, " R"]
     axes: Float64[np.ndarray, "R 3"]

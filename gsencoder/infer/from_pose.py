@@ -61,7 +61,6 @@ class PosePoint:
     """Where a camera sees what a word says.
 
     Attributes:
-        camera: number of the camera.
         visible: whether the relevancy of the pixel reaches the threshold. Where it does not, the other values are those
             of the best pixel there is.
         threshold: relevancy from which on something relevant is visible; NaN where no Gaussian has a feature.
@@ -70,10 +69,9 @@ class PosePoint:
         alpha: opacity of all Gaussians at the pixel.
         pixel: (x, y), pixel centers at .5.
         depth: z in the camera, world units: the median, by blending weight, over those Gaussians of the pixel whose own
-            relevancy reaches the threshold, or over all that have features where none does. The expected depth of a
-            pixel at an edge lies between object and background, where nothing is. The median over all Gaussians may be
-            that of the background: a cosine has no length, so that before a background with about the mean feature
-            a pixel with a small share of the object is as relevant as one that shows nothing else.
+            relevancy reaches the threshold, or over all that have features where none does. An expected depth may lie
+            between object and background, and the median over all Gaussians may be that of the background, as a cosine
+            has no length: a small share of the object before a mean feature is as relevant as the object alone.
         position: in world coordinates, with the scene's origin added.
     """
 

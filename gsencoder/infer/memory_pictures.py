@@ -28,13 +28,8 @@ GRID = 64
 def strongest_components(
     memory: QueryMemory, b: Blend, pixel: tuple[int, int], count: int
 ) -> tuple[Int64[np.ndarray, " k"], Float32[np.ndarray, " k"]]:
-    """The components that a pixel's rendered query gives the largest weights, rows of the bank, and these weights; of
-    equal ones the first.
-
-    Args:
-        b: of all pixels of the view.
-        count: at most so many components.
-    """
+    """At most `count` components, rows of the bank, that a pixel's rendered query gives the largest weights, and these
+    weights; of equal ones the first."""
     (x, y), (height, width) = pixel, b.shape
     if not (0 <= x < width and 0 <= y < height):
         raise InputError(f"pixel ({x}, {y}): expected a column from 0 to {width - 1} and a row from 0 to {height - 1}")
@@ -52,11 +47,7 @@ def strongest_components(
 
 def salient_pixel(memory: QueryMemory, b: Blend) -> tuple[int, int] | None:
     """The pixel whose attention has the lowest entropy, so that few components are most of it: among evenly spaced
-    pixels that are opaque, those of the middle half of the view if any of them is. None where no pixel is opaque.
-
-    Args:
-        b: of all pixels of the view.
-    """
+    pixels that are opaque, those of the middle half of the view if any of them is. None where no pixel is opaque."""
     height, width = b.shape
     columns, rows = (even_indices(size, max(1, size * GRID // max(height, width))) for size in (width, height))
     x, y = (each.ravel() for each in np.meshgrid(columns, rows))
@@ -91,12 +82,7 @@ LEAST_OUTLINE = 7.0
 def attention_pictures(
     memory: QueryMemory, scene: Scene, *, views: int, config: BlendConfig = BlendConfig()
 ) -> Iterator[tuple[int, Image.Image]]:
-    """For evenly spaced views a picture of what their most salient pixel attends to.
-
-    Args:
-        scene: Gaussians, and the views that the memory was made from.
-        views: so many, or all if there are fewer.
-    """
+    """For a number of evenly spaced views a picture of what their most salient pixel attends to."""
     if scene.gaussians is None or scene.views is None:
         raise InputError(f"pictures: scene {scene.name} needs Gaussians and cameras")
     for view in even_indices(len(scene.views), views).tolist():
@@ -124,8 +110,7 @@ def attention_picture(
 
     Args:
         scene: Gaussians, and the views that the memory was made from.
-        pixel: column and row; None = the pixel whose attention has the lowest entropy, and no picture where no pixel
-            is opaque.
+        pixel: column and row; None = `salient_pixel`, and no picture where no pixel is opaque.
         count: components that are drawn, at most.
     """
     gaussians, views, bank = scene.gaussians, scene.views, memory.bank

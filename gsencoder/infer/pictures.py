@@ -29,11 +29,7 @@ BLOCK_AXES = 32
 
 
 class BlendedFeatures:
-    """Features of Gaussians as a view blends them.
-
-    Attributes:
-        alpha: how opaque the Gaussians that have a feature make each pixel.
-    """
+    """Features of Gaussians as a view blends them; alpha is how opaque those that have a feature make each pixel."""
 
     alpha: Float32[np.ndarray, " P"]
 
@@ -55,13 +51,8 @@ class BlendedFeatures:
 
 
 class AttendedQueries:
-    """Features that the queries of a view's pixels attend to in the bank of a memory.
-
-    Attention is not linear, so that the features of all pixels are computed, and kept in their axes.
-
-    Attributes:
-        alpha: how opaque the Gaussians that have a query make each pixel.
-    """
+    """Features that the queries of a view's pixels attend to in the bank of a memory; alpha is how opaque the Gaussians
+    that have a query make each pixel. Attention is not linear, so that the features of all pixels are computed."""
 
     alpha: Float32[np.ndarray, " P"]
 

@@ -43,10 +43,8 @@ class MemoryAttention(nn.Module):
         temperature: float,
         values: Float[Tensor, "M C"] | None = None,
     ) -> None:
-        """Args:
-        mean: of the space, about which centered cosines are; that of the bank is zero where it was made without.
-        scoring: how queries are compared with components.
-        values: what is averaged, such as the components in a basis; None = the components."""
+        """Centered cosines are about the mean of the space; that of the bank is zero where it was made without. Values
+        are what is averaged, such as the components in a basis; None = the components."""
         super().__init__()
         self.scoring, self.temperature = scoring, temperature
         self.projection = nn.Parameter(projection)

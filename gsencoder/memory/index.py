@@ -56,7 +56,6 @@ class IndexMemory:
     """Features that share the rows of a table.
 
     Attributes:
-        features: with a table and an index.
         threshold: θ of the cover that the table was made from, a centered cosine.
         error: 1 − mean centered cosine with the features that it was made from; features at the space's mean, which
             have no direction, do not count.

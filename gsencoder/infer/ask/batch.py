@@ -19,9 +19,9 @@ from gsencoder.data.labels.expressions import wrapped_caption
 from gsencoder.data.labels.files import box_corners
 from gsencoder.data.prompts import PromptStore, StoredPrompt
 from gsencoder.data.splats.files import fingerprint
-from gsencoder.infer.ask.ask import THOUGHT, Asker, Prompt, Question, chosen_mark, encoded_picture, prompt_messages
+from gsencoder.infer.ask.ask import THOUGHT, Asker, Question, chosen_mark, encoded_picture, prompt_messages
 from gsencoder.infer.ask.questions import BatchQuestion, Benchmark, read_answers
-from gsencoder.infer.ask.server import MODEL_VARIABLE, URL_VARIABLE, Reply, ServerError, VlmServer, request_body
+from gsencoder.infer.ask.server import MODEL_VARIABLE, URL_VARIABLE, ServerError, VlmServer, request_body
 from gsencoder.infer.localize import box_to_json
 from gsencoder.infer.views.pictures import Fit, feature_tokens, token_blends, views_to_json, write_pictures
 from gsencoder.render import BlendConfig
@@ -52,44 +52,28 @@ def ask_question(
         write_pictures(folder, scene, prompt.views, views, prompt.pictures, prompt.boxes)
         write_bytes(folder / PROMPT, prompt.text.encode() + b"\n")
         write_json(folder / REQUEST, body)
+    # In the order of the marks, in world coordinates: boxes that words found, or the one that was given.
+    given = {"aabb_min": list(question.aabb[:3]), "aabb_max": list(question.aabb[3:])}
+    targets = [box_to_json(box) for box in prompt.boxes] or [given for _ in prompt.targets]
     row: dict[str, Any] = {
         "question": question.text,
         "task": question.task,
         "words": list(prompt.words),
         "absent": [{"query": word, "probability": value} for word, value in prompt.absent.items()],
-        "targets": targets_to_json(question, prompt),
+        "targets": targets,
         "views": views,
     }
     if server is not None:
         with clock("ask"):
             reply = server.ask(body)
-        row |= reply_to_json(question, prompt, reply)
+        row |= {"answer": reply.text.strip(), "model": reply.model, "finish": reply.finish, "tokens": reply.tokens}
+        row["seconds"] = round(reply.seconds, 3)
+        if question.task == "ground":
+            row["mark"] = mark = chosen_mark(prompt, reply.text)
+            row["box"] = targets[mark - 1] if mark else None
+        if reply.finish == "length":
+            warnings.warn("the answer ends where vlm.max_tokens cut it off", SceneWarning, stacklevel=2)
         write_json(folder / ANSWER, row)
-    return row
-
-
-def targets_to_json(question: Question, prompt: Prompt) -> list[dict[str, Any]]:
-    """What the pictures are of, in the order of the marks, in world coordinates: boxes that words found, or the one
-    that was given."""
-    if prompt.boxes:
-        return [box_to_json(box) for box in prompt.boxes]
-    return [{"aabb_min": list(question.aabb[:3]), "aabb_max": list(question.aabb[3:])} for _ in prompt.targets]
-
-
-def reply_to_json(question: Question, prompt: Prompt, reply: Reply) -> dict[str, Any]:
-    """The fields of a row that come from the server's reply."""
-    row: dict[str, Any] = {
-        "answer": reply.text.strip(),
-        "model": reply.model,
-        "finish": reply.finish,
-        "tokens": reply.tokens,
-        "seconds": round(reply.seconds, 3),
-    }
-    if question.task == "ground":
-        row["mark"] = chosen_mark(prompt, reply.text)
-        row["box"] = targets_to_json(question, prompt)[row["mark"] - 1] if row["mark"] else None
-    if reply.finish == "length":
-        warnings.warn("the answer ends where vlm.max_tokens cut it off", SceneWarning, stacklevel=3)
     return row
 
 

@@ -123,13 +123,8 @@ Benchmark = Literal["scanqa", "sqa3d", "scanrefer", "scan2cap"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class QuestionSet:
-    """The questions of a benchmark's file.
-
-    Attributes:
-        benchmark: whose form the file and the predictions have.
-        questions: in the order of the file.
-        names: for captions without given boxes, the names of the objects of each scene, whose boxes are localized.
-    """
+    """The questions of a benchmark's file, whose form the predictions have; for captions without given boxes the names
+    of the objects of each scene, whose boxes are localized."""
 
     benchmark: Benchmark
     questions: tuple[BatchQuestion, ...]

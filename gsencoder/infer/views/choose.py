@@ -274,13 +274,8 @@ def choose_views(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Candidates:
-    """Cameras, what they are called, which frames they are, and what they show of each target.
-
-    Attributes:
-        frames: None for cameras that were placed.
-        free: the free space that they were placed in.
-        blend: accuracy of the small renders.
-    """
+    """Cameras, what they are called, which frames they are (None for those that were placed in the free space), what
+    they show of each target, and the accuracy of the small renders."""
 
     cameras: Cameras
     names: list[str]

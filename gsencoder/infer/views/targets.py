@@ -122,13 +122,7 @@ CONSTANTS = ViewConstants()
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Target:
-    """Something to look at.
-
-    Attributes:
-        name: for people, such as "mug" or "mug 2".
-        center: the middle of their means, relative to the scene's origin.
-        radius: of the ball around it that holds their means, world units, > 0.
-    """
+    """Something to look at: Gaussians, and the ball that holds their means, relative to the scene's origin."""
 
     name: str
     rows: Integer[np.ndarray, " n"]
@@ -231,11 +225,9 @@ class SelectedView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ViewSet:
-    """Views that were chosen, best first (or in the scene's order where uniform).
+    """Views that were chosen, best first (or in the scene's order where uniform), relative to the scene's origin.
 
     Attributes:
-        cameras: relative to the scene's origin.
-        chosen: why, one for each.
         judged: how many candidates there were.
         near: near plane for their renders, world units: scenes of small units are not cut open.
     """
