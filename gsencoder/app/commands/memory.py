@@ -40,7 +40,7 @@ from gsencoder.train.memory import (
 )
 from gsencoder.train.prepare_scenes import SourceConfig
 from gsencoder.train.samples import sample_rows
-from gsencoder.types import GaussianFeatures, QueryMemory, Scene
+from gsencoder.types import FeatureSpace, GaussianFeatures, QueryMemory, Scene
 
 DRAWN_FEATURES = 20_000
 """Raw features in a scatter plot, at most."""
