@@ -26,14 +26,12 @@ from gsencoder.data.labels.scans import (
 from gsencoder.data.readers.depth_images import DepthFiles
 from gsencoder.data.readers.images import (
     ImageFiles,
-    InstanceFiles,
     PixelGrid,
-    is_deep_grey,
     picture_info,
     picture_size,
     pinhole_of,
-    read_integers,
 )
+from gsencoder.data.readers.label_images import LabelFiles
 from gsencoder.data.readers.layouts import (
     SPLAT_SUFFIXES,
     describe_layouts,
@@ -42,7 +40,7 @@ from gsencoder.data.readers.layouts import (
     read_bare_splat,
     warn_of_unused_splat,
 )
-from gsencoder.data.readers.masks import EmptyFiles, MaskFiles, find_background
+from gsencoder.data.readers.masks import MaskFiles, find_background
 from gsencoder.data.readers.posed import (
     MAX_COORDINATE,
     DepthMeasure,
@@ -53,7 +51,7 @@ from gsencoder.data.readers.posed import (
     rigid_pose,
 )
 from gsencoder.data.readers.transforms_json import TRANSFORMS, read_objects, read_transforms
-from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, pinhole_for
+from gsencoder.data.readers.undistort import CameraModel, Pinhole, pinhole_for, remap_between
 from gsencoder.data.splats.files import load_splat
 from gsencoder.types import Cameras, Scene, Views
 from gsencoder.types.checks import invert_rigid, move_origin
@@ -206,7 +204,6 @@ def _kind_of_folder(folder: Path) -> str:
 
 
 FEW_CAMERAS = 8
-FEWEST_STEPS = 64  # Integer depth images whose largest value is smaller have lost most of what was measured
 MEASURED = 0.05  # Where depth was measured on a larger share of it, what looks like a background is a wall
 
 
@@ -247,7 +244,6 @@ def make_views(
         depth_grids.append(replace(grids[-1], source=image.depth_camera or image.camera))
         _check_sizes(image, grids[-1], depth_grids[-1], size, where)
         transparent.append(image.image if is_transparent else None)
-    remaps = RemapCache()
     cameras = Cameras(
         cam_from_world=move_origin(cam_from_world, origin).astype(np.float32),
         Ks=np.array([grid.pinhole.matrix(grid.width, grid.height) for grid in grids]).astype(np.float32),
@@ -256,7 +252,7 @@ def make_views(
     )
     masks = [image.mask for image in images]
     instances = [image.instance for image in images]
-    partial = _have_empty_pixels({(grid.pinhole, grid.source, grid.reduction) for grid in grids}, remaps)
+    partial = _have_empty_pixels({(grid.pinhole, grid.source, grid.reduction) for grid in grids})
     background = None
     # A fisheye picture may be a disc in a black frame.
     is_plain = not (_any(masks) or _any(transparent) or any("FISHEYE" in image.camera.model for image in images))
@@ -267,14 +263,13 @@ def make_views(
     views = Views(
         cameras=cameras,
         names=tuple(image.name for image in images),
-        images=ImageFiles([image.image for image in images], grids, remaps),
-        depths=DepthFiles(images, depth_grids, remaps) if _any([image.depth for image in images]) else None,
-        masks=MaskFiles(masks, grids, remaps, outlined, background) if _any(masks) or has_outlines or partial else None,
-        empty=EmptyFiles(masks, grids, remaps, outlined, background) if has_outlines else None,
-        instances=InstanceFiles(instances, grids, remaps) if _any(instances) else None,
+        images=ImageFiles([image.image for image in images], grids),
+        depths=DepthFiles(images, depth_grids) if _any([image.depth for image in images]) else None,
+        masks=MaskFiles(masks, grids, outlined, background) if _any(masks) or has_outlines or partial else None,
+        empty=MaskFiles(masks, grids, outlined, background, empty=True) if has_outlines else None,
+        instances=LabelFiles(instances, grids) if _any(instances) else None,
         orientations=tuple(orientations) if max(orientations) > 1 else None,
     )
-    _warn_of_odd_files(posed.source, images)
     mirrored = sum(UNMIRRORED[orientation] != orientation for orientation in orientations)
     if mirrored:
         _warn(
@@ -289,29 +284,6 @@ def make_views(
             "and taken for empty space (data.background=none uses it)"
         )
     return views, origin
-
-
-def _warn_of_odd_files(source: str, images: Sequence[PosedImage]) -> None:
-    """Warns if photographs look like depth images, or depth images like meters in integers; one file of each is
-    looked at."""
-    middle = images[len(images) // 2]
-    if is_deep_grey(middle.image):
-        _warn(
-            f"{source}: {middle.image.name} has one channel of 16 bits, as depth images have; is it listed as a "
-            "photograph by mistake?"
-        )
-    depths = [image.depth for image in images if image.depth is not None and image.depth.suffix.lower() != ".npy"]
-    if depths:
-        file = depths[len(depths) // 2]
-        largest = 0
-        # A file that cannot be read is an error when the depth of its view is.
-        with suppress(InputError):
-            largest = int(read_integers(file, "depth", wide=True).max(initial=0))
-        if 0 < largest < FEWEST_STEPS:
-            _warn(
-                f"{source}: {file.name} holds depths of at most {largest} steps; if these are meters, the rest was "
-                "lost when they were saved as integers: save millimeters in 16 bits, or floating-point numbers as .npy"
-            )
 
 
 def _is_measured(views: Views) -> bool:
@@ -343,12 +315,12 @@ def _check_sizes(image: PosedImage, grid: PixelGrid, depth_grid: PixelGrid, size
             )
 
 
-def _have_empty_pixels(cameras: set[tuple[Pinhole, CameraModel, int]], remaps: RemapCache) -> bool:
+def _have_empty_pixels(cameras: set[tuple[Pinhole, CameraModel, int]]) -> bool:
     """Whether some pixel of a pinhole camera is outside the distorted picture."""
     distorted = [camera for camera in cameras if not camera[1].is_pinhole]
     if len(distorted) > FEW_CAMERAS:
         return True
-    maps = [remaps.get(*camera) for camera in distorted]
+    maps = [remap_between(*camera) for camera in distorted]
     return any(remap is not None and not remap.valid.all() for remap in maps)
 
 

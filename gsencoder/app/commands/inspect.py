@@ -23,7 +23,7 @@ from gsencoder.data.check.epipolar import EpipolarCheck
 from gsencoder.data.check.findings import Finding
 from gsencoder.data.check.scene_check import DepthCheck
 from gsencoder.data.labels.mesh import MeshInstances
-from gsencoder.data.readers.label_images import ArchivedLabels
+from gsencoder.data.readers.label_images import LabelFiles
 from gsencoder.data.readers.layouts import find_splat
 from gsencoder.data.readers.posed import PosedImage, PosedImages
 from gsencoder.data.scenes import (
@@ -232,7 +232,7 @@ def _instances_source(views: Views) -> str:
     maps = views.instances
     while isinstance(maps, Selected):
         maps = maps.items
-    if isinstance(maps, ArchivedLabels):
+    if isinstance(maps, LabelFiles) and maps.archive is not None:
         return f"pictures in {maps.archive.name}"
     if isinstance(maps, MeshInstances):
         return "drawn from the labeled mesh"

@@ -28,7 +28,7 @@ from gsencoder.core.arrays import first_repeated
 from gsencoder.core.errors import InputError, SceneWarning, counted
 from gsencoder.data.labels.files import check_file, entries_of, read_checked_text, shown
 from gsencoder.data.labels.mesh import MeshInstances, read_mesh
-from gsencoder.data.readers.label_images import ArchivedLabels, archived_size, label_files, members_by_stem
+from gsencoder.data.readers.label_images import label_files, members_by_stem, read_member
 from gsencoder.data.readers.posed import rigid_pose
 from gsencoder.data.readers.transforms_json import read_json
 from gsencoder.types import MeshLabels, Scene, SceneObject, Views
@@ -365,11 +365,11 @@ def with_archived_instances(views: Views, folder: Path) -> Views:
     if missing := [stem for stem in stems if stem not in members]:
         fault = f"has no picture of {counted(len(missing), 'view')} of {len(stems)} (first: {missing[0]}.png)"
     else:
-        maps = label_files([members[stem] for stem in stems], views, ArchivedLabels)
-        size, source = archived_size(members[stems[0]]), maps.grids[0].source
-        if size == (source.width, source.height):
+        maps = label_files([members[stem] for stem in stems], views, archive)
+        (height, width), source = read_member(archive, members[stems[0]]).shape, maps.grids[0].source
+        if (width, height) == (source.width, source.height):
             return replace(views, instances=maps)
-        fault = f"has pictures of {size[0]}×{size[1]} pixels, and photographs have {source.width}×{source.height}"
+        fault = f"has pictures of {width}×{height} pixels, and photographs have {source.width}×{source.height}"
     warnings.warn(
         f"{archive}: {fault}, so that instance maps are drawn from the labeled mesh", SceneWarning, stacklevel=3
     )

@@ -10,7 +10,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.threads import kernel
 from gsencoder.data.readers.images import PictureFiles, PixelGrid, load_npy, read_integers
 from gsencoder.data.readers.posed import PosedImage
-from gsencoder.data.readers.undistort import RemapCache, pinhole_for
+from gsencoder.data.readers.undistort import pinhole_for, remap_between
 from gsencoder.types.checks import invert_rigid
 from gsencoder.types.scene import pixel_centers, unproject_points
 
@@ -28,12 +28,12 @@ class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
     also mean none. Depth of a sensor that stands elsewhere is carried over (`register_depth`).
     """
 
-    def __init__(self, images: Sequence[PosedImage], grids: Sequence[PixelGrid], remaps: RemapCache) -> None:
-        super().__init__([image.depth for image in images], grids, remaps)
+    def __init__(self, images: Sequence[PosedImage], grids: Sequence[PixelGrid]) -> None:
+        super().__init__([image.depth for image in images], grids)
         self._images = tuple(images)
 
     def _load(self, view: int) -> Float32[np.ndarray, "H W"]:
-        path, grid = self._paths[view], self._grids[view]
+        path, grid = self._paths[view], self.grids[view]
         if path is None:
             return np.zeros((grid.height, grid.width), np.float32)
         if path.suffix.lower() == ".npy":
@@ -59,11 +59,10 @@ class DepthFiles(PictureFiles[Float32[np.ndarray, "H W"]]):
 
     def _registered(self, view: int, depth: np.ndarray, image: PosedImage) -> Float32[np.ndarray, "H W"]:
         """The depth of a sensor that stands elsewhere, as the photograph's camera sees it."""
-        grid = self._grids[view]
+        grid = self.grids[view]
         depth = self._of_source(view, depth)
-        source = grid.source
-        pinhole = pinhole_for(source, str(self._paths[view]))
-        remap = self._remaps.get(pinhole, source)
+        pinhole = pinhole_for(grid.source, str(self._paths[view]))
+        remap = remap_between(pinhole, grid.source)
         if remap is not None:
             depth = remap.nearest(depth)
         K = pinhole.matrix(pinhole.width, pinhole.height)
@@ -96,20 +95,11 @@ def register_depth(
     """Depth z in the color camera at its pixels, 0 = none: also where a surface hides from the depth sensor.
 
     Each depth pixel becomes a square that faces the color camera, as large as the pixel at its depth. Of several in a
-    pixel the nearest counts.
-
-    Args:
-        depth: z in the depth camera, 0 = none.
-        color_K: intrinsics of the color camera at the size of the result.
+    pixel the nearest counts. `color_K` is that of the result's size.
     """
     result = np.full((height, width), np.inf, np.float32)
-    _register(
-        np.ascontiguousarray(depth, np.float32),
-        np.ascontiguousarray(depth_K, np.float64),
-        np.ascontiguousarray(color_from_depth, np.float64),
-        np.ascontiguousarray(color_K, np.float64),
-        result,
-    )
+    matrices = (np.ascontiguousarray(matrix, np.float64) for matrix in (depth_K, color_from_depth, color_K))
+    _register(np.ascontiguousarray(depth, np.float32), *matrices, result)
     result[np.isinf(result)] = 0
     return result
 

@@ -20,14 +20,14 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, overload
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 import numpy as np
-from jaxtyping import Bool, Int32, UInt8
+from jaxtyping import Bool, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import check_foreign
-from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache, check_camera
+from gsencoder.data.readers.undistort import CameraModel, Pinhole, check_camera, remap_between
 from gsencoder.types.orientation import EXCHANGED, turned
 from gsencoder.types.scene import Selected
 
@@ -39,8 +39,6 @@ PIXEL_LIMIT = 80_000_000
 """Pictures of more pixels are refused before they are decoded (Pillow's own warning starts a little above this)."""
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "PPM")
 EXIF_ORIENTATION = 0x0112
-TIFF_UNDO = (0, 0, 0, 3, 1, 5, 2, 6, 4)
-"""By EXIF orientation: Pillow's number (`Image.Transpose`) of what turns an upright picture back."""
 DEEP_GREY = ("I;16", "I;16B", "I;16L", "I")  # Pillow's modes of pictures with one channel of more than 8 bits
 
 
@@ -51,11 +49,7 @@ def check_picture_size(path: Path, width: int, height: int) -> None:
 
 
 def open_picture(path: Path, data: io.BytesIO | None = None) -> "Image":
-    """A picture whose header was read, and whose pixels were not.
-
-    Args:
-        data: its content, where that was read already; `path` names it in messages.
-    """
+    """A picture whose header was read, and whose pixels were not; of `data`, where its content was read already."""
     from PIL import Image
 
     # Pillow raises nearly any error on hostile files.
@@ -71,6 +65,9 @@ def open_picture(path: Path, data: io.BytesIO | None = None) -> "Image":
         raise InputError(f"{path}: not a readable picture ({_brief(error)}); expected {', '.join(FORMATS)}") from error
     try:
         check_picture_size(path, *picture.size)
+        # Pillow turns the pixels of these upright, and poses belong to the stored ones.
+        if picture.format == "TIFF" and _orientation(picture) > 1:
+            raise InputError(f"{path}: a TIFF file with an EXIF orientation; expected one without, or another format")
     except InputError:
         picture.close()
         raise
@@ -82,17 +79,11 @@ def _brief(error: Exception) -> str:
 
 
 def _decode(path: Path, picture: "Image") -> "Image":
-    """The stored pixels; Pillow turns those of TIFF files upright, and of no others."""
-    orientation = _orientation(picture) if picture.format == "TIFF" else 1
     try:
         picture.load()
     except Exception as error:
         raise InputError(f"{path}: cannot be decoded ({_brief(error)}); the file is cut short or damaged") from error
-    if orientation == 1:
-        return picture
-    from PIL import Image
-
-    return picture.transpose(Image.Transpose(TIFF_UNDO[orientation]))
+    return picture
 
 
 def _orientation(picture: "Image") -> int:
@@ -105,11 +96,6 @@ def _orientation(picture: "Image") -> int:
     except Exception:
         return 1
     return int(value) if isinstance(value, int) and 1 <= value <= 8 else 1
-
-
-def _stored_size(picture: "Image") -> tuple[int, int]:
-    width, height = picture.size
-    return (height, width) if picture.format == "TIFF" and _orientation(picture) in EXCHANGED else (width, height)
 
 
 def check_picture(path: Path) -> None:
@@ -125,24 +111,23 @@ def load_npy(path: Path, *, header_only: bool = False) -> np.ndarray:
         header_only: whether to leave the values unread, for the shape and the type. Those of a file that is cut off
             afterwards must not be touched: the system would end the process.
     """
-    values = _checked_npy(path, "r")
-    return values if header_only else _checked_npy(path, None)
-
-
-def _checked_npy(path: Path, mapped: Literal["r"] | None) -> np.ndarray:
     try:
         check_foreign(path)
-        values = np.load(path, mmap_mode=mapped, allow_pickle=False)
+        values = np.load(path, mmap_mode="r", allow_pickle=False)
     except Exception as error:
         raise InputError(f"{path}: not a readable .npy array ({_brief(error)})") from error
     if not isinstance(values, np.ndarray) or values.dtype.kind not in "fiu":
         raise InputError(f"{path}: expected a .npy array of numbers [H, W]")
-    if values.ndim == 3 and values.shape[2] == 1:
-        values = values[..., 0]
-    if values.ndim != 2:
-        raise InputError(f"{path}: expected an array [H, W], got {list(values.shape)}")
-    check_picture_size(path, values.shape[1], values.shape[0])
-    return values
+    shape = values.shape[:2] if values.shape[2:] == (1,) else values.shape
+    if len(shape) != 2:
+        raise InputError(f"{path}: expected an array [H, W], got {list(shape)}")
+    check_picture_size(path, shape[1], shape[0])
+    if header_only:
+        return values.reshape(shape)
+    try:
+        return np.load(path, allow_pickle=False).reshape(shape)
+    except Exception as error:
+        raise InputError(f"{path}: not a readable .npy array ({_brief(error)})") from error
 
 
 def picture_size(path: Path) -> tuple[int, int]:
@@ -151,23 +136,16 @@ def picture_size(path: Path) -> tuple[int, int]:
         height, width = load_npy(path, header_only=True).shape
         return width, height
     with open_picture(path) as picture:
-        return _stored_size(picture)
+        return picture.size
 
 
 def picture_info(path: Path) -> tuple[tuple[int, int], bool, int]:
-    """((width, height), whether there is transparency, EXIF orientation) from the header alone; errors as in
-    `picture_size`."""
+    """((width, height), whether there is transparency, EXIF orientation) from the header alone."""
     with open_picture(path) as picture:
         try:
-            return _stored_size(picture), bool(picture.has_transparency_data), _orientation(picture)
+            return picture.size, bool(picture.has_transparency_data), _orientation(picture)
         except Exception as error:
             raise InputError(f"{path}: not a readable picture ({_brief(error)})") from error
-
-
-def is_deep_grey(path: Path) -> bool:
-    """Whether a picture has one channel of 16 bits, as depth images have, from the header alone."""
-    with open_picture(path) as picture:
-        return picture.mode in DEEP_GREY
 
 
 def read_rgba(path: Path, *, reduction: int = 1) -> tuple[UInt8[np.ndarray, "H W 3"], UInt8[np.ndarray, "H W"] | None]:
@@ -201,8 +179,7 @@ def read_rgba(path: Path, *, reduction: int = 1) -> tuple[UInt8[np.ndarray, "H W
 
 
 def read_small(path: Path, side: int) -> UInt8[np.ndarray, "h w 3"]:
-    """About side × side pixels or more of a picture, for a quick look: JPEG is decoded at a fraction of its size, of
-    other files every n-th pixel is taken."""
+    """About side × side pixels or more of a picture: JPEG is decoded smaller, of others every n-th pixel is taken."""
     with open_picture(path) as file:
         if file.format == "JPEG":
             file.draft("RGB", (side, side))
@@ -223,11 +200,9 @@ def read_mask(path: Path) -> Bool[np.ndarray, "H W"]:
     return np.asarray(values[..., : len(bands) - ("A" in bands)].any(axis=2))
 
 
-def read_integers(path: Path, subject: str, *, wide: bool, data: io.BytesIO | None = None) -> np.ndarray:
-    """A single-channel integer PNG [H, W], int32; `wide` asks for more than 8 bits, as depth in millimetres has.
-
-    With `data`, the content of the file is there already, and `path` names it in messages.
-    """
+def read_integers(path: Path, subject: str, *, wide: bool = False, data: io.BytesIO | None = None) -> np.ndarray:
+    """A single-channel integer PNG [H, W], int32, of `data` where its content was read already; `wide` asks for more
+    than 8 bits, as depth in millimetres has."""
     with open_picture(path, data) as file:
         if file.format == "JPEG":
             raise InputError(f"{path}: {subject} was saved as JPEG, which changes values; expected PNG")
@@ -284,8 +259,8 @@ class PixelGrid:
 class PictureFiles(Sequence[Array]):
     """Files of V views, read on access; nothing is kept in memory."""
 
-    def __init__(self, paths: Sequence[Path | None], grids: Sequence[PixelGrid], remaps: RemapCache) -> None:
-        self._paths, self._grids, self._remaps = tuple(paths), tuple(grids), remaps
+    def __init__(self, paths: Sequence[Path | None], grids: Sequence[PixelGrid]) -> None:
+        self._paths, self.grids = tuple(paths), tuple(grids)
 
     def __len__(self) -> int:
         return len(self._paths)
@@ -302,22 +277,12 @@ class PictureFiles(Sequence[Array]):
             raise IndexError(f"view {view} of {len(self)}")
         return self._load(view % len(self))
 
-    @property
-    def grids(self) -> tuple[PixelGrid, ...]:
-        """How the pixels of each file become those of its view."""
-        return self._grids
-
-    @property
-    def remaps(self) -> RemapCache:
-        """The shared maps of undistortion."""
-        return self._remaps
-
     @abstractmethod
     def _load(self, view: int) -> Array: ...
 
     def check_size(self, view: int, shape: tuple[int, ...]) -> None:
         """Raises InputError where the pixels of a file are not of the size [H, W] that its header had at first."""
-        source = self._grids[view].source
+        source = self.grids[view].source
         if shape != (source.height, source.width):
             raise InputError(
                 f"{self._paths[view]}: {shape[1]}×{shape[0]} pixels, expected {source.width}×{source.height}"
@@ -325,21 +290,21 @@ class PictureFiles(Sequence[Array]):
 
     def _turned(self, view: int, pixels: np.ndarray) -> np.ndarray:
         """Pixels of a file turned as those of `source`, where width and height are exchanged."""
-        grid = self._grids[view]
+        grid = self.grids[view]
         return turned(pixels, grid.turn) if grid.is_exchanged(pixels.shape[1], pixels.shape[0]) else pixels
 
     def _of_source(self, view: int, values: np.ndarray) -> np.ndarray:
         """Values of a file turned and scaled by the nearest pixel to the pixels of `source`."""
-        values, grid = self._turned(view, values), self._grids[view]
+        values, grid = self._turned(view, values), self.grids[view]
         if grid.fits(values.shape[1], values.shape[0]):
             values = resized_nearest(values, grid.source.width, grid.source.height)
         self.check_size(view, values.shape)
         return values
 
     def _nearest(self, view: int, values: np.ndarray) -> np.ndarray:
-        grid = self._grids[view]
+        grid = self.grids[view]
         values = self._of_source(view, values)
-        remap = self._remaps.get(grid.pinhole, grid.source)
+        remap = remap_between(grid.pinhole, grid.source)
         if remap is not None:
             values = remap.nearest(values)
         return resized_nearest(values, grid.width, grid.height)
@@ -358,7 +323,7 @@ class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
     """Photographs as uint8 [H, W, 3] RGB, undistorted and scaled."""
 
     def _load(self, view: int) -> UInt8[np.ndarray, "H W 3"]:
-        path, grid = self._paths[view], self._grids[view]
+        path, grid = self._paths[view], self.grids[view]
         assert path is not None
         state = path.stat() if path.exists() else None
         key = (path, grid, state and (state.st_mtime_ns, state.st_size))
@@ -376,7 +341,7 @@ class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
     def _decoded(self, view: int, path: Path) -> UInt8[np.ndarray, "H W 3"]:
         from PIL import Image
 
-        grid = self._grids[view]
+        grid = self.grids[view]
         reduction = grid.reduction
         size, color = picture_size(path), read_rgba(path, reduction=reduction)[0]
         if color.shape[:2] == size[::-1] and reduction > 1:
@@ -384,7 +349,7 @@ class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
         if grid.is_exchanged(*size):
             color, size = turned(color, grid.turn), size[::-1]
         self.check_size(view, size[::-1])
-        remap = self._remaps.get(grid.pinhole, grid.source, reduction)
+        remap = remap_between(grid.pinhole, grid.source, reduction)
         if remap is not None:
             color = remap.bilinear(color)
         if color.shape[:2] != (grid.height, grid.width):
@@ -393,16 +358,6 @@ class ImageFiles(PictureFiles[UInt8[np.ndarray, "H W 3"]]):
             whole = (0, 0, size[0] / reduction, size[1] / reduction)
             color = np.array(Image.fromarray(color).resize((grid.width, grid.height), method, box=whole))
         return color
-
-
-class InstanceFiles(PictureFiles[Int32[np.ndarray, "H W"]]):
-    """Instance maps as int32 [H, W], 0 = none; a view without a file is all zero."""
-
-    def _load(self, view: int) -> Int32[np.ndarray, "H W"]:
-        path, grid = self._paths[view], self._grids[view]
-        if path is None:
-            return np.zeros((grid.height, grid.width), np.int32)
-        return self._nearest(view, read_integers(path, "an instance map", wide=False))
 
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")

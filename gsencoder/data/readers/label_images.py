@@ -20,10 +20,9 @@ from gsencoder.data.readers.images import (
     PixelGrid,
     check_picture_size,
     load_npy,
-    open_picture,
     read_integers,
 )
-from gsencoder.data.readers.undistort import CameraModel, Pinhole, RemapCache
+from gsencoder.data.readers.undistort import CameraModel, Pinhole
 from gsencoder.types import Views
 from gsencoder.types.scene import Selected
 
@@ -32,33 +31,37 @@ LARGEST_LABEL = 2**31 - 1
 
 
 class LabelFiles(PictureFiles[Int32[np.ndarray, "H W"]]):
-    """Label images as int32 [H, W], 0 = none, undistorted and scaled as the photographs are."""
+    """Label images as int32 [H, W], undistorted and scaled as the photographs are; a view without a file is all 0.
+
+    Attributes:
+        archive: the .zip that the files are members of; None where they lie in folders.
+    """
+
+    def __init__(self, paths: Sequence[Path | None], grids: Sequence[PixelGrid], archive: Path | None = None) -> None:
+        super().__init__(paths, grids)
+        self.archive = archive
 
     def _load(self, view: int) -> Int32[np.ndarray, "H W"]:
-        path = self._paths[view]
-        assert path is not None
-        return self._nearest(view, self._read(path))
-
-    def _read(self, path: Path) -> Int32[np.ndarray, "H W"]:
-        return read_labels(path)
+        path, grid = self._paths[view], self.grids[view]
+        if path is None:
+            return np.zeros((grid.height, grid.width), np.int32)
+        return self._nearest(view, read_labels(path) if self.archive is None else read_member(self.archive, path))
 
 
-def label_files(paths: Sequence[Path], views: Views, kind: type[LabelFiles] = LabelFiles) -> PictureFiles[Any]:
+def label_files(paths: Sequence[Path], views: Views, archive: Path | None = None) -> PictureFiles[Any]:
     """Label images of views, read on access.
 
     Args:
         views: where their photographs come from files, labels belong to the pixels of these files; else to the cameras.
-
-    Returns:
-        int32 [H, W] for each view, 0 = none.
+        archive: the .zip that the files are members of; None where they lie in folders.
     """
     pictures: Any = views.images
     rows = list(range(len(views)))
     while isinstance(pictures, Selected):
         pictures, rows = pictures.items, [pictures.rows[row] for row in rows]
     if isinstance(pictures, PictureFiles):
-        return kind(paths, [pictures.grids[row] for row in rows], pictures.remaps)
-    return kind(paths, [_grid_of(views, view) for view in range(len(views))], RemapCache())
+        return LabelFiles(paths, [pictures.grids[row] for row in rows], archive)
+    return LabelFiles(paths, [_grid_of(views, view) for view in range(len(views))], archive)
 
 
 def _grid_of(views: Views, view: int) -> PixelGrid:
@@ -74,16 +77,13 @@ def _grid_of(views: Views, view: int) -> PixelGrid:
 
 
 def read_labels(path: Path) -> Int32[np.ndarray, "H W"]:
-    """The label image of a file.
-
-    Args:
-        path: a PNG of 8 or 16 bits with one channel, a .npy array, or a .safetensors file with one array, of integers.
-    """
+    """The label image of a PNG of 8 or 16 bits with one channel, or of a .npy or .safetensors file with one array of
+    integers."""
     kind = path.suffix.lower()
     if kind not in LABEL_SUFFIXES:
         raise InputError(f"{path}: expected a label image as {', '.join(LABEL_SUFFIXES)}")
     if kind == ".png":
-        return read_integers(path, "a label image", wide=False)
+        return read_integers(path, "a label image")
     values = load_npy(path) if kind == ".npy" else _load_safetensors(path)
     if values.dtype.kind not in "iu":
         raise InputError(f"{path}: expected labels as integers, one a pixel and 0 = none, got {values.dtype}")
@@ -113,22 +113,8 @@ def _load_safetensors(path: Path) -> np.ndarray:
 MAX_MEMBER_BYTES = 64 << 20  # Larger files in an archive are no label images
 
 
-class ArchivedLabels(LabelFiles):
-    """Label images of views in one archive, as int32 [H, W]; paths are those of members below that of the archive."""
-
-    @property
-    def archive(self) -> Path:
-        """The .zip."""
-        path = self._paths[0]
-        assert path is not None
-        return archive_of(path)
-
-    def _read(self, path: Path) -> Int32[np.ndarray, "H W"]:
-        return read_integers(path, "a label image", wide=False, data=member_bytes(path))
-
-
 def members_by_stem(archive: Path) -> dict[str, Path]:
-    """The .png files of an archive by their stems, as paths below that of the archive."""
+    """The .png files of an archive by their stems."""
     try:
         check_foreign(archive)
         with zipfile.ZipFile(archive) as file:
@@ -140,36 +126,25 @@ def members_by_stem(archive: Path) -> dict[str, Path]:
         stem = PurePosixPath(name).stem
         if stem in members:
             raise InputError(f"{archive}: has several files called {stem}.png, such as {name}; expected one a frame")
-        members[stem] = archive / name
+        members[stem] = Path(name)
     return members
 
 
-def archived_size(path: Path) -> tuple[int, int]:
-    """(width, height) of a member, from its header."""
-    with open_picture(path, member_bytes(path)) as picture:
-        return picture.size
-
-
-def archive_of(path: Path) -> Path:
-    """The archive that a member's path is below."""
-    return next(each for each in path.parents if each.suffix.lower() == ".zip" and each.is_file())
-
-
-def member_bytes(path: Path) -> io.BytesIO:
-    """The content of a member."""
-    archive = archive_of(path)
-    name = path.relative_to(archive).as_posix()
+def read_member(archive: Path, member: Path) -> Int32[np.ndarray, "H W"]:
+    """The label image that is a member of an archive."""
+    path = archive / member
     try:
         check_foreign(archive)
         with zipfile.ZipFile(archive) as file:
-            size = file.getinfo(name).file_size
+            size = file.getinfo(member.as_posix()).file_size
             if size > MAX_MEMBER_BYTES:
                 raise InputError(f"{path}: {size:,} bytes; a label image has at most {MAX_MEMBER_BYTES:,}")
-            return io.BytesIO(file.read(name))
+            data = io.BytesIO(file.read(member.as_posix()))
     except InputError:
         raise
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, KeyError, RuntimeError, NotImplementedError) as error:
         raise InputError(f"{path}: cannot be read: {' '.join(str(error).split())[:120]}") from error
+    return read_integers(path, "a label image", data=data)
 
 
 def table_lines(path: Path) -> list[list[str]]:
@@ -188,20 +163,12 @@ def table_lines(path: Path) -> list[list[str]]:
 
 def read_numbers(path: Path, *shapes: tuple[int | None, int]) -> Float64[np.ndarray, "rows columns"]:
     """A table of numbers of one of the shapes; None = any number of rows from 1. NaN and infinity are numbers."""
-    lines = table_lines(path)
     expected = " or ".join(f"{'n' if rows is None else rows}×{columns}" for rows, columns in shapes)
-    lengths = {len(words) for words in lines}
-    if len(lengths) > 1:
-        odd = next(number for number, words in enumerate(lines) if len(words) != len(lines[0]))
-        raise InputError(
-            f"{path}: row {odd + 1} has {len(lines[odd])} values and the first {len(lines[0])}; expected {expected}"
-        )
+    lines = [" ".join(words) for words in table_lines(path)]
     try:
-        values = np.array(lines, np.float64).reshape(len(lines), len(lines[0]) if lines else 0)
+        values = np.loadtxt(lines, ndmin=2) if lines else np.zeros((0, 0))
     except ValueError as error:
-        raise InputError(f"{path}: not a table of numbers ({' '.join(str(error).split())[:120]})") from error
-    if not len(lines) or not any(
-        values.shape[1] == columns and rows in (None, values.shape[0]) for rows, columns in shapes
-    ):
+        raise InputError(f"{path}: not a table of {expected} numbers ({str(error)[:120]})") from error
+    if not any(values.shape[1] == columns and rows in (None, values.shape[0]) for rows, columns in shapes):
         raise InputError(f"{path}: expected {expected} numbers, got {list(values.shape)}")
     return values

@@ -2,8 +2,8 @@
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -31,24 +31,21 @@ MASKS = "masks"
 COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", ".")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Layout:
+class Layout(NamedTuple):
     """One way in which scenes are stored."""
 
-    name: str  # for people
+    name: str
     files: str  # what is recognized, for people
-    matches: Callable[[Path], bool]  # whether a folder has this layout
+    matches: Callable[[Path], bool]
     # The posed images of a folder, and the folder of the scene.
     read: Callable[[Path, ReadOptions], tuple[PosedImages, Path]]
 
 
 def transforms_in(root: Path) -> Path | None:
-    """The transforms.json of a folder."""
     return next((root / file for file in TRANSFORMS if (root / file).is_file()), None)
 
 
 def colmap_model_in(root: Path) -> Path | None:
-    """The folder of the COLMAP model of a folder."""
     return next((root / file for file in COLMAP_FOLDERS if is_colmap_model(root / file)), None)
 
 
@@ -92,57 +89,40 @@ def _in_place(
 
 LAYOUTS = (
     Layout(
-        name="transforms.json",
-        files=f"{' or '.join(TRANSFORMS)} (nerfstudio, instant-ngp, Blender)",
-        matches=lambda root: transforms_in(root) is not None,
-        read=_read_transforms,
+        "transforms.json",
+        f"{' or '.join(TRANSFORMS)} (nerfstudio, instant-ngp, Blender)",
+        lambda root: transforms_in(root) is not None,
+        _read_transforms,
     ),
     Layout(
-        name="COLMAP",
-        files="sparse/0 or sparse with a COLMAP model, and images/",
-        matches=lambda root: colmap_model_in(root) is not None,
-        read=_read_colmap,
+        "COLMAP",
+        "sparse/0 or sparse with a COLMAP model, and images/",
+        lambda root: colmap_model_in(root) is not None,
+        _read_colmap,
     ),
     Layout(
-        name="ScanNet++",
-        files="dslr/ or iphone/ of ScanNet++ (frames extracted to iphone/rgb)",
-        matches=is_scannetpp,
-        read=_in_place(read_scannetpp),
+        "ScanNet++",
+        "dslr/ or iphone/ of ScanNet++ (frames extracted to iphone/rgb)",
+        is_scannetpp,
+        _in_place(read_scannetpp),
     ),
+    Layout("ScanNet", "color/, pose/, depth/ and intrinsic/ of ScanNet", is_scannet_export, _in_place(read_scannet)),
     Layout(
-        name="ScanNet",
-        files="color/, pose/, depth/ and intrinsic/ of ScanNet",
-        matches=is_scannet_export,
-        read=_in_place(read_scannet),
+        "7-Scenes",
+        "frame-NNNNNN.color.png, .depth.png and .pose.txt of 7-Scenes",
+        is_seven_scenes,
+        _in_place(read_seven_scenes),
     ),
-    Layout(
-        name="7-Scenes",
-        files="frame-NNNNNN.color.png, .depth.png and .pose.txt of 7-Scenes",
-        matches=is_seven_scenes,
-        read=_in_place(read_seven_scenes),
-    ),
-    Layout(
-        name="TUM RGB-D",
-        files="rgb.txt, depth.txt and groundtruth.txt of TUM RGB-D",
-        matches=is_tum,
-        read=_in_place(read_tum),
-    ),
-    Layout(
-        name="Replica",
-        files="results/ and traj.txt of Replica (NICE-SLAM)",
-        matches=is_replica,
-        read=_in_place(read_replica),
-    ),
+    Layout("TUM RGB-D", "rgb.txt, depth.txt and groundtruth.txt of TUM RGB-D", is_tum, _in_place(read_tum)),
+    Layout("Replica", "results/ and traj.txt of Replica (NICE-SLAM)", is_replica, _in_place(read_replica)),
 )
 
 
 def layout_of(folder: Path) -> Layout | None:
-    """The layout of a folder; None if it has none of them."""
     return next((layout for layout in LAYOUTS if layout.matches(folder)), None)
 
 
 def describe_layouts() -> str:
-    """What a scene holds, for a message."""
     return f"a scene holds one of: {'; '.join(layout.files for layout in LAYOUTS)}; a splat"
 
 

@@ -4,12 +4,10 @@ A pixel of the photograph is used if its mask file is not 0, alpha is at least o
 color, and it has content in the distorted picture; each counts only where it exists. After scaling a
 pixel counts only if all that it covers does.
 
-Photographs of an object before a background of one color, as renderings and product pictures have.
-
-The color is looked for along the borders of some photographs. It counts as a background where nearly all of them have
-it along nearly all of their border, to within rounding or the noise of JPEG: walls and skies of real photographs vary
-by more, and windows do not surround the picture. In a view the background is what has this color and is connected to
-the border, so that white parts of an object stay.
+A background of one color, as renderings and product pictures of objects have, is looked for along the borders of some
+photographs. It counts where nearly all of them have it along nearly all of their border, to within rounding or the
+noise of JPEG: walls and skies of real photographs vary by more, and windows do not surround the picture. In a view the
+background is what has this color and is connected to the border, so that white parts of an object stay.
 """
 
 from collections import Counter
@@ -23,7 +21,7 @@ from jaxtyping import Bool, UInt8
 
 from gsencoder.core.arrays import even_indices
 from gsencoder.data.readers.images import PictureFiles, PixelGrid, read_mask, read_rgba, read_small
-from gsencoder.data.readers.undistort import RemapCache
+from gsencoder.data.readers.undistort import remap_between
 
 LOOKED_AT = 16  # Photographs that are looked at, evenly spaced
 EXCEPTIONS = 3  # Photographs that may lack the background, since the object fills them
@@ -55,26 +53,15 @@ class Background:
 
 
 def find_background(paths: Sequence[Path]) -> Background | None:
-    """The background that nearly all photographs have in common; None where there is none.
-
-    Photographs are looked at until too many lack a background, which is after four in most
-    scenes.
-
-    Args:
-        paths: of the photographs, none of which has transparency.
-    """
+    """The background that nearly all photographs, none of which has transparency, have in common; None where there is
+    none. Photographs are looked at until too many lack a background, which is after four in most scenes."""
     sample = [paths[int(row)] for row in even_indices(len(paths), LOOKED_AT)]
     if len(sample) < MIN_PICTURES:
         return None
-    return _find(tuple((path, path.stat().st_mtime_ns, path.stat().st_size) for path in sample))
-
-
-@lru_cache(maxsize=64)
-def _find(files: tuple[tuple[Path, int, int], ...]) -> Background | None:
-    allowed = min(EXCEPTIONS, (len(files) - 1) // 3)
+    allowed = min(EXCEPTIONS, (len(sample) - 1) // 3)
     colors: list[tuple[int, int, int]] = []
     pictures: list[tuple[UInt8[np.ndarray, "h w 3"], Path]] = []
-    for path, _, _ in files:
+    for path in sample:
         picture = read_small(path, SMALL_SIDE)
         color = _border_color(picture, tolerance_of(path))
         if color is None:
@@ -150,14 +137,17 @@ def _is_one_outline(regions: Sequence[Bool[np.ndarray, "h w"]]) -> bool:
     return bool(same) and float(np.median(same)) >= SAME_OUTLINE
 
 
-def outline(path: Path, background: Background | None) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+@lru_cache(maxsize=2)
+def _outline(
+    path: Path,
+    background: Background | None,
+    modified: int,  # noqa: ARG001
+    size: int,  # noqa: ARG001
+) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
     """Which pixels of a photograph show something, and which show that nothing is there; those between do neither.
 
     Alpha of one half and more shows something, none (below 1/64) that nothing is there. Next to a background of one
-    color the two nearest pixels do neither.
-
-    Args:
-        background: of its scene; None = only its alpha counts.
+    color the two nearest pixels do neither. Kept, since both kinds of masks ask one after the other.
     """
     from scipy import ndimage
 
@@ -171,75 +161,43 @@ def outline(path: Path, background: Background | None) -> tuple[Bool[np.ndarray,
     return foreground, np.asarray(ndimage.binary_erosion(region, iterations=1, border_value=1))
 
 
-class _OutlineFiles(PictureFiles[Bool[np.ndarray, "H W"]]):
-    """Photographs of which transparency, or a background, tells where something is."""
+class MaskFiles(PictureFiles[Bool[np.ndarray, "H W"]]):
+    """Which pixels to use, bool [H, W]; with `empty`, which show that nothing is there: transparent ones, and a
+    background of one color.
+
+    Args:
+        paths: mask files.
+        outlined: photographs of which transparency, or `background`, tells where something is.
+    """
 
     def __init__(
         self,
         paths: Sequence[Path | None],
         grids: Sequence[PixelGrid],
-        remaps: RemapCache,
         outlined: Sequence[Path | None],
         background: Background | None = None,
+        *,
+        empty: bool = False,
     ) -> None:
-        super().__init__(paths, grids, remaps)
-        self._outlined, self._background = tuple(outlined), background
+        super().__init__(paths, grids)
+        self._outlined, self._background, self._is_empty = tuple(outlined), background, empty
 
-    def _outline(self, view: int) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]] | None:
-        """Used and empty pixels of the photograph, at the size of its file."""
-        path = self._outlined[view]
-        if path is None:
-            return None
-        state = path.stat()
-        outlines = _last_outline(path, self._background, state.st_mtime_ns, state.st_size)
-        foreground, empty = (self._turned(view, pixels) for pixels in outlines)
-        self.check_size(view, foreground.shape)
-        return foreground, empty
-
-    def _fitted(self, view: int, pixels: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "h w"]:
-        """Pixels of the file as pixels of the view."""
+    def _load(self, view: int) -> Bool[np.ndarray, "H W"]:
         from PIL import Image
 
-        grid = self._grids[view]
-        remap = self._remaps.get(grid.pinhole, grid.source)
+        mask, photograph, grid = self._paths[view], self._outlined[view], self.grids[view]
+        pixels = np.full((grid.source.height, grid.source.width), not self._is_empty)
+        if photograph is not None:
+            state = photograph.stat()
+            outline = _outline(photograph, self._background, state.st_mtime_ns, state.st_size)
+            pixels = self._turned(view, outline[self._is_empty])
+            self.check_size(view, pixels.shape)
+        if mask is not None and not self._is_empty:
+            pixels = pixels & self._of_source(view, read_mask(mask))
+        remap = remap_between(grid.pinhole, grid.source)
         if remap is not None:
             pixels = remap.nearest(pixels)
         if pixels.shape != (grid.height, grid.width):
             grey = Image.fromarray(pixels.astype(np.uint8) * 255)
             pixels = np.asarray(grey.resize((grid.width, grid.height), Image.Resampling.BOX)) == 255
         return pixels
-
-
-@lru_cache(maxsize=2)
-def _last_outline(
-    path: Path,
-    background: Background | None,
-    modified: int,  # noqa: ARG001
-    size: int,  # noqa: ARG001
-) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    """The outline of a photograph; both kinds of masks ask for it one after the other."""
-    return outline(path, background)
-
-
-class MaskFiles(_OutlineFiles):
-    """Which pixels to use, bool [H, W]."""
-
-    def _load(self, view: int) -> Bool[np.ndarray, "H W"]:
-        path, grid = self._paths[view], self._grids[view]
-        pixels = np.ones((grid.source.height, grid.source.width), bool)
-        if path is not None:
-            pixels &= self._of_source(view, read_mask(path))
-        outlines = self._outline(view)
-        if outlines is not None:
-            pixels &= outlines[0]
-        return self._fitted(view, pixels)
-
-
-class EmptyFiles(_OutlineFiles):
-    """Which pixels show that nothing is there, bool [H, W]: transparent ones, and a background of one color."""
-
-    def _load(self, view: int) -> Bool[np.ndarray, "H W"]:
-        grid, outlines = self._grids[view], self._outline(view)
-        if outlines is None:
-            return np.zeros((grid.height, grid.width), bool)
-        return self._fitted(view, outlines[1])

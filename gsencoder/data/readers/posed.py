@@ -3,6 +3,7 @@
 import sys
 import warnings
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -87,8 +88,7 @@ class PosedImages:
 def choose_origin(points: Float64[np.ndarray, "P 3"]) -> Float64[np.ndarray, "3"]:
     """The mean of `points`, each coordinate rounded to a multiple of 1000 units; zero for none.
 
-    A scene near zero keeps its coordinates. One far away gets a round offset, which is subtracted in float64 before
-    positions are rounded to float32; a scene that is moved by a multiple of 1000 has the same float32 coordinates.
+    A scene near zero keeps its coordinates. One that is moved by a multiple of 1000 has the same float32 coordinates.
     """
     if not len(points):
         return np.zeros(3)
@@ -101,20 +101,15 @@ def rigid_pose(matrix: Float64[np.ndarray, "4 4"], where: str) -> Float64[np.nda
         raise InputError(f"{where}: the pose has values that are not finite")
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > 1e-6:
         raise InputError(f"{where}: the last row of the pose must be 0 0 0 1, got {matrix[3].tolist()}")
-    far, largest = np.abs(matrix[:3, 3]).max(), np.abs(matrix[:3, :3]).max()
+    far = np.abs(matrix[:3, 3]).max()
     if far > MAX_COORDINATE:
         raise InputError(f"{where}: the camera is {far:g} units away; at most {MAX_COORDINATE:g}")
-    if largest > 1e6:
-        raise InputError(f"{where}: the pose is not rigid (entries of {largest:g} in its rotation)")
     left, stretch, right = np.linalg.svd(matrix[:3, :3])
-    values = ", ".join(f"{value:.6g}" for value in stretch)
     if np.abs(stretch - 1).max() > RIGID_TOLERANCE:
-        if stretch[2] <= 1e-9 * stretch[0] or stretch[0] < 1e-9:
-            raise InputError(f"{where}: the pose is singular (singular values {values}), expected a rotation")
-        if stretch[0] - stretch[2] <= RIGID_TOLERANCE * stretch[0]:
-            raise InputError(
-                f"{where}: the pose has a uniform scale of {stretch.mean():.6g}; divide its rotation by it"
-            )
+        if stretch[2] > 0 and stretch[0] - stretch[2] <= RIGID_TOLERANCE * stretch[0]:
+            scale = f"a uniform scale of {stretch.mean():.6g}"
+            raise InputError(f"{where}: the pose has {scale}; divide its rotation by it")
+        values = ", ".join(f"{value:.6g}" for value in stretch)
         raise InputError(f"{where}: the pose is not rigid (singular values {values}, expected 1, 1, 1)")
     rotation = left @ right
     if np.linalg.det(rotation) < 0:
@@ -126,12 +121,11 @@ def rigid_pose(matrix: Float64[np.ndarray, "4 4"], where: str) -> Float64[np.nda
 
 def inside(folder: Path, relative: str, where: str, *, root: Path | None = None, allow_outside: bool = False) -> Path:
     """`folder / relative`, which may not leave `root` (None = `folder`) through "..", an absolute path or a link unless
-    allowed; `where` begins errors."""
+    allowed."""
     root = folder if root is None else root
     # No file has a longer path, and resolving links takes time quadratic in the length.
     if len(relative) > MAX_PATH:
-        limit = f"{len(relative):,} characters, at most {MAX_PATH:,}"
-        raise InputError(f"{where}: {relative[:80]!r}… is not a path ({limit})")
+        raise InputError(f"{where}: {relative[:80]!r}… is not a path ({len(relative):,} characters)")
     try:
         path = folder / relative
         leaves = not path.resolve().is_relative_to(root.resolve())
@@ -155,6 +149,16 @@ def number(values: Mapping[str, object], key: str, where: str) -> float | None:
     if not abs(value) <= sys.float_info.max:
         raise InputError(f"{where}: {key} must be finite, got {str(value)[:40]}")
     return float(value)
+
+
+def numbers(values: Mapping[str, object], key: str, where: str, *shapes: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
+    """An array of one of the shapes from lists of numbers in a JSON object. NaN and infinity are numbers."""
+    array = np.array(values.get(key), object)
+    if array.shape in shapes and all(type(entry) in (int, float) for entry in array.flat):
+        with suppress(OverflowError):
+            return array.astype(np.float64)
+    expected = " or ".join("×".join(map(str, shape)) for shape in shapes)
+    raise InputError(f"{where}: {key} must be {expected} numbers, got {str(values.get(key))[:60]}")
 
 
 def warn_left_out(missing: Iterable[str], total: int, source: str, subject: str, result: str) -> None:

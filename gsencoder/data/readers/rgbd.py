@@ -37,12 +37,10 @@ MILLIMETRES = 1e-3
 
 
 def is_scannet_export(folder: Path) -> bool:
-    """True where the two folders that every such export has are there."""
     return (folder / "color").is_dir() and (folder / "pose").is_dir()
 
 
 def read_scannet(root: Path, options: ReadOptions = ReadOptions()) -> PosedImages:
-    """Reads an export of ScanNet."""
     color = files_by_stem(root / "color", PICTURE_SUFFIXES)
     if not color:
         raise InputError(f"{root / 'color'}: no pictures (.jpg, .png); expected one a frame")
@@ -85,7 +83,7 @@ def read_scannet(root: Path, options: ReadOptions = ReadOptions()) -> PosedImage
 def _intrinsic_files(root: Path) -> tuple[Path, Path]:
     """The files of the color and the depth camera; one file serves both where there is no other."""
     folder = root / "intrinsic"
-    common = [folder / "intrinsic.txt", folder / "intrinsics.txt", root / "intrinsics.txt", root / "intrinsic.txt"]
+    common = [home / name for home in (folder, root) for name in ("intrinsic.txt", "intrinsics.txt")]
     color = next((path for path in (folder / "intrinsic_color.txt", *common) if path.is_file()), None)
     depth = next((path for path in (folder / "intrinsic_depth.txt", *common) if path.is_file()), None)
     color, depth = color or depth, depth or color
@@ -113,12 +111,10 @@ KINECT_BASELINE = 0.025  # Metres from the infrared to the color lens of a Kinec
 
 
 def is_seven_scenes(folder: Path) -> bool:
-    """Whether a folder holds frames of this kind, with poses."""
     return any(folder.glob("frame-*.pose.txt")) and any(FRAME.fullmatch(path.name) for path in folder.glob("frame-*"))
 
 
 def read_seven_scenes(root: Path, options: ReadOptions = ReadOptions()) -> PosedImages:
-    """Reads a sequence of 7-Scenes."""
     matches = sorted((match[1], path) for path in root.iterdir() if (match := FRAME.fullmatch(path.name)))
     intrinsics_file = root / INTRINSICS_FILE
     K = read_numbers(intrinsics_file, (3, 3), (4, 4)) if intrinsics_file.is_file() else None
@@ -160,9 +156,7 @@ def read_seven_scenes(root: Path, options: ReadOptions = ReadOptions()) -> Posed
 
 
 COLOR_FILE, DEPTH_FILE, POSE_FILE = "rgb.txt", "depth.txt", "groundtruth.txt"
-MAX_APART = 0.02
-"""Largest difference in seconds between the times of a photograph and its depth, as the benchmark's own script has it.
-"""
+MAX_APART = 0.02  # Largest difference in seconds of a photograph and its depth, as in the benchmark's own script
 MAX_GAP = 0.1  # Poses further apart in seconds are not interpolated: tracking was lost between them
 METRES_PER_STEP = 1 / 5000
 KINECTS = {
@@ -174,12 +168,10 @@ KINECTS = {
 
 
 def is_tum(folder: Path) -> bool:
-    """Whether a folder holds such a sequence."""
     return all((folder / name).is_file() for name in (COLOR_FILE, POSE_FILE))
 
 
 def read_tum(root: Path, options: ReadOptions = ReadOptions()) -> PosedImages:
-    """Reads a sequence of TUM RGB-D."""
     colors = _listed_files(root / COLOR_FILE)
     depths = _listed_files(root / DEPTH_FILE) if (root / DEPTH_FILE).is_file() else []
     times, poses = read_trajectory(root / POSE_FILE)
@@ -299,12 +291,10 @@ DEFAULT_PARAMETERS = {"fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "scale
 
 
 def is_replica(folder: Path) -> bool:
-    """Whether a folder holds such an export."""
     return (folder / TRAJECTORY).is_file() and (folder / PICTURES).is_dir()
 
 
 def read_replica(root: Path, options: ReadOptions = ReadOptions()) -> PosedImages:
-    """Reads an export of Replica."""
     pictures = files_by_stem(root / PICTURES, PICTURE_SUFFIXES)
     colors = {stem[5:]: path for stem, path in pictures.items() if stem.startswith("frame")}
     if not colors:

@@ -19,12 +19,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.colmap import is_colmap_model, read_colmap
 from gsencoder.data.readers.images import files_by_stem, picture_size, pinhole_of
-from gsencoder.data.readers.posed import Frames, PosedImage, PosedImages, ReadOptions, inside, warn_left_out
+from gsencoder.data.readers.posed import Frames, PosedImage, PosedImages, ReadOptions, inside, numbers, warn_left_out
 from gsencoder.data.readers.transforms_json import read_json, read_transforms
 from gsencoder.data.readers.undistort import CameraModel
 
@@ -138,23 +137,13 @@ def _read_arkit(folder: Path, options: ReadOptions) -> PosedImages:
         if entry is None or entry.get("aligned_pose") is None:
             frames.skip(f"are not in {ARKIT_POSES}" if entry is None else "have no aligned_pose", picture.name)
             continue
-        pose = frames.pose(_matrix(entry, "aligned_pose", 4, where), picture.name, where)
+        pose = frames.pose(numbers(entry, "aligned_pose", where, (4, 4)), picture.name, where)
         if pose is None:
             continue
-        K = _matrix(entry, "intrinsic", 3, where)
+        K = numbers(entry, "intrinsic", where, (3, 3))
         camera = pinhole_of(K[0, 0], K[1, 1], K[0, 2], K[1, 2], picture, where)
         frames.images.append(PosedImage(name=picture.name, camera=camera, cam_from_world=pose, image=picture))
     return frames.finish(depth=False, source=str(path))
-
-
-def _matrix(frame: dict[str, object], key: str, size: int, where: str) -> Float64[np.ndarray, "n n"]:
-    try:
-        matrix = np.array(frame.get(key), np.float64)
-    except (TypeError, ValueError):
-        matrix = np.empty(0)
-    if matrix.shape != (size, size):
-        raise InputError(f"{where}: {key} must have {size} rows of {size} numbers")
-    return matrix
 
 
 def _with_files(image: PosedImage, folder: Path, options: ReadOptions) -> PosedImage:

@@ -35,7 +35,16 @@ from jaxtyping import Float64, UInt8
 from gsencoder.core.errors import InputError, listed
 from gsencoder.core.files import check_written, read_foreign_text
 from gsencoder.data.readers.images import picture_info, picture_size
-from gsencoder.data.readers.posed import PosedImage, PosedImages, ReadOptions, inside, number, rigid_pose, warn_left_out
+from gsencoder.data.readers.posed import (
+    PosedImage,
+    PosedImages,
+    ReadOptions,
+    inside,
+    number,
+    numbers,
+    rigid_pose,
+    warn_left_out,
+)
 from gsencoder.data.readers.undistort import CameraModel, check_camera, focal_count
 from gsencoder.data.splats.ply import read_points
 from gsencoder.types import Cameras, SceneObject
@@ -53,36 +62,31 @@ CAMERA_KEYS = {
     "depth_from_color", "depth_measure", "no_depth",
 }  # fmt: skip
 FILES_OF_FRAME = {
-    "depth": ("depth_file_path", "depth_path"), "mask": ("mask_path",), "instance": ("instance_file_path",)
-}  # fmt: skip
-FILE_KEYS = {"frames", "metres_per_unit", "up", "ply_file_path"}
-FRAME_KEYS = {"file_path", "transform_matrix", *(key for keys in FILES_OF_FRAME.values() for key in keys)}
-"""Keys that are read here: of cameras, for the file or a frame, and of one of these alone."""
-MISSING = {
-    "image": ("listed images", "their frames are left out"),
-    "depth": ("listed depth files", "those views have no depth"),
-    "mask": ("listed masks", "all pixels of those views are used"),
-    "instance": ("listed instance maps", "those views have no instances"),
+    "depth": (("depth_file_path", "depth_path"), "listed depth files", "those views have no depth"),
+    "mask": (("mask_path",), "listed masks", "all pixels of those views are used"),
+    "instance": (("instance_file_path",), "listed instance maps", "those views have no instances"),
 }
+"""By field of `PosedImage`: the keys of its file, and what is said where such files are missing."""
+FILE_KEYS = {"frames", "metres_per_unit", "up", "ply_file_path"}
+FRAME_KEYS = {"file_path", "transform_matrix", *(key for keys, *_ in FILES_OF_FRAME.values() for key in keys)}
+"""Keys that are read here: of cameras, for the file or a frame, and of one of these alone."""
 
 TRANSFORMS = ("transforms.json", "transforms_train.json")  # The names that such files have
 
 
 def read_json(path: Path, *, unique_keys: bool = False) -> Any:
-    """The content of a JSON file; with `unique_keys`, objects that have a key twice are refused, of which readers take
-    the last."""
+    """The content of a JSON file; with `unique_keys`, objects that have a key twice are refused."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         keys = [key for key, _ in pairs]
-        repeated = next((key for key in keys if keys.count(key) > 1), None) if len(set(keys)) < len(keys) else None
-        if repeated is not None:
+        if len(set(keys)) < len(keys):
+            repeated = next(key for key in keys if keys.count(key) > 1)
             raise InputError(f"{path}: the key {repeated[:40]!r} is there twice; expected each once")
         return dict(pairs)
 
     check_written(path)
     try:
-        text = read_foreign_text(path)
-        return json.loads(text, object_pairs_hook=unique if unique_keys else None)
+        return json.loads(read_foreign_text(path), object_pairs_hook=unique if unique_keys else None)
     except FileNotFoundError:
         raise InputError(f"{path}: no such file") from None
     except (OSError, ValueError, RecursionError) as error:
@@ -108,7 +112,8 @@ def read_transforms(
     frames, root, allow_outside = data["frames"], path.parent, options.allow_outside
     homes = {"mask": masks} if masks is not None and masks.is_dir() else {}
     images: list[PosedImage] = []
-    missing: dict[str, list[str]] = {kind: [] for kind in MISSING}
+    missing: dict[str, list[str]] = {kind: [] for kind in FILES_OF_FRAME}
+    without_image: list[str] = []
     names: set[str] = set()
     metric_depth = False
     for index, frame in enumerate(frames):
@@ -121,10 +126,10 @@ def read_transforms(
         names.add(name)
         image = _find_image(pictures or root, name, where, allow_outside=allow_outside)
         if image is None:
-            missing["image"].append(name)
+            without_image.append(name)
             continue
         files: dict[str, Path | None] = dict.fromkeys(FILES_OF_FRAME)
-        for kind, keys in FILES_OF_FRAME.items():
+        for kind, (keys, *_) in FILES_OF_FRAME.items():
             key = next((key for key in keys if frame.get(key) is not None), None)
             if key is None:
                 continue
@@ -136,12 +141,11 @@ def read_transforms(
             else:
                 missing[kind].append(frame[key])
         metric_depth |= None not in (frame.get("depth_file_path"), (data | frame).get("depth_unit_scale_factor"))
-        pose = rigid_pose(read_matrix(frame, "transform_matrix", where), where)
         images.append(
             PosedImage(
                 name=name,
                 camera=_camera(data, frame, image, where),
-                cam_from_world=invert_rigid(pose @ OPENCV_FROM_OPENGL),
+                cam_from_world=invert_rigid(_pose(frame, "transform_matrix", where) @ OPENCV_FROM_OPENGL),
                 image=image,
                 mask=files["mask"],
                 instance=files["instance"],
@@ -149,16 +153,20 @@ def read_transforms(
             )
         )
     if not images:
-        first = missing["image"][0][:200]
-        raise InputError(f"{path}: none of the {len(frames)} listed images exists (first: {first!r})")
-    for kind, words in MISSING.items():
+        raise InputError(f"{path}: none of the {len(frames)} listed images exists (first: {without_image[0][:200]!r})")
+    warn_left_out(without_image, len(frames), path.name, "listed images", "their frames are left out")
+    for kind, (_, *words) in FILES_OF_FRAME.items():
         warn_left_out(missing[kind], len(frames), path.name, *words)
     points, colors, points_file = _points(data, path, allow_outside=allow_outside)
     metres, up = number(data, "metres_per_unit", str(path)), None
     if metres is not None and metres <= 0:
         raise InputError(f"{path}: metres_per_unit must be positive, got {metres:g}")
     if data.get("up") is not None:
-        up = _up(data["up"], path)
+        up = numbers(data, "up", str(path), (3,))
+        length = math.hypot(*up.tolist())
+        if not 1e-6 < length < 1e6:
+            raise InputError(f"{path}: up must be three finite numbers that are not all zero, got {data['up']}")
+        up = up / length
     elif metric_depth:
         up = np.array([0, 0, 1.0])
     return PosedImages(
@@ -192,7 +200,7 @@ def _depth(values: dict[str, Any], frame: dict[str, Any], depth: Path | None, wh
             raise InputError(f"{where}: depth_camera must be an object with fl_x, fl_y, cx and cy")
         camera = _camera({}, camera_keys, depth, f"{where}: depth_camera")
     if from_color is not None:
-        from_color = rigid_pose(read_matrix(values, "depth_from_color", where), f"{where}: depth_from_color")
+        from_color = _pose(values, "depth_from_color", f"{where}: depth_from_color")
     return {
         "depth": depth,
         "depth_camera": camera,
@@ -238,26 +246,11 @@ def _find_image(root: Path, name: str, where: str, *, allow_outside: bool) -> Pa
     return None
 
 
-def read_matrix(values: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "4 4"]:
-    """A matrix of 4 rows, or of the upper 3, of a JSON object; whether it is a pose is not asked."""
-    rows = values.get(key)
-    if not isinstance(rows, list) or not (
-        len(rows) in (3, 4) and all(isinstance(row, list) and len(row) == 4 for row in rows)
-    ):
-        raise InputError(f"{where}: {key} must have 4 rows (or the upper 3) of 4 numbers")
-    matrix = np.eye(4)
-    matrix[: len(rows)] = [[_number({key: entry}, key, where) for entry in row] for row in rows]
-    return matrix
-
-
-def _up(value: object, path: Path) -> Float64[np.ndarray, "3"]:
-    if not isinstance(value, list) or len(value) != 3:
-        raise InputError(f"{path}: up must be three numbers")
-    up = np.array([_number({"up": entry}, "up", str(path)) for entry in value])
-    length = math.hypot(*up.tolist())
-    if not 1e-6 < length < 1e6:
-        raise InputError(f"{path}: up must be three finite numbers that are not all zero, got {value}")
-    return up / length
+def _pose(values: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "4 4"]:
+    """A rigid transform of 4 rows, or of the upper 3."""
+    rows, pose = numbers(values, key, where, (4, 4), (3, 4)), np.eye(4)
+    pose[: len(rows)] = rows
+    return rigid_pose(pose, where)
 
 
 def _camera(data: dict[str, Any], frame: dict[str, Any], image: Path, where: str) -> CameraModel:
@@ -409,45 +402,32 @@ def read_objects(path: Path) -> tuple[SceneObject, ...]:
         where = f"{path}: object {index}"
         if not isinstance(row, dict):
             raise InputError(f"{where}: expected an object with id, name, aabb_min and aabb_max")
+        key: Any = row.get("id")
         name, placed = row.get("name"), row.get("placed", True)
-        if name is not None and not (isinstance(name, str) and len(name) <= MAX_NAME):
-            raise InputError(f"{where}: name must be null or a word of at most {MAX_NAME:,} characters")
-        lower, upper = _corner(row, "aabb_min", where), _corner(row, "aabb_max", where)
-        if (lower > upper).any():
-            raise InputError(f"{where}: aabb_min {lower.tolist()} is not below aabb_max {upper.tolist()}")
-        if not isinstance(placed, bool):
-            raise InputError(f"{where}: placed must be true or false, got {str(placed)[:40]!r}")
-        counts = {key: _count(row, key, where, 0) for key in ("views", "max_pixels")}
-        key = _count(row, "id", where, None, minimum=1)
+        counts = {field: row.get(field, 0) for field in ("views", "max_pixels")}
+        is_named = name is None or (isinstance(name, str) and len(name) <= MAX_NAME)
+        if not is_named or not isinstance(placed, bool):
+            raise InputError(f"{where}: name must be null or at most {MAX_NAME:,} characters, placed true or false")
+        for field, value, least in (("id", key, 1), *((field, value, 0) for field, value in counts.items())):
+            if type(value) is not int or not least <= value < 2**31:
+                raise InputError(f"{where}: {field} must be a whole number from {least}, got {str(value)[:40]!r}")
+        lower, upper = (numbers(row, corner, where, (3,)) for corner in ("aabb_min", "aabb_max"))
+        if not (np.abs((lower, upper)) < MAX_CORNER).all() or (lower > upper).any():
+            raise InputError(
+                f"{where}: expected aabb_min below aabb_max, both within {MAX_CORNER:g}, "
+                f"got {lower.tolist()} and {upper.tolist()}"
+            )
         if key in objects:
             raise InputError(f"{path}: id {key} belongs to several objects")
         objects[key] = SceneObject(id=key, name=name, aabb_min=lower, aabb_max=upper, placed=placed, **counts)
     return tuple(objects.values())
 
 
-def _count(row: dict[str, Any], key: str, where: str, default: int | None, minimum: int = 0) -> int:
-    value = row.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not minimum <= value < 2**31:
-        raise InputError(f"{where}: {key} must be a whole number from {minimum}, got {str(value)[:40]!r}")
-    return value
-
-
-def _corner(row: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "3"]:
-    values = row.get(key)
-    if not isinstance(values, list) or len(values) != 3:
-        raise InputError(f"{where}: {key} must be three finite numbers, got {str(values)[:60]}")
-    corner = np.array([_number({key: value}, key, where) for value in values])
-    if np.abs(corner).max() >= MAX_CORNER:
-        raise InputError(f"{where}: {key} must lie within {MAX_CORNER:g}, got {values}")
-    return corner
-
-
 MAX_CORNER = 1e15
 MAX_CAMERAS = 10_000
 MAX_PIXELS = 1 << 24  # A blend of this many pixels takes gigabytes
-POSES = ("cam_from_world", "transform_matrix")
-INTRINSICS = (("fx", "fl_x"), ("fy", "fl_y"), ("cx",), ("cy",), ("width", "w"), ("height", "h"))
-"""Each with the names that it may have."""
+INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
+NERFSTUDIO_NAMES = {"fl_x": "fx", "fl_y": "fy", "w": "width", "h": "height"}
 
 
 def read_cameras(path: Path, origin: Float64[np.ndarray, "3"]) -> Cameras:
@@ -459,57 +439,34 @@ def read_cameras(path: Path, origin: Float64[np.ndarray, "3"]) -> Cameras:
     poses, Ks, sizes = [], [], []
     for index, entry in enumerate(entries):
         where = f"{path}: camera {index}" if isinstance(data, list) else str(path)
-        if not isinstance(entry, dict):
-            raise InputError(f"{where}: expected an object with cam_from_world, fx, …, got {str(entry)[:40]!r}")
-        pose, K, size = _camera_of_file(entry, where)
+        keys: dict[str, Any] = entry if isinstance(entry, dict) else {}
+        values: dict[str, Any] = {NERFSTUDIO_NAMES.get(key, key): value for key, value in keys.items()}
+        pose_key = "transform_matrix" if "transform_matrix" in values else "cam_from_world"
+        if len(values) < len(keys) or set(values) != {pose_key, *INTRINSICS}:
+            raise InputError(
+                f"{where}: expected an object with cam_from_world or transform_matrix, and {', '.join(INTRINSICS)}, "
+                f"got {listed([str(key)[:40] for key in keys]) or str(entry)[:40]}"
+            )
+        pose = _pose(values, pose_key, where)
+        if pose_key == "transform_matrix":
+            pose = invert_rigid(pose @ OPENCV_FROM_OPENGL)
+        stated = {"camera": [values[key] for key in INTRINSICS]}
+        fx, fy, cx, cy, width, height = numbers(stated, "camera", where, (len(INTRINSICS),)).tolist()
+        # Cameras are held in float32, in which 1e-50 is zero and 1e300 infinite.
+        if not (1e-9 <= fx <= 1e9 and 1e-9 <= fy <= 1e9 and abs(cx) <= 1e9 and abs(cy) <= 1e9):
+            raise InputError(
+                f"{where}: expected focal lengths from 1e-9 and a principal point, within 1e9 pixels, "
+                f"got fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}"
+            )
+        if not (width >= 1 and height >= 1 and width % 1 == height % 1 == 0 and width * height <= MAX_PIXELS):
+            raise InputError(
+                f"{where}: expected width and height as whole numbers, {MAX_PIXELS:,} pixels at most, "
+                f"got {width:g}×{height:g}"
+            )
         poses.append(move_origin(pose, origin))
-        Ks.append(K)
-        sizes.append(size)
+        Ks.append(intrinsic_matrix(fx, fy, cx, cy))
+        sizes.append((int(width), int(height)))
     widths, heights = np.array(sizes, np.int32).T.copy()
     return Cameras(
         cam_from_world=np.array(poses, np.float32), Ks=np.array(Ks, np.float32), widths=widths, heights=heights
     )
-
-
-def _camera_of_file(
-    entry: dict[str, Any], where: str
-) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "3 3"], tuple[int, int]]:
-    """Pose, intrinsics and size (width, height)."""
-    keys = (*POSES, *(name for names in INTRINSICS for name in names))
-    unknown = [str(key)[:40] for key in entry if key not in keys]
-    if unknown:
-        raise InputError(f"{where}: unknown keys {listed(unknown)}; expected {', '.join(keys)}")
-    pose_key = _key(entry, POSES, where)
-    pose = rigid_pose(read_matrix(entry, pose_key, where), f"{where}: {pose_key}")
-    if pose_key == "transform_matrix":
-        pose = invert_rigid(pose @ OPENCV_FROM_OPENGL)
-    fx, fy, cx, cy, width, height = (_number(entry, _key(entry, names, where), where) for names in INTRINSICS)
-    for name, focal in (("fx", fx), ("fy", fy)):
-        # Cameras are held in float32, in which 1e-50 is zero and 1e300 infinite.
-        if not 1e-9 <= focal <= 1e9:
-            raise InputError(f"{where}: {name} must be a positive number of pixels, 1e-9 to 1e9, got {focal:g}")
-    for name, value in (("cx", cx), ("cy", cy)):
-        if not abs(value) <= 1e9:
-            raise InputError(f"{where}: {name} must lie within 1e9 pixels, got {value:g}")
-    for name, side in (("width", width), ("height", height)):
-        if side < 1 or side != int(side):
-            raise InputError(f"{where}: {name} must be a whole number of pixels from 1, got {side:g}")
-    if width * height > MAX_PIXELS:
-        raise InputError(f"{where}: {width:g}×{height:g} pixels are too many; expected at most {MAX_PIXELS:,}")
-    return pose, intrinsic_matrix(fx, fy, cx, cy), (int(width), int(height))
-
-
-def _key(entry: dict[str, Any], names: tuple[str, ...], where: str) -> str:
-    """The one of these names that an object has."""
-    there = [name for name in names if entry.get(name) is not None]
-    if len(there) != 1:
-        expected = " or ".join(names)
-        raise InputError(f"{where}: {expected} is missing" if not there else f"{where}: expected {expected}, got both")
-    return there[0]
-
-
-def _number(entry: dict[str, Any], key: str, where: str) -> float:
-    value = number(entry, key, where)
-    if value is None:
-        raise InputError(f"{where}: {key} must be a number, got null")
-    return value

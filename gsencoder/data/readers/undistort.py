@@ -15,6 +15,7 @@ import signal
 import sys
 import threading
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -88,11 +89,9 @@ class Pinhole:
 
 
 def check_camera(camera: CameraModel, where: str) -> None:
-    """Raises InputError where the camera cannot be used; `where` begins the message."""
+    """Raises InputError where the camera cannot be used."""
     if camera.model not in _FOCALS:
-        raise InputError(
-            f"{where}: camera model {camera.model} cannot be undistorted; expected one of {', '.join(sorted(_FOCALS))}"
-        )
+        raise InputError(f"{where}: camera model {camera.model} is not supported; expected {', '.join(_FOCALS)}")
     if not (0 < camera.width <= MAX_SIDE and 0 < camera.height <= MAX_SIDE):
         raise InputError(f"{where}: picture size {camera.width}×{camera.height}, expected sides of 1 to {MAX_SIDE}")
     if len(camera.params) < _FOCALS[camera.model] + 2 or not all(map(math.isfinite, camera.params)):
@@ -238,45 +237,23 @@ class Remap:
         return values
 
 
-def build_remap(target: Pinhole, source: CameraModel) -> Remap:
-    """The exact map from the pixels of `target` to those of `source`, both looking from the same place."""
-    pixels = pixel_centers(target.width, target.height).reshape(-1, 2)
-    where, valid = _project(source, target.matrix(target.width, target.height), pixels)
+@lru_cache(maxsize=8)
+def remap_between(target: Pinhole, source: CameraModel, reduction: int = 1) -> Remap | None:
+    """The exact map from the pixels of `target` to those of `source`, both looking from the same place; None where
+    they have the same pixels. The last eight are kept, since most scenes have few cameras.
+
+    Args:
+        reduction: how many times smaller both pictures are.
+    """
+    if (
+        source.is_pinhole
+        and (target.width, target.height) == (source.width, source.height)
+        and (target.fx, target.fy, target.cx, target.cy) == source.pinhole_params()
+    ):
+        return None
+    reduced = target.reduced(reduction)
+    pixels = pixel_centers(reduced.width, reduced.height).reshape(-1, 2)
+    where, valid = _project(source, reduced.matrix(reduced.width, reduced.height), pixels)
     where[~valid] = np.nan
-    grid = where.astype(np.float32).reshape(target.height, target.width, 2)
-    return Remap(x=np.ascontiguousarray(grid[..., 0]), y=np.ascontiguousarray(grid[..., 1]))
-
-
-_remap_lock = threading.Lock()
-
-
-class RemapCache:
-    """A cache of the remaps of a scene, one for each camera, of at most `budget` bytes; the least recently used is
-    dropped first."""
-
-    def __init__(self, budget: int = 256 << 20) -> None:
-        self._budget = budget
-        self._remaps: dict[tuple[Pinhole, CameraModel, int], Remap] = {}
-
-    def get(self, target: Pinhole, source: CameraModel, reduction: int = 1) -> Remap | None:
-        """The remap between pictures that are both reduced by this factor, or None if they have the same pixels."""
-        if (
-            source.is_pinhole
-            and (target.width, target.height) == (source.width, source.height)
-            and (target.fx, target.fy, target.cx, target.cy) == source.pinhole_params()
-        ):
-            return None
-        # Views are read on several threads. The lock is no attribute, because scenes are sent to other processes.
-        with _remap_lock:
-            key = (target, source, reduction)
-            remap = self._remaps.pop(key, None)
-            if remap is None:
-                full = build_remap(target.reduced(reduction), source)
-                remap = Remap(x=full.x / np.float32(reduction), y=full.y / np.float32(reduction))
-                size = remap.x.nbytes + remap.y.nbytes
-                size_of_all = sum(r.x.nbytes + r.y.nbytes for r in self._remaps.values())
-                while self._remaps and size_of_all + size > self._budget:
-                    oldest = self._remaps.pop(next(iter(self._remaps)))
-                    size_of_all -= oldest.x.nbytes + oldest.y.nbytes
-            self._remaps[key] = remap
-            return remap
+    x, y = where.astype(np.float32).reshape(reduced.height, reduced.width, 2).transpose(2, 0, 1) / np.float32(reduction)
+    return Remap(x=x, y=y)

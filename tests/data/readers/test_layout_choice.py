@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from gsencoder.core.errors import InputError, SceneWarning
-from gsencoder.data.readers.layouts import COLMAP_FOLDERS, colmap_model_in, describe_layouts, layout_of, transforms_in
+from gsencoder.data.readers.layouts import COLMAP_FOLDERS, colmap_model_in, layout_of, transforms_in
 from gsencoder.data.readers.posed import ReadOptions
 
 
@@ -91,9 +91,3 @@ def test_a_transforms_json_comes_before_a_model_and_says_so_unless_it_was_made_f
     model(tmp_path / "sparse" / "0")
     with pytest.warns(SceneWarning, match="transforms.json is used"):
         layout.read(tmp_path, ReadOptions())
-
-
-def test_an_empty_folder_has_no_layout(tmp_path):
-    assert layout_of(tmp_path) is None
-    assert (transforms_in(tmp_path), colmap_model_in(tmp_path)) == (None, None)
-    assert describe_layouts().count(";") == 7

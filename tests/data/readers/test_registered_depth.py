@@ -1,7 +1,6 @@
 """Depth that is carried over from its sensor to the photograph."""
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
 
 from gsencoder.data.readers.depth_images import register_depth
@@ -51,16 +50,3 @@ def test_a_pixel_of_depth_covers_its_own_square_a_tenth_wider():
     wide = register_depth(depth, sensor, np.eye(4), np.array([[200.0, 0, 40], [0, 200, 30], [0, 0, 1]]), 80, 60)
     assert set(np.flatnonzero(wide.any(axis=0))) == set(range(39, 61))
     assert set(np.flatnonzero(wide.any(axis=1))) == set(range(19, 41))
-
-
-@pytest.mark.parametrize(("row", "column"), [(0, 0), (0, 3), (2, 0), (2, 3)])
-def test_squares_that_leave_the_picture_are_cut_off(row, column):
-    depth = np.zeros((3, 4), np.float32)
-    depth[row, column] = 1.0
-    K = np.array([[10.0, 0, 2], [0, 10, 1.5], [0, 0, 1]])
-    aside = np.eye(4)
-    aside[:2, 3] = (-0.05 if column == 0 else 0.05), (-0.05 if row == 0 else 0.05)
-    seen = register_depth(depth, K, aside, K, 4, 3)
-    assert np.argwhere(seen > 0).tolist() == [[row, column]]
-    aside[:2, 3] *= 30
-    assert not register_depth(depth, K, aside, K, 4, 3).any()
