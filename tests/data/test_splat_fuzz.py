@@ -1,13 +1,9 @@
 """Readers against damaged files: a splat, or an InputError of one line, and nothing else."""
 
-import gzip
 import json
-import struct
 import warnings
-from itertools import pairwise
 from pathlib import Path
 
-import imagecodecs
 import numpy as np
 import pytest
 import splat_samples as samples
@@ -20,9 +16,9 @@ from gsencoder.data.splats.repair import inspect_splat, repair_splat
 
 pytestmark = pytest.mark.slow
 
-NAMES = ("a.ply", "a.compressed.ply", "a.spz", "v3.spz", "ascii.ply", "a.splat", "a.sog")
+NAMES = ("a.ply", "a.compressed.ply", "a.spz", "v3.spz", "a.splat", "a.sog")
 FUZZ = settings(
-    max_examples=100,
+    max_examples=40,
     deadline=None,
     derandomize=True,
     database=None,
@@ -89,33 +85,6 @@ def test_changed_and_cut_bytes(valid, tmp_path, name, edits, length):
     assert_holds(tmp_path / name)
 
 
-@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "ascii.ply"])
-@FUZZ
-@given(head_edits=EDITS, body_edits=EDITS)
-def test_changed_ply_headers_and_bodies(valid, tmp_path, name, head_edits, body_edits):
-    head, body = valid[name].split(b"end_header\n", 1)
-    (tmp_path / name).write_bytes(edited(head, head_edits) + b"end_header\n" + edited(body, body_edits))
-    assert_holds(tmp_path / name)
-
-
-@FUZZ
-@given(edits=EDITS, length=st.floats(0, 1))
-def test_changed_bytes_inside_the_gzip_of_an_spz(valid, tmp_path, edits, length):
-    data = gzip.decompress(valid["v3.spz"])
-    # Half of the edits go to the 16 bytes of the header.
-    data = edited(data[:16], edits[::2]) + edited(data[16:], edits[1::2], length)
-    (tmp_path / "a.spz").write_bytes(gzip.compress(data, 1))
-    assert_holds(tmp_path / "a.spz")
-
-
-@FUZZ
-@given(edits=EDITS)
-def test_changed_headers_and_tables_of_an_spz(valid, tmp_path, edits):
-    data = valid["a.spz"]
-    (tmp_path / "a.spz").write_bytes(edited(data[:128], edits) + data[128:])
-    assert_holds(tmp_path / "a.spz")
-
-
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.just("quats.webp"),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
@@ -142,29 +111,6 @@ def test_any_json_in_the_place_of_a_sog_field(tmp_path, key, field, value):
     assert_holds(tmp_path / "a.sog")
 
 
-@FUZZ
-@given(
-    name=st.sampled_from(["means_l", "quats", "scales", "sh0", "shN_centroids", "shN_labels"]),
-    edits=EDITS,
-    length=st.one_of(st.just(1.0), st.floats(0, 1)),
-)
-def test_changed_bytes_inside_the_images_of_a_sog(tmp_path, name, edits, length):
-    files = samples.sog_files(9)
-    files[f"{name}.webp"] = edited(files[f"{name}.webp"], edits, length)
-    (tmp_path / "a.sog").write_bytes(samples.zipped(files))
-    assert_holds(tmp_path / "a.sog")
-
-
-@pytest.mark.parametrize("suffix", [".ply", ".spz", ".splat", ".sog", ""])
-@FUZZ
-@given(
-    start=st.sampled_from([b"", b"ply\n", b"NGSP\4\0\0\0", b"\x1f\x8b\x08\0", b"PK\3\4"]), rest=st.binary(max_size=200)
-)
-def test_bytes_without_any_sense(tmp_path, suffix, start, rest):
-    (tmp_path / f"x{suffix}").write_bytes(start + rest)
-    assert_holds(tmp_path / f"x{suffix}")
-
-
 @pytest.mark.parametrize("name", ["a.ply", "a.splat"])
 def test_a_signalling_nan_in_any_column_is_counted(valid, tmp_path, name):
     data = bytearray(valid[name])
@@ -173,34 +119,3 @@ def test_a_signalling_nan_in_any_column_is_counted(valid, tmp_path, name):
     (tmp_path / name).write_bytes(data)
     assert_holds(tmp_path / name)
     assert inspect_splat(read_raw(tmp_path / name)).defects[0].first_rows == (0,)
-
-
-@FUZZ
-@given(values=st.lists(st.floats(width=32), min_size=14, max_size=14), far=st.floats(allow_nan=False))
-def test_any_numbers_in_the_columns_of_a_ply(tmp_path, values, far):
-    columns = samples.ply_columns(samples.make_raw(4, 0))
-    columns = {
-        name: np.r_[column.astype(np.float64), value]
-        for (name, column), value in zip(columns.items(), values, strict=True)
-    }
-    columns["x"][0] = far
-    (tmp_path / "a.ply").write_bytes(samples.ply_bytes(columns, kinds="double"))
-    assert_holds(tmp_path / "a.ply")
-
-
-def zstd_frames(parts: list[bytes]) -> bytes:
-    frames = [bytes(imagecodecs.zstd_encode(part, level=1)) for part in parts]
-    table = b"".join(struct.pack("<QQ", len(f), len(p)) for f, p in zip(frames, parts, strict=True))
-    return table + b"".join(frames)
-
-
-@FUZZ
-@given(body=st.binary(min_size=20 * 3, max_size=20 * 3), bits=st.integers(0, 30))
-def test_any_bytes_in_the_sections_of_an_spz_make_a_splat(tmp_path, body, bits):
-    ends = [0, 27, 30, 39, 48, 60]
-    parts = [body[a:b] for a, b in pairwise(ends)]
-    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, 3, 0, bits, 0, 5, 32)
-    (tmp_path / "a.spz").write_bytes(header + zstd_frames(parts))
-    assert_holds(tmp_path / "a.spz")
-    if 1 <= bits <= 24:
-        assert len(read_raw(tmp_path / "a.spz")) == 3

@@ -5,7 +5,6 @@ import os
 import struct
 import subprocess
 import sys
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -22,7 +21,7 @@ C0 = 0.28209479177387814
 SPZ = {"quats": 2e-3, "log_scales": 0.03126, "opacities": 0.00197, "dc": 0.01308, "rest": 0.00391}
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_an_inria_ply_comes_back_exactly_but_for_logarithms(tmp_path, degree):
     gaussians = samples.make_gaussians(5000, degree)
     save_splat(tmp_path / "a.ply", gaussians)
@@ -33,7 +32,7 @@ def test_an_inria_ply_comes_back_exactly_but_for_logarithms(tmp_path, degree):
 
 
 @pytest.mark.parametrize("version", [3, 4])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_an_spz_comes_back_within_its_steps(tmp_path, version, degree):
     gaussians = samples.make_gaussians(2000, degree)
     save_splat(tmp_path / "a.spz", gaussians, spz_version=version)
@@ -42,7 +41,7 @@ def test_an_spz_comes_back_within_its_steps(tmp_path, version, degree):
     samples.assert_close(loaded, gaussians, means=2.0**-13 * 1.001, **SPZ)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 3])
 def test_a_compressed_ply_in_order_comes_back_within_the_steps_of_each_chunk(tmp_path, degree):
     gaussians = samples.make_gaussians(1000, degree)
     save_splat(tmp_path / "a.compressed.ply", gaussians, keep_order=True)
@@ -86,19 +85,6 @@ def test_opacities_0_and_1_are_written_as_finite_logits_and_come_back(tmp_path):
         assert np.abs(load_splat(tmp_path / name).opacities - gaussians.opacities).max() <= tolerance
 
 
-def test_scales_from_1e_minus_9_to_1e4_survive_a_ply(tmp_path):
-    scales = np.array([[1e-9, 1e4, 1], [1e-37, 1e37, 3]], np.float32)
-    save_splat(tmp_path / "a.ply", replace(samples.make_gaussians(2, 0), scales=scales))
-    assert np.abs(load_splat(tmp_path / "a.ply").scales / scales - 1).max() < 1e-5
-
-
-def test_one_gaussian_goes_through_every_format(tmp_path):
-    one = samples.make_gaussians(1, 0)
-    for name in ("a.ply", "a.compressed.ply", "a.spz", "A.PLY"):
-        save_splat(tmp_path / name, one)
-        assert np.abs(load_splat(tmp_path / name).means - one.means).max() < 1e-3
-
-
 def test_a_scene_a_million_metres_away_is_the_scene_at_zero_when_its_ply_has_doubles(tmp_path):
     gaussians = samples.make_gaussians(100, 0)
     origin = np.array([1e6, -2e6, 3e5])
@@ -108,14 +94,6 @@ def test_a_scene_a_million_metres_away_is_the_scene_at_zero_when_its_ply_has_dou
     assert np.abs(loaded.means - gaussians.means).max() < 1e-6
     with pytest.warns(SceneWarning, match="origin"):
         load_splat(tmp_path / "far.ply")
-
-
-def test_float_columns_far_away_stay_rounded_and_an_origin_does_not_warn(tmp_path):
-    raw = samples.make_raw(50, 0)
-    far = replace(raw, means=(raw.means + 1e6).astype(np.float32).astype(np.float64))
-    (tmp_path / "far.ply").write_bytes(samples.ply_bytes(samples.ply_columns(far)))
-    loaded = load_splat(tmp_path / "far.ply", origin=np.full(3, 1e6))
-    assert 1e-3 < np.abs(loaded.means - raw.means).max() <= 0.0626
 
 
 def test_packed_formats_refuse_or_announce_a_far_origin(tmp_path):
@@ -148,8 +126,9 @@ def test_values_beyond_a_packed_range_are_clipped_with_one_counted_warning(tmp_p
         assert len(caught) == 1
 
 
-@pytest.mark.parametrize("kinds", ["float", "double"])
-@pytest.mark.parametrize("encoding", ["binary_little_endian", "binary_big_endian", "ascii"])
+@pytest.mark.parametrize(
+    ("encoding", "kinds"), [("binary_little_endian", "double"), ("binary_big_endian", "float"), ("ascii", "double")]
+)
 def test_any_byte_order_number_type_and_property_order_reads_the_same(tmp_path, encoding, kinds):
     raw = samples.make_raw(20, 2)
     columns = samples.ply_columns(raw)
@@ -160,14 +139,8 @@ def test_any_byte_order_number_type_and_property_order_reads_the_same(tmp_path, 
     for name in ("means", "quats", "log_scales", "logit_opacities", "sh"):
         # An ascii file keeps the digits of its text, whatever its columns are declared to be.
         assert np.array_equal(getattr(got, name).astype(np.float32), getattr(raw, name).astype(np.float32)), name
-
-
-def test_doubles_keep_positions_that_float_cannot_hold(tmp_path):
-    raw = samples.make_raw(20, 0)
-    raw = replace(raw, means=raw.means + 1e7 + 1 / 3)
-    for encoding in ("binary_little_endian", "ascii"):
-        (tmp_path / "a.ply").write_bytes(samples.ply_bytes(samples.ply_columns(raw), encoding, "double"))
-        assert np.array_equal(read_raw(tmp_path / "a.ply").means, raw.means)
+    if kinds == "double":
+        assert np.array_equal(got.means, raw.means)
 
 
 def test_crlf_headers_and_elements_around_the_vertices_are_skipped(tmp_path):
@@ -228,13 +201,8 @@ def test_dotsplat_rows_mean_what_their_bytes_say(tmp_path):
     assert np.allclose(got.opacities, [102 / 255], rtol=1e-6)
     assert np.allclose(0.5 + C0 * got.sh[0, 0], [1, 0, 0.2], atol=1e-6)
     assert np.allclose(got.quats, [[np.sqrt(0.5), -np.sqrt(0.5), 0, 0]], atol=1e-6)
-
-
-def test_a_dotsplat_scale_of_zero_is_a_defect(tmp_path):
     (tmp_path / "a.splat").write_bytes(struct.pack("<6f8B", 1, 2, 3, 0.5, 0, -2, *range(8)))
     assert read_raw(tmp_path / "a.splat").log_scales[0, 1:].tolist() == [-np.inf, -np.inf]
-    with pytest.raises(InputError, match="1 with scales"):
-        load_splat(tmp_path / "a.splat")
 
 
 def test_spz_version_2_stores_three_bytes_of_a_quaternion(tmp_path):
@@ -270,12 +238,3 @@ def test_loading_needs_neither_torch_nor_numba(tmp_path):
     code += "; print([m for m in ('torch', 'numba', 'gsply', 'open3d', 'scipy') if m in sys.modules])"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert result.stdout.strip() == "[]"
-
-
-def test_a_good_file_gives_no_warning(tmp_path):
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        for name in ("a.ply", "a.compressed.ply", "a.spz"):
-            save_splat(tmp_path / name, samples.make_gaussians(300, 3))
-            load_splat(tmp_path / name)
-    assert [str(warning.message) for warning in caught if warning.category is SceneWarning] == []

@@ -92,7 +92,7 @@ def test_missing_files_and_properties_are_refused(written: Path) -> None:
     with pytest.raises(InputError, match=LABELS_PLY):
         load_property(written / LABELS_PLY, "label")
     (written / "a.spz").write_bytes(b"NGSP" + bytes(60))
-    with pytest.raises(InputError, match="is no .ply"):
+    with pytest.raises(InputError, match="not a .ply file"):
         load_property(written / "a.spz", "label")
 
 

@@ -26,11 +26,11 @@ from gsencoder.data.splats.ply import (
     is_compressed,
     morton_order,
     packed_bytes,
+    read_columns,
     read_compressed,
     read_dotsplat,
     read_header,
     read_inria,
-    read_property,
     write_inria,
 )
 from gsencoder.data.splats.raw import (
@@ -62,16 +62,14 @@ def load_splat(path: str | Path, *, origin: Float64[np.ndarray, "3"] | None = No
     Args:
         path: a file, or a SOG folder. Known by content first, suffix second.
         origin: world coordinates of the scene's origin. It is subtracted in float64 before positions become float32,
-            so a .ply with double columns keeps its precision far from zero. Where a file has float32 columns, what
-            they rounded away is lost (0.06 at 10⁶), and no origin brings it back.
+            so a .ply with double columns keeps its precision far from zero. What float32 columns rounded away is lost.
 
     Returns:
-        Gaussians relative to `origin`, in the axes and units of the file. Quaternions are normalized (INRIA files
-        keep them at any length); nothing else is changed.
+        Gaussians relative to `origin`, in the axes and units of the file. Quaternions are normalized; nothing else is
+        changed.
 
     Warns:
-        SceneWarning: SH of degree 4 was cut, extensions were left out, positions lose precision without an origin, or
-            values look as if they were stored otherwise (see `odd_values`).
+        SceneWarning: something was left out, or values look as if they were stored otherwise (see `odd_values`).
     """
     check_written(path)
     return gaussians_from_raw(read_raw(path), origin=origin, where=str(path))
@@ -80,10 +78,7 @@ def load_splat(path: str | Path, *, origin: Float64[np.ndarray, "3"] | None = No
 def gaussians_from_raw(
     raw: RawSplat, *, origin: Float64[np.ndarray, "3"] | None = None, where: str = "splat"
 ) -> Gaussians:
-    """Activates raw values: scale = e^log_scale, opacity = 1/(1 + e^−logit), quaternion over its norm.
-
-    `where` names the source in messages. Arguments, errors and warnings are those of `load_splat`.
-    """
+    """Activates raw values: scale = e^log_scale, opacity = 1/(1 + e^−logit), quaternion over its norm."""
     if len(raw) == 0:
         raise InputError(f"{where}: holds no Gaussians; expected at least one")
     bad = {name: int(rows.sum()) for name, rows in unusable_rows(raw).items()}
@@ -130,8 +125,7 @@ def is_ply_of_splat(path: Path) -> bool:
 def read_raw(path: str | Path) -> RawSplat:
     """Reads a splat file without judging its values: only what breaks the format is an error.
 
-    Unpacking is bounded: a packed file may claim 200 times its size, or 16 MiB, and counts are checked against the
-    size of the file before memory is taken.
+    Counts are checked against the size of the file before memory is taken, and unpacking is bounded.
     """
     path = Path(path)
     try:
@@ -139,9 +133,7 @@ def read_raw(path: str | Path) -> RawSplat:
         if stat.S_ISDIR(status.st_mode):
             if not (path / "meta.json").is_file():
                 inner = sorted(each.name for each in path.iterdir() if is_ply_of_splat(each))
-                hint = (
-                    f"; give its {', '.join(inner)}" if inner else ", such as the splat.ply of `gsencoder reconstruct`"
-                )
+                hint = f"; give its {', '.join(inner)}" if inner else ""
                 raise InputError(f"{path}: is a folder without meta.json; expected a splat file or a SOG folder{hint}")
             return read_sog_folder(path)
         if path.name == "meta.json":
@@ -173,23 +165,12 @@ def _read_file(path: Path, size: int) -> RawSplat:
             return read_sog_zip(path, size)
         if suffix == ".splat":
             return read_dotsplat(path, stream, size)
-    beginnings = {".ply": "'ply'", ".spz": "'NGSP' or gzip", ".sog": "a zip"}
-    expected = f"a {suffix} starts with {beginnings[suffix]}" if suffix in beginnings else f"expected {READABLE}"
-    raise InputError(f"{path}: starts with {start!r}, which no known splat format does; {expected}")
+    raise InputError(f"{path}: starts with {start!r}, which no known splat format does; expected {READABLE}")
 
 
 def load_property(path: str | Path, name: str) -> Float64[np.ndarray, " N"]:
     """One value for each Gaussian that a .ply holds besides those of a splat (see `further` of `save_splat`)."""
-    path = Path(path)
-    try:
-        with open_foreign(path) as stream:
-            if stream.read(4)[:3] != b"ply":
-                raise InputError(f"{path}: is no .ply, and only these have further properties")
-            stream.seek(0)
-            size = os.fstat(stream.fileno()).st_size
-            return read_property(path, stream, read_header(path, stream), size, name)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return read_columns(Path(path), [name])[0][name]
 
 
 def check_splat_name(path: Path) -> None:
@@ -224,9 +205,6 @@ def save_splat(
             half of a 255th of their range in a chunk, other SH ±1/64 in ±4, quaternion components 7e-4 (the left-out
             one 2e-3).
         .spz: see `gsencoder.data.splats.packed.write_spz`.
-
-    Warns:
-        SceneWarning: values were clipped to the range of a packed format, or positions lose precision in it.
     """
     path = Path(path)
     check_splat_name(path)

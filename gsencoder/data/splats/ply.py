@@ -8,7 +8,7 @@ index, and hold opacities to a logit of ±10.
 
 import re
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -147,39 +147,18 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
     coefficients = min(per_channel + 1, SH_COEFFICIENTS[-1])
     if coefficients < per_channel + 1:
         warnings.warn(f"{path}: SH degree 4 was cut to degree 3", SceneWarning, stacklevel=2)
-
-    count = vertex.count
-    if header.encoding == "ascii":
-        rows = _ascii_rows(path, stream, header, vertex, size)
-    else:
-        stream.seek(element_start(path, header, "vertex", size))
-        rows = None
+    count, blocks = vertex.count, _blocks(path, stream, header, vertex, size)
     means = np.empty((count, 3), np.float64)
     quats, scales = np.empty((count, 4), np.float32), np.empty((count, 3), np.float32)
     opacities, sh = np.empty(count, np.float32), np.empty((count, coefficients, 3), np.float32)
     widths = np.zeros(count, np.float64)
-    normals = [name for name in _NORMALS if name in names]
-    used = {*_REQUIRED, *colors, *normals, FILTER}
+    columns = _columns(means, quats, scales, opacities, sh, per_channel)
+    if FILTER in names:
+        columns[FILTER] = widths
     with np.errstate(over="ignore", invalid="ignore"):
-        for start in range(0, count, _BLOCK):
-            stop = min(start + _BLOCK, count)
-            block = np.fromfile(stream, vertex.dtype, stop - start) if rows is None else rows[start:stop]
-            if len(block) < stop - start:
-                raise InputError(f"{path}: ended while it was read, at row {start + len(block):,} of {count:,}")
-            for axis, name in enumerate("xyz"):
-                means[start:stop, axis] = block[name]
-            for axis in range(4):
-                quats[start:stop, axis] = block[f"rot_{axis}"]
-            for axis in range(3):
-                scales[start:stop, axis] = block[f"scale_{axis}"]
-                sh[start:stop, 0, axis] = block[f"f_dc_{axis}"]
-                for k in range(1, coefficients):
-                    sh[start:stop, k, axis] = block[f"f_rest_{axis * per_channel + k - 1}"]
-            opacities[start:stop] = block["opacity"]
-            if FILTER in names:
-                widths[start:stop] = block[FILTER]
-            # Trainers write normals of zeros.
-            used -= {name for name in normals if block[name].any()}
+        for part, block in blocks:
+            for name, column in columns.items():
+                column[part] = block[name]
     if FILTER in names:
         if wrong := int((~((widths >= 0) & (widths < np.inf))).sum()):
             raise InputError(f"{path}: {FILTER} of {wrong:,} rows is no width; expected 0 or more in each row")
@@ -189,6 +168,7 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
             SceneWarning,
             stacklevel=2,
         )
+    used = {*columns, *colors, *_NORMALS}
     others = [f"element {element.name}" for element in header.elements if element is not vertex and element.count]
     return RawSplat(
         means=means,
@@ -199,6 +179,40 @@ def read_inria(path: Path, stream: BinaryIO, header: PlyHeader, size: int) -> Ra
         format=f"INRIA .ply, {header.encoding}{f', {FILTER} applied' if FILTER in names else ''}",
         unused=(*(f"property {name}" for name in names if name not in used), *others),
     )
+
+
+def _columns(
+    means: np.ndarray, quats: np.ndarray, log_scales: np.ndarray, logits: np.ndarray, sh: np.ndarray, per_channel: int
+) -> dict[str, np.ndarray]:
+    """The properties of INRIA's layout, in its order, as views of arrays; f_rest has `per_channel` values a color."""
+    return {
+        **{name: means[:, axis] for axis, name in enumerate("xyz")},
+        **{f"f_dc_{axis}": sh[:, 0, axis] for axis in range(3)},
+        **{f"f_rest_{axis * per_channel + k - 1}": sh[:, k, axis] for axis in range(3) for k in range(1, sh.shape[1])},
+        "opacity": logits,
+        **{f"scale_{axis}": log_scales[:, axis] for axis in range(3)},
+        **{f"rot_{axis}": quats[:, axis] for axis in range(4)},
+    }
+
+
+def _blocks(
+    path: Path, stream: BinaryIO, header: PlyHeader, vertex: PlyElement, size: int
+) -> Iterator[tuple[slice, np.ndarray]]:
+    """The rows of an element, some at a time, and where they stand; their number is checked by the call itself."""
+    assert vertex.dtype is not None
+    if header.encoding == "ascii":
+        return iter([(slice(0, vertex.count), _ascii_rows(path, stream, header, vertex, size))])
+    stream.seek(element_start(path, header, vertex.name, size))
+
+    def read() -> Iterator[tuple[slice, np.ndarray]]:
+        for start in range(0, vertex.count, _BLOCK):
+            part = slice(start, min(start + _BLOCK, vertex.count))
+            block = np.fromfile(stream, vertex.dtype, part.stop - start)
+            if len(block) < part.stop - start:
+                raise InputError(f"{path}: ended while it was read, at row {start + len(block):,} of {vertex.count:,}")
+            yield part, block
+
+    return read()
 
 
 def _filtered(
@@ -213,42 +227,38 @@ def _filtered(
     return wider.astype(np.float32), logits_from_opacities(opacities)
 
 
-def read_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
-    """Positions of the element `vertex` of a point cloud, and its colors if it has red, green and blue; others than
-    integers are taken for shares of 1."""
+def read_columns(
+    path: Path, names: Sequence[str], optional: Sequence[str] = ()
+) -> tuple[dict[str, Float64[np.ndarray, " N"]], np.dtype]:
+    """Properties of the element `vertex`, those of `optional` if all are there, and the type of its rows."""
     with readable(path), open_foreign(path) as stream:
         if stream.read(4)[:3] != b"ply":
-            raise InputError(f"{path}: not a .ply file; expected a point cloud")
+            raise InputError(f"{path}: not a .ply file")
         size = stream.seek(0, 2)
         stream.seek(0)
         header = read_header(path, stream)
-        points = np.stack([read_property(path, stream, header, size, name) for name in "xyz"], axis=1)
         vertex = header.element("vertex")
-        assert vertex is not None
-        assert vertex.dtype is not None
-        if not set(_COLORS) <= set(vertex.dtype.names or ()):
-            return points, None
-        scale = 1 if vertex.dtype["red"].kind in "iu" else 255
-        colors = [read_property(path, stream, header, size, name) * scale for name in _COLORS]
-    return points, np.stack(colors, axis=1).round().clip(0, 255).astype(np.uint8)
+        known = () if vertex is None or vertex.dtype is None else vertex.dtype.names or ()
+        if vertex is None or vertex.dtype is None or not set(names) <= set(known):
+            raise InputError(f"{path}: the .ply has no property {next(n for n in names if n not in known)!r}")
+        blocks, chosen = _blocks(path, stream, header, vertex, size), [*names, *optional]
+        columns = {
+            name: np.empty(vertex.count, np.float64) for name in (chosen if set(optional) <= set(known) else names)
+        }
+        for part, block in blocks:
+            for name, column in columns.items():
+                column[part] = block[name]
+    return columns, vertex.dtype
 
 
-def read_property(path: Path, stream: BinaryIO, header: PlyHeader, size: int, name: str) -> Float64[np.ndarray, " N"]:
-    """One property of the element `vertex`."""
-    vertex = header.element("vertex")
-    if vertex is None or vertex.dtype is None or name not in (vertex.dtype.names or ()):
-        raise InputError(f"{path}: the .ply has no property {name!r}")
-    if header.encoding == "ascii":
-        return np.asarray(_ascii_rows(path, stream, header, vertex, size)[name], np.float64)
-    stream.seek(element_start(path, header, "vertex", size))
-    values = np.empty(vertex.count, np.float64)
-    for start in range(0, vertex.count, _BLOCK):
-        stop = min(start + _BLOCK, vertex.count)
-        block = np.fromfile(stream, vertex.dtype, stop - start)
-        if len(block) < stop - start:
-            raise InputError(f"{path}: ended while it was read, at row {start + len(block):,} of {vertex.count:,}")
-        values[start:stop] = block[name]
-    return values
+def read_points(path: Path) -> tuple[Float64[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"] | None]:
+    """Positions of a point cloud, and its colors if it has any; others than integers are taken for shares of 1."""
+    columns, row = read_columns(path, "xyz", _COLORS)
+    points = np.stack([columns[name] for name in "xyz"], axis=1)
+    if "red" not in columns:
+        return points, None
+    colors = np.stack([columns[name] for name in _COLORS], axis=1) * (1 if row["red"].kind in "iu" else 255)
+    return points, colors.round().clip(0, 255).astype(np.uint8)
 
 
 def _ascii_rows(path: Path, stream: BinaryIO, header: PlyHeader, vertex: PlyElement, size: int) -> np.ndarray:
@@ -295,20 +305,12 @@ def write_inria(
     `double_means` writes x y z as doubles, for scenes far from zero; everything else is float. `further` properties
     follow.
     """
-    rest = raw.sh.shape[1] - 1
-    position = "f8" if double_means else "f4"
-    names = [
-        "x",
-        "y",
-        "z",
-        "nx",
-        "ny",
-        "nz",
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(3 * rest)),
-    ]
-    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)), *further]
-    dtype = np.dtype([(name, "<" + (position if name in "xyz" else "f4")) for name in names])
+    columns = _columns(
+        raw.means, raw.quats, raw.log_scales, raw.logit_opacities, raw.sh, per_channel=raw.sh.shape[1] - 1
+    )
+    columns |= further
+    names = ["x", "y", "z", *_NORMALS, *list(columns)[3:]]
+    dtype = np.dtype([(name, "<f8" if double_means and name in "xyz" else "<f4") for name in names])
     words = {"<f8": "double", "<f4": "float"}
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(raw)}"]
     lines += [f"property {words[dtype[name].str]} {name}" for name in names]
@@ -316,18 +318,8 @@ def write_inria(
     for start in range(0, len(raw), _BLOCK):
         part = slice(start, start + _BLOCK)
         block = np.zeros(len(raw.means[part]), dtype)
-        for axis, name in enumerate("xyz"):
-            block[name] = raw.means[part, axis]
-        for axis in range(3):
-            block[f"f_dc_{axis}"] = raw.sh[part, 0, axis]
-            block[f"scale_{axis}"] = raw.log_scales[part, axis]
-            for k in range(rest):
-                block[f"f_rest_{axis * rest + k}"] = raw.sh[part, k + 1, axis]
-        for axis in range(4):
-            block[f"rot_{axis}"] = raw.quats[part, axis]
-        block["opacity"] = raw.logit_opacities[part]
-        for name, values in further.items():
-            block[name] = values[part]
+        for name, column in columns.items():
+            block[name] = column[part]
         stream.write(block.tobytes())
 
 
@@ -370,7 +362,6 @@ def read_compressed(path: Path, stream: BinaryIO, header: PlyHeader, size: int) 
             or rest.count != count
         ):
             raise InputError(f"{path}: 'sh' has {rest.count:,} rows of {len(names)}; expected {count:,} of 9, 24 or 45")
-
     stream.seek(starts["chunk"])
     bounds = np.fromfile(stream, chunk.dtype, chunk.count)
     stream.seek(starts["vertex"])

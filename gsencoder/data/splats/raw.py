@@ -14,17 +14,11 @@ from gsencoder.core.arrays import even_indices
 from gsencoder.core.errors import InputError
 
 LOGIT_LIMIT = 20.0  # Opacities 0 and 1 are written as this logit: 2e-9 away from the true value, and finite
-
 MAX_EXPANSION = 200  # A packed file may unpack to this many times its size …
-
 ALWAYS_ALLOWED = 16 << 20  # … or to this many bytes, whichever is more
-
 SH_COEFFICIENTS = (1, 4, 9, 16)
-
 ENOUGH = 100  # Fewer Gaussians say nothing about how their values were stored
-
 SAMPLE = 4096  # Gaussians whose neighbors and coordinates are looked at
-
 OVERLAP = 3.0
 """Scales are 0.4 to 0.8 times the distance to the nearest neighbor in real splats (median of both), and up to 1.5 where
 they were just made."""
@@ -56,14 +50,8 @@ class RawSplat:
 
     def select(self, rows: Bool[np.ndarray, " N"] | Integer[np.ndarray, " n"]) -> "RawSplat":
         """The Gaussians of `rows` (indices or a mask), in that order."""
-        return replace(
-            self,
-            means=self.means[rows],
-            quats=self.quats[rows],
-            log_scales=self.log_scales[rows],
-            logit_opacities=self.logit_opacities[rows],
-            sh=self.sh[rows],
-        )
+        arrays = ("means", "quats", "log_scales", "logit_opacities", "sh")
+        return replace(self, **{name: getattr(self, name)[rows] for name in arrays})
 
 
 def logits_from_opacities(opacities: Float[np.ndarray, " N"]) -> Float32[np.ndarray, " N"]:
@@ -89,17 +77,12 @@ def logs_from_scales(scales: Float[np.ndarray, "N 3"]) -> Float32[np.ndarray, "N
 def quats_from_smallest_three(
     largest: Integer[np.ndarray, " N"], others: Float[np.ndarray, "N 3"]
 ) -> Float32[np.ndarray, "N 4"]:
-    """Unit quaternions from the index of their largest component and the other three in order.
-
-    The left-out component is √(1 − Σ others²), taken positive; the order of components is the caller's.
-    """
+    """Unit quaternions from the index of their largest component, √(1 − Σ others²), and the other three in order."""
     values = others.astype(np.float64)
-    largest_values = np.sqrt(np.maximum(0, 1 - np.square(values).sum(axis=1)))
+    is_largest = np.arange(4) == np.asarray(largest)[:, None]
     quats = np.empty((len(values), 4), np.float32)
-    for column in range(4):
-        before = values[:, column - 1] if column > 0 else values[:, 0]
-        after = values[:, column] if column < 3 else values[:, 2]
-        quats[:, column] = np.where(largest == column, largest_values, np.where(largest < column, before, after))
+    quats[is_largest] = np.sqrt(np.maximum(0, 1 - np.square(values).sum(axis=1)))
+    quats[~is_largest] = values.reshape(-1)
     return quats
 
 
@@ -146,8 +129,7 @@ def linear_columns(raw: RawSplat) -> dict[str, str]:
         apart = float(np.median(cKDTree(raw.means).query(raw.means[rows], k=2)[0][:, 1]))
         length = float(np.median(raw.log_scales))
         if length < OVERLAP * apart < math.exp(min(length, LOGIT_LIMIT)):
-            columns["scales"] = f"all are 0 or more, and e^scale is {math.exp(length) / apart:.3g} times the distance"
-            columns["scales"] += " between Gaussians"
+            columns["scales"] = f"all are 0 or more, and e^scale is {math.exp(length) / apart:.3g} times their distance"
     logits = raw.logit_opacities
     if logits.min() >= 0 and 0 < logits.max() <= 1:
         columns["opacities"] = f"all are between {logits.min():.3g} and {logits.max():.3g}"

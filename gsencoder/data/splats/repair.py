@@ -107,10 +107,7 @@ class RepairReport:
 
 
 def inspect_splat(raw: RawSplat) -> SplatReport:
-    """Counts, extent, quantiles and every defect, without changing anything.
-
-    Costs a few passes over the arrays and one sort of N hashes: about a second a million rows at SH 3.
-    """
+    """Counts, extent, quantiles and every defect: about a second a million rows at SH 3."""
     unusable = unusable_rows(raw)
     finite = ~unusable["nonfinite"]
     means = raw.means[finite]
@@ -145,10 +142,7 @@ def inspect_splat(raw: RawSplat) -> SplatReport:
 
 
 def repair_splat(raw: RawSplat, fixes: Sequence[str]) -> tuple[RawSplat, RepairReport]:
-    """Mends what `fixes` names, or everything for "all", in the order of `FIXES`, and nothing else.
-
-    Each fix sees what the ones before it left, so a dropped row is counted once.
-    """
+    """Mends what `fixes` names, or everything for "all", in the order of `FIXES`; each sees what the last one left."""
     unknown = [fix for fix in fixes if fix not in (*FIXES, "all")]
     if isinstance(fixes, str) or unknown or not fixes:
         raise InputError(f"fixes={fixes!r}: expected a list of names among {', '.join(FIXES)}, or all")
@@ -215,10 +209,8 @@ def _robust_box(means: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "2 3"]
 
 def _huge(means: Float64[np.ndarray, "N 3"], log_scales: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
     diagonal = float(np.linalg.norm(np.diff(_robust_box(means), axis=0)))
-    if diagonal == 0:
-        return np.zeros(len(means), bool)  # One point, or coincident ones: there is no scene to be larger than.
-    largest = log_scales.max(axis=1)
-    return largest > np.log(diagonal)
+    # One point, or coincident ones: there is no scene to be larger than.
+    return log_scales.max(axis=1) > (np.log(diagonal) if diagonal else np.inf)
 
 
 def _floaters(means: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
@@ -229,13 +221,8 @@ def _floaters(means: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
 
 def _duplicates(raw: RawSplat) -> Bool[np.ndarray, " N"]:
     """Rows equal to an earlier one, bit for bit."""
-    arrays = [
-        raw.means,
-        raw.quats,
-        raw.log_scales,
-        raw.logit_opacities[:, None],
-        raw.sh.reshape(len(raw), 3 * raw.sh.shape[1]),
-    ]
+    colors = raw.sh.reshape(len(raw), 3 * raw.sh.shape[1])
+    arrays = [raw.means, raw.quats, raw.log_scales, raw.logit_opacities[:, None], colors]
     defective = np.zeros(len(raw), bool)
     # Equal rows have equal means: only those few need their other columns compared.
     _, group, counts = np.unique(_row_bytes(arrays[:1]), return_inverse=True, return_counts=True)
