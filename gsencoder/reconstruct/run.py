@@ -140,8 +140,8 @@ def initial_gaussians(
     added: DenseSeeds | None = None
     triangulated = None
     if source == "photographs":
-        from_photographs = seeds_of_photographs(photographs, views, dense, training=training, track=track)
-        added, triangulated = from_photographs.dense, len(from_photographs.triangulation.points)
+        added = seeds_of_photographs(photographs, views, dense, training=training, track=track)
+        triangulated = added.triangulated
     elif source == "points" and scene.sfm_points is not None and dense.enough > 0:
         colors = colors_or_grey(scene.sfm_points, scene.sfm_colors)
         added = densify(photographs, training, scene.sfm_points, colors, dense, track=track)

@@ -5,7 +5,6 @@ import pytest
 import torch
 from walls import DEPTH, TILT, cameras, seen, wall_points, wall_views
 
-from gsencoder.core.errors import InputError
 from gsencoder.data.photographs import Photographs
 from gsencoder.data.seeding.from_photographs import (
     DenseConfig,
@@ -18,15 +17,14 @@ from gsencoder.data.seeding.from_photographs import (
 )
 from gsencoder.data.seeding.stereo import DepthMap, count_agreeing, source_views, sweep, window_mean, world_points
 
-SMALL = DenseConfig(spacing=3.0, size=96, sources=3, samples=1)
+SMALL = DenseConfig(spacing=3.0, samples=1)
 
 
 def pose(view: int, count: int = 4) -> torch.Tensor:
     return torch.from_numpy(cameras(count).cam_from_world[view])
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 9), (3, 2), (7, 4), (40, 31)])
-@pytest.mark.parametrize("side", [1, 3, 5])
+@pytest.mark.parametrize(("size", "side"), [((1, 9), 5), ((7, 4), 3), ((40, 31), 5)])
 def test_means_of_windows_are_those_of_pooling(size, side):
     maps = torch.rand(2, 3, *size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     pooled = torch.nn.functional.avg_pool2d(maps, side, stride=1, padding=side // 2, count_include_pad=False)
@@ -106,11 +104,11 @@ def test_what_stands_in_the_way_is_carved_out():
     floating, hidden, elsewhere = ([[0.2, 0.1, 2.0]], [[0.2, 0.1, 4.0]], [[50.0, 0.0, 2.0]])
     points = np.concatenate((on, np.array(floating + hidden + elsewhere, np.float32)))
     colors = np.arange(15, dtype=np.uint8).reshape(5, 3)
-    remaining, tints = carve(points, colors, depths, photos, poses, 0.02)
+    remaining, tints = carve(points, colors, depths, photos, poses)
     np.testing.assert_array_equal(remaining, points[[0, 1, 3, 4]])
     np.testing.assert_array_equal(tints, colors[[0, 1, 3, 4]])
     unknown = {view: torch.zeros_like(depth) for view, depth in depths.items()}
-    assert len(carve(points, colors, unknown, photos, poses, 0.02)[0]) == 5
+    assert len(carve(points, colors, unknown, photos, poses)[0]) == 5
 
 
 def test_few_points_on_a_wall_become_many_that_lie_on_it():
@@ -129,20 +127,3 @@ def test_points_that_cover_the_pictures_are_left_alone():
     points = wall_points(20_000)
     assert covered_share(Photographs(wall_views()), range(4), points) > 0.95
     assert densify(Photographs(wall_views()), range(4), points, np.zeros((len(points), 3), np.uint8), SMALL) is None
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("enough", 2.0),
-        ("spacing", 0.0),
-        ("spacing", 1e-300),
-        ("spacing", float("inf")),
-        ("samples", 0),
-        ("size", 8),
-        ("sources", 1),
-    ],
-)
-def test_settings_that_mean_nothing_are_refused(name, value):
-    with pytest.raises(InputError, match=name):
-        DenseConfig(**{name: value})

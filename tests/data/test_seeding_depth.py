@@ -44,7 +44,7 @@ def test_the_noise_of_second_differences_is_the_root_of_six_times_that_of_a_pixe
     assert seeds_depth._second_difference_noise(inverse, np.zeros_like(valid)) == 0
 
 
-@pytest.mark.parametrize("shape", [(12, 15), (12, 3), (3, 15), (1, 1), (2, 2), (4, 5), (1, 15), (5, 4)])
+@pytest.mark.parametrize("shape", [(12, 15), (3, 15), (1, 1), (5, 4)])
 def test_smoothing_is_a_mean_over_pairs_of_opposite_pixels_that_lie_on_a_line(rng, shape):
     inverse, valid = (array[: shape[0], : shape[1]] for array in inverse_depths(rng))
     step, radius = 0.01, SMOOTHING_RADIUS
@@ -67,7 +67,7 @@ def test_smoothing_is_a_mean_over_pairs_of_opposite_pixels_that_lie_on_a_line(rn
 
 def test_gradients_keep_to_a_pixels_own_surface_and_name_those_that_lie_on_none(rng):
     step, seen = 0.01, set()
-    for _ in range(20):
+    for _ in range(8):
         inverse, valid = inverse_depths(rng)
         gradient, none = seeds_depth._gradient(inverse, valid, np.float32(step))
         for y, x in np.ndindex(*inverse.shape):
@@ -100,7 +100,7 @@ def test_gradients_keep_to_a_pixels_own_surface_and_name_those_that_lie_on_none(
     assert len(seen) == 6
 
 
-@pytest.mark.parametrize("min_cos", [0.3, 0.6, 0.9])
+@pytest.mark.parametrize("min_cos", [0.3, 0.9])
 def test_a_plane_is_used_where_it_is_seen_steeply_enough(min_cos):
     camera = front_camera(80, 60, 40.0)
     y, x = (np.mgrid[:60, :80] + 0.5 - np.array([30, 40])[:, None, None]) / 40

@@ -1,15 +1,14 @@
-"""Oriented surface samples from RGB-D frames: back-projection, normals, rejection of floating pixels at edges.
+"""Oriented surface samples from RGB-D frames: back-projection, normals, rejection of floating pixels at edges, and
+grid subsampling that separates different surfaces inside one voxel.
 
 Everything local is done on inverse depth w = 1/z, because a plane n·x = −c seen through a pinhole is
 w = −n·r / c with the ray r = (u', v', 1): linear in the pixel. Its normal is then read off the gradient,
 n ∝ −(∂w/∂u', ∂w/∂v', w − u' ∂w/∂u' − v' ∂w/∂v'), and always faces the camera, because n·r ∝ −w < 0.
 
-Grid subsampling of oriented surface samples that separates different surfaces inside one voxel.
-
 The mean of all samples in a voxel lies between the surfaces where two of them share it: a spoon's rim sinks towards
-the table, the edge of a box is rounded off. Samples are therefore summed by voxel, by the axis direction that they
-face, and by their layer along the normal; sums of one voxel that turn out to be the same surface are joined again at
-the end. Sums add up in any order, so frames stream through in constant memory.
+the table. Samples are therefore summed by voxel, by the axis direction that they face, and by their layer along the
+normal; sums of one voxel that turn out to be the same surface are joined again at the end. Sums add up in any order,
+so frames stream through in constant memory.
 """
 
 from typing import NamedTuple, no_type_check
@@ -19,7 +18,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 
 from gsencoder.core.errors import InputError, about
 from gsencoder.core.threads import ahead, kernel
-from gsencoder.types import Cameras, Views
+from gsencoder.types import Views
 from gsencoder.types.scene import pixel_centers, unproject_points
 
 AXIS_BITS = 19  # Bits of a voxel index along one axis: 524,288 voxels, or 10 km at 2 cm
@@ -62,7 +61,7 @@ class SurfaceGrid:
     def add(
         self, points: Float32[np.ndarray, "n 3"], normals: Float32[np.ndarray, "n 3"], colors: UInt8[np.ndarray, "n 3"]
     ) -> None:
-        """Adds samples. Raises InputError where one lies outside the grid's reach."""
+        """Adds samples."""
         if not len(points):
             return
         self._make_room(self._rows + len(points))
@@ -244,7 +243,9 @@ def surface_pixels(
     along_u, float_u = _gradient(inverse, valid, step)
     along_v, float_v = _gradient(inverse.T, valid.T, step)
     along_u, along_v = along_u * K[0, 0], along_v.T * K[1, 1]
-    ray_u, ray_v = _rays(depth.shape, K)
+    across, down = (pixel_centers(*size).astype(np.float32) for size in ((depth.shape[1], 1), (1, depth.shape[0])))
+    columns, rows = (unproject_points(line, np.ones_like(line[..., 0]), K) for line in (across, down))
+    ray_u, ray_v = columns[..., 0], rows[..., 1]  # x/z of each column [1, W], y/z of each row [H, 1]
     normals = np.stack([-along_u, -along_v, ray_u * along_u + ray_v * along_v - inverse], axis=-1)
     length = np.sqrt(np.einsum("ijk,ijk->ij", normals, normals))
     normals /= np.maximum(length, np.float32(1e-30))[..., None]
@@ -255,11 +256,7 @@ def surface_pixels(
 
 
 def depth_samples(views: Views, *, voxel: float) -> tuple[SurfaceSamples, list[str]]:
-    """Surface samples of all RGB-D frames on a grid of `voxel` world units, two views in memory at a time.
-
-    Returns the samples and the names of the views that gave none. Raises InputError where there is no depth or image,
-    or one has the wrong size or is not finite.
-    """
+    """Surface samples of all RGB-D frames on a grid of `voxel` world units, and the names of views that gave none."""
     if not len(views):
         raise InputError("seeds: the scene has no views; seeds from depth need posed RGB-D frames")
     if views.depths is None:
@@ -273,7 +270,9 @@ def depth_samples(views: Views, *, voxel: float) -> tuple[SurfaceSamples, list[s
         if views.masks is not None:
             depth = np.where(views.masks[view], depth, np.float32(0))
         pixels = surface_pixels(depth, views.cameras.Ks[view])
-        return *_to_world(pixels, views.cameras, view), image[pixels.use]
+        centers = pixel_centers(depth.shape[1], depth.shape[0])[pixels.use].astype(np.float32)
+        points = views.cameras.unproject(centers, pixels.depth[pixels.use], view)
+        return points, views.cameras.rotate_to_world(pixels.normals[pixels.use], view), image[pixels.use]
 
     empty = []
     for name, samples in zip(views.names, ahead(samples_of, range(len(views))), strict=True):
@@ -285,7 +284,7 @@ def depth_samples(views: Views, *, voxel: float) -> tuple[SurfaceSamples, list[s
 
 
 def read_rgbd(views: Views, view: int) -> tuple[Float32[np.ndarray, "H W"], UInt8[np.ndarray, "H W 3"]]:
-    """Depth and image of one view. Raises InputError naming the view where they cannot be used."""
+    """Depth and image of one view."""
     assert views.depths is not None
     assert views.images is not None
     depth, image = views.depths[view], views.images[view]
@@ -382,19 +381,3 @@ def _gradient(inverse, valid, step):
             behind = max(after, -before) > edge + 3 * smaller or (after > edge and -before > edge)
             astray[y, x] = between or behind
     return gradient, astray
-
-
-def _rays(shape: tuple[int, ...], K: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """x/z of each column [1, W] and y/z of each row [H, 1]."""
-    height, width = shape
-    across, down = (pixel_centers(*size).astype(np.float32) for size in ((width, 1), (1, height)))
-    columns, rows = (unproject_points(line, np.ones_like(line[..., 0]), K) for line in (across, down))
-    return columns[..., 0], rows[..., 1]
-
-
-def _to_world(pixels: SurfacePixels, cameras: Cameras, view: int) -> tuple[np.ndarray, np.ndarray]:
-    """World positions and normals of the used pixels, float32 [n, 3] each."""
-    height, width = pixels.depth.shape
-    centers = pixel_centers(width, height)[pixels.use].astype(np.float32)
-    points = cameras.unproject(centers, pixels.depth[pixels.use], view)
-    return points, cameras.rotate_to_world(pixels.normals[pixels.use], view)

@@ -10,8 +10,8 @@ through them.
 """
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -22,13 +22,7 @@ from gsencoder.core.errors import InputError
 from gsencoder.core.process import Track, untracked
 from gsencoder.core.settings import check_limits, option
 from gsencoder.data.photographs import Photographs, ScaledPhotograph
-from gsencoder.data.seeding.matches import (
-    Triangulation,
-    depth_range_of_cameras,
-    overlaps,
-    triangulate,
-    typical_distance,
-)
+from gsencoder.data.seeding.matches import overlaps, triangulate, typical_distance
 from gsencoder.data.seeding.points import seed_from_points
 from gsencoder.data.seeding.stereo import (
     DEPTH_TOLERANCE,
@@ -58,12 +52,8 @@ def interpolated_depths(
     poses: Mapping[int, Tensor],
     points: Float32[np.ndarray, "P 3"],
 ) -> dict[int, Float[Tensor, "h w"]]:
-    """Depth at every pixel of every view: that of its plane sweep, else that of the nearest point that projects there,
-    else one between those of its neighbors.
-
-    Args:
-        consistent: depths of plane sweeps, 0 = unknown.
-    """
+    """Depth at every pixel of every view: that of its plane sweep (`consistent`, 0 = unknown), else that of the nearest
+    point that projects there, else one between those of its neighbors."""
     cloud = torch.cat((torch.from_numpy(points), torch.from_numpy(back_project(consistent, photos, poses)[0])))
     return {
         view: interpolate(torch.where(depth > 0, depth, splat_depths(cloud, photos[view], poses[view])))
@@ -78,16 +68,8 @@ def supported_depths(
     poses: Mapping[int, Tensor],
     neighbors: Mapping[int, Sequence[int]],
 ) -> dict[int, Float[Tensor, "h w"]]:
-    """Interpolated depths whose colors two other photographs confirm, and that no other view sees through.
-
-    Args:
-        interpolated: depth of each pixel of each view (`interpolated_depths`).
-        consistent: depths of plane sweeps, 0 = unknown; pixels that have one are left out.
-        neighbors: the other views that each is compared with.
-
-    Returns:
-        Depths by view; 0 where they are not supported.
-    """
+    """Interpolated depths whose colors two neighbors confirm, and that no neighbor sees through; 0 elsewhere, and where
+    plane sweeps (`consistent`) found one."""
     smooth = {view: window_mean(photos[view].image.permute(2, 0, 1)[None])[0] for view in interpolated}
     supported = {}
     for view, depth in interpolated.items():
@@ -170,6 +152,7 @@ FILLED_SPACING = 2.0
 MAX_SEE_THROUGH = 1  # A point that no view confirms may be seen through by this many views
 MIN_CORRELATION = 0.6
 """Normalized cross-correlation of two windows, −1 to 1, from which they are taken to show the same surface."""
+SIZE, SOURCES = 200, 4  # Longer side in pixels of the pictures that are compared, and with how many others each is
 CELL = 1 / 40  # Side of the cells in which coverage is counted, as a share of the picture's longer side
 
 
@@ -182,8 +165,6 @@ class DenseConfig:
     )
     spacing: float = option(6.0, "distance of seeds in pixels of a typical photograph", ge=0.1, lt=math.inf)
     samples: int = option(3, "pixels that must agree on a seed, from all photographs", ge=1)
-    size: int = option(200, "longer side in pixels of the pictures that are compared", ge=32)
-    sources: int = option(4, "other photographs that each is compared with", ge=2)
 
     def __post_init__(self) -> None:
         check_limits(self)
@@ -198,6 +179,7 @@ class DenseSeeds:
     swept: int  # how many came from plane sweeps
     filled: int  # how many were interpolated
     coverage: tuple[float, float]  # mean share of the pictures' cells with a point, before and after
+    triangulated: int | None = None  # how many are points of matched features; None where those were given
 
 
 def covered_share(photographs: Photographs, views: Sequence[int], points: Float32[np.ndarray, "P 3"]) -> float:
@@ -242,21 +224,17 @@ def densify(
     before = covered_share(photographs, training, points)
     if before >= config.enough:
         return None
-    neighbors = source_views(cameras, guide, training, config.sources)
-    photos, poses = scaled_photographs(photographs, training, config.size)
-    maps: dict[int, DepthMap] = {}
-    for view in track(training, "sweeping planes"):
-        limits, others = depth_range(cameras, view, guide), neighbors[view]
-        if limits is not None and len(others) >= 2:
-            maps[view] = sweep_neighbors(view, others, photos, poses, *limits)
-    consistent = consistent_depths(maps, photos, poses, neighbors)
+    neighbors = source_views(cameras, guide, training, SOURCES)
+    photos, poses = scaled_photographs(photographs, training, SIZE)
+    limits = {view: depth_range(cameras, view, guide) for view in training}
+    consistent = consistent_depths(photos, poses, neighbors, limits, track(training, "sweeping planes"))
     swept = back_project(consistent, photos, poses)
     interpolated = interpolated_depths(consistent, photos, poses, guide)
     filled = back_project(supported_depths(interpolated, consistent, photos, poses, neighbors), photos, poses)
     voxel = config.spacing * _pixel_size(cameras, consistent)
-    swept = carve(*average_by_voxel(*swept, voxel, config.samples), consistent, photos, poses, DEPTH_TOLERANCE)
+    swept = carve(*average_by_voxel(*swept, voxel, config.samples), consistent, photos, poses)
     filled = average_by_voxel(*filled, FILLED_SPACING * voxel, config.samples, occupied=swept[0])
-    filled = carve(*filled, consistent, photos, poses, DEPTH_TOLERANCE)
+    filled = carve(*filled, consistent, photos, poses)
     sparse, swept, filled = (
         (positions[inside], rgb[inside])
         for positions, rgb in ((points, colors), swept, filled)
@@ -282,27 +260,36 @@ def scaled_photographs(
     return photos, poses
 
 
-def sweep_neighbors(
-    view: int,
-    others: Sequence[int],
+def consistent_depths(
     photos: Mapping[int, ScaledPhotograph],
     poses: Mapping[int, Tensor],
-    near: float,
-    far: float,
+    neighbors: Mapping[int, Sequence[int]],
+    limits: Mapping[int, tuple[float, float] | None],
+    views: Iterable[int],
     *,
     max_planes: int = MAX_PLANES,
-) -> DepthMap:
-    """The plane sweep of a view against others; its depth is 0 where their windows do not correlate."""
-    depth_map = sweep(
-        photos[view],
-        poses[view],
-        [photos[o] for o in others],
-        [poses[o] for o in others],
-        near,
-        far,
-        max_planes=max_planes,
-    )
-    return depth_map._replace(depth=torch.where(depth_map.score >= MIN_CORRELATION, depth_map.depth, 0))
+    tolerance: float = DEPTH_TOLERANCE,
+) -> dict[int, Float[Tensor, "h w"]]:
+    """Depths of plane sweeps that two neighbors confirm, 0 elsewhere, of the views with two neighbors or more.
+
+    Args:
+        limits: the nearest and the largest depth to sweep; None = the view is left out.
+        tolerance: largest relative difference of two depths of one surface.
+    """
+    maps: dict[int, DepthMap] = {}
+    for view in views:
+        depths, others = limits[view], neighbors[view]
+        if depths is None or len(others) < 2:
+            continue
+        sources, source_poses = [photos[other] for other in others], [poses[other] for other in others]
+        found = sweep(photos[view], poses[view], sources, source_poses, *depths, max_planes=max_planes)
+        maps[view] = found._replace(depth=torch.where(found.score >= MIN_CORRELATION, found.depth, 0))
+    consistent = {}
+    for view, depth_map in maps.items():
+        swept = [(maps[other], photos[other], poses[other]) for other in neighbors[view] if other in maps]
+        votes = count_agreeing(depth_map.depth, photos[view], poses[view], swept, tolerance)
+        consistent[view] = torch.where(votes >= 2, depth_map.depth, 0)
+    return consistent
 
 
 def _pixel_size(cameras: Cameras, depths: Mapping[int, Float[Tensor, "h w"]]) -> float:
@@ -317,20 +304,14 @@ def carve(
     consistent: Mapping[int, Float[Tensor, "h w"]],
     photos: Mapping[int, ScaledPhotograph],
     poses: Mapping[int, Tensor],
-    tolerance: float,
 ) -> tuple[Float32[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Removes points in free space: points that more views see through, to a surface behind, than confirm.
-
-    Args:
-        consistent: depths of each view, 0 = unknown.
-        tolerance: relative difference of depths that agree; what lies in front by twice as much is seen through.
-    """
+    """Removes points in free space: points that more views see through, to a surface behind, than confirm."""
     positions = torch.from_numpy(points)
     through, confirmed = (torch.zeros(len(points), dtype=torch.int64) for _ in range(2))
     for view, depth in consistent.items():
         z, measured = sample_depth(positions, depth, photos[view], poses[view])
-        through += sees_through(z, measured, tolerance)
-        confirmed += confirms(z, measured, tolerance)
+        through += sees_through(z, measured, DEPTH_TOLERANCE)
+        confirmed += confirms(z, measured, DEPTH_TOLERANCE)
     keep = (through <= confirmed.clamp(min=MAX_SEE_THROUGH)).numpy()
     return points[keep], colors[keep]
 
@@ -359,22 +340,6 @@ def average_by_voxel(
     return means[:, :3].astype(np.float32), np.round(means[:, 3:]).astype(np.uint8)
 
 
-def consistent_depths(
-    maps: Mapping[int, DepthMap],
-    photos: Mapping[int, ScaledPhotograph],
-    poses: Mapping[int, Tensor],
-    neighbors: Mapping[int, Sequence[int]],
-    tolerance: float = DEPTH_TOLERANCE,
-) -> dict[int, Float[Tensor, "h w"]]:
-    """Depths that two other views confirm; 0 elsewhere."""
-    consistent = {}
-    for view, depth_map in maps.items():
-        others = [(maps[other], photos[other], poses[other]) for other in neighbors[view] if other in maps]
-        votes = count_agreeing(depth_map.depth, photos[view], poses[view], others, tolerance)
-        consistent[view] = torch.where(votes >= 2, depth_map.depth, 0)
-    return consistent
-
-
 MAX_DENSE_SPACING = 4.0  # Spacing of dense seeds is clipped to this many medians: outliers must not become large blobs
 MIN_COVERAGE = 0.25
 """Where triangulated points reach a smaller share of the pictures' cells, a sweep over all depths finds rough points.
@@ -384,19 +349,6 @@ ROUGH_PLANES = 192
 ROUGH_TOLERANCE = 0.06  # Largest relative difference of two rough depths of one surface
 
 
-SAME_PLACE = 1e-6  # Cameras that are this near to each other, relative to their coordinates, differ by rounding
-FLAT = 0.01  # Standard deviation of colors (0 to 1) below which a photograph is of one color
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PhotographSeeds:
-    """Seeds of posed photographs, and where they come from."""
-
-    dense: DenseSeeds  # all of them
-    triangulation: Triangulation  # the points of matched features among them
-    rough: int  # number of points of the sweep over all depths, which only guided the second one
-
-
 def seeds_of_photographs(
     photographs: Photographs,
     views: Views,
@@ -404,7 +356,7 @@ def seeds_of_photographs(
     *,
     training: Sequence[int] | None = None,
     track: Track = untracked,
-) -> PhotographSeeds:
+) -> DenseSeeds:
     """Points on the surfaces that posed photographs show.
 
     Args:
@@ -416,65 +368,49 @@ def seeds_of_photographs(
             f"seeds: {len(rows)} photograph without depth and points says nothing about where surfaces are; give two "
             "or more, a splat (splat=PATH), or a mesh (seeds.source=mesh seeds.mesh=PATH)"
         )
-    triangulation = triangulate(views, track=track)
-    points = triangulation.points
-    cameras = views.cameras
-    rough = np.empty((0, 3), np.float32)
+    points, colors = triangulate(views, track=track)
+    guide = points
     if covered_share(photographs, rows, points) < MIN_COVERAGE:
-        rough = _rough_points(photographs, rows, cameras, track)
-    dense = densify(
-        photographs, rows, points, triangulation.colors, config, guide=np.concatenate((points, rough)), track=track
-    )
+        guide = np.concatenate((points, _rough_points(photographs, rows, views.cameras, track)))
+    dense = densify(photographs, rows, points, colors, config, guide=guide, track=track)
     if dense is None:
-        dense = DenseSeeds(points=points, colors=triangulation.colors, swept=0, filled=0, coverage=(1.0, 1.0))
+        dense = DenseSeeds(points=points, colors=colors, swept=0, filled=0, coverage=(1.0, 1.0))
     if not len(dense.points):
-        raise InputError(f"seeds: {_why_nothing(photographs, rows)}")
-    return PhotographSeeds(dense=dense, triangulation=triangulation, rough=len(rough))
-
-
-def _why_nothing(photographs: Photographs, rows: Sequence[int]) -> str:
-    """Why photographs gave no point, for an error."""
-    centers = photographs.cameras.centers[rows]
-    if np.ptp(centers, axis=0).max() <= SAME_PLACE * (1 + np.abs(centers).max()):
-        return (
-            f"all {len(rows)} cameras stand in one place by their poses, from which photographs say nothing about "
-            "depth; check the translations of the poses, or give depth, a mesh or a splat"
+        raise InputError(
+            f"seeds: no two of the {len(rows)} photographs show the same surface from different places by their poses; "
+            "check the poses (axes, translations, world_from_camera or its inverse), or give photographs with more "
+            "overlap and detail, depth, a mesh or a splat"
         )
-    flat = [view for view in rows if float(photographs.at_scale(view).image.std(dim=(0, 1)).max()) < FLAT]
-    if len(flat) > len(rows) / 2:
-        return (
-            f"{len(flat)} of {len(rows)} photographs are of one color all over (first: "
-            f"{photographs.names[flat[0]]!r}), and nothing in them can be found in others"
-        )
-    return (
-        f"no two of the {len(rows)} photographs show the same surface from different places by their poses; check the "
-        "poses (axes, world_from_camera or its inverse), or take photographs with more overlap"
-    )
+    return replace(dense, triangulated=len(points))
 
 
 def seed_from_photographs(views: Views, config: DenseConfig = DenseConfig(), *, track: Track = untracked) -> Gaussians:
-    """Flat Gaussians at `seeds_of_photographs`, as wide as they are apart; arguments and errors are its own."""
-    dense = seeds_of_photographs(Photographs(views, track=track), views, config, track=track).dense
+    """Flat Gaussians at `seeds_of_photographs`, as wide as they are apart."""
+    dense = seeds_of_photographs(Photographs(views, track=track), views, config, track=track)
     return seed_from_points(dense.points, dense.colors, views=views, largest_spacing=MAX_DENSE_SPACING)
 
 
 def _rough_points(
     photographs: Photographs, rows: Sequence[int], cameras: Cameras, track: Track
 ) -> Float32[np.ndarray, "P 3"]:
-    """Points of plane sweeps of small pictures over the depths that the cameras allow."""
-    limits = depth_range_of_cameras(cameras)
-    shares = overlaps(cameras, typical_distance(cameras))
+    """Points of plane sweeps of small pictures over a fifth to four times the typical distance of the cameras."""
+    distance = typical_distance(cameras)
+    shares = overlaps(cameras, distance)
     neighbors = {
         row: [rows[other] for other in _spread_neighbors(cameras, shares[index], index)]
         for index, row in enumerate(rows)
     }
     photos, poses = scaled_photographs(photographs, rows, ROUGH_SIZE)
-    maps = {
-        row: sweep_neighbors(row, neighbors[row], photos, poses, *limits, max_planes=ROUGH_PLANES)
-        for row in track(rows, "sweeping planes at all depths")
-        if len(neighbors[row]) >= 2
-    }
-    return back_project(consistent_depths(maps, photos, poses, neighbors, ROUGH_TOLERANCE), photos, poses)[0]
+    depths = consistent_depths(
+        photos,
+        poses,
+        neighbors,
+        dict.fromkeys(rows, (distance / 5, 4 * distance)),
+        track(rows, "sweeping planes at all depths"),
+        max_planes=ROUGH_PLANES,
+        tolerance=ROUGH_TOLERANCE,
+    )
+    return back_project(depths, photos, poses)[0]
 
 
 def _spread_neighbors(cameras: Cameras, shares: np.ndarray, view: int) -> list[int]:

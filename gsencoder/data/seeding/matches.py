@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
@@ -24,56 +24,6 @@ DATABASE = "database.db"
 def picture_name(view: int) -> str:
     """The name of a view in the database."""
     return f"{view:06d}.png"
-
-
-def detect_features(
-    pycolmap: Any, database_path: Path, pictures: Path, views: Views, cameras: Cameras, features: int, track: Track
-) -> None:
-    """Writes the pictures at the size of `cameras`, and their features into a new database."""
-    from PIL import Image
-
-    masks = pictures.with_name("masks")
-    assert views.images is not None
-    for view in track(range(len(views)), "reading photographs"):
-        size = int(cameras.widths[view]), int(cameras.heights[view])
-        Image.fromarray(views.images[view]).resize(size, Image.Resampling.BOX).save(
-            pictures / picture_name(view), compress_level=1
-        )
-        if views.masks is not None:
-            masks.mkdir(exist_ok=True)
-            mask = Image.fromarray(views.masks[view].astype(np.uint8) * 255).resize(size, Image.Resampling.NEAREST)
-            mask.save(masks / f"{picture_name(view)}.png", compress_level=1)
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.max_image_size = max(int(cameras.widths.max()), int(cameras.heights.max()))
-    extraction.use_gpu = False
-    extraction.sift.max_num_features = features
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "PINHOLE"
-    if views.masks is not None:
-        reader.mask_path = masks
-    pycolmap.extract_features(
-        database_path,
-        pictures,
-        image_names=[picture_name(view) for view in range(len(views))],
-        camera_mode=pycolmap.CameraMode.PER_IMAGE,
-        reader_options=reader,
-        extraction_options=extraction,
-        device=pycolmap.Device.cpu,
-    )
-
-
-def match_pairs(pycolmap: Any, database_path: Path, list_path: Path, pairs: Sequence[tuple[int, int]]) -> None:
-    """Writes the nearest features of pairs of views into the database, without any check of their geometry."""
-    lines = [f"{picture_name(first)} {picture_name(second)}\n" for first, second in pairs]
-    list_path.write_text("".join(lines), encoding="utf-8")
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.use_gpu = False
-    matching.skip_geometric_verification = True
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = list_path
-    pycolmap.match_image_pairs(
-        database_path, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
-    )
 
 
 def image_ids(database: Any, count: int) -> list[int]:
@@ -96,8 +46,8 @@ def epipolar_distances(
     first_pixels: Float64[np.ndarray, "M 2"],
     second_pixels: Float64[np.ndarray, "M 2"],
 ) -> Float64[np.ndarray, " M"]:
-    """How far pairs of pixels are from showing one point: the larger of the distances in pixels of each from the
-    epipolar line of the other; 0 where there is no such line, as for views from one place."""
+    """The larger of the distances in pixels of each pixel from the epipolar line of the other; 0 where there is no such
+    line, as for views from one place."""
     largest = np.zeros(len(first_pixels))
     for pixels, other, matrix in (
         (second_pixels, first_pixels, fundamental),
@@ -124,15 +74,54 @@ class PairMatches:
 def _matched(
     views: Views, cameras: Cameras, pairs: Sequence[tuple[int, int]], features: int, track: Track
 ) -> Iterator[tuple[Any, Path]]:
-    """pycolmap, and a folder with images/ and the database of the features of views and of their matches."""
+    """pycolmap, and a folder with images/, pictures at the size of `cameras`, and the database of their features and of
+    the nearest ones of pairs of views, whose geometry is not checked."""
+    from PIL import Image
+
     pycolmap = load_pycolmap()
     pycolmap.logging.minloglevel = pycolmap.logging.FATAL
+    assert views.images is not None
     with TemporaryDirectory(prefix="gsencoder_match_") as name:
         folder = Path(name)
-        (folder / "images").mkdir()
+        database, pictures, masks = folder / DATABASE, folder / "images", folder / "masks"
+        pictures.mkdir()
+        masks.mkdir()
+        names = [picture_name(view) for view in range(len(views))]
+        for view in track(range(len(views)), "reading photographs"):
+            size = int(cameras.widths[view]), int(cameras.heights[view])
+            picture = Image.fromarray(views.images[view]).resize(size, Image.Resampling.BOX)
+            picture.save(pictures / names[view], compress_level=1)
+            if views.masks is not None:
+                mask = Image.fromarray(views.masks[view].astype(np.uint8) * 255).resize(size, Image.Resampling.NEAREST)
+                mask.save(masks / f"{names[view]}.png", compress_level=1)
+        extraction = pycolmap.FeatureExtractionOptions()
+        extraction.max_image_size = max(int(cameras.widths.max()), int(cameras.heights.max()))
+        extraction.use_gpu = False
+        extraction.sift.max_num_features = features
+        reader = pycolmap.ImageReaderOptions()
+        reader.camera_model = "PINHOLE"
+        if views.masks is not None:
+            reader.mask_path = masks
+        matching = pycolmap.FeatureMatchingOptions()
+        matching.use_gpu = False
+        matching.skip_geometric_verification = True
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = listed = folder / "pairs.txt"
+        lines = [f"{names[first]} {names[second]}\n" for first, second in pairs]
+        listed.write_text("".join(lines), encoding="utf-8")
         try:
-            detect_features(pycolmap, folder / DATABASE, folder / "images", views, cameras, features, track)
-            match_pairs(pycolmap, folder / DATABASE, folder / "pairs.txt", pairs)
+            pycolmap.extract_features(
+                database,
+                pictures,
+                image_names=names,
+                camera_mode=pycolmap.CameraMode.PER_IMAGE,
+                reader_options=reader,
+                extraction_options=extraction,
+                device=pycolmap.Device.cpu,
+            )
+            pycolmap.match_image_pairs(
+                database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu
+            )
             yield pycolmap, folder
         except (RuntimeError, ValueError) as error:
             message = " ".join(str(error).split())[:160]
@@ -158,9 +147,7 @@ def match_photographs(
 ) -> list[PairMatches]:
     """Matched features of pairs of photographs, unverified; pairs without any are left out.
 
-    Args:
-        cameras: of the same views, at the size in which features are detected.
-        features: largest number of features of a photograph.
+    `cameras` are those of the views at the size in which features, `features` a photograph at most, are detected.
     """
     matched = _matched(views, cameras, pairs, features, track)
     with matched as (pycolmap, folder), pycolmap.Database.open(folder / DATABASE) as database:
@@ -174,13 +161,6 @@ MAX_ANGLE = np.deg2rad(75.0)
 """Views of a surface from directions that differ more are not matched: their features look different."""
 FORWARD_BASELINES = 10.0
 """Parallel cameras are taken to look at something this many times as far away as the nearest other camera."""
-
-
-class DepthRange(NamedTuple):
-    """Depths z at which a view may show something, world units."""
-
-    near: float
-    far: float
 
 
 def typical_distance(cameras: Cameras) -> float:
@@ -244,12 +224,6 @@ def choose_pairs(cameras: Cameras, count: int) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def depth_range_of_cameras(cameras: Cameras) -> DepthRange:
-    """Depths to sweep where nothing is known but the cameras: a fifth to four times the typical distance."""
-    distance = typical_distance(cameras)
-    return DepthRange(distance / 5, 4 * distance)
-
-
 MAX_EPIPOLAR_ERROR = 2.0
 """Largest distance of a match from the epipolar line, in pixels of the pictures that are matched."""
 MIN_MATCHES = 15  # Pairs of views with fewer verified matches are not used
@@ -258,51 +232,42 @@ FITTING_SHARE, ENOUGH_MATCHES = 0.1, 100
 those of eight choices of views, and 0.00 to 0.11 (once 0.20) with other axes, inverse or exchanged poses."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Triangulation:
-    """Points that were triangulated."""
-
-    # World units, in the world of the cameras; sorted, so that a rerun gives the same array.
-    points: Float32[np.ndarray, "P 3"]
-    colors: UInt8[np.ndarray, "P 3"]  # RGB
-    pairs: int  # pairs of views with verified matches
-    error: float  # mean reprojection error in pixels of the pictures that were matched; NaN without points
+SIZE, FEATURES, NEIGHBORS = 1000, 4096, 16
+"""Longer side in pixels at which features are detected, features of a photograph, and others it is matched with."""
 
 
 def triangulate(
-    views: Views, *, size: int = 1000, features: int = 4096, neighbors: int = 16, track: Track = untracked
-) -> Triangulation:
-    """Points that several photographs show, seen from the given poses.
-
-    Args:
-        views: posed photographs, without distortion; features on masked pixels are not used.
-        size: longer side in pixels at which features are detected; smaller photographs keep theirs.
+    views: Views, *, track: Track = untracked
+) -> tuple[Float32[np.ndarray, "P 3"], UInt8[np.ndarray, "P 3"]]:
+    """Points that several photographs show, seen from the given poses, and their colors; features on masked pixels are
+    not used. Sorted, so that a rerun gives the same arrays.
 
     Warns:
         SceneWarning: hardly a match lies on the epipolar lines of the poses.
     """
     if views.images is None or len(views) < 2:
         raise InputError(f"triangulate: expected two posed photographs or more, got {len(views)}")
-    cameras = views.cameras.resized(size, enlarge=False)
-    pairs = choose_pairs(cameras, neighbors)
-    with _matched(views, cameras, pairs, features, track) as (pycolmap, folder):
-        verified = _verify(pycolmap, folder / DATABASE, cameras, pairs)
-        if not verified:
-            return _result(None, verified)
-        model = _posed_model(pycolmap, folder / DATABASE, cameras)
-        options = pycolmap.IncrementalPipelineOptions()
-        options.random_seed = 0
-        options.num_threads = 1
-        model = pycolmap.triangulate_points(model, folder / DATABASE, folder / "images", folder, options=options)
-        model.extract_colors_for_all_images(folder / "images")
-        return _result(model, verified)
+    cameras = views.cameras.resized(SIZE, enlarge=False)
+    pairs = choose_pairs(cameras, NEIGHBORS)
+    with _matched(views, cameras, pairs, FEATURES, track) as (pycolmap, folder):
+        points = []
+        if _verify(pycolmap, folder / DATABASE, cameras, pairs):
+            model = _posed_model(pycolmap, folder / DATABASE, cameras)
+            options = pycolmap.IncrementalPipelineOptions()
+            options.random_seed = 0
+            options.num_threads = 1
+            model = pycolmap.triangulate_points(model, folder / DATABASE, folder / "images", folder, options=options)
+            model.extract_colors_for_all_images(folder / "images")
+            points = list(model.points3D.values())
+    positions = np.array([point.xyz for point in points], np.float32).reshape(-1, 3)
+    colors = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
+    order = np.lexsort(positions.T)
+    return positions[order], colors[order]
 
 
-def _verify(
-    pycolmap: Any, database_path: Path, cameras: Cameras, pairs: Sequence[tuple[int, int]]
-) -> list[tuple[int, int]]:
-    """Writes the matches that lie on the epipolar lines of the poses; returns the pairs that have enough of them."""
-    verified, total, fitting = [], 0, 0
+def _verify(pycolmap: Any, database_path: Path, cameras: Cameras, pairs: Sequence[tuple[int, int]]) -> int:
+    """Writes the matches that lie on the epipolar lines of the poses; returns how many pairs have enough of them."""
+    verified, total, fitting = 0, 0, 0
     with pycolmap.Database.open(database_path) as database:
         for ids, rows, pair in _matches_in(database, len(cameras), pairs):
             good = on_epipolar_lines(cameras, pair.first, pair.second, pair.first_pixels, pair.second_pixels)
@@ -315,7 +280,7 @@ def _verify(
             geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
             geometry.inlier_matches = rows[good]
             database.write_two_view_geometry(*ids, geometry)
-            verified.append((pair.first, pair.second))
+            verified += 1
     if total >= ENOUGH_MATCHES and fitting < FITTING_SHARE * total:
         warnings.warn(
             f"the photographs do not seem to fit their poses: of {total:,} matched features {fitting:,} lie on their "
@@ -355,12 +320,3 @@ def _posed_model(pycolmap: Any, database_path: Path, cameras: Cameras) -> Any:
             )
             model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
     return model
-
-
-def _result(model: Any, verified: Sequence[tuple[int, int]]) -> Triangulation:
-    points = [] if model is None else list(model.points3D.values())
-    positions = np.array([point.xyz for point in points], np.float32).reshape(-1, 3)
-    colors = np.array([point.color for point in points], np.uint8).reshape(-1, 3)
-    order = np.lexsort(positions.T)
-    error = float(model.compute_mean_reprojection_error()) if len(points) else float("nan")
-    return Triangulation(points=positions[order], colors=colors[order], pairs=len(verified), error=error)

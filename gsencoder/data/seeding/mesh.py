@@ -57,7 +57,7 @@ def seed_from_mesh(path: str | Path, *, voxel: float, origin: Float64[np.ndarray
 
 
 def mesh_bounds(path: str | Path) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-    """Lower and upper corner of a mesh file's vertices. Raises InputError as seed_from_mesh does."""
+    """Lower and upper corner of a mesh file's vertices."""
     vertices = [np.asarray(part.vertices, np.float64).reshape(-1, 3) for part in _parts(Path(path))]
     together = np.concatenate(vertices) if vertices else np.zeros((0, 3))
     if not len(together) or not np.isfinite(together).all():
@@ -78,8 +78,15 @@ def seed_from_tsdf(views: Views, *, voxel: float, truncation: float = 4.0, min_w
     """
     if not len(views) or views.depths is None or views.images is None:
         raise InputError("seeds: source=tsdf needs posed views with depth and images; use source=points or source=mesh")
-    o3d = _open3d()
-    core, geometry = o3d.core, o3d.t.geometry
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise InputError(
+            f"seeds: source=tsdf needs open3d, which does not load ({' '.join(str(error).split())[:120]}); on "
+            "Debian or Ubuntu: apt-get install libusb-1.0-0 libgl1"
+        ) from error
+    library: Any = open3d
+    core, geometry = library.core, library.t.geometry
     fine = voxel / 2
     blocks = geometry.VoxelBlockGrid(
         attr_names=("tsdf", "weight", "color"),
@@ -121,17 +128,6 @@ def seed_from_tsdf(views: Views, *, voxel: float, truncation: float = 4.0, min_w
     grid.add(vertices[good], normals[good] / length[good], np.rint(255 * colors[good]).astype(np.uint8))
     samples = grid.samples()
     return flat_gaussians(samples.points, samples.normals, samples.colors, largest=LARGEST_SPACING * voxel)
-
-
-def _open3d() -> Any:
-    try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise InputError(
-            f"seeds: source=tsdf needs open3d, which does not load ({' '.join(str(error).split())[:120]}); on "
-            "Debian or Ubuntu: apt-get install libusb-1.0-0 libgl1"
-        ) from error
-    return open3d
 
 
 def _parts(path: Path) -> list[Any]:

@@ -129,7 +129,7 @@ def seed_from_points(
     the Gaussian is as thick as they are.
 
     Args:
-        points: positions in world units relative to the scene's origin.
+        points: world units, relative to the scene's origin.
         colors: RGB; None makes them mid-grey, with a warning.
         views: cameras, which orient the normals and limit the size of strays.
         voxel: edge of the grid in world units; None keeps every distinct point.
@@ -170,10 +170,7 @@ def colors_or_grey(
 def average_in_voxels(
     points: Float32[np.ndarray, "P 3"], colors: UInt8[np.ndarray, "P 3"], voxel: float | None
 ) -> tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 3"]]:
-    """Mean position and RGB in [0, 1] of each occupied voxel, in the order of the voxels; None joins equal points only.
-
-    Raises InputError where the voxel is not positive or too small for the points' extent.
-    """
+    """Mean position and RGB in [0, 1] of each occupied voxel, in their order; None joins equal points only."""
     if voxel is None:
         cells: np.ndarray = points
     else:
@@ -252,29 +249,17 @@ def scene_spacing(means: Float32[np.ndarray, "N 3"]) -> float:
 
 
 def unit_of(scene: Scene, voxel: float) -> float:
-    """Metres per unit of a scene with Gaussians, for a grid of `voxel` metres.
-
-    Where the scene does not say, its Gaussians are taken to lie one voxel apart, as seeds do.
-
-    Warns:
-        SceneWarning: the unit was estimated, and how.
-    """
+    """Metres per unit of a scene with Gaussians. Where the scene does not say, these are taken, with a warning, to lie
+    one `voxel` (metres) apart, as seeds do."""
     if scene.metres_per_unit is not None:
         return scene.metres_per_unit
     assert scene.gaussians is not None
     spacing = scene_spacing(scene.gaussians.means)
-    if not spacing:
-        warnings.warn(
-            f"the unit of scene {scene.name!r} is unknown, and its Gaussians all lie in one place; a unit is taken for "
-            "1 m; give data.metres_per_unit= if you know better",
-            SceneWarning,
-            stacklevel=3,
-        )
-        return 1.0
-    unit = voxel / spacing
+    unit = voxel / spacing if spacing else 1.0
+    found = f"lie {spacing:.4g} units apart, which is taken for {voxel:g} m" if spacing else "all lie in one place"
     warnings.warn(
-        f"the unit of scene {scene.name!r} is unknown; its Gaussians lie {spacing:.4g} units apart, which is taken for "
-        f"{voxel:g} m, so a unit for {unit:.4g} m; give data.metres_per_unit= if you know better",
+        f"the unit of scene {scene.name!r} is unknown; its Gaussians {found}, so a unit for {unit:.4g} m; "
+        "give data.metres_per_unit= if you know better",
         SceneWarning,
         stacklevel=3,
     )

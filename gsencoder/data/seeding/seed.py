@@ -39,11 +39,10 @@ STARTS = 4  # Cameras whose axes the search begins at
 def room_frame(views: Views) -> Float64[np.ndarray, "4 4"] | None:
     """frame_from_world, rigid: the axes lie along walls, floor and furniture, the origin is the mean of the cameras.
 
+    None where no surface is seen, and without depth.
+
     A grid of cubes is the same whichever axis comes first and whichever way it points. Each is the one nearest to the
     world's, so that rows that are sorted by cells come in the world's order.
-
-    Returns:
-        The frame; None where no surface is seen, and without depth.
     """
     normals = _normals(views) if views.depths is not None and len(views) else np.empty((0, 3))
     if not len(normals):
@@ -83,8 +82,6 @@ def _nearest_order(axes: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3
     rotation[np.abs(rotation.diagonal()).argmin()] *= np.sign(np.linalg.det(rotation))
     return rotation
 
-
-__all__ = ["SeedConfig", "seed", "seed_from_depth", "seed_from_mesh", "seed_from_points", "seed_from_tsdf"]
 
 LARGEST_SPACING = 4.0
 """Upper limit of a Gaussian's spacing in voxels, for surfaces that the frames sample more coarsely than the grid."""
@@ -143,9 +140,6 @@ def seed(scene: Scene, config: SeedConfig = SeedConfig(), *, track: Track = untr
     hundredth of the median depth, for points their median nearest-neighbor distance, for a mesh one hundredth of the
     median distance from the cameras to its middle, or one 300th of its diagonal. Seeds of photographs are as far apart
     as a few pixels (`gsencoder.data.seeding.from_photographs`).
-
-    Args:
-        config: the source, and how large the grid is.
     """
     source, views = choose_source(scene, config), scene.views
     if source == "points":
@@ -156,9 +150,7 @@ def seed(scene: Scene, config: SeedConfig = SeedConfig(), *, track: Track = untr
         return seed_from_points(points, scene.sfm_colors, views=views, voxel=voxel)
     if source == "mesh":
         mesh = config.mesh if scene.folder is None else file_of_scene("seeds.mesh", config.mesh, scene.folder)
-        voxel = _voxel(
-            scene, config, lambda: _mesh_voxel(scene, mesh), "estimated from the mesh's size and the cameras"
-        )
+        voxel = _voxel(scene, config, lambda: _mesh_voxel(scene, mesh), "by the mesh's size and the cameras")
         return seed_from_mesh(mesh, voxel=voxel, origin=scene.origin)
     if views is None:
         inputs = "photographs" if source == "photographs" else "RGB-D frames"
@@ -243,5 +235,5 @@ def _mesh_voxel(scene: Scene, path: str | Path) -> float:
 
 
 def with_gaussians(scene: Scene, config: SeedConfig = SeedConfig(), *, track: Track = untracked) -> Scene:
-    """The scene, with seeds where it has no splat; the arguments are those of `seed`."""
+    """The scene, with seeds where it has no splat."""
     return scene if scene.gaussians is not None else replace(scene, gaussians=seed(scene, config, track=track))

@@ -110,12 +110,7 @@ def sweep(
     *,
     max_planes: int = MAX_PLANES,
 ) -> DepthMap:
-    """Depths of a view by comparing it with others.
-
-    Args:
-        sources: views to compare with, at least two, so that occluded pixels are recognized.
-        max_planes: largest number of planes; a wide range of depths needs more.
-    """
+    """Depths of a view by comparing it with others, at least two, so that occluded pixels are recognized."""
     rays = _points_at(torch.ones(reference.height, reference.width), reference)
     relative = [other @ invert_rigid(pose) for other in source_poses]
     depths = _planes(rays, relative, sources, near, far, max_planes)
@@ -233,11 +228,7 @@ def count_agreeing(
     others: Sequence[tuple[DepthMap, ScaledPhotograph, Float[Tensor, "4 4"]]],
     tolerance: float,
 ) -> Int64[Tensor, "h w"]:
-    """Number of other depth maps that have a surface at each pixel's point.
-
-    Args:
-        depth: of the view, 0 = unknown.
-    """
+    """Number of other depth maps that have a surface at each pixel's point; 0 where its depth is 0, unknown."""
     points = world_points(depth, photo, pose).reshape(-1, 3)
     votes = torch.zeros(len(points), dtype=torch.int64)
     for depth_map, other, other_pose in others:

@@ -27,8 +27,8 @@ def some_transform(number: int) -> np.ndarray:
     return matrix
 
 
-@pytest.mark.parametrize("number", range(2))
-def test_seeds_of_a_turned_room_are_its_turned_seeds(number):
+def test_seeds_of_a_turned_room_are_its_turned_seeds():
+    number = 0
     views = make_room(number, objects=6, views=6, width=96, height=72).views
     config = SeedConfig(voxel=0.04)
     other_from_world = some_transform(number)
@@ -47,7 +47,7 @@ def test_seeds_of_a_turned_room_are_its_turned_seeds(number):
     assert np.mean(np.abs(cosines[same]) > 0.999) > 0.99
 
 
-@pytest.mark.parametrize("number", range(3))
+@pytest.mark.parametrize("number", range(2))
 def test_the_axes_of_a_box_are_those_of_its_walls_and_the_origin_is_among_the_cameras(number):
     other_from_world = some_transform(number)
     views = moved(box_views(box_cameras(5, width=96, height=72, focal=67.2)), other_from_world)
@@ -58,13 +58,6 @@ def test_the_axes_of_a_box_are_those_of_its_walls_and_the_origin_is_among_the_ca
     assert np.linalg.det(frame[:3, :3]) == pytest.approx(1)
     center = views.cameras.centers.mean(axis=0)
     np.testing.assert_allclose(frame[:3, :3] @ center + frame[:3, 3], 0, atol=1e-5)
-
-
-def test_larger_depth_images_give_the_same_frame():
-    small, large = (
-        room_frame(box_views(box_cameras(3, width=80 * size, height=60 * size, focal=56.0 * size))) for size in (1, 4)
-    )
-    np.testing.assert_allclose(np.abs(large[:3, :3] @ small[:3, :3].T).max(axis=0), 1, atol=1e-4)
 
 
 def test_depth_without_surfaces_has_no_frame():

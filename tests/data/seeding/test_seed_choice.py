@@ -66,13 +66,6 @@ class TestSeed:
         with pytest.raises(InputError, match="no depth images"):
             seed(replace(room, views=replace(room.views, depths=None)), SeedConfig(source="depth"))
 
-    @pytest.mark.usefixtures("no_jaxtyping")
-    def test_options_out_of_range_are_errors(self):
-        for options in ({"voxel": 0.0}, {"voxel": float("nan")}, {"source": "mesh"}):
-            (name,) = options
-            with pytest.raises(InputError, match=name):
-                SeedConfig(**options)
-
     @pytest.mark.shared
     def test_a_house_scene_is_seeded_in_seconds_with_a_seed_at_every_seen_point(self, shared):
         scene = load_scene(shared / "scenes/house/train_004")
@@ -86,36 +79,6 @@ class TestSeed:
         distance, _ = cKDTree(g.means).query(points)
         assert np.quantile(distance, 0.99) < 0.02
         assert np.isfinite(pose).all()
-
-    @pytest.mark.shared
-    @pytest.mark.slow
-    def test_small_objects_keep_their_boxes(self, shared):
-        """Seeds inside an object's box, on its surface by the instance maps, span at least half of its volume."""
-        scene = load_scene(shared / "scenes/house/train_012")
-        g = seed(scene)
-        votes = np.zeros((len(g), max(thing.id for thing in scene.objects) + 1), np.int32)
-        for view in range(len(scene.views)):
-            pose, M = scene.views.cameras.cam_from_world[view], scene.views.cameras.Ks[view]
-            local = g.means @ pose[:3, :3].T + pose[:3, 3]
-            rows = np.flatnonzero(local[:, 2] > 0.05)
-            x, y = np.floor(local[rows, :2] / local[rows, 2:] * np.diag(M)[:2] + M[:2, 2]).astype(int).T
-            depth, labels = scene.views.depths[view], scene.views.instances[view]
-            inside = (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
-            rows, x, y = rows[inside], x[inside], y[inside]
-            seen = (np.abs(depth[y, x] - local[rows, 2]) < 0.02) & (labels[y, x] < votes.shape[1])
-            np.add.at(votes, (rows[seen], labels[y[seen], x[seen]]), 1)
-        owner = np.where(votes.max(axis=1) > 0, votes.argmax(axis=1), 0)
-        overlaps = []
-        for thing in scene.objects:
-            if thing.placed and thing.views >= 5 and thing.max_pixels >= 60:
-                mine = g.means[owner == thing.id].astype(np.float64) + scene.origin
-                lower, upper = mine.min(axis=0), mine.max(axis=0)
-                common = np.clip(np.minimum(upper, thing.aabb_max) - np.maximum(lower, thing.aabb_min), 0, None).prod()
-                both = (upper - lower).prod() + (thing.aabb_max - thing.aabb_min).prod()
-                overlaps.append(common / (both - common))
-        assert len(overlaps) >= 5
-        assert min(overlaps) > 0.5
-        assert np.mean(overlaps) > 0.8
 
     @pytest.mark.shared
     def test_the_plush_is_usable_through_its_sfm_points(self, shared):

@@ -13,7 +13,6 @@ from gsencoder.data.seeding.from_photographs import MIN_COVERAGE, _spread_neighb
 from gsencoder.data.seeding.matches import (
     DEPTHS,
     choose_pairs,
-    depth_range_of_cameras,
     fundamental_matrix,
     match_photographs,
     nearest_distances,
@@ -44,33 +43,15 @@ def test_distances_and_overlaps_do_not_depend_on_the_world():
     cameras = arc(6)
     other = moved(cameras, Rotation.random(random_state=0).as_matrix(), 7.0)
     assert typical_distance(other) == pytest.approx(7 * typical_distance(cameras), rel=1e-4)
-    near, far = depth_range_of_cameras(other)
-    assert (near, far) == pytest.approx((7 * 2 / 5, 7 * 2 * 4), rel=1e-4)
     np.testing.assert_allclose(overlaps(other, 14.0), overlaps(cameras, 2.0), atol=0.02)
     assert choose_pairs(other, 2) == choose_pairs(cameras, 2)
 
 
-def test_the_overlap_with_a_view_at_the_same_place_is_whole_and_with_a_wider_one_too():
-    pair = arc(1).select([0, 0])
-    assert overlaps(pair, 1.0).tolist() == [[0, 1], [1, 0]]
-    wide = replace(pair, Ks=np.stack((pair.Ks[0], pair.Ks[1] * np.array([[0.5], [0.5], [1]], np.float32))))
-    wide.Ks[1, :2, 2] = 32, 24
-    # Rays through the middles of fifths: three of five in each direction lie in the middle half.
-    assert overlaps(wide, 1.0).tolist() == [[0, 1], [pytest.approx(9 / 25), 0]]
-
-
-def test_a_view_from_behind_sees_the_points_and_does_not_count():
-    """Two cameras that look at each other: what lies between them is seen from opposite sides."""
-    centers = np.array([[-2.0, 0, 0], [2.0, 0, 0]])
-    face = looking_cameras(centers, -centers / 2, UP, width=64, height=48, focal=60.0)
-    assert overlaps(face, 2.0).sum() == 0
-
-
 def test_the_overlap_is_the_share_of_points_that_both_see_from_similar_directions():
     """The oracle: each of the 125 points by itself."""
-    cameras = arc(5, 40.0)
+    cameras = arc(3, 40.0)
     shares = overlaps(cameras, 1.5)
-    for view, other in np.ndindex(5, 5):
+    for view, other in np.ndindex(3, 3):
         count = 0
         for depth in DEPTHS:
             for column in (6.4, 19.2, 32.0, 44.8, 57.6):
@@ -101,10 +82,6 @@ def test_cameras_that_look_apart_are_taken_to_look_ten_neighbors_away():
     mixed = cameras.cam_from_world.copy()
     mixed[0] = outward[0]
     assert typical_distance(replace(cameras, cam_from_world=mixed)) == pytest.approx(2, rel=0.05)
-
-
-def test_two_cameras_that_look_at_one_point_are_as_far_from_it_as_they_are():
-    assert typical_distance(arc(2, 30.0)) == pytest.approx(2, rel=1e-5)
 
 
 def test_distances_between_neighbors_count_each_place_once():
