@@ -4,6 +4,7 @@ import json
 import shutil
 import warnings
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -36,13 +37,10 @@ class Course(NamedTuple):
 
 
 def follow(pictures: Iterable[UInt8[np.ndarray, "H W"]]) -> Course:
-    """Measures motion and sharpness of all frames.
+    """Motion and sharpness of all frames, of whose pictures the longer side has about `SIZE` pixels.
 
     Each frame is compared with the newest one from which the picture had moved by some pixels, so that slow motion
     counts in full, and trembling about one place does not.
-
-    Args:
-        pictures: brightness of each frame, at a longer side of about `SIZE` pixels.
     """
     positions: list[float] = []
     sharpness: list[float] = []
@@ -51,7 +49,8 @@ def follow(pictures: Iterable[UInt8[np.ndarray, "H W"]]) -> Course:
     for picture in pictures:
         full = picture.astype(np.float32)
         sharpness.append(laplacian_variance(full))
-        half = _halved(full)
+        height, width = (side // 2 for side in full.shape)
+        half = full[: 2 * height, : 2 * width].reshape(height, 2, width, 2).mean(axis=(1, 3))
         # A picture of another size cannot be compared; few videos change theirs.
         if reference is None or reference.shape != half.shape:
             reference = half
@@ -99,10 +98,7 @@ def median_motion(before: Float[np.ndarray, "H W"], after: Float[np.ndarray, "H 
 def choose_frames(course: Course, *, motion: float, most: int, least: int) -> Int64[np.ndarray, " n"]:
     """Indices of the frames to take, rising: of those nearest to each of evenly spaced positions a sharp one.
 
-    Args:
-        motion: wanted distance between two frames in widths of the picture.
-        most: largest number of frames; they stand farther apart where that is too few.
-        least: smallest number, closer together where the picture moves little.
+    Positions are `motion` widths of the picture apart, or as far as `most` and `least` frames ask.
     """
     total = float(course.positions[-1])
     if total < motion:
@@ -129,12 +125,6 @@ def _blocks(picture: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "B h w"]:
     return cut.swapaxes(1, 2).reshape(-1, height, width)
 
 
-def _halved(picture: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "h w"]:
-    height, width = (side // 2 * 2 for side in picture.shape)
-    halves: np.ndarray = picture[:height, :width].reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3))
-    return halves
-
-
 TIME_BASE = 1_000_000  # Parts of a second in which files state how long they are
 SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 
@@ -150,37 +140,31 @@ def refuse_video(path: Path) -> None:
         raise InputError(f"{path}: is a video; gsencoder reconstruct makes a scene of it")
 
 
-def load_av() -> Any:
-    """The module av."""
-    try:
-        import av
-    except ImportError:
-        raise InputError("video files are decoded by PyAV, which is missing: pip install 'gsencoder[video]'") from None
-    av.logging.set_level(av.logging.PANIC)
-    return av
-
-
 class Video:
     """A video file that can be decoded from its beginning several times.
 
     Attributes:
-        path: of the file.
         pixel_aspect: width of a stored pixel by its height; 1 where the file states none.
         seconds: duration that the file states; 0 = it states none.
         decoded: seconds of the video that the last pass decoded.
-        failure: why decoding ended before the end of the file, from the last pass; None = it did not, so far as the
-            decoder says.
+        failure: why the last pass ended before the end of the file; None = the decoder says that it did not.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self._av = load_av()
+        try:
+            import av
+        except ImportError:
+            raise InputError(
+                "video files are decoded by PyAV, which is missing: pip install 'gsencoder[video]'"
+            ) from None
+        av.logging.set_level(av.logging.PANIC)
+        self.path, self._av = path, av
+        self.decoded = 0.0
+        self.failure: str | None = None
         with self._open() as container:
             stream = container.streams.video[0]
             duration = stream.duration * stream.time_base if stream.duration else (container.duration or 0) / TIME_BASE
-            self.pixel_aspect = float(stream.sample_aspect_ratio or 1)
-        self.seconds, self.decoded = float(duration), 0.0
-        self.failure: str | None = None
+            self.pixel_aspect, self.seconds = float(stream.sample_aspect_ratio or 1), float(duration)
 
     def _open(self) -> Any:
         try:
@@ -213,17 +197,6 @@ class Video:
             raise InputError(f"{self.path}: no frame can be decoded ({self.failure or 'the video is empty'})")
 
 
-def grey_picture(frame: Any, size: int) -> UInt8[np.ndarray, "H W"]:
-    """Brightness of a frame as stored, not rotated.
-
-    Args:
-        size: its longer side becomes at most this many pixels.
-    """
-    width, height = _fitted(frame.width, frame.height, size)
-    grey: np.ndarray = frame.reformat(width=width, height=height, format="gray").to_ndarray()
-    return grey
-
-
 def color_picture(frame: Any, size: int, pixel_aspect: float = 1.0) -> UInt8[np.ndarray, "H W 3"]:
     """RGB of a frame as it is meant to be seen: rotated as the file states, with square pixels.
 
@@ -231,14 +204,15 @@ def color_picture(frame: Any, size: int, pixel_aspect: float = 1.0) -> UInt8[np.
         size: its longer side becomes at most this many pixels.
         pixel_aspect: width of a stored pixel by its height.
     """
-    width, height = _fitted(round(frame.width * pixel_aspect), frame.height, size)
-    color: np.ndarray = frame.reformat(width=width, height=height, format="rgb24").to_ndarray()
+    color = _reformatted(frame, round(frame.width * pixel_aspect), frame.height, size, "rgb24")
     return np.ascontiguousarray(np.rot90(color, round(frame.rotation / 90)))
 
 
-def _fitted(width: int, height: int, size: int) -> tuple[int, int]:
+def _reformatted(frame: Any, width: int, height: int, size: int, form: str) -> np.ndarray:
+    """The pixels of a frame at width × height, reduced to a longer side of `size`."""
     scale = min(1.0, size / max(width, height))
-    return max(1, round(width * scale)), max(1, round(height * scale))
+    width, height = (max(1, round(side * scale)) for side in (width, height))
+    return np.asarray(frame.reformat(width=width, height=height, format=form).to_ndarray())
 
 
 def _reason(error: BaseException) -> str:
@@ -249,6 +223,7 @@ RECORD_FILE = "frames.json"
 FEWEST = 16  # Frames that are taken of a video in which the picture moves little
 THIN = 0.35  # Frames that are farther apart, in widths of the picture, overlap too little to be registered surely
 ENOUGH = 0.98  # A video of which a smaller share can be decoded, less a second for its last frames, is not whole
+PIXELS = 1600  # Longer side of the frames, at most
 QUALITY = 95  # Of the JPEG files
 
 
@@ -260,7 +235,6 @@ class VideoConfig:
     motion: float = option(
         0.08, "by what share of its width the picture moves from one frame to the next", ge=0.001, le=1
     )
-    pixels: int = option(1600, "longer side of the frames in pixels, at most", ge=64, le=16384)
 
     def __post_init__(self) -> None:
         check_limits(self)
@@ -272,32 +246,27 @@ def take_frames(
     """Writes the frames of a video that show most: sharp ones, evenly spaced by how far the picture moves.
 
     The video is decoded twice: small, to measure motion and sharpness of all frames, and large, for the frames that are
-    taken. A folder that an earlier call completed for the same file and settings is used again.
-
-    Args:
-        folder: is replaced; it receives `frame_000000.jpg` and so on, the number being that of the frame in the video,
-            and a record of what they were made from.
+    taken. A folder that an earlier call completed for the same file and settings is used again; any other is replaced.
 
     Returns:
-        Names of the files, in the order of the video.
-
-    Warns:
-        SceneWarning: the video ends early because it is damaged, or the frames are far apart.
+        Names of the files in the order of the video, such as frame_000007.jpg for its frame 7.
     """
-    inputs = _inputs(path, config)
-    earlier = _taken(folder, inputs)
-    if earlier is not None:
-        return earlier
+    state = path.stat()
+    inputs = {"video": [path.name, state.st_size, state.st_mtime_ns], "settings": asdict(config)}
+    with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
+        record = json.loads(read_foreign_text(folder / RECORD_FILE))
+        if record["asked"] == inputs and all((folder / name).is_file() for name in record["files"]):
+            return tuple(record["files"])
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     video = Video(path)
-    course = follow(_small_pictures(video, track))
+    small = track(video.frames(), "looking through the video")
+    course = follow(_reformatted(frame, frame.width, frame.height, SIZE, "gray") for frame in small)
     if video.failure is not None or video.decoded < ENOUGH * video.seconds - 1:
         reason = f" ({video.failure})" if video.failure else ""
         warnings.warn(
             f"{path}: is damaged or cut off: {video.decoded:.1f} s of {video.seconds:.1f} s can be decoded{reason}; "
-            "the "
-            "rest is not used",
+            "the rest is not used",
             SceneWarning,
             stacklevel=2,
         )
@@ -318,30 +287,10 @@ def take_frames(
     for index, frame in track(enumerate(video.frames()), f"taking {len(numbers)} frames"):
         if index in selected:
             names.append(f"frame_{index:06d}.jpg")
-            picture = color_picture(frame, config.pixels, video.pixel_aspect)
+            picture = color_picture(frame, PIXELS, video.pixel_aspect)
             write_picture(folder / names[-1], picture, quality=QUALITY, subsampling=0)
         if index == numbers[-1]:
             break
     # Written last: with it the folder is whole.
     write_json(folder / RECORD_FILE, {"asked": inputs, "files": names})
     return tuple(names)
-
-
-def _small_pictures(video: Video, track: Track) -> Iterator[UInt8[np.ndarray, "H W"]]:
-    for frame in track(video.frames(), "looking through the video"):
-        yield grey_picture(frame, SIZE)
-
-
-def _taken(folder: Path, inputs: dict[str, Any]) -> tuple[str, ...] | None:
-    """Names of the frames that an earlier call has written, if they are whole and were asked for as now."""
-    try:
-        record = json.loads(read_foreign_text(folder / RECORD_FILE))
-        is_whole = record["asked"] == inputs and all((folder / name).is_file() for name in record["files"])
-        return tuple(record["files"]) if is_whole else None
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return None
-
-
-def _inputs(path: Path, config: VideoConfig) -> dict[str, Any]:
-    state = path.stat()
-    return {"video": [path.name, state.st_size, state.st_mtime_ns], "settings": asdict(config)}

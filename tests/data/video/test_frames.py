@@ -1,6 +1,5 @@
 """Frames of video files: upright, sharp, written once, and nothing bad gets in."""
 
-import os
 import struct
 import sys
 from fractions import Fraction
@@ -13,7 +12,7 @@ from PIL import Image
 
 from gsencoder.core.errors import InputError, SceneWarning
 from gsencoder.data.readers.images import picture_size
-from gsencoder.data.video import RECORD_FILE, Video, VideoConfig, color_picture, is_video, take_frames
+from gsencoder.data.video import RECORD_FILE, Video, VideoConfig, color_picture, take_frames
 
 av = pytest.importorskip("av")
 
@@ -64,9 +63,10 @@ def test_sharp_frames_are_written_with_their_number_in_the_video(video, tmp_path
         assert np.abs(stored - picture).mean(axis=(1, 2)).argmin() == number
 
 
-@pytest.mark.parametrize("size", [100, 384, 5000])
-def test_frames_are_made_smaller_and_never_larger(video, tmp_path, size):
-    names = take_frames(video, tmp_path / "images", VideoConfig(pixels=size, frames=6))
+@pytest.mark.parametrize("size", [100, 5000])
+def test_frames_are_made_smaller_and_never_larger(video, tmp_path, monkeypatch, size):
+    monkeypatch.setattr("gsencoder.data.video.PIXELS", size)
+    names = take_frames(video, tmp_path / "images", VideoConfig(frames=6))
     assert len(names) == 6
     assert max(picture_size(tmp_path / "images" / names[0])) == min(size, 384)
 
@@ -133,13 +133,13 @@ def test_frames_are_taken_again_only_for_another_file_or_settings_or_when_damage
 
 
 def test_a_video_that_was_cut_off_gives_what_can_be_decoded_and_a_warning(tmp_path):
-    whole = write_video(tmp_path / "whole.mkv", pan(150, step=4.0))
+    whole = write_video(tmp_path / "whole.mkv", pan(90, step=6.0))
     cut = tmp_path / "cut.mkv"
     data = whole.read_bytes()
     cut.write_bytes(data[: len(data) // 2])
-    with pytest.warns(SceneWarning, match=r"cut.mkv: is damaged or cut off: [12]\.\d s of 5\.0 s can be decoded; the"):
+    with pytest.warns(SceneWarning, match=r"cut.mkv: is damaged or cut off: [12]\.\d s of 3\.0 s can be decoded; the"):
         names = take_frames(cut, tmp_path / "images")
-    assert numbers(names).max() < 100
+    assert numbers(names).max() < 60
 
 
 def test_what_is_no_video_is_an_error_of_one_line(tmp_path):
@@ -173,26 +173,3 @@ def test_without_pyav_the_error_says_what_to_install(video, tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"PyAV, which is missing: pip install 'gsencoder\[video\]'"):
         take_frames(video, tmp_path / "images")
-
-
-def test_files_are_videos_by_their_suffix_and_folders_are_none(video, tmp_path):
-    (tmp_path / "x.mp4").mkdir()
-    assert is_video(video)
-    assert not is_video(tmp_path / "x.mp4")
-    assert not is_video(tmp_path / "missing.mov")
-    os.symlink(video, tmp_path / "LINK.MOV")
-    assert is_video(tmp_path / "LINK.MOV")
-
-
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"frames": 2}, "3 or more"),
-        ({"motion": 0.0}, "0.001 to 1"),
-        ({"motion": 1.5}, "0.001"),
-        ({"pixels": 32}, "64"),
-    ],
-)
-def test_settings_out_of_range_are_errors(changes, expected):
-    with pytest.raises(InputError, match=expected):
-        VideoConfig(**changes)
