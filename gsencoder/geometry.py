@@ -15,28 +15,18 @@ from torch import Tensor
 from gsencoder.types import SH_C0
 
 ALPHA_MIN = 1 / 255  # Below this a Gaussian does not mark a pixel (Kerbl et al. 2023; gsplat).
-
 ALPHA_MAX = 0.999  # One Gaussian never closes a ray completely, so that log1p(-alpha) stays finite
 
 
 class Projected(NamedTuple):
-    """Gaussians on one image plane.
+    """Gaussians on one image plane."""
 
-    Attributes:
-        means2d: centers in pixels.
-        conics: a, b, c of the inverse 2D covariance [[a, b], [b, c]], in 1/pixel².
-        depths: z in the camera, world units.
-        mahalanobis2: squared Mahalanobis radius at which alpha falls to ALPHA_MIN; 0 where it never reaches it.
-        extents: half width and half height in pixels of the ellipse of that radius.
-        valid: in front of the near plane, not too faint, and touching the image.
-    """
-
-    means2d: Float[Tensor, "N 2"]
-    conics: Float[Tensor, "N 3"]
-    depths: Float[Tensor, " N"]
-    mahalanobis2: Float[Tensor, " N"]
-    extents: Float[Tensor, "N 2"]
-    valid: Bool[Tensor, " N"]
+    means2d: Float[Tensor, "N 2"]  # centers in pixels
+    conics: Float[Tensor, "N 3"]  # a, b, c of the inverse 2D covariance [[a, b], [b, c]], in 1/pixel²
+    depths: Float[Tensor, " N"]  # z in the camera, world units
+    mahalanobis2: Float[Tensor, " N"]  # squared Mahalanobis radius at which alpha falls to ALPHA_MIN; 0 = it is fainter
+    extents: Float[Tensor, "N 2"]  # half width and half height in pixels of the ellipse of that radius
+    valid: Bool[Tensor, " N"]  # in front of the near plane, not too faint, and touching the image
 
 
 def normalize_quats(quats: Float[Tensor, "*n 4"], eps: float = 1e-18) -> Float[Tensor, "*n 4"]:
@@ -85,12 +75,7 @@ def project_points(
     """Pixels (fx·x/z + cx, fy·y/z + cy) of points in camera axes; not finite where z = 0.
 
     A point behind the camera has the pixel of its mirror image −x in front of it, so that `unproject_points` with its
-    negative depth gives it back.
-
-    Args:
-        points: [x, y, z] in camera axes.
-        K: intrinsics in pixels.
-        min_depth: where given, z is raised to it first, so that points behind the camera leave the image sideways.
+    negative depth gives it back. With `min_depth` z is raised to it first: such points leave the image sideways.
     """
     x, y, z = points.unbind(dim=-1)
     if min_depth is not None:
@@ -123,17 +108,8 @@ def project(
     """Perspective EWA splatting (Zwicker et al. 2001) with gsplat's conventions.
 
     The Jacobian is taken at x/z and y/z clamped to 30 % of the half field of view beyond the image: without that, a
-    Gaussian just next to the camera covers the whole image. `eps2d` pixels² are added to both variances.
-
-    Args:
-        means: centers, world units.
-        scales: standard deviations, world units.
-        opacities: in [0, 1].
-        K: intrinsics in pixels.
-        width: image width in pixels.
-        height: image height in pixels.
-        eps2d: low-pass variance in pixels².
-        near: smallest depth, world units.
+    Gaussian just next to the camera covers the whole image. `eps2d` pixels² are added to both variances. Depths up to
+    `near` are left out.
     """
     rotation = cam_from_world[:3, :3]
     x, y, z = transform(cam_from_world, means).unbind(dim=-1)
@@ -168,11 +144,8 @@ def project(
 
 
 def sh_basis(directions: Float[Tensor, "n 3"], degree: int) -> Float[Tensor, "n K"]:
-    """Real spherical harmonics of unit directions up to `degree` ≤ 3, in the order and signs of the INRIA files.
-
-    Args:
-        directions: unit vectors from the camera to the Gaussian, world axes.
-    """
+    """Real spherical harmonics of unit directions from the camera, in world axes, up to `degree` ≤ 3, in the order and
+    signs of the INRIA files."""
     x, y, z = directions.unbind(dim=-1)
     pi = math.pi
     columns = [torch.full_like(x, SH_C0)]

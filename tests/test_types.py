@@ -1,6 +1,5 @@
 """What the types that pass between stages do beside holding arrays."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,7 +7,6 @@ import pytest
 from splats import random_gaussians
 
 from gsencoder.core.errors import InputError
-from gsencoder.render import blend
 from gsencoder.types import Cameras, FeatureBasis, FeatureMap, FeatureSpace, GaussianFeatures, Scene, Views
 
 
@@ -35,46 +33,10 @@ def test_resized_cameras_keep_their_field_of_view(width, height, longest):
     assert (small.cam_from_world == whole.cam_from_world).all()
 
 
-def test_a_resized_picture_of_large_gaussians_shows_the_same():
-    gaussians = random_gaussians(40, log_scale=-1.0)
-    large, small = camera(128, 96), camera(128, 96).resized(32)
-    fine = blend(gaussians, large).alpha.reshape(24, 4, 32, 4).mean(dim=(1, 3))
-    coarse = blend(gaussians, small).alpha.reshape(24, 32)
-    assert (fine - coarse).abs().mean() < 0.03
-
-
 @pytest.mark.parametrize("unit", [0.0, -1.0, float("nan"), float("inf"), 10**400, True, "1"])
 def test_a_scene_has_a_positive_unit_or_none(unit, no_jaxtyping):
     with pytest.raises(InputError, match=r"Scene\.metres_per_unit: expected a positive number of metres"):
         Scene(name="room", metres_per_unit=unit)
-
-
-def test_selected_views_read_what_belongs_to_them_when_it_is_asked_for():
-    read = []
-
-    class Files(Sequence[np.ndarray]):
-        def __len__(self) -> int:
-            return 3
-
-        def __getitem__(self, index: Any) -> Any:
-            read.append(index)
-            return np.full((4, 5), index, np.float32)
-
-    cameras = Cameras(
-        cam_from_world=np.tile(np.eye(4, dtype=np.float32), (3, 1, 1)),
-        Ks=np.tile(np.array([[5, 0, 2], [0, 5, 2], [0, 0, 1]], np.float32), (3, 1, 1)),
-        widths=np.array([5, 6, 7], np.int32),
-        heights=np.full(3, 4, np.int32),
-    )
-    views = Views(cameras=cameras, names=("a", "b", "c"), depths=Files())
-    chosen = views.select(np.array([2, 0]))
-    assert (chosen.names, chosen.cameras.widths.tolist(), chosen.images) == (("c", "a"), [7, 5], None)
-    # Runtime checks of types look at an entry of a sequence.
-    read.clear()
-    assert [float(depth[0, 0]) for depth in chosen.depths] == [2, 0]
-    assert read == [2, 0]
-    assert float(chosen.select([1]).depths[0][0, 0]) == 0  # type: ignore[index]
-    assert [float(depth[0, 0]) for depth in chosen.depths[1:]] == [0]
 
 
 def test_views_need_a_name_and_an_entry_for_each_camera(no_jaxtyping):

@@ -11,25 +11,15 @@ from gsencoder.types.checks import check_array, check_finite, check_rows, fail
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FeatureSpace:
-    """Names a feature space and what produced it. Two features may be compared only if their spaces are equal.
+    """Names a feature space and what produced it. Two features may be compared only if their spaces are equal."""
 
-    Attributes:
-        name: a short name for people, such as "clip-vit-b32".
-        channels: D.
-        teacher: the teacher's kind ("labels", "onnx", …).
-        weights: what the teacher was loaded from: a fingerprint, never a path.
-        layer: which output of the teacher.
-        preprocessing: resize, crop and normalization, in words.
-        text_encoder: what turns words into this space; empty if nothing does.
-    """
-
-    name: str
+    name: str  # for people, such as "clip-vit-b32"
     channels: int
-    teacher: str = ""
-    weights: str = ""
-    layer: str = ""
-    preprocessing: str = ""
-    text_encoder: str = ""
+    teacher: str = ""  # its kind ("labels", "onnx", …)
+    weights: str = ""  # a fingerprint of what the teacher was loaded from, never a path
+    layer: str = ""  # which output of the teacher
+    preprocessing: str = ""  # resize, crop and normalization, in words
+    text_encoder: str = ""  # what turns words into this space; empty if nothing does
 
     def __post_init__(self) -> None:
         if type(self.channels) is not int or self.channels < 1:
@@ -49,14 +39,11 @@ class FeatureMap:
     """One view's teacher output: dense `features`, `codes` into a `table`, or `shares` of its rows.
 
     Attributes:
-        features: one vector for each cell of the grid; None where the map is coded or mixed.
-        codes: for each cell a row of `table`, −1 = no feature here.
-        shares: for each cell how much of each row of `table` it is, from 0; such as the posteriors of a classifier.
-            Their sum is the weight of the cell; all zero = no feature here.
-        table: the vectors that codes or shares stand for.
         grid_from_image: affine from image pixels to grid cells, both with centers at .5: the teacher's resize and
             crop. Diagonal: grid = (ax·x + bx, ay·y + by).
-        space: what the vectors are.
+        codes: rows of `table`, −1 = no feature here.
+        shares: how much of each row of `table` a cell is, from 0, such as the posteriors of a classifier. Their sum is
+            the weight of the cell; all zero = no feature here.
     """
 
     grid_from_image: Float64[np.ndarray, "2 3"]
@@ -125,18 +112,11 @@ class FeatureMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FeatureBasis:
-    """An affine subspace of a feature space: feature = mean + coordinates @ components.
-
-    Attributes:
-        mean: the space's mean over what the basis was fitted to.
-        components: orthonormal rows, most energy first.
-        energy_kept: share of the energy about the mean that the rank keeps, in [0, 1].
-        space: the space that the rows live in.
-    """
+    """An affine subspace of a feature space: feature = mean + coordinates @ components."""
 
     mean: Float32[np.ndarray, " D"]
-    components: Float32[np.ndarray, "R D"]
-    energy_kept: float
+    components: Float32[np.ndarray, "R D"]  # orthonormal rows, most energy first
+    energy_kept: float  # share of the energy about the mean that the rank keeps, in [0, 1]
     space: FeatureSpace
 
     def __post_init__(self) -> None:
@@ -158,12 +138,9 @@ class GaussianFeatures:
     """Features on Gaussians, fused or predicted: a row each, or, with `index`, rows of a table that many share.
 
     Attributes:
-        features: vectors, or coordinates in `basis`: of each Gaussian, where rows with weight 0 are zero and mean
-            nothing; with `index` of each row of the table.
+        features: vectors, or coordinates in `basis`. Rows with weight 0 are zero and mean nothing.
         weights: how much each Gaussian was seen, in summed blending weight (pixels); 0 = never.
-        mean: the space's mean, which centered cosines remove; it equals `basis.mean` where there is a basis.
-        space: what the (decoded) vectors are.
-        basis: what the coordinates stand for, or None where `features` holds the vectors themselves.
+        mean: of the space, which centered cosines remove; it equals `basis.mean` where there is a basis.
         index: for each Gaussian its row of the table, −1 where it was never seen; None where each has a row of its own.
     """
 
@@ -217,28 +194,18 @@ class GaussianFeatures:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Box:
-    """A box of a query, in world coordinates with the origin of the scene added.
-
-    Attributes:
-        query: the word.
-        rank: 0 = best of its query.
-        score: see infer/localize/boxes.py.
-        probability: that the Gaussians inside are what the word says; see infer/localize/presence.py.
-        aabb_min, aabb_max: axis-aligned corners.
-        obb_center, obb_rotation, obb_size: oriented box; columns of the rotation are its axes.
-        rows: the Gaussians inside, as row numbers.
-    """
+    """A box of a query, in world coordinates with the origin of the scene added."""
 
     query: str
-    rank: int
-    score: float
-    probability: float
+    rank: int  # 0 = best of its query
+    score: float  # see infer/localize/boxes.py
+    probability: float  # that the Gaussians inside are what the word says
     aabb_min: Float64[np.ndarray, "3"]
     aabb_max: Float64[np.ndarray, "3"]
     obb_center: Float64[np.ndarray, "3"]
-    obb_rotation: Float64[np.ndarray, "3 3"]
+    obb_rotation: Float64[np.ndarray, "3 3"]  # columns are the axes of the oriented box
     obb_size: Float64[np.ndarray, "3"]
-    rows: Integer[np.ndarray, " n"]
+    rows: Integer[np.ndarray, " n"]  # the Gaussians inside
 
     @property
     def center(self) -> Float64[np.ndarray, "3"]:
@@ -251,9 +218,9 @@ class Localization:
 
     Attributes:
         queries: the words, in the order asked.
-        relevancy: one score a word and Gaussian, in [−1, 1] or [0, 1]; NaN where the Gaussian was never seen.
-        thresholds: the relevancy above which a Gaussian was taken, for each word.
-        probabilities: that a word is in the scene: the highest of its boxes, those included that were left out as too
+        relevancy: in [−1, 1] or [0, 1]; NaN where the Gaussian was never seen.
+        thresholds: the relevancy above which a Gaussian was taken.
+        probabilities: that a word is in the scene: the highest of its boxes, with those that were left out as too
             improbable; 0 where no Gaussians answer it.
         boxes: best first within each query, queries in order.
     """
@@ -287,15 +254,12 @@ class MemoryBank:
     """The principal scene components (PSC) of one teacher in one scene: some of the raw features of its maps.
 
     Attributes:
-        components: raw features.
-        sources: for each component the view, and the row and column of the map's cell, that it comes from.
-        grid_from_image: for each component the affine of its map, as `FeatureMap` has it: from pixels of the view's
-            image to cells of the map.
+        sources: the view, and the row and column of its map's cell, that each component comes from.
+        grid_from_image: the affine of the map that each component comes from, as `FeatureMap` has it.
         mean: of the space; zero where cosines are not centered.
         threshold: θ, a cosine.
         coverage: share of the raw features that have a component within the threshold.
         cosine: mean over the raw features of the cosine with the nearest component.
-        space: of the features.
     """
 
     components: Float32[np.ndarray, "M D"]
@@ -345,11 +309,9 @@ class QueryMemory:
     Queries blend as features do: those of a pixel are its row of B times `queries`, divided by its alpha.
 
     Attributes:
-        queries: a row for each Gaussian; rows with weight 0 are zero and mean nothing.
+        queries: of the Gaussians; rows with weight 0 are zero and mean nothing.
         weights: how much each Gaussian was seen, in summed blending weight (pixels); 0 = never.
         projection: W_m, from query channels to the space.
-        bank: the components.
-        scoring: how queries are compared with components.
         temperature: τ; M3's equation has 1, its code 0.05 with cosines.
         mean: of the space, which centered cosines of decoded features remove.
         basis: in whose coordinates `features` decodes; None = in channels.
@@ -392,18 +354,11 @@ class QueryMemory:
     def __len__(self) -> int:
         return len(self.queries)
 
-    def attention(self, queries: Float32[np.ndarray, "n s"]) -> Float32[np.ndarray, "n M"]:
-        """The weights of the components for queries; each row sums to 1."""
-        return self._attention(queries, self._projected_keys())
-
-    def _projected_keys(self) -> Float32[np.ndarray, "s M"]:
-        """W_m PSCᵀ, which is the same for all queries."""
-        return self.projection @ attention_keys(self.bank.components, self.mean, self.scoring).T
-
-    def _attention(
-        self, queries: Float32[np.ndarray, "n s"], keys: Float32[np.ndarray, "s M"]
+    def attention(
+        self, queries: Float32[np.ndarray, "n s"], keys: Float32[np.ndarray, "s M"] | None = None
     ) -> Float32[np.ndarray, "n M"]:
-        scores = queries @ keys
+        """The weights of the components for queries, each row of sum 1; `keys` are W_m PSCᵀ where these are known."""
+        scores = queries @ (self._keys() if keys is None else keys)
         if self.scoring != "dot":
             gram = self.projection.astype(np.float64) @ self.projection.T
             lengths = np.sqrt(np.maximum(np.einsum("ns,st,nt->n", queries, gram, queries, dtype=np.float64), 0))
@@ -412,20 +367,17 @@ class QueryMemory:
         weights = np.exp(scores - scores.max(axis=1, keepdims=True))
         return np.asarray(weights / weights.sum(axis=1, keepdims=True), np.float32)
 
+    def _keys(self) -> Float32[np.ndarray, "s M"]:
+        return self.projection @ attention_keys(self.bank.components, self.mean, self.scoring).T
+
     def attend(
         self, queries: Float32[np.ndarray, "n s"], values: Float32[np.ndarray, "M C"] | None = None
     ) -> Float32[np.ndarray, "n C"]:
-        """The features that queries stand for, block by block.
-
-        Args:
-            queries: any, such as those rendered for pixels; their length does not matter with cosines.
-            values: what is averaged; None = the components.
-        """
+        """The features that queries stand for, block by block: averages of `values`, or of the components; with cosines
+        the length of a query does not matter."""
         values = self.bank.components if values is None else values
-        step, keys = max(1, BLOCK_SCORES // len(self.bank)), self._projected_keys()
-        parts = [
-            self._attention(queries[start : start + step], keys) @ values for start in range(0, len(queries), step)
-        ]
+        step, keys = max(1, BLOCK_SCORES // len(self.bank)), self._keys()
+        parts = [self.attention(queries[start : start + step], keys) @ values for start in range(0, len(queries), step)]
         return np.concatenate(parts) if parts else np.zeros((0, values.shape[1]), np.float32)
 
     def features(self) -> GaussianFeatures:

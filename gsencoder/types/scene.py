@@ -1,9 +1,8 @@
 """Scenes: Gaussians, cameras, posed views and labeled objects of one place.
 
-Cameras: pinhole intrinsics and rigid poses, projection and its inverse (Hartley and Zisserman 2004, ch. 6).
-
-For numpy arrays of any float type, without torch; gsencoder.geometry holds the pinhole for tensors. Pixel centers lie
-at .5, as in COLMAP. Depth is z in the camera, and not the length of the ray.
+Cameras: pinhole intrinsics and rigid poses, projection and its inverse (Hartley and Zisserman 2004, ch. 6), for numpy
+arrays of any float type; gsencoder.geometry holds the pinhole for tensors. Pixel centers lie at .5, as in COLMAP. Depth
+is z in the camera, and not the length of the ray.
 """
 
 import math
@@ -38,21 +37,13 @@ def sh_from_colors(colors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 1 3
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Gaussians:
-    """A splat in physical values.
+    """A splat in physical values."""
 
-    Attributes:
-        means: centers, in world units relative to the scene's origin.
-        quats: unit rotations wxyz, world_from_gaussian.
-        scales: standard deviations along the Gaussian's own axes, > 0, world units.
-        opacities: in [0, 1].
-        sh: spherical-harmonic color coefficients, degree-major as in the INRIA files; K = 1, 4, 9 or 16.
-    """
-
-    means: Float32[np.ndarray, "N 3"]
-    quats: Float32[np.ndarray, "N 4"]
-    scales: Float32[np.ndarray, "N 3"]
-    opacities: Float32[np.ndarray, " N"]
-    sh: Float32[np.ndarray, "N K 3"]
+    means: Float32[np.ndarray, "N 3"]  # world units, relative to the scene's origin
+    quats: Float32[np.ndarray, "N 4"]  # unit rotations wxyz, world_from_gaussian
+    scales: Float32[np.ndarray, "N 3"]  # standard deviations along the Gaussian's own axes, > 0, world units
+    opacities: Float32[np.ndarray, " N"]  # in [0, 1]
+    sh: Float32[np.ndarray, "N K 3"]  # color coefficients, degree-major as in the INRIA files; K = 1, 4, 9 or 16
 
     def __post_init__(self) -> None:
         n = len(self.means) if isinstance(self.means, np.ndarray) and self.means.ndim else 0
@@ -63,7 +54,7 @@ class Gaussians:
         check_array("Gaussians", "sh", self.sh, "float32", (n, "K", 3))
         if self.sh.shape[1] not in (1, 4, 9, 16):
             fail("Gaussians", "sh", "1, 4, 9 or 16 coefficients (SH degree 0 to 3)", str(self.sh.shape[1]))
-        for name in ("means", "quats", "scales", "opacities", "sh"):
+        for name in self.__dataclass_fields__:
             check_finite("Gaussians", name, getattr(self, name))
         with np.errstate(over="ignore"):  # A norm beyond float32 is infinite, and refused.
             norms = np.linalg.norm(self.quats, axis=1)
@@ -83,13 +74,7 @@ class Gaussians:
 
     def select(self, rows: np.ndarray) -> "Gaussians":
         """The Gaussians of `rows` (indices or a mask), in that order."""
-        return Gaussians(
-            means=self.means[rows],
-            quats=self.quats[rows],
-            scales=self.scales[rows],
-            opacities=self.opacities[rows],
-            sh=self.sh[rows],
-        )
+        return Gaussians(**{name: getattr(self, name)[rows] for name in self.__dataclass_fields__})
 
 
 def intrinsic_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64[np.ndarray, "3 3"]:
@@ -108,11 +93,7 @@ def project_points(
     """Pixels (fx·x/z + cx, fy·y/z + cy) of points in camera axes; not finite where z = 0.
 
     A point behind the camera has the pixel of its mirror image −x in front of it, so that `unproject_points` with its
-    negative depth gives it back.
-
-    Args:
-        points: [x, y, z] in camera axes.
-        min_depth: where given, z is raised to it first, so that points behind the camera leave the image sideways.
+    negative depth gives it back. With `min_depth` z is raised to it first: such points leave the image sideways.
     """
     rows = points.mT
     z = rows[..., 2:, :] if min_depth is None else np.maximum(rows[..., 2:, :], min_depth)
@@ -134,18 +115,11 @@ def unproject_points(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Cameras:
-    """Pinhole cameras without distortion (it is removed at load).
+    """Pinhole cameras without distortion (it is removed at load)."""
 
-    Attributes:
-        cam_from_world: rigid transforms into OpenCV camera axes; world is relative to the scene's origin.
-        Ks: intrinsics in pixels, pixel centers at .5.
-        widths: image widths in pixels.
-        heights: image heights in pixels.
-    """
-
-    cam_from_world: Float32[np.ndarray, "V 4 4"]
-    Ks: Float32[np.ndarray, "V 3 3"]
-    widths: Int32[np.ndarray, " V"]
+    cam_from_world: Float32[np.ndarray, "V 4 4"]  # rigid, OpenCV camera axes, world relative to the scene's origin
+    Ks: Float32[np.ndarray, "V 3 3"]  # pixels, pixel centers at .5
+    widths: Int32[np.ndarray, " V"]  # of the images, pixels
     heights: Int32[np.ndarray, " V"]
 
     def __post_init__(self) -> None:
@@ -185,12 +159,11 @@ class Cameras:
     def project(
         self, points: Float[np.ndarray, "n 3"], view: int | None = None, *, min_depth: float | None = None
     ) -> tuple[Float[np.ndarray, "*v n 2"], Float[np.ndarray, "*v n"]]:
-        """Pixels and depths of world points, in the points' float type; see `project_points` for those behind.
+        """Pixels and depths of world points, in the points' float type; see `project_points` for those behind, and for
+        `min_depth`, which leaves the depths that are returned as they are.
 
         Args:
-            points: in the cameras' world.
             view: one camera; None = all of them, which puts an axis V before the others.
-            min_depth: see `project_points`; the depths that are returned stay as they are.
         """
         chosen = slice(None) if view is None else view
         poses, center = self.cam_from_world[chosen].astype(np.float64), np.zeros(3, points.dtype)
@@ -211,12 +184,7 @@ class Cameras:
         *,
         near: float = 0.0,
     ) -> Bool[np.ndarray, "*v n"]:
-        """Which projected points lie in the image and beyond depth `near`; what may hide them is not asked.
-
-        Args:
-            view: one camera; None = all of them.
-            near: smallest depth, world units, itself excluded.
-        """
+        """Which projected points lie in the image and beyond depth `near`; what may hide them is not asked."""
         chosen = slice(None) if view is None else view
         u, v = pixels[..., 0], pixels[..., 1]
         # In the pixels' own type: against integers a comparison of float32 is done in float64.
@@ -251,16 +219,10 @@ class Cameras:
     def select(self, views: Sequence[int] | np.ndarray | slice) -> "Cameras":
         """The cameras of `views`, in that order."""
         rows = views if isinstance(views, slice) else np.asarray(views, dtype=np.int64)
-        return Cameras(
-            cam_from_world=self.cam_from_world[rows],
-            Ks=self.Ks[rows],
-            widths=self.widths[rows],
-            heights=self.heights[rows],
-        )
+        return Cameras(**{name: getattr(self, name)[rows] for name in self.__dataclass_fields__})
 
     def resized(self, longest: int, *, enlarge: bool = True) -> "Cameras":
-        """The same fields of view in pictures whose longer side has `longest` pixels; without `enlarge`, at
-        most."""
+        """The same fields of view in pictures whose longer side has `longest` pixels; without `enlarge`, at most."""
         factors = longest / np.maximum(self.widths, self.heights)
         if not enlarge:
             factors = np.minimum(factors, 1)
@@ -280,28 +242,18 @@ LAZY = ("images", "depths", "masks", "empty", "instances")  # Fields of Views th
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Views:
-    """Cameras with what was seen through them. The sequences load on access: `views.images[3]` reads one file.
-
-    Attributes:
-        cameras: V cameras.
-        names: V names, unique, as the scene's files give them.
-        images: uint8 [H, W, 3] each, RGB; None where there are no pictures.
-        depths: float32 [H, W] each, z in world units, 0 = none; None where no sensor depth exists.
-        masks: bool [H, W] each, True = use this pixel.
-        empty: bool [H, W] each, True = the photograph shows that nothing is there, as transparency does; such pixels
-            are masked, too.
-        instances: int32 [H, W] each, 0 = none.
-        orientations: EXIF orientations, 1 to 8: how the stored pixels, which cameras and pictures are of, are turned to
-            be upright (`gsencoder.types.orientation`); None = all are.
-    """
+    """Cameras with what was seen through them. The sequences load on access: `views.images[3]` reads one file."""
 
     cameras: Cameras
-    names: tuple[str, ...]
-    images: Sequence[UInt8[np.ndarray, "_ _ 3"]] | None = None
-    depths: Sequence[Float32[np.ndarray, "_ _"]] | None = None
-    masks: Sequence[Bool[np.ndarray, "_ _"]] | None = None
+    names: tuple[str, ...]  # unique, as the scene's files give them
+    images: Sequence[UInt8[np.ndarray, "_ _ 3"]] | None = None  # RGB
+    depths: Sequence[Float32[np.ndarray, "_ _"]] | None = None  # z in world units, 0 = none
+    masks: Sequence[Bool[np.ndarray, "_ _"]] | None = None  # True = use this pixel
+    # True = the photograph shows that nothing is there, as transparency does; such pixels are masked, too.
     empty: Sequence[Bool[np.ndarray, "_ _"]] | None = None
-    instances: Sequence[Int32[np.ndarray, "_ _"]] | None = None
+    instances: Sequence[Int32[np.ndarray, "_ _"]] | None = None  # 0 = none
+    # EXIF orientations, 1 to 8: how the stored pixels, which cameras and pictures are of, are turned to be upright
+    # (`gsencoder.types.orientation`); None = all are.
     orientations: tuple[int, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -330,12 +282,7 @@ class Views:
 
 
 class Selected(Sequence[Any]):
-    """Selected entries of a sequence, each read on access.
-
-    Attributes:
-        items: the whole sequence.
-        rows: which of them, in this order.
-    """
+    """Entries `rows` of a sequence, each read on access."""
 
     def __init__(self, items: Sequence[Any], rows: list[int]) -> None:
         self.items, self.rows = items, rows
@@ -351,56 +298,34 @@ class Selected(Sequence[Any]):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SceneObject:
-    """A labeled object, for evaluation. The box is in world coordinates, origin included.
+    """A labeled object, for evaluation. The box is in world coordinates, origin included."""
 
-    Attributes:
-        id: its value in the instance maps.
-        name: a word of the name table, or None.
-        aabb_min: lower corner, world units.
-        aabb_max: upper corner.
-        placed: one of the small objects, as opposed to furniture; of scanned scenes whatever is no part of the building
-            (`gsencoder.data.labels.scans.is_placed`).
-        views: in how many views it shows; None where not counted (`with_counted_views` of the same module does).
-        max_pixels: its largest visible area in a view; None as above.
-    """
-
-    id: int
+    id: int  # its value in the instance maps
     name: str | None
     aabb_min: Float64[np.ndarray, "3"]
     aabb_max: Float64[np.ndarray, "3"]
+    # One of the small objects, as opposed to furniture; of scanned scenes whatever is no part of the building
+    # (`gsencoder.data.labels.scans.is_placed`).
     placed: bool = True
-    views: int | None = 0
-    max_pixels: int | None = 0
+    views: int | None = 0  # in how many it shows; None where not counted (`with_counted_views` of the same module does)
+    max_pixels: int | None = 0  # its largest visible area in a view; None as above
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scene:
-    """A place: Gaussians, or views, or both.
+    """A place: Gaussians, or views, or both; positions are relative to `origin`."""
 
-    Attributes:
-        name: for people and for output folders.
-        gaussians: the splat, relative to `origin`; None until there is one.
-        views: posed cameras and what they saw, relative to `origin`; None for a bare splat.
-        features: per-Gaussian features by space name.
-        origin: float64 offset that was taken off every position; boxes add it back.
-        metres_per_unit: None where the unit of length is unknown.
-        up: unit vector in the world, or None where unknown.
-        objects: labeled objects, where the scene has them.
-        sfm_points: structure-from-motion points relative to `origin`, with uint8 colors.
-        folder: that the scene was read from; None for one that was made.
-    """
-
-    name: str
+    name: str  # for people and for output folders
     gaussians: Gaussians | None = None
     views: Views | None = None
-    features: dict[str, GaussianFeatures] = field(default_factory=dict)
-    origin: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    metres_per_unit: float | None = None
-    up: Float64[np.ndarray, "3"] | None = None
+    features: dict[str, GaussianFeatures] = field(default_factory=dict)  # by name of the space
+    origin: Float64[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))  # boxes add it back
+    metres_per_unit: float | None = None  # None = unknown
+    up: Float64[np.ndarray, "3"] | None = None  # unit vector in the world; None = unknown
     objects: tuple[SceneObject, ...] = ()
     sfm_points: Float32[np.ndarray, "P 3"] | None = None
     sfm_colors: UInt8[np.ndarray, "P 3"] | None = None
-    folder: Path | None = None
+    folder: Path | None = None  # that the scene was read from
 
     def __post_init__(self) -> None:
         if self.name in ("", ".", "..") or "/" in self.name or "\0" in self.name:
@@ -428,9 +353,9 @@ class MeshLabels:
         vertices: in the world of the scene's poses, world units, no origin subtracted; in the order of the mesh file,
             since benchmarks count by it.
         instances: the id of each vertex's object, 0 = none.
-        objects: (id, raw name) of each object, in the order of the annotation; ids are unique and at least 1. An object
-            may have no vertex left, where others overlap it.
-        faces: rows of the three vertices of each triangle; None where the file has none or they were not read.
+        objects: (id from 1, raw name), in the order of the annotation. An object may have no vertex left, where others
+            overlap it.
+        faces: rows of vertices; None where the file has none or they were not read.
         aligned_from_world: rigid transform into the frame in which a benchmark's boxes are axis-aligned, such as that
             of ScanRefer; None where no file states one, and the world is that frame.
     """
