@@ -51,7 +51,7 @@ from gsencoder.data.readers.posed import (
     rigid_pose,
 )
 from gsencoder.data.readers.transforms_json import TRANSFORMS, read_objects, read_transforms
-from gsencoder.data.readers.undistort import CameraModel, Pinhole, pinhole_for, remap_between
+from gsencoder.data.readers.undistort import CameraModel, pinhole_for, remap_between
 from gsencoder.data.splats.files import load_splat
 from gsencoder.types import Cameras, Scene, Views
 from gsencoder.types.checks import invert_rigid, move_origin
@@ -222,7 +222,7 @@ def make_views(
         images = tuple(images[row] for row in even_indices(len(images), max_views))
     cam_from_world = np.stack([image.cam_from_world for image in images])
     origin = choose_origin(invert_rigid(cam_from_world)[:, :3, 3])
-    pinholes: dict[CameraModel, Pinhole] = {}
+    pinholes: dict[CameraModel, CameraModel] = {}
     grids, depth_grids = [], []
     transparent: list[Path | None] = []
     orientations: list[int] = []
@@ -315,7 +315,7 @@ def _check_sizes(image: PosedImage, grid: PixelGrid, depth_grid: PixelGrid, size
             )
 
 
-def _have_empty_pixels(cameras: set[tuple[Pinhole, CameraModel, int]]) -> bool:
+def _have_empty_pixels(cameras: set[tuple[CameraModel, CameraModel, int]]) -> bool:
     """Whether some pixel of a pinhole camera is outside the distorted picture."""
     distorted = [camera for camera in cameras if not camera[1].is_pinhole]
     if len(distorted) > FEW_CAMERAS:

@@ -27,7 +27,7 @@ from jaxtyping import Bool, UInt8
 
 from gsencoder.core.errors import InputError
 from gsencoder.core.files import check_foreign
-from gsencoder.data.readers.undistort import CameraModel, Pinhole, check_camera, remap_between
+from gsencoder.data.readers.undistort import CameraModel, check_camera, remap_between
 from gsencoder.types.orientation import EXCHANGED, turned
 from gsencoder.types.scene import Selected
 
@@ -227,7 +227,7 @@ class PixelGrid:
     """How the pixels of a view's file become the pixels of the view."""
 
     source: CameraModel  # the camera that the file's pixels belong to
-    pinhole: Pinhole  # the camera without distortion, at full size
+    pinhole: CameraModel  # the camera without distortion, at full size
     width: int  # of the view, after scaling
     height: int  # of the view, after scaling
     # EXIF orientation by which a file is turned whose width and height are those of `source` exchanged; 1 = no such

@@ -22,7 +22,7 @@ from gsencoder.data.readers.images import (
     load_npy,
     read_integers,
 )
-from gsencoder.data.readers.undistort import CameraModel, Pinhole
+from gsencoder.data.readers.undistort import CameraModel
 from gsencoder.types import Views
 from gsencoder.types.scene import Selected
 
@@ -67,13 +67,9 @@ def label_files(paths: Sequence[Path], views: Views, archive: Path | None = None
 def _grid_of(views: Views, view: int) -> PixelGrid:
     """The pixels of a camera as they are."""
     K, width, height = views.cameras.Ks[view], int(views.cameras.widths[view]), int(views.cameras.heights[view])
-    fx, fy, cx, cy = (float(value) for value in (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
-    return PixelGrid(
-        source=CameraModel(model="PINHOLE", width=width, height=height, params=(fx, fy, cx, cy)),
-        pinhole=Pinhole(fx=fx, fy=fy, cx=cx, cy=cy, width=width, height=height),
-        width=width,
-        height=height,
-    )
+    params = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    camera = CameraModel(model="PINHOLE", width=width, height=height, params=params)
+    return PixelGrid(source=camera, pinhole=camera, width=width, height=height)
 
 
 def read_labels(path: Path) -> Int32[np.ndarray, "H W"]:

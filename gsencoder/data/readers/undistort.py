@@ -60,32 +60,22 @@ class CameraModel:
             return (self.params[0], *self.params[:3])  # type: ignore[return-value]
         return self.params[:4]  # type: ignore[return-value]
 
+    def matrix(self, width: int, height: int) -> Float64[np.ndarray, "3 3"]:
+        """K of the model, distortion left out, for the same picture resized to width × height."""
+        fx, fy, cx, cy = self.pinhole_params()
+        sx, sy = width / self.width, height / self.height
+        return intrinsic_matrix(fx * sx, fy * sy, cx * sx, cy * sy)
+
+    def reduced(self, factor: int) -> "CameraModel":
+        """The pinhole of pixels that stand for factor × factor of this one's; the last ones may be cut off."""
+        width, height = (-(-side // factor) for side in (self.width, self.height))
+        params = tuple(value / factor for value in self.pinhole_params())
+        return CameraModel(model="PINHOLE", width=width, height=height, params=params)
+
 
 def focal_count(camera: CameraModel) -> int:
     """Whether a model has one focal length or two; they come first in its parameters."""
     return _FOCALS.get(camera.model, 2)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Pinhole:
-    """A camera without distortion, in pixels, pixel centers at .5."""
-
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    width: int
-    height: int
-
-    def matrix(self, width: int, height: int) -> Float64[np.ndarray, "3 3"]:
-        """K for the same picture resized to width × height."""
-        sx, sy = width / self.width, height / self.height
-        return intrinsic_matrix(self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
-
-    def reduced(self, factor: int) -> "Pinhole":
-        """The camera of pixels that stand for factor × factor of this one's; the last ones may be cut off."""
-        values = {name: getattr(self, name) / factor for name in ("fx", "fy", "cx", "cy")}
-        return Pinhole(**values, width=-(-self.width // factor), height=-(-self.height // factor))
 
 
 def check_camera(camera: CameraModel, where: str) -> None:
@@ -163,7 +153,7 @@ def _project(
     return where, valid
 
 
-def pinhole_for(camera: CameraModel, where: str) -> Pinhole:
+def pinhole_for(camera: CameraModel, where: str) -> CameraModel:
     """The pinhole camera that stands for `camera` (see the head of this file)."""
     check_camera(camera, where)
     fx, fy, cx, cy = camera.pinhole_params()
@@ -193,7 +183,7 @@ def pinhole_for(camera: CameraModel, where: str) -> Pinhole:
                 f"{where}: {camera.model} with {list(camera.params)} can be inverted on only {share:.0%} of its pixels "
                 "within 170°; check the calibration, or undistort the images yourself"
             )
-    return Pinhole(fx=fx * zoom, fy=fy * zoom, cx=cx, cy=cy, width=w, height=h)
+    return CameraModel(model="PINHOLE", width=w, height=h, params=(fx * zoom, fy * zoom, cx, cy))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -238,7 +228,7 @@ class Remap:
 
 
 @lru_cache(maxsize=8)
-def remap_between(target: Pinhole, source: CameraModel, reduction: int = 1) -> Remap | None:
+def remap_between(target: CameraModel, source: CameraModel, reduction: int = 1) -> Remap | None:
     """The exact map from the pixels of `target` to those of `source`, both looking from the same place; None where
     they have the same pixels. The last eight are kept, since most scenes have few cameras.
 
@@ -248,7 +238,7 @@ def remap_between(target: Pinhole, source: CameraModel, reduction: int = 1) -> R
     if (
         source.is_pinhole
         and (target.width, target.height) == (source.width, source.height)
-        and (target.fx, target.fy, target.cx, target.cy) == source.pinhole_params()
+        and target.pinhole_params() == source.pinhole_params()
     ):
         return None
     reduced = target.reduced(reduction)
