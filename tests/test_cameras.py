@@ -186,17 +186,6 @@ def test_the_inverse_of_a_rigid_transform_is_that_of_linear_algebra_and_of_scipy
     assert (inverse[:, 3] == [0, 0, 0, 1]).all()
 
 
-def test_transforms_compose_and_their_inverses_compose_backwards():
-    first, second = random_poses(20), random_poses(20, seed=1)
-    points = some_points()
-    for a, b in zip(first, second, strict=True):
-        np.testing.assert_allclose(transform(a @ b, points), transform(a, transform(b, points)), atol=1e-12)
-        np.testing.assert_allclose(invert_rigid(a @ b), invert_rigid(b) @ invert_rigid(a), atol=1e-12)
-    np.testing.assert_allclose(transform(first, points)[3], transform(first[3], points), atol=1e-12)
-    expected = Rotation.from_matrix(first[3, :3, :3]).apply(points) + first[3, :3, 3]
-    np.testing.assert_allclose(transform(first[3], points), expected, atol=1e-12)
-
-
 @pytest.mark.parametrize("length", EXTREME)
 def test_a_moved_origin_changes_coordinates_and_no_camera(length):
     poses, origin = random_poses(20), length * np.array([1.0, -2.0, 0.5])

@@ -113,7 +113,7 @@ def test_a_row_of_another_length_is_named(room, tmp_path):
     lines = (folder / "traj.txt").read_text().splitlines()
     lines[3] = lines[3].rsplit(" ", 1)[0]
     (folder / "traj.txt").write_text("\n".join(lines))
-    with pytest.raises(InputError, match="row 4 has 15 values and the first 16; expected n×16"):
+    with pytest.raises(InputError, match="not a table of n×16 numbers .*from 16 to 15 at row 4"):
         load_scene(folder)
 
 

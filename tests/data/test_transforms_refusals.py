@@ -10,8 +10,10 @@ from gsencoder.data.readers.transforms_json import read_transforms
 from gsencoder.data.scenes import load_scene
 
 
-@pytest.mark.parametrize("key", ["file_path", "depth_file_path", "mask_path", "instance_file_path"])
-@pytest.mark.parametrize("kind", ["dots", "absolute", "link"])
+@pytest.mark.parametrize(
+    ("key", "kind"),
+    [("file_path", "dots"), ("depth_file_path", "absolute"), ("mask_path", "link"), ("instance_file_path", "dots")],
+)
 def test_paths_that_leave_the_scene_folder_are_refused(tmp_path, key, kind):
     folder = tmp_path / "scene"
     data = write_transforms(folder)

@@ -40,7 +40,6 @@ def pickled(path: Path) -> None:
     ("name", "write", "problem"),
     [
         ("m.png", lambda p: save(p, photograph(0)), "must be a 8- or 16-bit picture with one channel, got mode RGB"),
-        ("m.png", lambda p: p.write_bytes(b"no"), "not a readable picture"),
         ("m.jpg", lambda p: save(p, LABELS.astype(np.uint8)), "expected a label image as .png, .npy, .safetensors"),
         (
             "m.npy",
@@ -48,14 +47,11 @@ def pickled(path: Path) -> None:
             "expected labels as integers, one a pixel and 0 = none, got float64",
         ),
         ("m.npy", lambda p: np.save(p, LABELS - 1), "expected labels from 0"),
-        ("m.npy", lambda p: np.save(p, LABELS.astype(np.int64) << 40), "expected labels from 0"),
         ("m.npy", lambda p: np.save(p, photograph(0)), r"expected an array \[H, W\], got \[24, 32, 3\]"),
-        ("m.npy", lambda p: np.save(p, LABELS > 0), "expected a .npy array of numbers"),
         ("m.npy", pickled, "not a readable .npy array"),
         ("m.safetensors", lambda p: p.write_bytes(b"no"), "cannot be read as .safetensors"),
         ("m.safetensors", lambda p: save_file({"a": LABELS / 2}, p), "got float64"),
         ("m.safetensors", lambda p: save_file({"a": LABELS, "b": LABELS}, p), "expected one array .*, got 2 arrays"),
-        ("m.safetensors", lambda p: save_file({"a": LABELS[0]}, p), r"got the shape \[3\]"),
     ],
 )
 def test_other_files_are_refused_in_one_line(tmp_path, name, write, problem):
