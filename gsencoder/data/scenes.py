@@ -70,7 +70,10 @@ def find_scenes(paths: Iterable[str | Path]) -> tuple[Path, ...]:
         try:
             if not path.exists():
                 raise InputError(f"{path}: no such file or folder")
-            inner = [path] if is_scene(path) else sorted(filter(_is_scene_folder, path.iterdir()))
+            inner = [path]
+            if not is_scene(path):
+                folders = [each for each in path.iterdir() if each.is_dir() and not each.name.startswith(".")]
+                inner = sorted(filter(is_scene, folders))
         except InputError:
             raise
         except (OSError, ValueError) as error:
@@ -129,10 +132,6 @@ def is_scene(path: Path) -> bool:
         or layout_of(path) is not None
         or any(entry.suffix.lower() in SPLAT_SUFFIXES and entry.is_file() for entry in path.iterdir())
     )
-
-
-def _is_scene_folder(entry: Path) -> bool:
-    return entry.is_dir() and not entry.name.startswith(".") and is_scene(entry)
 
 
 def has_views(path: Path) -> bool:

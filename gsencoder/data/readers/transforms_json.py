@@ -124,7 +124,12 @@ def read_transforms(
         if name in names:
             raise InputError(f"{where}: this file_path is repeated; every frame needs its own")
         names.add(name)
-        image = _find_image(pictures or root, name, where, allow_outside=allow_outside)
+        # Blender leaves the suffix away.
+        candidates = (
+            inside(pictures or root, name + suffix, where, allow_outside=allow_outside)
+            for suffix in ("", *GUESSED_SUFFIXES)
+        )
+        image = next((file for file in candidates if file.is_file()), None)
         if image is None:
             without_image.append(name)
             continue
@@ -235,15 +240,6 @@ def _unused_keys(path: Path, data: dict[str, Any], frames: list[dict[str, Any]])
     of_frames = dict.fromkeys(key for frame in frames for key in frame if key not in FRAME_KEYS | CAMERA_KEYS)
     lists = ((of_file, f"key {{}} of {path.name}"), (of_frames, f"key {{}} of the frames of {path.name}"))
     return tuple(form.format(key[:40]) for keys, form in lists for key in keys)
-
-
-def _find_image(root: Path, name: str, where: str, *, allow_outside: bool) -> Path | None:
-    """The file of a frame; Blender leaves the suffix away."""
-    for suffix in ("", *GUESSED_SUFFIXES):
-        file = inside(root, name + suffix, where, allow_outside=allow_outside)
-        if file.is_file():
-            return file
-    return None
 
 
 def _pose(values: dict[str, Any], key: str, where: str) -> Float64[np.ndarray, "4 4"]:

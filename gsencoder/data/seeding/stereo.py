@@ -195,20 +195,16 @@ def to_grid(points: Float[Tensor, "*n 3"], photo: ScaledPhotograph) -> tuple[Flo
     return grid, (points[..., 2] > SMALLEST_DEPTH) & (u.abs() < 1) & (v.abs() < 1)
 
 
-def sample_nearest(values: Float[Tensor, "h w"], grid: Float[Tensor, "n 2"]) -> Float[Tensor, " n"]:
-    """The pixel that each place of `to_grid` lies in; 0 outside."""
-    return torch.nn.functional.grid_sample(
-        values[None, None], grid[None, None], mode="nearest", align_corners=False, padding_mode="zeros"
-    )[0, 0, 0]
-
-
 def sample_depth(
     points: Float[Tensor, "n 3"], depth: Float[Tensor, "h w"], photo: ScaledPhotograph, pose: Float[Tensor, "4 4"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
     """Depths of world points in a view, and the depths that were found where they project: 0 = none, or outside."""
     camera = transform(pose, points)
     grid, inside = to_grid(camera, photo)
-    return camera[:, 2], torch.where(inside, sample_nearest(depth, grid), 0)
+    nearest = torch.nn.functional.grid_sample(
+        depth[None, None], grid[None, None], mode="nearest", align_corners=False, padding_mode="zeros"
+    )[0, 0, 0]
+    return camera[:, 2], torch.where(inside, nearest, 0)
 
 
 def confirms(z: Float[Tensor, " n"], measured: Float[Tensor, " n"], tolerance: float) -> Bool[Tensor, " n"]:

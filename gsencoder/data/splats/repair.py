@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float64
 
 from gsencoder.core.errors import InputError
 from gsencoder.data.splats.raw import (
@@ -195,28 +195,22 @@ def _find(name: str, raw: RawSplat, unusable: dict[str, Bool[np.ndarray, " N"]])
         return _duplicates(raw)
     finite = ~unusable["nonfinite"]
     defective = np.zeros(len(raw), bool)
-    if finite.any():
-        means = raw.means[finite]
-        defective[finite] = _huge(means, raw.log_scales[finite]) if name == "huge" else _floaters(means)
+    means = raw.means[finite]
+    if not len(means):
+        return defective
     if name == "huge":
-        defective &= ~unusable["scales"]
+        diagonal = float(np.linalg.norm(np.diff(_robust_box(means), axis=0)))
+        # One point, or coincident ones: there is no scene to be larger than.
+        defective[finite] = raw.log_scales[finite].max(axis=1) > (np.log(diagonal) if diagonal else np.inf)
+        return defective & ~unusable["scales"]
+    distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    reach = float(np.quantile(distances, 0.9))
+    defective[finite] = distances > (FLOATER_FACTOR * reach if reach > 0 else np.inf)
     return defective
 
 
 def _robust_box(means: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "2 3"]:
     return np.quantile(means, (0.01, 0.99), axis=0)
-
-
-def _huge(means: Float64[np.ndarray, "N 3"], log_scales: Float32[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-    diagonal = float(np.linalg.norm(np.diff(_robust_box(means), axis=0)))
-    # One point, or coincident ones: there is no scene to be larger than.
-    return log_scales.max(axis=1) > (np.log(diagonal) if diagonal else np.inf)
-
-
-def _floaters(means: Float64[np.ndarray, "N 3"]) -> Bool[np.ndarray, " N"]:
-    distances = np.linalg.norm(means - np.median(means, axis=0), axis=1)
-    reach = float(np.quantile(distances, 0.9))
-    return distances > FLOATER_FACTOR * reach if reach > 0 else np.zeros(len(means), bool)
 
 
 def _duplicates(raw: RawSplat) -> Bool[np.ndarray, " N"]:
