@@ -102,7 +102,7 @@ def test_gaussians_stand_on_a_mesh(tmp_path: Path) -> None:
 def test_points_without_colors_are_grey_and_it_is_said_once() -> None:
     points = wall_points()
     bare = wall(views=wall_views(), sfm_points=points)
-    for dense in (NEVER, DenseConfig(size=96, sources=3, samples=1)):
+    for dense in (NEVER, DenseConfig(samples=1)):
         with pytest.warns(SceneWarning, match="40 points without colors are made mid-grey") as warned:
             start = begun(bare, dense=dense)
         assert len(warned) == 1

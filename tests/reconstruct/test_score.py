@@ -139,7 +139,7 @@ def test_points_before_empty_pixels_of_two_photographs_are_outside_the_hull() ->
 
 def test_seeds_are_added_where_something_is_and_masked_cells_need_none() -> None:
     photographs, points = Photographs(half_empty_views()), wall_points()
-    small = DenseConfig(size=48, spacing=4.0)
+    small = DenseConfig(spacing=4.0)
     cloud = densify(photographs, range(4), points, np.full((len(points), 3), 128, np.uint8), small)
     assert cloud.swept + cloud.filled > 20
     assert not outside_hull(cloud.points, photographs, range(4)).any()
